@@ -7,6 +7,8 @@ other.
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,27 +36,26 @@ PIXELS = [row * WIDTH + column for row, column in zip(D1.rows, D1.columns, stric
 """Pixel of each electrode E1..E24."""
 
 
-class Rest:
-    """Learns where the electrodes of one finger rest."""
+class RestCounts:
+    """Learns where the electrodes of each finger rest."""
 
     def __init__(self) -> None:
-        """Without a reading."""
-        self._mean: NDArray[np.float64] = np.zeros(ELECTRODES)
-        self._number = 0
+        self._means: dict[str, NDArray[np.float64]] = {}
+        self._readings: Counter[str] = Counter()
 
-    @property
-    def counts(self) -> NDArray[np.float64] | None:
-        """Where each electrode rests, counts, shape (24,); None as long as it is not known."""
-        return self._mean if self._number >= KNOWN_AFTER else None
+    def of(self, finger: str) -> NDArray[np.float64] | None:
+        """Return the counts of a finger at rest, shape (24,); None: not known yet."""
+        return self._means[finger] if self._readings[finger] >= KNOWN_AFTER else None
 
-    def learn(self, counts: NDArray[np.float64], sound: NDArray[np.bool_]) -> None:
-        """Take in a reading of a finger that touches nothing; shapes (24,)."""
-        self._number += 1
-        share = max(1.0 / self._number, SHARE)
-        strays = counts - self._mean
-        if self.counts is not None:
+    def learn(self, finger: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]) -> None:
+        """Learn from a reading of a finger that touches nothing; shapes (24,)."""
+        mean = self._means.setdefault(finger, np.zeros(ELECTRODES))
+        strays = counts - mean
+        if self.of(finger) is not None:
             strays = np.clip(strays, -STRAY_COUNTS, STRAY_COUNTS)
-        self._mean += np.where(sound, share * strays, 0.0)
+        self._readings[finger] += 1
+        share = max(1.0 / self._readings[finger], SHARE)
+        mean += np.where(sound, share * strays, 0.0)
 
 
 def fall_of(

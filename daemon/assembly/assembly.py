@@ -1,4 +1,4 @@
-"""Makes the model, the judge and the drivers of a scene; imports only the drivers it names."""
+"""Makes the model, the judge and the drivers of a scene."""
 
 from __future__ import annotations
 
@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 
 DEFAULT_MODEL = "small-session"
 MCAP = ".mcap"
-"""Ending of graspd's own recordings."""
 LINK_LOGS = (".log", ".serial")
-"""Endings of what came over a link: candump text, serial bytes."""
+"""Endings of candump text and of serial bytes."""
 
 Clock = Callable[[], int]
 """Gives monotonic ns."""
@@ -67,8 +66,7 @@ def build_pipeline(
 ) -> Pipeline:
     """Build the judge of this scene, whose session `learns` from its grasps or does not change.
 
-    Raises `ModelError` if the model does not fit the hand, `SceneError` or `RecordingError` if
-    recordings do not say whether they are grasps or streams.
+    Raises `ModelError`, `SceneError` or `RecordingError` where the parts do not fit.
     """
     _refuse_other_fingers(scene, model)
     limits = Limits(
@@ -89,7 +87,6 @@ def build_pipeline(
 
 
 def _trust(scene: Scene, model: TactileModel) -> Trust | None:
-    """Build what learns from outcomes and keeps the risk; None if the scene wants neither."""
     risk, given = scene.risk, model.contract.input
     if risk is None and not scene.learn.enabled:
         return None
@@ -99,7 +96,7 @@ def _trust(scene: Scene, model: TactileModel) -> Trust | None:
 
 
 def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
-    """Raise `ModelError` with what to write if the model is not for the hand's fingers."""
+    """Raise `ModelError`, with advice, if the model is not for the hand's fingers."""
     wanted, hand = model.contract.fingers, scene.hand.fingers
     if hand == wanted:
         return
@@ -125,8 +122,10 @@ def _and_sensors(scene: Scene) -> str:
 
 
 def gate_mode(scene: Scene) -> GateMode:
-    """Return the gate's mode, by the recordings unless given. Raises `SceneError` or
-    `RecordingError`."""
+    """Return the gate's mode, by the recordings unless given.
+
+    Raises `SceneError` or `RecordingError`.
+    """
     if scene.gate.mode is not None:
         return scene.gate.mode
     if not isinstance(scene.tactile, ReplayTactile) or is_mcap(scene.tactile):
@@ -138,7 +137,7 @@ def gate_mode(scene: Scene) -> GateMode:
 
 
 def hand_limits(scene: Scene) -> HandLimits | None:
-    """Return the limits of the gate; None with mode `every`, where each reading is a grasp."""
+    """Return the limits of the gate; None with mode `every`."""
     mode, gate = gate_mode(scene), scene.gate
     if mode == "every":
         if gate.sweeps == 3:
@@ -183,7 +182,7 @@ def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
 
 
 def joint_limits(scene: Scene) -> JointLimits | None:
-    """Return the limits of the joints; None without joints, in the recordings too."""
+    """Return the limits of the joints; None without joints."""
     tactile = scene.tactile
     recorded = isinstance(tactile, ReplayTactile) and _has_joints(scene, tactile)
     if scene.joints is None and not recorded:
@@ -194,10 +193,7 @@ def joint_limits(scene: Scene) -> JointLimits | None:
 
 
 def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:
-    """Make the drivers of this scene, not yet open, the tactile one first.
-
-    Raises `SceneError` naming the section where values do not fit the driver or each other.
-    """
+    """Make the drivers of this scene, not yet open, the tactile one first. Raises `SceneError`."""
     with _section("tactile"):
         drivers = [_tactile(scene, clock)]
     if isinstance(scene.joints, StreamJoints):
@@ -210,7 +206,7 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
 
 
 def open_driver(driver: Driver) -> None:
-    """Open a driver. Raises `LinkError` if a later try may succeed, `SceneError` if none can."""
+    """Open a driver. Raises `LinkError` if a later try may succeed, else `SceneError`."""
     try:
         driver.open()
     except LinkError:

@@ -1,4 +1,4 @@
-"""What came over a link, judged again: which scene it is of, and the driver that decodes it."""
+"""What came over a link, judged again: its scene and its driver."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _SECTIONS = ("hand", "tactile", "model", "gate", "session")
 
 
 class LinkLogs:
-    """Link logs of one kind, in the order of time, and the scene that they are of."""
+    """Link logs of one kind, in the order of time."""
 
     def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
-        """`path` is of the scene; without it the link is one of this kind with the usual options.
+        """`path` is of the scene; None: a link with the usual options.
 
         Raises `SceneError` if the files are of several kinds.
         """
@@ -37,7 +37,7 @@ class LinkLogs:
         self._scene_path = path
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """The scene of the link, with another model or gate mode if given. Raises `SceneError`."""
+        """Return the scene of the link. Raises `SceneError`."""
         driver = _DRIVER[self._ending]
         if self._scene_path is None:
             port = {"port": "link log"} if self._ending == SERIAL else {}
@@ -53,10 +53,7 @@ class LinkLogs:
         )
 
     def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """What plays the files and judges them: readings are as old as they were then.
-
-        Raises `SceneError`.
-        """
+        """Return what plays the files and judges them. Raises `SceneError`."""
         try:
             driver = _driver(wanted, self._paths, speed)
         except ValueError as error:
@@ -79,7 +76,7 @@ def changed(
     model: dict[str, Any],
     mode: str | None,
 ) -> dict[str, dict[str, Any]]:
-    """Sections of a scene with these instead: thresholds stay where the model is another."""
+    """Return sections of a scene with these instead; thresholds of the model stay."""
     former = sections.get("model", {})
     if model:
         former = {key: value for key, value in former.items() if key not in ("name", "path")}

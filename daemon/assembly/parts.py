@@ -36,7 +36,7 @@ class Parts:
     drivers: list[Driver]
     """The tactile one first."""
     boot_id: str | None = None
-    """Start of the daemon that judged the recording; None for grasps of this start."""
+    """Start of the daemon that judged the recording; None for this start."""
 
     @classmethod
     def of(cls, scene: Scene, model: TactileModel) -> Parts:
@@ -46,17 +46,16 @@ class Parts:
 
 
 class Assembly:
-    """Opens the parts of one run and puts around them what the scene wants, one call a part.
+    """Opens the parts of one run, and what the scene wants around them, one call a part.
 
-    `graspd run` makes the calls in this order. A part that the scene does not want is not imported.
+    `graspd run` makes the calls in this order. What is not wanted is not imported.
     """
 
     def __init__(self, parts: Parts, stack: ExitStack) -> None:
-        """`stack` closes what is opened."""
         self.companions: list[Companion] = []
-        """Those of sockets, session keeper and recorder that the scene wants."""
+        """Sockets, session keeper and recorder."""
         self.keep: Callable[[Answer], None] = at_once
-        """Answers an outcome once it is on the disk; at once if there is no session keeper."""
+        """Answers an outcome once it is on the disk."""
         self._outputs: list[Output] = []
         self._parts = parts
         self._stack = stack
@@ -70,7 +69,7 @@ class Assembly:
         self.companions.append(sockets)
 
     def open_drivers(self) -> None:
-        """Open the drivers, with a tap on a link that is recorded. Raises as `open_driver`."""
+        """Open the drivers, and tap a link that is recorded. Raises as `open_driver`."""
         record, drivers = self._parts.scene.record, self._parts.drivers
         if record is not None and record.raw:
             from daemon.record.link_log import tap_of
@@ -81,7 +80,7 @@ class Assembly:
             assembly.open_driver(driver)
 
     def keep_session(self) -> bool:
-        """Watch for exchanged sensors; restore and keep session and outcomes if the scene wants it.
+        """Watch for exchanged sensors; restore and keep the session if the scene wants it.
 
         The file is saved for the last time when the stack closes. Return False without a file.
         """
@@ -108,7 +107,7 @@ class Assembly:
         return True
 
     def _session_file(self) -> SessionFile | None:
-        """Take the file of the session; return None if none is kept or it cannot be had."""
+        """Take the file of the session; None if none is kept or it cannot be had."""
         scene, pipeline = self._parts.scene, self._parts.pipeline
         if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
             return None
@@ -121,7 +120,7 @@ class Assembly:
             return None
 
     def record(self) -> None:
-        """Record if the scene wants it; call this after `keep_session`. Raises `SceneError`."""
+        """Record if the scene wants it, after `keep_session`. Raises `SceneError`."""
         parts = self._parts
         if parts.scene.record is None:
             return
@@ -136,7 +135,6 @@ class Assembly:
             self.companions.append(recorder)
 
     def build_outbox(self) -> Outbox:
-        """Make what sends the messages of this run to sockets and recorder."""
         hand, model = self._parts.scene.hand, self._parts.model
         return Outbox(
             hand.name,

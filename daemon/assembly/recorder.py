@@ -1,4 +1,4 @@
-"""Builds the recorder of a scene, and the headers of its files."""
+"""Builds the recorder of a scene."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ def build_recorder(
 ) -> Recorder | None:
     """Start the recorder of a scene; return None if the scene does not record.
 
-    `pipeline` has the session that it starts with by now. `tap` is on the link, if that is
-    recorded. Raises `SceneError` without the package `mcap`.
+    `pipeline` has its session by now. Raises `SceneError` without the package `mcap`.
     """
     directory = wanted.record_directory
     if wanted.record is None or directory is None:
@@ -57,7 +56,7 @@ def build_recorder(
 
 
 def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
-    """Make the header of the run's files, without the state of judge and session."""
+    """Make the header of a run's files, without the state of judge and session."""
     network = wanted.model.model_dump(mode="json", exclude_none=True)
     if wanted.model.path is not None:
         network["path"] = str(wanted.model.path.absolute())

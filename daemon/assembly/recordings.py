@@ -1,4 +1,4 @@
-"""Builds what judges recordings again as they were judged: scene, driver, judge and session."""
+"""Builds what judges recordings again as they were judged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from models.runtime import TactileModel
 log = logging.getLogger("graspd")
 
 SECTIONS: Final[tuple[str, ...]] = ("hand", "model", "gate", "session", "learn", "risk")
-"""Of a scene, that a recording says."""
+"""Sections that a recording has."""
 NOTHING_KNOWN: Final = (
     "%s: begins in the middle of a run and does not say what was known there: verdicts may differ "
     "until the hand has been open and its grasps are known"
@@ -37,23 +37,21 @@ class RecordedRun:
     """The recordings of one run of the daemon, in the order of time."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the headers; warn of files that are missing between. Raises `RecordingError`."""
+        """Read the headers; warn of missing files. Raises `RecordingError`."""
         headers = [header_of(path) for path in paths]
         self.header = headers[0]
-        """Of the first file."""
         self._paths = tuple(paths)
         self._companion = Companion()
         self._same_grasps = True
-        """Whether grasps are told apart as they were then; else outcomes are of none of them."""
+        """False if grasps are told apart in another way: outcomes are of none of them."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """The scene that was recorded, playing the files.
+        """Return the scene that was recorded, playing the files. Raises `SceneError`.
 
-        `publish` and `model` are sections of it; an empty `model` and `mode` None leave model and
-        gate mode as recorded. Raises `SceneError`.
+        An empty `model` and `mode` None leave model and gate mode as recorded.
         """
         recorded = self.header.scene
         sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
@@ -74,9 +72,9 @@ class RecordedRun:
         return parse(changed(sections, publish, model, mode), self._paths[0])
 
     def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """What plays the files and judges them, in the recorded state but for the session.
+        """Return what plays the files and judges them, in the recorded state.
 
-        Readings are as old as they were then. `speed` None is as fast as possible.
+        `speed` None is as fast as possible.
         """
         header = self.header
         same_model = model.sha256 == header.model_sha256
@@ -98,7 +96,7 @@ class RecordedRun:
         return Parts(wanted, model, pipeline, [driver], header.boot_id)
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Give `pipeline` the recorded session and what outcomes had taught. Raises `SceneError`.
+        """Restore the recorded session and what outcomes had taught. Raises `SceneError`.
 
         Another model than the recorded one begins with nothing learned.
         """
@@ -114,11 +112,11 @@ class RecordedRun:
             raise SceneError(f"{self._paths[0]}: the session in it {error}") from error
 
     def tell(self, companion: Companion) -> None:
-        """Tell a companion outcomes of this run where they were recorded."""
+        """Tell a companion the recorded outcomes of this run."""
         self._companion = companion
 
     def _repeat(self, pipeline: Pipeline, event: RecordedEvent) -> None:
-        """Have the judge hear of an event as it did when it was recorded."""
+        """Repeat a recorded event to the judge."""
         match event:
             case Topic.ASKED:
                 pipeline.ask()

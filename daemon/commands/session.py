@@ -101,7 +101,7 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
             "former_saved_at": None if (former := _former(path)) is None else former.saved_at,
             "put_aside": [
                 {"serials": each.serials, "grasps": _grasps(each), "saved_at": each.saved_at}
-                for each in others(path)
+                for each in others(path).values()
             ],
         }
         sys.stdout.write(json.dumps(document) + "\n")
@@ -133,7 +133,7 @@ def _lines(path: Path, kept: KeptSession | None, from_on: float | None) -> Itera
     former = _former(path)
     if former is not None and former != kept:
         yield f"  before   {_when(former)}, {_grasps(former)} grasps"
-    for each in others(path):
+    for each in others(path).values():
         names = ", ".join(f"{finger} {serial}" for finger, serial in each.serials.items())
         yield f"  aside    {_when(each)}, {_grasps(each)} grasps of {printable(names)}"
     for finger in kept.fingers:

@@ -41,7 +41,7 @@ STYLES: Final = {PUBLISHED: "s-", ALONE: "o:", LEARNING: "o-", RISK: "o-"}
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class CurvePoint:
     """What was said of the grasps after so many outcomes."""
 
     told: int
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-Curves = dict[str, list[Point]]
+Curves = dict[str, list[CurvePoint]]
 """By method."""
 
 
@@ -95,7 +95,7 @@ def measured(several: Sequence[Stream]) -> Curves:
 
 def _curve(
     stable: Sequence[NDArray[np.bool_]], slipped: Sequence[NDArray[np.bool_]]
-) -> list[Point]:
+) -> list[CurvePoint]:
     points = []
     for first, last in itertools.pairwise(TOLD):
         said = np.concatenate([one[first:last] for one in stable])
@@ -103,7 +103,7 @@ def _curve(
         if len(said) < LEAST:
             break
         among = float(slips[said].mean()) if said.any() else float("nan")
-        points.append(Point((first + last) // 2, among, float(said[~slips].mean())))
+        points.append(CurvePoint((first + last) // 2, among, float(said[~slips].mean())))
     return points
 
 

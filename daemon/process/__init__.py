@@ -9,7 +9,7 @@ LIBRARIES = {
     # Plugins that other packages have installed do not belong in a daemon.
     "PYDANTIC_DISABLE_PLUGINS": "__all__",
 }
-"""Settings that libraries read when they are imported; those of the user come first."""
+"""Settings that libraries read on import; those of the user come first."""
 
 
 def set_up_libraries() -> None:

@@ -1,4 +1,4 @@
-"""What to tell a user who lacks a package that only an extra of `pyproject.toml` installs."""
+"""Advice for a user who lacks the package of an extra."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ OURS = frozenset({"daemon", "drivers", "models"})
 
 
 def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
-    """One line for a user: `what` needs the package that `error` misses, and how to install it.
+    """Return one line: `what` needs the package that `error` misses, and how to install it.
 
-    `what` is such as "watch" or "[record]", `extra` the extras that bring the package. Raises
-    `error` itself if it misses a module of graspd's own: no extra brings that.
+    Raises `error` itself if it misses a module of graspd's own.
     """
     package = (error.name or "").partition(".")[0]
     if package in OURS:
@@ -26,7 +25,7 @@ def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
 
 
 def installer(environment: Path) -> str:
-    """The command that adds packages to a virtual environment, by who made it: pipx, uv or pip."""
+    """Return the command that adds packages to a virtual environment: pipx, uv or pip."""
     if (environment / "pipx_metadata.json").exists():
         return f"pipx runpip {shlex.quote(environment.name)} install"
     config = environment / "pyvenv.cfg"

@@ -12,8 +12,7 @@ from pathlib import Path
 def read_regular(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file; never wait for a pipe's writer.
 
-    Raises `OSError`, with a reason in `strerror`, if it cannot be read, has more than `max_bytes`
-    bytes, or is no regular file.
+    Raises `OSError`, with a reason in `strerror`, also beyond `max_bytes`.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "not a regular file")
@@ -27,10 +26,10 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
 def write_atomically(
     path: Path, content: bytes, mode: int = 0o600, *, former: Path | None = None
 ) -> None:
-    """Put `content` at `path` in one step, in place of what is there; `mode` as in chmod(2).
+    """Replace the file at `path` in one step, keeping the former one at `former`.
 
-    A reader sees the former file or the whole new one, also after a power cut. The former file is
-    kept at `former`, if that is given. Raises `OSError`, and leaves the former file in place.
+    A reader sees the former file or the whole new one, also after a power cut. Raises `OSError`,
+    and leaves the former file in place.
     """
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
     handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)

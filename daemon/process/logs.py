@@ -1,4 +1,4 @@
-"""The log on stderr: plain for a terminal, with priorities for the journal, limited in rate."""
+"""The log on stderr: plain for a terminal, with priorities for the journal."""
 
 from __future__ import annotations
 
@@ -8,21 +8,19 @@ import time
 from collections.abc import Callable, Mapping
 
 LOGGERS = ("graspd", "daemon", "drivers", "models")
-"""Ours; libraries speak up only when something is wrong."""
 SYSLOG_LEVELS = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-"""Level, and its number in a journal prefix (sd-daemon(3)); what is below is 7."""
+"""Numbers of levels in a journal prefix (sd-daemon(3)); 7 below."""
 JOURNAL_ERROR = "<3>"
-"""What a line of an error begins with in the journal."""
+"""Prefix of an error in the journal."""
 BURST = 10
-"""Messages of one kind in a window. A fault that repeats must not fill the journal of a robot."""
+"""Messages of one kind in a window: a fault must not fill a robot's journal."""
 WINDOW_S = 60.0
-"""Length of a window, s."""
 KINDS_MAX = 200
-"""Kinds of messages that are told apart; the code has fewer."""
+"""Most kinds that are told apart; the code has fewer."""
 
 
 def set_up(environment: Mapping[str, str]) -> None:
-    """Log to stderr: with priorities if that is the journal, as `environment` says it is."""
+    """Log to stderr, with priorities if `environment` says that it is the journal."""
     handler = logging.StreamHandler()
     handler.setFormatter(JournalFormatter() if is_journal(environment) else _PLAIN)
     handler.addFilter(RateLimit())
@@ -41,29 +39,28 @@ def is_journal(environment: Mapping[str, str]) -> bool:
 
 
 class JournalFormatter(logging.Formatter):
-    """Every line with its priority: `journalctl -p warning` then shows warnings."""
+    """Gives each line its priority, for `journalctl -p warning`."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The message, each line with a prefix such as `<4>`."""
+        """Return the message, each line with a prefix such as `<4>`."""
         number = next((n for level, n in SYSLOG_LEVELS if record.levelno >= level), 7)
         return "\n".join(f"<{number}>{line}" for line in super().format(record).splitlines())
 
 
 class RateLimit(logging.Filter):
-    """Lets a burst of each kind of message pass, then one a window with what was held back.
+    """Lets a burst of each kind of message pass, then one a window.
 
     A kind is a message before its arguments are filled in.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` gives monotonic s."""
         super().__init__()
         self._clock = clock
         self._kinds: dict[str, tuple[float, int]] = {}
         """Start of the window, s, and how many came in it."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the message passes; the first of a window says how many did not."""
+        """Return True if the message passes; the first of a window counts those that did not."""
         now_s, kind = self._clock(), f"{record.name} {record.msg}"
         if kind not in self._kinds and len(self._kinds) >= KINDS_MAX:
             return True

@@ -1,4 +1,4 @@
-"""Stopping on SIGINT and SIGTERM, reloading on SIGHUP, in a form that a selector can wait on."""
+"""SIGINT, SIGTERM and SIGHUP, in a form that a selector can wait on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Protocol, Self
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKEUPS_MAX = 4096
-"""Bytes that `take_reload` takes out of the pipe at once: one a signal."""
+"""Bytes taken out of the pipe at once: one a signal."""
 
 
 class StopRequest(Protocol):
@@ -18,7 +18,7 @@ class StopRequest(Protocol):
 
     @property
     def received(self) -> signal.Signals | None:
-        """Signal that stops the process; None before it."""
+        """Signal that stops the process."""
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when a signal arrives."""
@@ -28,10 +28,10 @@ class StopRequest(Protocol):
 
 
 class StopSignal:
-    """Keeps the signal that stops the process, and makes a descriptor readable."""
+    """Keeps the signal that stops the process."""
 
     def __init__(self, *, reloads: bool = False) -> None:
-        """With `reloads`, SIGHUP asks for a reload; else it does what it did before."""
+        """With `reloads`, SIGHUP asks for a reload."""
         self.received: signal.Signals | None = None
         self._reload = False
         self._signals = (*STOPPING, signal.SIGHUP) if reloads else STOPPING
@@ -40,7 +40,6 @@ class StopSignal:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def fileno(self) -> int:
-        """Return a descriptor that becomes readable when a signal arrives."""
         return self._read
 
     def take_reload(self) -> bool:

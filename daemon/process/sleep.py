@@ -7,13 +7,12 @@ from collections.abc import Callable
 from functools import partial
 
 SLEPT_NS = 50_000_000
-"""Least difference of the clocks that is a sleep, ns. A sleep takes seconds; the scheduler comes
-between two looks at the clocks for less."""
+"""Least difference of the clocks that is a sleep, ns: the scheduler takes less."""
 LOOKS = 3
-"""Looks at the clocks at the start, so that the scheduler interrupts at most some of them."""
+"""Looks at the clocks at the start: the scheduler interrupts at most some."""
 
 boottime_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
-"""Time since the computer was started, ns, with that of its sleep (clock_gettime(2))."""
+"""Time since the computer was started, ns, with its sleep (clock_gettime(2))."""
 
 
 class Sleep:
@@ -24,12 +23,11 @@ class Sleep:
         clock: Callable[[], int] = time.monotonic_ns,
         boot_clock: Callable[[], int] = boottime_ns,
     ) -> None:
-        """Both give ns; only `boot_clock` goes on in a sleep."""
+        """Only `boot_clock` goes on in a sleep; both give ns."""
         self._clock = clock
         self._boot_clock = boot_clock
         # In this order a look that the scheduler interrupts makes no sleep.
         self._slept_from_ns = SLEPT_NS + max(boot_clock() - clock() for _ in range(LOOKS))
 
     def has_slept(self) -> bool:
-        """Return True once the computer has slept. Takes a microsecond."""
         return self._boot_clock() - self._clock() > self._slept_from_ns

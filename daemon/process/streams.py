@@ -1,4 +1,4 @@
-"""The standard streams of the process, which may be closed, full, broken or not UTF-8."""
+"""The standard streams, which may be closed, full, broken or not UTF-8."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ FAILED = 1
 def guarded(command: Callable[[], int]) -> int:
     """Run a command whose standard output may fail, and return its exit code.
 
-    0 if the reader of the output has gone, as in `graspd replay | head`. 1 and one line on stderr
-    if it cannot be written. Other errors pass. Characters that the output's encoding lacks are
-    written as escape sequences.
+    0 if the reader has gone, as in `graspd replay | head`; 1 and a line on stderr if it cannot be
+    written. Characters that the encoding lacks are escaped.
     """
     raw = _take_over()
     try:
@@ -54,7 +53,7 @@ class _Raw(io.FileIO):
 
 
 def _take_over() -> _Raw:
-    """Put streams of ours in place of `sys.stdout` and, where it is closed, `sys.stderr`."""
+    """Replace `sys.stdout` and, where it is closed, `sys.stderr`."""
     former = sys.stdout
     if isinstance(former, io.TextIOWrapper):
         descriptor = former.fileno()
@@ -75,7 +74,7 @@ def _take_over() -> _Raw:
 
 
 def _discard(raw: _Raw) -> None:
-    """Let go of what is still in the buffer, so that the interpreter does not try it again."""
+    """Discard the buffer, so that the interpreter does not try it again."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, raw.fileno())
     os.close(nowhere)

@@ -1,4 +1,4 @@
-"""Text for people: untrusted text made harmless for a terminal, colours, errors, tables."""
+"""Text for people: made harmless for a terminal, coloured, in tables."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import TextIO
 from daemon.process.logs import JOURNAL_ERROR, is_journal
 
 PROGRESS_MAX = 78
-"""Characters: one that wraps could not be taken back."""
+"""Characters: a wrapped line could not be taken back."""
 
 
 class Colour(IntEnum):
-    """How a terminal shows a text; the numbers are those of ECMA-48, SGR."""
+    """Numbers of ECMA-48, SGR."""
 
     BOLD = 1
     RED = 31
@@ -24,9 +24,9 @@ class Colour(IntEnum):
 
 
 def coloured(text: str, colour: Colour, stream: TextIO | None = None) -> str:
-    """The text in this colour if `stream`, stdout unless given, is a terminal that shows colours.
+    """Return the text in this colour if `stream`, stdout unless given, shows colours.
 
-    `NO_COLOR` (https://no-color.org) and `TERM=dumb` say that it is not to.
+    `NO_COLOR` (https://no-color.org) and `TERM=dumb` say no.
     """
     stream = sys.stdout if stream is None else stream
     if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
@@ -35,7 +35,7 @@ def coloured(text: str, colour: Colour, stream: TextIO | None = None) -> str:
 
 
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
-    """What to add to an error about a mistyped word: the nearest that is known, if one is near."""
+    """Return advice on a mistyped word, if a known one is near."""
     import difflib  # only where it is needed
 
     near = difflib.get_close_matches(wrong, list(known), n=1)
@@ -43,7 +43,7 @@ def did_you_mean(wrong: str, known: Iterable[str]) -> str:
 
 
 def printable(text: str, length_max: int | None = None) -> str:
-    """The text with everything escaped that moves a cursor or hides; cut at `length_max`."""
+    """Return the text with control characters escaped, cut at `length_max`."""
     if length_max is not None and len(text) > length_max:
         text = text[: length_max - 3] + "..."
     if text.isprintable():
@@ -57,7 +57,7 @@ def printable(text: str, length_max: int | None = None) -> str:
 
 
 def complain(problem: object) -> None:
-    """Say on stderr what is wrong, one line per line of the message."""
+    """Say on stderr what is wrong."""
     lines = [printable(line) for line in str(problem).split("\n")]
     if is_journal(os.environ):
         sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)
@@ -66,10 +66,7 @@ def complain(problem: object) -> None:
 
 
 def progress(doing: str) -> None:
-    """Show on a terminal what is being done, in the place of what was shown before; "": nothing.
-
-    Writes to stderr, and only if that is a terminal.
-    """
+    """Show on a terminal what is being done, in place of what was shown; "": nothing."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{printable(doing, PROGRESS_MAX)}")
         sys.stderr.flush()
@@ -78,10 +75,7 @@ def progress(doing: str) -> None:
 def markdown_table(
     titles: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[str] = ()
 ) -> Iterator[str]:
-    """Lines of a Markdown table; each row has a cell per title.
-
-    Columns whose title is in `right` are aligned to the right.
-    """
+    """Yield the lines of a Markdown table; columns in `right` are aligned to the right."""
     yield f"| {' | '.join(titles)} |"
     yield f"| {' | '.join('---:' if title in right else '---' for title in titles)} |"
     for row in rows:

@@ -15,10 +15,9 @@ from typing import Final, Generic, TypeVar
 R = TypeVar("R")
 
 SWITCH_S: Final = 0.0005
-"""Python's switch interval from the first job on, s: how long a worker's thread may keep the loop
-waiting for the interpreter. The default is ten times as long."""
+"""Python's switch interval from the first job on, s: the longest wait of the loop."""
 PROCESSORS: Final = frozenset(os.sched_getaffinity(0))
-"""Processors of the process at its start, before realtime mode pins the loop to some of them."""
+"""Processors at the start, before realtime mode pins the loop to some of them."""
 
 log = logging.getLogger("graspd")
 
@@ -30,20 +29,18 @@ class Worker(Generic[R]):
     """
 
     def __init__(self, name: str) -> None:
-        """`name` is that of the thread."""
         self._name = name
         self._thread: threading.Thread | None = None
         self._jobs: SimpleQueue[Callable[[], R] | None]
-        """Jobs of this thread; None ends it."""
+        """None ends the thread."""
         self._results: SimpleQueue[R | Exception]
-        """What its jobs returned or raised."""
         self._ended: int
-        """Descriptor that counts the results; the thread closes it."""
+        """Counts the results; the thread closes it."""
         self.busy = False
         """True from `submit` until the result is taken."""
 
     def submit(self, job: Callable[[], R]) -> bool:
-        """Start a job; return False if the worker is busy, or the system has no thread for it."""
+        """Start a job; False if the worker is busy, or the system has no thread for it."""
         if self.busy or (self._thread is None and not self._start_thread()):
             return False
         self.busy = True
@@ -51,11 +48,11 @@ class Worker(Generic[R]):
         return True
 
     def filenos(self) -> list[int]:
-        """Descriptor that is readable once the job has ended; empty while there is no job."""
+        """Return what becomes readable once the job has ended; empty without a job."""
         return [self._ended] if self.busy else []
 
     def take(self, wait_s: float = 0.0) -> R | Exception | None:
-        """Return what the job returned or raised; None if it has not ended within `wait_s`."""
+        """Return the result of the job, or what it raised; None if it has not ended in time."""
         if not self.busy:
             return None
         poll = select.poll()
@@ -67,9 +64,9 @@ class Worker(Generic[R]):
         return self._results.get()
 
     def close(self, wait_s: float) -> bool:
-        """End the thread; return False if its job has not ended within `wait_s`.
+        """End the thread; False if its job has not ended within `wait_s`.
 
-        The thread of such a job ends with it, or with the process.
+        That thread ends with its job, or with the process.
         """
         thread, self._thread = self._thread, None
         if thread is None:
@@ -80,7 +77,6 @@ class Worker(Generic[R]):
         return not thread.is_alive()
 
     def _start_thread(self) -> bool:
-        """Start the thread; return False if the system refuses it."""
         self._jobs, self._results, self._ended = SimpleQueue(), SimpleQueue(), -1
         try:
             self._ended = os.eventfd(0, os.EFD_CLOEXEC)
@@ -100,7 +96,6 @@ class Worker(Generic[R]):
 def _run(
     jobs: SimpleQueue[Callable[[], R] | None], results: SimpleQueue[R | Exception], ended: int
 ) -> None:
-    """Do the jobs, and close `ended` after the last one."""
     while (job := jobs.get()) is not None:
         _be_ordinary()
         try:

@@ -1,5 +1,4 @@
-"""Companions of the loop, which it tells what happens: sockets, session keeper, recorder, printer,
-realtime mode, service manager."""
+"""Companions of the loop: sockets, session keeper, recorder, printer, realtime mode, systemd."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ R = TypeVar("R")
 Answer = Callable[[str | None], None]
 """Takes None for yes, or why not."""
 REPEATED = "repeated"
-"""Answers an outcome that is known and kept already: nothing was written or published again."""
+"""Answers an outcome that is known and kept already."""
 
 
 def at_once(answer: Answer) -> None:
@@ -27,12 +26,11 @@ def at_once(answer: Answer) -> None:
 
 
 class LoopEvent(Enum):
-    """What a replay must know besides the readings, to judge them the same way."""
+    """What a replay must know besides the readings."""
 
     ASKED = "asked"
-    """A controller has asked for a verdict."""
     SKIPPED = "skipped"
-    """Readings before the next one were skipped, because they came too fast."""
+    """Readings before the next one were skipped."""
 
 
 class PublishedVerdict(NamedTuple):
@@ -41,14 +39,13 @@ class PublishedVerdict(NamedTuple):
     judgement: Judgement
     verdict: Verdict
     payload: bytes
-    """The verdict, encoded."""
+    """JSON."""
     reading: TactileReading | None
-    """What the verdict is about; None after silence."""
+    """None after silence."""
     is_answer: bool
-    """True if this is the verdict that controllers who ask wait for."""
+    """True if controllers who ask wait for this verdict."""
     grasp: GraspId
     lifts: LiftBook
-    """Where a peer that asked to lift the grasp claims it."""
 
 
 class Requests(Protocol):
@@ -58,22 +55,20 @@ class Requests(Protocol):
         """Ask for a verdict, by which a controller decides whether to lift."""
 
     def outcome(self, report: Report, answer: Answer) -> None:
-        """Tell how the lift of a grasp has ended.
+        """Tell how a lift has ended; `answer` gets None once that is on the disk.
 
-        `answer` is called with None once the outcome is on the disk, with `REPEATED`, or with the
-        reason why the outcome is refused or not kept.
+        Else `answer` gets `REPEATED`, or why the outcome is refused or not kept.
         """
 
 
 class Companion:
     """Base class: a companion overrides the hooks that concern it.
 
-    Hooks are called in the loop's thread, in the order of the companions: they must not block, and
-    what they raise ends the loop.
+    The loop's thread calls them: they must not block, and what they raise ends the loop.
     """
 
     def before_wait(self, requests: Requests) -> None:
-        """Pass on to `requests` what has come from outside; the loop waits after this."""
+        """Pass on to `requests` what has come from outside."""
 
     def due_ns(self) -> int | None:
         """Latest end of the loop's wait, monotonic ns; None: no limit."""
@@ -103,7 +98,7 @@ class Companion:
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """Counts since the start, for the status, by the name of the part."""
+        """Counts since the start, by the name of the part."""
         return {}
 
 

@@ -1,10 +1,8 @@
 """The ZeroMQ sockets of a scene. libzmq serves them in threads of its own, beside the loop.
 
-A PUB, XPUB or ROUTER in the loop's thread would not be safe: its calls do not come back while peers
-flood it. The loop therefore has sockets within the process (`inproc`) only. `zmq.proxy` copies
-messages to the subscribers, in C and without the interpreter. `Courier` carries questions and
-answers: it takes few questions at a time, while `zmq.proxy` takes a thousand and lets no answer
-pass until the loop has read them.
+Calls of a PUB, XPUB or ROUTER do not return while peers flood it. The loop has sockets within the
+process (`inproc`) only. `zmq.proxy` copies messages to the subscribers, in C. `Courier` carries few
+questions at a time; `zmq.proxy` takes a thousand, and lets no answer pass meanwhile.
 """
 
 from __future__ import annotations
@@ -30,49 +28,48 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("graspd")
 
-Message = list[bytes]
+Frames = list[bytes]
 Socket = zmq.Socket[bytes]
 
 STATUS = b"status."
-"""Prefix of the topics whose messages come back to the loop. The last of them ends `close`."""
+"""Topics whose messages come back to the loop; the last of them ends `close`."""
 MESSAGE_MAX_BYTES: Final = 1024
 """Longest frame of a peer. An outcome has 128 bytes, the handshake with keys 257 (RFC 26)."""
 HANDSHAKE_MS: Final = 5000
-"""A peer that does not end its handshake in this time, ms, is disconnected."""
+"""Longest handshake of a peer, ms."""
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Time between two heartbeats over TCP, and the silence after which a peer is gone, ms."""
 SUBSCRIPTIONS_QUEUED, ASK_QUEUE = 2, 16
-"""Messages of one peer that wait in the PUB and in the ROUTER socket. More wait in the kernel."""
+"""Messages of one peer that wait in the PUB and in the ROUTER socket."""
 QUESTIONS_MAX: Final = 8
-"""Questions that the loop takes in one round: they take 0.3 ms on a slow, busy computer. More wait
-for the next round, with the next reading at the latest. As many are carried at a time."""
+"""Questions carried, and taken by the loop, at a time: 0.3 ms on a slow computer."""
 PAUSE_MS: Final = 2
 """Time until more questions are carried, ms."""
 FRAMES_MAX: Final = 4
-"""Frames kept of one message: routing id, delimiter, text, and one by which it is malformed."""
+"""Frames kept of a message: routing id, delimiter, text, and one too many."""
 ANSWERS_QUEUED: Final = 512
 """Answers on their way to the ROUTER socket: to 256 questions, and to as many outcomes."""
 LINGER_MS: Final = 500
 """How long closing waits for peers to take what is queued, ms."""
 CLOSE_S: Final = 1.0
-"""How long closing waits for libzmq's threads, s. A flood may hold them. The watchdog waits 2 s."""
+"""How long closing waits for libzmq's threads, s; the watchdog waits 2 s."""
 SUBSCRIBES_S: Final = 0.1
 """Time from a peer's handshake to its first subscription, s, at most."""
 ZAP_DOMAIN: Final = "graspd"
-"""Sent with each question to the authenticator. libzmq asks no question without it (RFC 27)."""
+"""libzmq asks the authenticator only if there is a domain (RFC 27)."""
 
 
 @dataclass(slots=True)
 class Admission:
-    """CURVE keys for `tcp://`, Z85: the daemon's own pair, and those of peers that may connect."""
+    """CURVE keys for `tcp://`, Z85: the daemon's pair, and those of peers that may connect."""
 
     public: bytes
     secret: bytes
     admitted: Mapping[bytes, str]
-    """Names of peers, by public key. Another list may be put here at any time."""
+    """Names of peers, by public key; may be replaced at any time."""
 
     def callback(self, _domain: str, key: bytes) -> bool:
-        """Return True if the key may connect. pyzmq's authenticator calls this in its thread."""
+        """Return True if the key may connect; called in pyzmq's thread."""
         name = self.admitted.get(key)
         if name is None:
             log.warning("turned away a peer: its key %s is not on the list", key.decode())
@@ -91,7 +88,6 @@ class Proxy(threading.Thread):
         self._front, self._back = front, back
 
     def run(self) -> None:
-        """Copy messages."""
         try:
             self._copy()
         except zmq.ContextTerminated:
@@ -127,7 +123,7 @@ class Courier(Proxy):
             self._front.send_multipart(self._back.recv_multipart(), zmq.NOBLOCK)
 
     def _carry_question(self) -> bool:
-        """Carry one, without the frames beyond `FRAMES_MAX`; False if there is none or no room."""
+        """Carry one, cut at `FRAMES_MAX`; False if there is none or no room."""
         if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
             return False
         frames = [self._front.recv()]
@@ -151,17 +147,16 @@ class Door:
         *,
         awaits_subscriber: bool = False,
     ) -> None:
-        """Queue at most `high_water_mark` messages for each subscriber.
+        """Queue at most `high_water_mark` messages for each subscriber. Raises `PublishError`.
 
-        With an `admission`, only peers with its keys may connect over TCP. `awaits_subscriber`:
-        `wait_for_subscriber` will be called. Raises `PublishError`.
+        With an `admission`, only peers with its keys may connect over TCP.
         """
         self._admission = admission
         self._context: zmq.Context[Socket] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
         self._proxies: list[Proxy] = []
         self._unheard = b""
-        """Last status, until it has come back from the proxy."""
+        """Last status, until it comes back."""
         self._out = self._socket(zmq.PUSH, sent=high_water_mark)
         self._echo = self._socket(zmq.SUB)
         self._ask = self._socket(zmq.DEALER, sent=ANSWERS_QUEUED, received=ASK_QUEUE)
@@ -182,7 +177,7 @@ class Door:
             proxy.start()
 
     def _socket(self, kind: int, sent: int = 1, received: int = 1) -> Socket:
-        """Return a socket that queues at most `sent` and `received` messages of each peer."""
+        """Return a socket that queues at most this many messages of each peer."""
         made = self._context.socket(kind)
         made.linger = 0
         made.sndhwm, made.rcvhwm = sent, received
@@ -242,25 +237,22 @@ class Door:
             raise refusal from error
 
     def fileno(self) -> int:
-        """Return a descriptor that becomes readable when a question comes.
-
-        Call `receive` before waiting for it: sending quietens it.
-        """
+        """Return what becomes readable when a question comes; sending quietens it."""
         return int(self._ask.getsockopt(zmq.FD))
 
     def send(self, topic: bytes, payload: bytes) -> bool:
-        """Publish one message; False if the proxy is behind and the message is dropped."""
+        """Publish one message; False if it is dropped because the proxy is behind."""
         if topic.startswith(STATUS):
             self._unheard = payload
         return _sent(self._out, (topic, payload))
 
     def answer(self, frames: Sequence[bytes]) -> bool:
-        """Send an answer with its routing id; False if the proxy is behind and it is dropped."""
+        """Send an answer with its routing id; False if it is dropped."""
         return _sent(self._ask, frames)
 
-    def receive(self) -> list[Message]:
-        """Return at most `QUESTIONS_MAX` questions that have come, each with its routing id."""
-        received: list[Message] = []
+    def receive(self) -> list[Frames]:
+        """Return at most `QUESTIONS_MAX` questions, each with its routing id."""
+        received: list[Frames] = []
         with suppress(zmq.Again):
             while len(received) < QUESTIONS_MAX:
                 received.append(self._ask.recv_multipart(zmq.NOBLOCK))
@@ -281,10 +273,7 @@ class Door:
             self._unheard = b""
 
     def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
-        """Wait until a peer has connected to hear messages.
-
-        Return False if none has within `timeout_s` seconds, or when `stop` becomes readable.
-        """
+        """Wait for a subscriber; False after `timeout_s`, or when `stop` becomes readable."""
         if self._monitor is None:
             raise RuntimeError("the door was not opened to wait")
         poller = zmq.Poller()
@@ -320,7 +309,7 @@ class Door:
         return not ending.is_alive()
 
     def _await_last_status(self) -> None:
-        """Wait until the proxy has published all messages: they are lost when its context ends."""
+        """Wait until all messages are published: the context's end loses them."""
         until_s = time.monotonic() + LINGER_MS / 1e3
         while self._unheard and (left_s := until_s - time.monotonic()) > 0:
             if self._echo.poll(round(left_s * 1e3)):

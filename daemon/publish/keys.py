@@ -18,17 +18,16 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 Z85_KEY = re.compile(rb"[0-9A-Za-z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 """A key of 32 bytes as text (RFC 32)."""
 CLIENTS_MAX = 1000
-"""Most keys of peers; more were put into the folder by mistake."""
+"""Most keys of peers."""
 FILE_MAX_BYTES = 1 << 16
-"""A key file has half a kilobyte."""
 SERVICE = "graspd"
-"""The user of the service, whose keys root may look at."""
+"""User of the service, whose keys root may look at."""
 LINKS_MAX = 40
-"""Symbolic links on the way to a file, as the kernel has it (path_resolution(7))."""
+"""Symbolic links on the way to a file (path_resolution(7))."""
 
 
 class KeysError(Exception):
-    """Keys are missing, wrong, or open to other users; the message names the file."""
+    """Keys are missing, wrong, or open to other users."""
 
 
 class Clients(NamedTuple):
@@ -37,14 +36,11 @@ class Clients(NamedTuple):
     admitted: dict[bytes, str]
     """Names of peers, by public key, Z85."""
     refused: list[str]
-    """Errors of the other key files, which admit no peer."""
+    """Errors of the other key files."""
 
 
 def make(folder: Path, name: str) -> tuple[Path, Path]:
-    """Make a pair of keys, `NAME.key` and `NAME.key_secret` (mode 0600); never over others.
-
-    Raises `KeysError`.
-    """
+    """Make `NAME.key` and `NAME.key_secret` (mode 0600), never over others. Raises `KeysError`."""
     from zmq.auth import create_certificates  # the daemon itself makes none
 
     if not NAME.fullmatch(name) or name.startswith("."):
@@ -83,7 +79,7 @@ def load_own(path: Path) -> tuple[bytes, bytes]:
 
 
 def load_public(path: Path, what: str = "the key") -> bytes:
-    """Return the public key, Z85, of a file; errors call it `what`. Raises `KeysError`."""
+    """Return the public key, Z85, of a file. Raises `KeysError`."""
     return _load(path, what)[0]
 
 
@@ -96,14 +92,14 @@ def load_clients(folder: Path) -> Clients:
         raise KeysError(f"{folder}: cannot list the keys: {error.strerror}") from error
     if len(paths) > CLIENTS_MAX:
         raise KeysError(f"{folder}: more than {CLIENTS_MAX} keys")
-    found = Clients({}, [])
+    clients = Clients({}, [])
     for path in paths:
         try:
             _refuse_open(path)
-            found.admitted[load_public(path)] = path.stem
+            clients.admitted[load_public(path)] = path.stem
         except KeysError as error:
-            found.refused.append(str(error))
-    return found
+            clients.refused.append(str(error))
+    return clients
 
 
 def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
@@ -111,14 +107,14 @@ def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
         content = read_regular(path, FILE_MAX_BYTES)
     except OSError as error:
         raise KeysError(f"{path}: cannot read {what}: {error.strerror}") from error
-    found: dict[bytes, bytes] = {}
+    fields: dict[bytes, bytes] = {}
     for line in content.splitlines():
         name, is_set, value = line.partition(b"=")
         if is_set:
-            found.setdefault(name.strip(), value.strip(b" \t'\""))
-    if b"public-key" not in found:
+            fields.setdefault(name.strip(), value.strip(b" \t'\""))
+    if b"public-key" not in fields:
         raise KeysError(f"{path}: has no public key")
-    public, secret = found[b"public-key"], found.get(b"secret-key")
+    public, secret = fields[b"public-key"], fields.get(b"secret-key")
     for key in (public, secret):
         if key is not None and not Z85_KEY.fullmatch(key):
             raise KeysError(f"{path}: a key must have 40 characters of Z85")
@@ -128,7 +124,7 @@ def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
 def _refuse_open(path: Path) -> None:
     """Raise `KeysError` if another user may write or replace what is at a path.
 
-    Each folder on the way to it is checked, also those to which symbolic links lead.
+    Folders on the way to it are checked, also those to which symbolic links lead.
     """
     at, ahead, links = Path("/"), [*reversed((Path.cwd() / path).parts[1:])], 0
     while True:
@@ -155,7 +151,6 @@ def _refuse_open(path: Path) -> None:
 
 
 def _refuse_writers(path: Path, status: os.stat_result) -> None:
-    """Raise `KeysError` if users other than its owner may write it."""
     _refuse_owner(path, status)
     mode = stat.S_IMODE(status.st_mode)
     if mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -163,7 +158,6 @@ def _refuse_writers(path: Path, status: os.stat_result) -> None:
 
 
 def _refuse_owner(path: Path, status: os.stat_result) -> None:
-    """Raise `KeysError` unless it belongs to root or to this process's user."""
     if status.st_uid in (0, os.geteuid()):
         return
     try:

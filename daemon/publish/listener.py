@@ -1,4 +1,4 @@
-"""Endpoints to listen on. A socket file replaces only the socket of a process that has ended."""
+"""Endpoints to listen on."""
 
 from __future__ import annotations
 
@@ -13,29 +13,25 @@ from contextlib import ExitStack
 from pathlib import Path
 
 BACKLOG = 100
-"""Connections that wait to be accepted; the number that libzmq asks for."""
+"""Connections that wait to be accepted, as in libzmq."""
 
 
 class PublishError(Exception):
-    """A socket cannot be had, or has ended: fix the endpoint or stop the program that holds it."""
+    """A socket cannot be had, or has ended."""
 
     taken: str | None = None
-    """Endpoint that another program holds, if that is the reason."""
+    """Endpoint that another program holds."""
 
 
 class Listener:
     """An endpoint, and the listening socket of an `ipc://` one.
 
-    A file at its path is replaced only if it is a socket of a dead process. `PATH.lock` is held
-    meanwhile: of two processes that find a dead socket, one takes its place and the other is
-    refused. `close` removes both files.
+    A file at its path is replaced only if it is a socket of a dead process. `PATH.lock` decides
+    which of two processes may do that. `close` removes both files.
     """
 
     def __init__(self, endpoint: str, mode: int | None = None, group: str | None = None) -> None:
-        """`mode` and `group` are those of the file; the process's unless given.
-
-        Raises `PublishError` and leaves no file if there can be no socket.
-        """
+        """`mode` and `group` are those of the file. Raises `PublishError`, and leaves no file."""
         self.endpoint = endpoint
         self.socket: socket.socket | None = None
         self._mode = mode
@@ -127,7 +123,6 @@ def _refuse_living(path: Path) -> None:
 
 
 def _locked(path: Path) -> int:
-    """Return a descriptor of the lock file, locked."""
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
         descriptor = os.open(path, flags, 0o600)

@@ -22,11 +22,9 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 Duration = Annotated[float, msgspec.Meta(ge=0.0)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 OBJECT_PATTERN: Final = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
-"""Name of an object: one word of a message, one bare cell of a CSV file that no spreadsheet takes
-for a formula, and no path."""
+"""One word of a message and bare cell of a CSV file; no formula, no path."""
 ObjectName = Annotated[str, msgspec.Meta(pattern=rf"^{OBJECT_PATTERN}$(?!\n)")]
 _HAND = msgspec.Meta(max_length=5)
-"""A hand has five fingers."""
 Motion = Annotated[dict[Finger, Duration | None], _HAND]
 
 
@@ -39,16 +37,15 @@ DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """How every message begins; what `t_mono_ns` is the time of, each says itself."""
+    """How every message begins."""
 
     v: Literal[1] = WIRE_VERSION
     boot_id: str
-    """Identifies this start of the daemon; a new one means that `seq` and `grasp` start again."""
+    """Identifies this start of the daemon, from which `seq` and `grasp` count."""
     seq: Count
-    """Counts up by one per message of this topic; a gap is a loss, or of `tactile.<hand>` that
-    nobody wanted it."""
+    """Counts up per message of this topic; a gap is a loss, or a `tactile` not wanted."""
     t: float
-    """Wall-clock seconds since 1970 at publishing, for plots and people only."""
+    """Wall-clock seconds since 1970, for plots and people only."""
     t_mono_ns: Count
     """Monotonic time, ns."""
 
@@ -76,11 +73,9 @@ class Verdict(_Message, frozen=True, kw_only=True):
     repaired: Annotated[list[str], msgspec.Meta(max_length=120)] = []
     """Electrodes that were replaced by what the others let expect, such as `ff_7` (1 to 24)."""
     session_calibrated: bool | None = None
-    """False: the session's grasps are too few yet, so the verdict is less sure; null: the model
-    needs none."""
+    """False: the grasps are too few yet, so it is less sure; null: the model needs none."""
     judged: bool = True
-    """Whether the network judged this very reading; if not, the reading confirms the grasp's
-    standing verdict, or is `unknown`."""
+    """False: the reading confirms the grasp's standing verdict, or is `unknown`."""
     gate: GateState | None = None
     """Null: each reading is a grasp of its own."""
     contact: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None
@@ -91,28 +86,24 @@ class Verdict(_Message, frozen=True, kw_only=True):
     model_sha: str
     """First 12 hex digits of the model file's SHA-256."""
     p_slip_model: Probability | None = None
-    """What the network alone says, before what outcomes have taught; null exactly when `p_slip`
-    is."""
+    """What the network says without outcomes; null exactly when `p_slip` is."""
     outcomes: Count = 0
-    """Outcomes of lifts that `p_slip` rests on: those learned from since the start of the session.
-    """
+    """Outcomes since the start of the session that `p_slip` rests on."""
     supervised: bool = False
-    """Lift it under supervision and tell the outcome, whatever the verdict: it would teach what is
-    not known yet."""
+    """Lift it under supervision, whatever the verdict, and tell the outcome: it teaches."""
     risk: RiskReport | None = None
     """What lifts of `stable` verdicts came to; null where nothing learns and no risk is set."""
     early: bool = False
-    """Whether it was judged when nothing moved fast, but something might still slide slowly
-    (`[gate] early`); a surer verdict of the same grasp follows."""
+    """Judged while something might still slide slowly; a surer verdict follows."""
     still_ms: Duration | None = None
-    """For how long the hand has touched and kept still, as far as that can be told, ms: from 100 on
-    nothing moves fast, from 240 on nothing slides slowly either; 0 while something moves. Null with
-    a null `gate`."""
+    """How long the hand has kept still, ms; null with a null `gate`.
+
+    From 100 on nothing moves fast, from 240 on nothing slides; 0 while something moves.
+    """
     motion: Motion | None = None
-    """How each finger moves, in units of its own noise (1 where only noise moves it); null where it
-    is not known, while nothing touches, and with a null `gate`."""
+    """Of each finger, in units of its own noise; null where it is not known, or nothing touches."""
     motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
-    """What it is at most for a finger that is still."""
+    """Most motion of a finger that is still."""
 
 
 class GateMessage(_Message, frozen=True, kw_only=True):
@@ -144,8 +135,8 @@ class Tactile(_Message, frozen=True, kw_only=True):
     counts: Annotated[list[Annotated[list[Count], msgspec.Meta(max_length=24)]], _HAND]
     """By finger, electrodes 1 to 24, 0..4095; as read, nothing repaired."""
     faults: Annotated[list[Annotated[list[Count], msgspec.Meta(max_length=24)]], _HAND]
-    """By finger and electrode, bits of what is wrong with a count: 1 missing, 2 not a count, 4
-    parity, 8 error word, 16 held, 32 cut off; 0 is well."""
+    """By finger and electrode, bits: 1 missing, 2 not a count, 4 parity, 8 error word, 16 held, 32
+    cut off; 0 is well."""
     joints: dict[str, float] = {}
     """Newest angle of each joint that has one, rad."""
 
@@ -161,8 +152,7 @@ class OutcomeMessage(_Message, frozen=True, kw_only=True):
     object: ObjectName | None = None
     """What was lifted; null: it was not told."""
     grasp_boot_id: str | None = None
-    """The `boot_id` under which the grasp was judged, if that was an earlier start; null: this
-    one."""
+    """The earlier start under which the grasp was judged; null: this one."""
 
 
 class State(StrEnum):
@@ -223,13 +213,11 @@ class Status(_Message, frozen=True, kw_only=True):
     tared: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None
     """Fingers of which it is known where they rest; null with a null `gate`."""
     health: Annotated[dict[str, Reason], msgspec.Meta(max_length=130)] = {}
-    """What is not well now: an electrode such as `ff_7`, a finger such as `ff`, `link`, `joints`,
-    `model` or `session`, and why."""
+    """What is not well now: `ff_7`, `ff`, `link`, `joints`, `model` or `session`, and why."""
     latency_us: dict[Literal["p50", "p99", "max"], Duration]
     """Reading to publish since start; all zero before the first verdict."""
     jitter_us: dict[Literal["p50", "p99", "max"], Duration] = {}
-    """How far the time between two readings in a row was from the driver's period, since start;
-    empty while that is not known."""
+    """Time between two readings less the driver's period; empty while that is not known."""
     late_readings: Count = 0
     """Readings since start whose verdict came more than a period after their last byte."""
     worst_age_ms: Duration = 0.0
@@ -247,7 +235,15 @@ class Status(_Message, frozen=True, kw_only=True):
     versions: dict[str, str]
 
 
-MESSAGES = (Verdict, GateMessage, Tactile, OutcomeMessage, Status)
+Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
+MESSAGES: Final[dict[str, type[Message]]] = {
+    "verdict": Verdict,
+    "gate": GateMessage,
+    "tactile": Tactile,
+    "outcome": OutcomeMessage,
+    "status": Status,
+}
+"""Messages by the first part of their topic."""
 
 encode = msgspec.json.Encoder().encode
 """JSON payload of a message."""
@@ -256,14 +252,14 @@ decode_gate = msgspec.json.Decoder(GateMessage).decode
 decode_tactile = msgspec.json.Decoder(Tactile).decode
 decode_outcome = msgspec.json.Decoder(OutcomeMessage).decode
 decode_status = msgspec.json.Decoder(Status).decode
-"""Each parses and checks one kind of payload, bytes or text. Raises `msgspec.DecodeError`."""
+"""Each decodes one kind of payload. Raises `msgspec.DecodeError`."""
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema (2020-12) of all messages, each under its name in `$defs`."""
+    """Return the JSON Schema (2020-12) of all messages, by name in `$defs`."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "graspd wire messages, version 1",
-        "anyOf": [{"$ref": f"#/$defs/{message.__name__}"} for message in MESSAGES],
-        "$defs": msgspec.json.schema_components(MESSAGES)[1],
+        "anyOf": [{"$ref": f"#/$defs/{message.__name__}"} for message in MESSAGES.values()],
+        "$defs": msgspec.json.schema_components(MESSAGES.values())[1],
     }

@@ -1,4 +1,4 @@
-"""Make messages of judgements, send each to every output, and count how late verdicts are."""
+"""Makes messages of judgements, sends them, and counts how late verdicts are."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 SHA_DIGITS = 12
 BUCKET_RATIO = 1.02
-"""Ratio of neighbouring bucket bounds: a percentile is right to 2 %."""
+"""A percentile is right to 2 %."""
 FLOOR_US = 0.1
 BUCKETS = math.ceil(math.log(1e8 / FLOOR_US) / math.log(BUCKET_RATIO)) + 1
 """Enough to reach 100 s."""
 OUTAGE_PERIODS = 10
-"""A gap of this many periods is an outage, which is reported as silence and is no jitter."""
+"""A gap of this many periods is silence and no jitter."""
 
 
 class LatencyHistogram:
@@ -49,12 +49,10 @@ class LatencyHistogram:
 
     def __init__(self) -> None:
         self.buckets = [0] * BUCKETS
-        """Durations in each bucket, the shortest first."""
         self.count = 0
         self.max_us = 0.0
 
     def add(self, duration_us: float) -> None:
-        """Count one duration, us."""
         index = 0
         if duration_us > FLOOR_US:
             index = int(math.log(duration_us / FLOOR_US) / math.log(BUCKET_RATIO))
@@ -64,7 +62,7 @@ class LatencyHistogram:
             self.max_us = duration_us
 
     def quantile_us(self, fraction: float) -> float:
-        """Return the duration, us, that `fraction` of all do not exceed, to 2 %; 0 if empty."""
+        """Return the duration, us, that `fraction` of all do not exceed; 0 if empty."""
         rank = math.ceil(fraction * self.count)
         below = 0
         for index, durations in enumerate(self.buckets):
@@ -79,16 +77,16 @@ class Deadlines:
 
     def __init__(self) -> None:
         self.jitter = LatencyHistogram()
-        """How far, us, the time between two readings in a row is from the driver's period."""
+        """Time between two readings less the driver's period, us."""
         self.late = 0
-        """Readings that were answered more than a period after their last byte."""
+        """Readings that were answered more than a period late."""
         self.worst_age_ms = 0.0
-        """Longest time from a reading's last byte to its verdict, ms."""
+        """From a reading's last byte to its verdict, ms."""
         self._last_seq = -1
         self._last_ns = 0
 
     def add(self, reading: TactileReading, age_ms: float, period_ns: int | None) -> None:
-        """Count a reading, answered `age_ms` after its last byte, of a driver with this period."""
+        """Count a reading, answered `age_ms` after its last byte."""
         if age_ms > self.worst_age_ms:
             self.worst_age_ms = age_ms
         if period_ns is not None:
@@ -133,10 +131,9 @@ class Outbox:
         *,
         boot_id: str | None = None,
     ) -> None:
-        """`hand` is its name; each output gets every message, readings only if it wants them.
+        """Each output gets every message of `hand`; readings only if it wants them.
 
-        `clock` gives monotonic ns, `wall_clock` seconds since 1970. `boot_id` is a new one unless
-        given.
+        `clock` gives monotonic ns, `wall_clock` seconds since 1970.
         """
         self._latency = LatencyHistogram()
         self._decisions: Counter[Decision] = Counter()
@@ -145,7 +142,6 @@ class Outbox:
         kinds = "verdict", "gate", "tactile", "outcome", "status"
         self._topics = {kind: f"{kind}.{hand}".encode() for kind in kinds}
         self._sent: Counter[str] = Counter()
-        """Messages of each kind."""
         self._fingers = tuple(fingers)
         self._model = model
         self._model_sha = model_sha256[:SHA_DIGITS]
@@ -153,7 +149,7 @@ class Outbox:
         self._clock = clock
         self._wall_clock = wall_clock
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
-        """Identifies this start of the daemon in all messages."""
+        """Identifies this start of the daemon."""
         self._versions = {
             "graspd": __version__,
             "onnxruntime": onnxruntime.__version__,
@@ -163,13 +159,13 @@ class Outbox:
     def verdict(
         self, judgement: Judgement, received_ns: int, silence_ns: int
     ) -> tuple[Verdict, bytes]:
-        """Send one verdict, and before it the changes of the gate; return it, plain and encoded.
+        """Send one verdict, after the changes of the gate; return it, plain and encoded.
 
-        `received_ns`: time when the driver handed the reading over, monotonic. `silence_ns`: time
-        without a message after which subscribers take the grasp for unknown.
+        `received_ns`: when the driver handed the reading over. `silence_ns`: time without a message
+        after which subscribers take the grasp for unknown.
         """
         moment, worth = judgement.moment, judgement.assessment
-        known = judgement.decision is not Decision.UNKNOWN
+        valid = judgement.decision is not Decision.UNKNOWN
         for change in moment.changes:
             self._gate_change(judgement.t_ns, moment, change)
         now_ns = self._clock()
@@ -181,7 +177,7 @@ class Outbox:
             verdict=judgement.decision,
             verdict_code=DECISION_CODE[judgement.decision],
             p_slip=judgement.p_slip,
-            valid=known,
+            valid=valid,
             reasons=list(judgement.reasons),
             age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
             latency_us=latency_us,
@@ -193,11 +189,11 @@ class Outbox:
             silence_ms=silence_ns / 1e6,
             model=self._model,
             model_sha=self._model_sha,
-            p_slip_model=judgement.opinion.p_slip if known else None,
+            p_slip_model=judgement.opinion.p_slip if valid else None,
             outcomes=0 if worth is None else worth.outcomes,
             supervised=judgement.supervised,
             risk=None if worth is None else worth.report,
-            early=known and moment.early,
+            early=valid and moment.early,
             still_ms=moment.still_ms,
             motion=moment.motion,
             motion_limits=moment.motion_limits,
@@ -213,7 +209,7 @@ class Outbox:
         return message, payload
 
     def outcome(self, report: Report) -> None:
-        """Send how the lift of a grasp ended, and what was lifted if that is known."""
+        """Send how the lift of a grasp ended."""
         boot_id, grasp = report.grasp
         message = OutcomeMessage(
             **self._head("outcome"),
@@ -226,7 +222,7 @@ class Outbox:
         self._send("outcome", encode(message))
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
-        """Send one reading, with the newest joint angles, to each output that wants it."""
+        """Send one reading, with the newest joint angles, where it is wanted."""
         topic = self._topics["tactile"]
         wanting = [output for output in self._outputs if output.wanted(topic)]
         if not wanting:
@@ -244,7 +240,6 @@ class Outbox:
             output.send(topic, payload)
 
     def _head(self, kind: str) -> _Head:
-        """Begin a message of this kind, which gets the next number."""
         seq = self._sent[kind]
         self._sent[kind] += 1
         return _Head(boot_id=self.boot_id, seq=seq, t=self._wall_clock())
@@ -278,7 +273,7 @@ class Outbox:
         skipped_readings: int,
         overloaded: bool,
     ) -> Status:
-        """Send one status message. `drivers` has the counters of all parts, by name."""
+        """Send one status. `drivers` has the counters of all parts, by name."""
         session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
         health = pipeline.health()
         if state is State.SILENT:
@@ -330,7 +325,7 @@ def _learner(trust: Trust) -> LearnerHealth:
 
 
 def _angles(joints: JointReading) -> dict[str, float]:
-    """Return the joints that have an angle, rad. JSON has no NaN."""
+    """Return the joints that have an angle, rad."""
     pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
     return {name: angle for name, angle in pairs if math.isfinite(angle)}
 

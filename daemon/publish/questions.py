@@ -11,16 +11,15 @@ from functools import partial
 from typing import Final
 
 from daemon.publish.companion import REPEATED, Requests
-from daemon.publish.door import Message
+from daemon.publish.door import Frames
 from daemon.publish.messages import OBJECT_PATTERN
 from daemon.trust.lift_book import GraspId, Report
 
 JUDGE, LIFT = b"judge", b"lift"
-"""Questions. The answer is the same, but only `lift` makes the peer the owner of the grasp."""
+"""Questions. Only `lift` makes the peer the owner of the grasp."""
 OUTCOME = b"outcome"
-"""First word of `outcome <boot_id> <grasp> <stable|slip> [<object>]`."""
 WAITING_MAX: Final = 256
-"""Questions that wait for an answer, one of each peer. A newer one replaces the oldest."""
+"""Questions that wait, one of each peer. A newer one replaces the oldest."""
 _REPORT = re.compile(
     rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
 )
@@ -29,34 +28,32 @@ MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
 Peer = bytes
 """Routing id of a connection."""
 NAME_BYTES: Final = 16
-"""A client with several connections begins their routing ids with the same 16 random bytes. It is
-the owner of its grasps by them."""
+"""Routing ids of a client begin with the same 16 random bytes: its name as an owner."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
     """Waits for an answer."""
 
-    envelope: Message
+    envelope: Frames
     """Routing id, and the delimiter of a REQ socket."""
     due_ns: int
     lifts: bool
 
 
 class Questions:
-    """Takes questions and outcomes, and answers them. A peer has one question at a time."""
+    """Takes questions and outcomes, and answers them."""
 
     def __init__(self, send: Callable[[Sequence[bytes]], bool], patience_ns: int) -> None:
-        """`send` returns False if it drops an answer. Questions wait at most `patience_ns`."""
+        """`send` returns False if it drops an answer."""
         self.counters: Counter[str] = Counter()
-        """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken, and kept where
-        that is wanted, and `outcomes_refused`; `dropped` answers."""
+        """By what became of questions and outcomes; `dropped`: answers."""
         self._send = send
         self._patience_ns = patience_ns
         self.waiting: dict[Peer, Question] = {}
-        """Questions without an answer, by the peer's routing id; the oldest first."""
+        """By the peer's routing id; the oldest first."""
 
-    def take(self, messages: Iterable[Message], now_ns: int, requests: Requests) -> None:
+    def take(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> None:
         """Take the messages of peers, and pass on to `requests` what they want."""
         asked = 0
         for peer, *envelope, text in messages:
@@ -81,8 +78,8 @@ class Questions:
             self.counters["given_up"] += 1
         self.waiting[peer] = question
 
-    def _take_outcome(self, envelope: Message, text: bytes, requests: Requests) -> None:
-        """Pass on how a lift has ended, or refuse a text that does not say so."""
+    def _take_outcome(self, envelope: Frames, text: bytes, requests: Requests) -> None:
+        """Pass on how a lift has ended, or refuse the text."""
         told = _REPORT.fullmatch(text)
         if told is None:
             self._answer_outcome(envelope, MALFORMED)
@@ -95,8 +92,8 @@ class Questions:
         )
         requests.outcome(report, partial(self._answer_outcome, envelope))
 
-    def _answer_outcome(self, envelope: Message, refusal: str | None) -> None:
-        """Tell the peer whether its outcome was taken. A peer that has gone misses it."""
+    def _answer_outcome(self, envelope: Frames, refusal: str | None) -> None:
+        """Tell the peer whether its outcome was taken."""
         answer: dict[str, object] = {"v": 1, "ok": refusal in (None, REPEATED)}
         if refusal == REPEATED:
             answer["repeated"] = True
@@ -106,7 +103,7 @@ class Questions:
         self.counters["outcomes" if answer["ok"] else refused] += 1
         self._answer(envelope, json.dumps(answer, separators=(",", ":")).encode())
 
-    def _answer(self, envelope: Message, payload: bytes) -> None:
+    def _answer(self, envelope: Frames, payload: bytes) -> None:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
     def answer(self, payload: bytes, now_ns: int | None = None) -> list[Peer]:

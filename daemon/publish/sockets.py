@@ -1,4 +1,4 @@
-"""The sockets of a scene, for messages and questions, and the keys of peers that may connect."""
+"""The sockets of a scene, and the keys of peers that may connect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 TACTILE = b"tactile."
-"""Prefix of the topics that are sent seldom."""
 
 
 class Sockets(Companion):
@@ -38,10 +37,7 @@ class Sockets(Companion):
         *,
         awaits_subscriber: bool = False,
     ) -> None:
-        """`clock` gives monotonic ns. `awaits_subscriber`: `wait_for_subscriber` will be called.
-
-        Raises `PublishError`, and `SceneError` for keys that are wrong.
-        """
+        """`clock` gives monotonic ns. Raises `PublishError`, and `SceneError` for wrong keys."""
         self.plan = plan(wanted)
         self.endpoint = wanted.endpoint
         self._clock = clock
@@ -102,12 +98,12 @@ class Sockets(Companion):
         return Admission(*pair, clients.admitted)
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Publish one message. It is dropped, and counted, where libzmq is behind."""
+        """Publish one message; count it if it is dropped."""
         if self._door is None or not self._door.send(topic, payload):
             self._counters["dropped"] += 1
 
     def wanted(self, topic: bytes) -> bool:
-        """Return True if a message of this topic is to be sent now: readings are sent seldom."""
+        """Return True if a message of this topic is due: readings are sent seldom."""
         if not topic.startswith(TACTILE):
             return True
         if self._tactile_period_ns is None:
@@ -123,18 +119,16 @@ class Sockets(Companion):
         return self._door is not None and self._door.answer(frames)
 
     def filenos(self) -> list[int]:
-        """Return what becomes readable when a question comes, if `before_wait` is called."""
         return self._filenos
 
     def before_wait(self, requests: Requests) -> None:
-        """Pass on what peers ask and report."""
         if self.questions is not None and self._door is not None:
             messages = self._door.receive()
             if messages:
                 self.questions.take(messages, self._clock(), requests)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Answer all questions, or those alone that have waited too long for a better answer."""
+        """Answer all questions, or only those that can wait no longer for a better answer."""
         if self.questions is None or not self.questions.waiting:
             return
         now_ns = None if published.is_answer else self._clock()
@@ -143,32 +137,26 @@ class Sockets(Companion):
             published.lifts.claim(published.grasp, peer)
 
     def on_status(self, status: Status) -> None:
-        """Check that libzmq still serves the sockets, and look at the list of keys.
-
-        Raises `PublishError`, which ends the daemon.
-        """
+        """Check the sockets and the list of keys. Raises `PublishError`, which ends the daemon."""
         if self._door is not None:
             self._door.check()
         self.check_keys()
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """What was counted, by part."""
         counters = {"publish": dict(self._counters)}
         if self.questions is not None:
             counters["ask"] = dict(self.questions.counters)
         return counters
 
     def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
-        """Wait until a peer has connected to hear messages; see `Door`."""
         return self._door is not None and self._door.wait_for_subscriber(timeout_s, stop)
 
     def check_keys(self) -> None:
-        """Take the list of keys if it has changed. A peer whose key is removed is disconnected.
+        """Take the list of keys if it has changed; disconnect a peer whose key is removed.
 
-        A list that cannot be read, or that others may write, admits no peer, and is tried again
-        when it changes. An endpoint that another program has taken meanwhile is tried again, too.
-        Raises `PublishError` if peers cannot be disconnected.
+        A list that cannot be read, or that others may write, admits no peer. An endpoint that is
+        taken is tried again. Raises `PublishError` if peers stay connected.
         """
         if self._curve is None or self._admission is None:
             return
@@ -200,7 +188,6 @@ class Sockets(Companion):
                 raise PublishError(f"{self.endpoint}: cannot disconnect a peer with a removed key")
 
     def close(self) -> None:
-        """Close all sockets. May be called again."""
         if self._door is not None and not self._door.close():
             log.warning("%s: peers keep libzmq from closing", self.endpoint)
         self._door = None
@@ -222,7 +209,7 @@ def _log_refused(clients: Clients) -> None:
 
 
 def plan(wanted: Scene) -> object:
-    """Return the parts of a scene that its sockets depend on. Scenes with equal ones share them."""
+    """Return the parts of a scene that its sockets depend on."""
     asked = (wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group, wanted.gate.request_ms)
     own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
     return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
@@ -232,15 +219,14 @@ def _state(folder: Path) -> object:
     """Return a value that changes when a file in the folder, or its rights, change."""
     try:
         with os.scandir(folder) as entries:
-            found = {entry.name: _signature(entry) for entry in entries}
+            signatures = {entry.name: _signature(entry) for entry in entries}
         about = os.stat(folder)
     except OSError as error:
         return error.errno
-    return found, about.st_ino, about.st_ctime_ns
+    return signatures, about.st_ino, about.st_ctime_ns
 
 
 def _signature(entry: os.DirEntry[str]) -> object:
-    """Return a value that changes when a file is replaced or changed, or its rights."""
     try:
         about = entry.stat()
     except OSError as error:  # a link that leads nowhere, for example

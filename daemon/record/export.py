@@ -1,5 +1,4 @@
-"""Makes a grasp table of recorded grasps with known outcomes, in the layout of the BioTac SP
-Stability Set. A row has the counts by which the grasp was judged last before its outcome."""
+"""Makes a grasp table of recorded grasps with known outcomes, as in the BioTac SP Stability Set."""
 
 from __future__ import annotations
 
@@ -27,10 +26,10 @@ class Grasp:
     """One grasp: a row of the table."""
 
     counts: NDArray[np.uint16]
-    """Shape (fingers, 24), as judged last before the outcome was told."""
+    """Shape (fingers, 24), as judged last before the outcome."""
     slipped: bool
     object_name: str | None = None
-    """What was lifted; None if the controller has not told it."""
+    """None: the controller has not told it."""
 
 
 @dataclass(slots=True)
@@ -41,13 +40,13 @@ class Export:
     grasps: dict[GraspId, Grasp] = field(default_factory=dict)
     """In the order of their outcomes."""
     without_outcome: int = 0
-    """Left out: judged grasps without an outcome."""
+    """Judged grasps without an outcome."""
     repaired: int = 0
-    """Left out: grasps with an outcome that were judged with repaired electrodes."""
+    """Grasps that were judged with repaired electrodes."""
     repeated: int = 0
-    """Left out: grasps with the counts of an earlier one, as a recording in a loop has them."""
+    """Grasps with the counts of an earlier one, as of a recording in a loop."""
     unjoined: int = 0
-    """Outcomes of grasps without judged counts before them in the recordings."""
+    """Outcomes of grasps without judged counts."""
     cut_off: int = 0
     """Files that were cut off or are damaged."""
     judged: dict[GraspId, Judged] = field(default_factory=dict)
@@ -91,8 +90,7 @@ class Export:
 def collect(paths: Sequence[Path]) -> Export:
     """Return the grasps of recordings, given in the order of time.
 
-    Raises `RecordingError` for a file that cannot be read, has other fingers than the first, or
-    does not have the counts that were judged.
+    Raises `RecordingError` for a file that is damaged, of other fingers, or without judged counts.
     """
     export = Export()
     told: set[GraspId | None] = set()
@@ -117,10 +115,7 @@ def collect(paths: Sequence[Path]) -> Export:
 
 
 def write(out: TextIO, export: Export, object_name: str) -> None:
-    """Write the table, one row a grasp: object, 1 for slip or 0 for stable, counts by finger.
-
-    `object_name` is for grasps without a told object. Raises `OSError`.
-    """
+    """Write the table, one row a grasp; `object_name` is for grasps without one."""
     writer = csv.writer(out, lineterminator="\n")
     names = [name for finger in export.fingers for name in electrode_columns(finger)]
     writer.writerow([OBJECT, SLIPPED, *names])

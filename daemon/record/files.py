@@ -1,4 +1,4 @@
-"""Files of a recording: their names, how many are kept, and how they reach the disk."""
+"""Files of a recording: how they are named, kept and written."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 MODE: Final = 0o640
-"""Mode of the files: what a hand grasped is not for all users."""
+"""What a hand grasped is not for all users."""
 _STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 
@@ -24,20 +24,20 @@ class Retention:
     hand: str
     boot_id: str
     keep_files: int
-    """Most recordings to keep; link logs go with theirs."""
+    """Most recordings; link logs go with theirs."""
     keep_bytes: int
-    """Largest size of all files, bytes."""
+    """Largest size of all files."""
     wall_clock: Callable[[], int] = time.time_ns
 
     def path(self, number: int, ending: str) -> Path:
-        """Return the path of file `number` of the run, from 0; names sort by time."""
+        """Return the path of file `number` of the run; names sort by time."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.wall_clock() // 1_000_000_000))
         return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{number:04}{ending}"
 
     def make_room(self, expected_bytes: int) -> int:
-        """Delete the oldest recordings until one more of `expected_bytes` fits; count them.
+        """Delete the oldest recordings until one of `expected_bytes` fits; count them.
 
-        Makes the directory if needed. Raises `OSError`.
+        Raises `OSError`.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         recordings = self._recordings()
@@ -55,7 +55,7 @@ class Retention:
         return removed
 
     def _recordings(self) -> dict[str, tuple[list[Path], int]]:
-        """Return paths and total size, bytes, of each recording, by the stamp in its name."""
+        """Return paths and total size of each recording, by the stamp in its name."""
         pattern = re.compile(rf"{re.escape(self.hand)}-({_STAMP})\.(mcap|can\.log|serial)")
         recordings: dict[str, tuple[list[Path], int]] = {}
         for path in self.directory.iterdir():
@@ -78,17 +78,15 @@ class RecordingFile:
         self._stream = os.fdopen(os.open(path, flags, MODE), "wb")
 
     def append(self, content: bytes) -> None:
-        """Write these bytes, at the latest with the next flush."""
         self._stream.write(content)
 
     def flush(self) -> int:
-        """Put everything written on the disk; return the file's size, bytes."""
+        """Put everything on the disk; return the file's size, bytes."""
         self._stream.flush()
         os.fdatasync(self._stream.fileno())
         return self._stream.tell()
 
     def close(self) -> None:
-        """Flush and close."""
         try:
             self.flush()
         finally:
@@ -100,7 +98,6 @@ class RecordingFile:
             self._stream.close()
 
     def remove(self) -> None:
-        """Close and delete the file."""
         self.abandon()
         with contextlib.suppress(OSError):
             self._path.unlink()

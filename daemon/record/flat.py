@@ -1,5 +1,4 @@
-"""Recorded messages in a form that viewers can read: no null, no tables, and a schema for each
-topic without references and alternatives."""
+"""Recorded messages without null and tables, and schemas without references, for viewers."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ TABLE: Final = (
 
 
 def flat(value: object) -> object:
-    """Return a message's content without null, each table as one list, row by row."""
+    """Return a message without null, each table as one list, row by row."""
     if isinstance(value, dict):
         return {name: flat(one) for name, one in value.items() if one is not None}
     if isinstance(value, list) and value and isinstance(value[0], list):
@@ -28,7 +27,7 @@ def flat(value: object) -> object:
 
 
 def table(values: object) -> object:
-    """Return recorded counts by finger, in rows of 24. Older recordings have them so already."""
+    """Return recorded counts by finger, in rows of 24, as older recordings have them."""
     if not isinstance(values, list) or not values or isinstance(values[0], list):
         return values
     return [values[first : first + ELECTRODES] for first in range(0, len(values), ELECTRODES)]
@@ -37,7 +36,7 @@ def table(values: object) -> object:
 def schema_of(message: type[msgspec.Struct]) -> JsonSchema:
     """Return the JSON Schema of what `flat` makes of messages of a type.
 
-    Raises `TypeError` for a type with a field that no viewer could read.
+    Raises `TypeError` for a field that no viewer could read.
     """
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -94,7 +93,7 @@ def _object(kind: inspect.StructType) -> JsonSchema:
 
 
 def _values(kind: inspect.Type) -> list[Any]:
-    """Return the values of an enumeration or a literal, in its order; none for other types."""
+    """Return the values of an enumeration or a literal, in its order."""
     if isinstance(kind, inspect.EnumType):
         return [member.value for member in kind.cls]
     return list(kind.values) if isinstance(kind, inspect.LiteralType) else []

@@ -1,4 +1,4 @@
-"""Bytes and frames of a link, on their way into a file beside the recording."""
+"""Bytes and frames of a link, on their way into a file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
 
 EARLY_MAX: Final = 1000
-"""Entries held until the recorder starts: those of the link's opening."""
+"""Entries held until the recorder starts."""
 
 Sink = Callable[[tuple[object, ...], int], None]
 """Takes an entry and its monotonic time, ns."""
@@ -28,8 +28,8 @@ class Tap:
     ) -> None:
         """`ending` is that of the file.
 
-        `encode` gives the bytes of an entry in the file. It takes the monotonic time of the entry,
-        ns, the offset of the wall clock from that, ns, and the parts of the entry.
+        `encode` makes the bytes of an entry from its monotonic time, ns, the offset of the wall
+        clock, ns, and the parts of the entry.
         """
         self.ending = ending
         self.encode = encode
@@ -44,7 +44,7 @@ class Tap:
         self._sink = sink
 
     def take(self, *entry: object) -> None:
-        """Take what a driver reads from its link: CAN frames, or bytes of a serial line."""
+        """Take CAN frames, or bytes of a serial line."""
         if self._sink is None:
             self._early.append((entry, self._clock()))
         else:
@@ -52,7 +52,7 @@ class Tap:
 
 
 def tap_of(driver: Driver, section: Tactile) -> Tap | None:
-    """Return a tap on the link of a driver; None if it is neither CAN nor serial."""
+    """Return a tap on a CAN or serial link; None for others."""
     if isinstance(section, CanTactile):
         from drivers.can.driver import CanBridgeDriver
         from drivers.recordings.can_log import encode_frames

@@ -1,7 +1,4 @@
-"""Serves a daemon's messages to Lichtblick and Foxglove, live, under the schemas of recordings.
-
-Needs the package `foxglove-sdk` (extra `foxglove`).
-"""
+"""Serves a daemon's messages to Lichtblick and Foxglove, live. Needs the extra `foxglove`."""
 
 from __future__ import annotations
 
@@ -20,17 +17,17 @@ from daemon.record.viewers import Viewer
 ADDRESS: Final = "127.0.0.1"
 """Loopback alone: the server does not check who connects."""
 BACKLOG: Final = 256
-"""Messages that may wait for a viewer, a second of them; a slow one loses the oldest."""
+"""Messages that may wait for a viewer; a slow one loses the oldest."""
 IMAGES_HZ: Final = 10.0
 CHANNELS_MAX: Final = 128
-"""Most topics that are served: those of some ten hands."""
+"""Most topics: those of some ten hands."""
 
 
 class LiveServer:
     """A WebSocket server for viewers, in threads of the library."""
 
     def __init__(self, port: int, wall_clock: Callable[[], int] = time.time_ns) -> None:
-        """Serve on a port of this computer, 0 for any free one. Raises `RuntimeError` if taken."""
+        """Serve on a port, 0 for any free one. Raises `RuntimeError` if it is taken."""
         self._wall_clock = wall_clock
         # Its threads would log through Python, and wait for a thread that waits for their lock.
         foxglove.set_log_level(logging.CRITICAL)
@@ -48,11 +45,10 @@ class LiveServer:
 
     @property
     def port(self) -> int:
-        """Port that it serves."""
         return int(self._server.port)
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Pass on a published message; ignore one that no daemon publishes."""
+        """Pass on a published message; ignore others."""
         kind, _, hand = topic.decode(errors="replace").partition(".")
         if kind not in schemas():
             return

@@ -1,7 +1,4 @@
-"""Writes and reads the MCAP files of recordings. Needs the package `mcap` (extra `record`).
-
-A file that was cut off has no summary at its end, so the reader looks for none.
-"""
+"""Writes and reads the MCAP files of recordings. Needs the extra `record`."""
 
 from __future__ import annotations
 
@@ -29,33 +26,31 @@ from drivers.base import RecordingError
 from drivers.recordings.csv_rows import open_recording
 
 METADATA: Final = "graspd"
-"""Name of the metadata record that every file of graspd begins with."""
+"""Metadata record that every file of graspd begins with."""
 RECORD_MAX_BYTES: Final = 64 << 20
-"""Largest record; graspd's chunks have 1 MB. A record that claims far more is damaged."""
+"""Largest record. One that claims more is damaged."""
 CHUNK_MAX_BYTES: Final = 8 << 20
-"""Largest unpacked chunk, which is in memory at once; graspd's have 1 MB, other tools' 4 MB."""
+"""Largest unpacked chunk; graspd's have 1 MB, other tools' 4 MB."""
 RATIO_MAX: Final = 100
-"""Largest unpacked size of all chunks beyond the first `CHUNK_MAX_BYTES`, per packed byte. Held
-grasps pack to a twelfth, a sensor that sends only zeros to a thirty-sixth."""
+"""Largest unpacked size of later chunks, per packed byte; held grasps have 12, zeros 36."""
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError),
 )
-"""Errors of the library for a file that is damaged, cut off or no MCAP; the last two come from
-lengths beyond all memory."""
+"""Errors of the library for a damaged file; the last two come from huge lengths."""
 
 
 class McapWriter(RecordingFile):
     """Writes one MCAP file."""
 
     def __init__(self, path: Path, header: RecordingHeader) -> None:
-        """Create the file, which must not exist, with `header` at its beginning."""
+        """Create the file, with `header` at its beginning."""
         super().__init__(path)
         self._offset_ns = header.wall_minus_monotonic_ns
         self._writer = Writer(self._stream)
         self._channels: dict[bytes, tuple[int, Iterator[int]]] = {}
-        """Number of each topic's channel, and the next numbers of its messages."""
+        """By topic: number of the channel, and of its next messages."""
         try:
             self._writer.start(profile="", library="graspd")
             self._writer.add_metadata(METADATA, header.texts())
@@ -65,7 +60,7 @@ class McapWriter(RecordingFile):
             raise
 
     def write(self, topic: bytes, payload: bytes, at_ns: int) -> None:
-        """Add a message (JSON) on `topic`, such as `verdict.right`, of monotonic `at_ns`, ns."""
+        """Add a message (JSON) on `topic`, of monotonic `at_ns`."""
         if topic not in self._channels:
             self._channels[topic] = self._register(topic.decode()), count()
         channel, numbers = self._channels[topic]
@@ -84,7 +79,6 @@ class McapWriter(RecordingFile):
         return super().flush()
 
     def close(self) -> None:
-        """Write the summary, flush and close."""
         try:
             self._writer.finish()
         except OSError:
@@ -97,9 +91,9 @@ class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     kind: str
-    """First part of its topic's name: a `Topic`, or an unknown one."""
+    """First part of its topic: a `Topic`, or an unknown one."""
     at_ns: int
-    """Time of recording, ns, by the monotonic clock of the recording daemon."""
+    """By the monotonic clock of the recording daemon, ns."""
     payload: bytes
     """JSON."""
 
@@ -107,15 +101,15 @@ class RecordedMessage(NamedTuple):
 class McapReader:
     """Reads one file: its header at once, its messages by iterating, once.
 
-    The iteration ends where the file is damaged, as if it ended there. It raises `RecordingError`
-    for a file that unpacks to more than any recording of graspd.
+    The iteration ends where the file is damaged, as there is no summary to look for. It raises
+    `RecordingError` for a file that unpacks to more than any recording of graspd.
     """
 
     def __init__(self, path: Path, stream: BinaryIO) -> None:
-        """`stream` is the opened file at `path`. Raises `RecordingError` if it is not graspd's."""
+        """`stream` is the opened file. Raises `RecordingError` if it is not graspd's."""
         self._path = path
         self.cut_off = False
-        """After iterating: True if the file was cut off or is damaged."""
+        """True if the file turned out to be cut off or damaged."""
         reader = StreamReader(
             stream, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES
         )
@@ -179,8 +173,7 @@ class McapReader:
 
 
 def _within(chunk: bytes) -> Iterator[McapRecord]:
-    """Yield channels and messages of an unpacked chunk, one by one: all at once take a hundred
-    times its memory."""
+    """Yield channels and messages of a chunk: all at once take a hundred times its memory."""
     stream = ReadDataStream(BytesIO(chunk))
     while stream.count < len(chunk):
         kind, length = stream.read1(), stream.read8()
@@ -193,7 +186,7 @@ def _within(chunk: bytes) -> Iterator[McapRecord]:
 
 
 def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:
-    """Unpack at most `max_bytes` of a chunk; return None if its window alone is too large."""
+    """Unpack at most `max_bytes` of a chunk; None if its window alone is too large."""
     unpacked = content
     if compression == "zstd":
         if zstandard.get_frame_parameters(content).window_size > CHUNK_MAX_BYTES:
@@ -212,6 +205,6 @@ def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:
 
 
 def header_of(path: Path) -> RecordingHeader:
-    """Return the header of the file at `path`. Raises `RecordingError` if there is none."""
+    """Return the header of a file. Raises `RecordingError`."""
     with open_recording(path) as stream:
         return McapReader(path, stream).header

@@ -1,4 +1,4 @@
-"""Plays recordings as a driver: the same readings, as old as they were when recorded."""
+"""Plays recordings as a driver."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from drivers.recordings.player import RecordedDriver
 _log = logging.getLogger(__name__)
 
 RecordedEvent = Topic | OutcomeMessage | Exchanged
-"""A topic without content (`ASKED` or `SKIPPED`), an outcome, or an exchange of sensors."""
+"""`ASKED` or `SKIPPED`, an outcome, or an exchange of sensors."""
 _Item = Reading | RecordedEvent
 
 
@@ -34,19 +34,18 @@ class McapCounters(DriverCounters):
     """Counts of a replay."""
 
     late: int = 0
-    """Readings handed over more than a period after they were due."""
+    """Readings handed over more than a period late."""
     malformed: int = 0
     """Broken messages, and readings of other fingers."""
     cut_off: int = 0
-    """Files that were cut off, as by a killed daemon, or are damaged."""
+    """Files that were cut off or are damaged."""
 
 
 class McapReplayDriver(RecordedDriver[_Item]):
     """Plays the files of one run in a row, at most one reading per call of `read_ready`.
 
-    `t_ns` of a reading makes it as old, when it is handed over, as it was when it was recorded;
-    `recorded_ns` is its `t_ns` of then less `axis_ns`. `open` raises `RecordingError`. A file that
-    is damaged is played up to the damage, and counted.
+    `t_ns` makes a reading as old as it was when it was recorded. `recorded_ns` is its `t_ns` of
+    then less `axis_ns`. A damaged file is played up to the damage, and counted.
     """
 
     def __init__(
@@ -66,17 +65,17 @@ class McapReplayDriver(RecordedDriver[_Item]):
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
         self.on_event: Callable[[RecordedEvent], None] | None = None
-        """Called with each recorded event that the judge must know of."""
+        """Called with each event that the judge must know of."""
         self._reset()
 
     def _reset(self) -> None:
         self.counters = McapCounters()
         self.period_ns: int | None = None
-        """Shortest time between two readings so far, ns, as played."""
+        """Shortest time between two readings so far, as played."""
         self._last_ns: int | None = None
 
     def open(self) -> None:
-        """Check the header of every file, then start over with the first one."""
+        """Check the header of every file, then start over. Raises `RecordingError`."""
         self.close()
         self._reset()
         for path in self.paths:
@@ -87,7 +86,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
         self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """Return the next reading if it is due. An event that is due goes to `on_event` instead."""
+        """Return the next reading if it is due. Events go to `on_event`."""
         taken = self.take()
         if taken is None:
             return ()
@@ -123,7 +122,6 @@ class McapReplayDriver(RecordedDriver[_Item]):
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
     def _items_of(self, message: RecordedMessage) -> Sequence[_Item]:
-        """Return the readings, events or outcomes of a message, in their order."""
         try:
             if message.kind == Topic.TACTILE:
                 reading, asked = tactile_reading(message.payload, self._fingers)

@@ -1,7 +1,6 @@
 """Records readings, published messages and events in files, without delaying the loop.
 
-The loop appends to a bounded queue and a thread writes. A slow or full disk costs entries, which
-are counted, and no time of the loop.
+The loop appends to a bounded queue and a thread writes: a slow disk costs entries, not time.
 """
 
 from __future__ import annotations
@@ -38,15 +37,13 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 QUEUE_MAX: Final = 20_000
-"""Longest queue, entries: some 12 MB, a minute of readings at 100 Hz. Later entries are dropped."""
+"""Longest queue, entries: some 12 MB, a minute of readings. Later ones are dropped."""
 RETRY_NS: Final = 60_000_000_000
 """Time from a failure of the disk to the next try, ns."""
 ROUNDS_PER_FLUSH: Final = 10
-"""Times that the thread empties the queue per flush: few, so that it seldom needs the interpreter
-when the loop does."""
+"""Rounds of the thread per flush: few, so that it seldom delays the loop."""
 FLUSH_AFTER: Final = 0.8
-"""Part of the flush interval after which a flush is due: with a round and the writing, no entry
-waits longer than the interval."""
+"""Part of the flush interval: with a round and the writing, no entry waits longer."""
 CLOSE_S: Final = 0.5
 """Longest time that `close` waits for the thread, s."""
 
@@ -54,9 +51,9 @@ MakeHeader = Callable[[], RecordingHeader]
 """Encodes a state that the loop has copied; called in the thread."""
 
 LINK: Final = b""
-"""Topic of entries for the link log."""
+"""Topic of link traffic."""
 NEXT_FILES: Final = b"next"
-"""Topic of the entry after which new files begin; its content is a `MakeHeader`."""
+"""Topic of an entry after which new files begin; its content is a `MakeHeader`."""
 
 _Entry = tuple[int, bytes, object]
 """Monotonic ns; topic; payload, or a function that makes the message."""
@@ -67,17 +64,17 @@ class _Open:
     """The files that are being written."""
 
     files: list[RecordingFile]
-    """Messages; then the link log, if there is one."""
+    """Messages; then the link log, if any."""
     offset_ns: int
     """Wall time less monotonic time, ns."""
     since_ns: int
     """Start of the files, monotonic ns."""
     unflushed: int = 0
-    """Entries that are written, but perhaps not yet on the disk."""
+    """Entries that may not be on the disk yet."""
 
 
 class Recorder(Companion):
-    """Records one run of the daemon. `send` and the hooks never block or raise."""
+    """Records one run of the daemon. Its methods never block or raise."""
 
     def __init__(
         self,
@@ -91,9 +88,8 @@ class Recorder(Companion):
     ) -> None:
         """Start the thread, which creates the first file.
 
-        `take_header` copies the state for the header of a file. The loop calls it here, and after a
-        status where a file is to end: then no reading is being judged. `tap` gives the link's
-        traffic.
+        `take_header` copies the state for a file's header. The loop calls it here and after a
+        status: then no reading is being judged.
         """
         self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
@@ -106,7 +102,6 @@ class Recorder(Companion):
         self._queue: deque[_Entry] = deque()
         self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
         self._last_topic = b""
-        """Topic of the newest entry."""
         self._viewer = Viewer(options.images_hz)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
@@ -115,7 +110,7 @@ class Recorder(Companion):
         self._flush_due_ns = clock() + self._flush_ns
         self._retry_due_ns: int | None = None
         self._awaits_turn = True
-        """True while `NEXT_FILES` is queued, or will be when the loop sees `_wants_turn`."""
+        """True while `NEXT_FILES` is queued, or wanted by `_wants_turn`."""
         self._wants_turn = False
         self._queue.append((clock(), NEXT_FILES, take_header()))
         self._stopping = threading.Event()
@@ -125,7 +120,6 @@ class Recorder(Companion):
             tap.connect(partial(self._put, LINK))
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Record a published message."""
         self._put(topic, payload)
 
     def wanted(self, topic: bytes) -> bool:
@@ -138,7 +132,6 @@ class Recorder(Companion):
             self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Record the counts that the network judged."""
         judgement = published.judgement
         if judgement.moment.judged and judgement.judged_counts is not None:
             making = partial(Judged.of, self._retention.boot_id, judgement)
@@ -157,7 +150,6 @@ class Recorder(Companion):
             self._queue.append((self._clock(), NEXT_FILES, self._take_header()))
 
     def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
-        """Record that a sensor was exchanged, and what was known of the new ones."""
         self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
@@ -169,13 +161,12 @@ class Recorder(Companion):
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """Entries `recorded`, `dropped` by a slow disk and `lost` by a failed one; `files` begun
-        and `removed`, `failures`; `writing` is 1 while a file is open."""
+        """Entries `recorded`, `dropped` by a slow disk and `lost` by a failed one; files."""
         writing = int(self._open is not None)
         return {"record": {**self._counted, "dropped": self._dropped, "writing": writing}}
 
     def close(self) -> None:
-        """Write the queue and end the files; give up if the disk does not answer in time."""
+        """Write the queue and end the files, if the disk answers in time."""
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -224,7 +215,6 @@ class Recorder(Companion):
             self._begin(now_ns, make_header())
 
     def _begin(self, now_ns: int, header: RecordingHeader) -> None:
-        """Create the next files, if the disk takes them."""
         offset_ns = self._wall_clock() - now_ns
         header = replace(header, file=self._number, wall_minus_monotonic_ns=offset_ns)
         path = self._retention.path(self._number, ".mcap")

@@ -1,4 +1,4 @@
-"""The topics of a recording, and the messages on them that are not published."""
+"""The topics of a recording, and the messages that are not published."""
 
 from __future__ import annotations
 
@@ -12,15 +12,8 @@ import msgspec
 import numpy as np
 
 from daemon.judge.pipeline import Judgement
-from daemon.publish.messages import (
-    WIRE_VERSION,
-    Count,
-    GateMessage,
-    OutcomeMessage,
-    Status,
-    Tactile,
-    Verdict,
-)
+from daemon.publish import messages
+from daemon.publish.messages import WIRE_VERSION, Count, Tactile
 from daemon.record.flat import schema_of, table
 from daemon.record.viewers import Log, RawImage
 from daemon.trust.learner import LearnerState
@@ -40,14 +33,13 @@ class Joints(msgspec.Struct, frozen=True, kw_only=True):
     v: Literal[1] = WIRE_VERSION
     seq: int
     t_mono_ns: int
-    """Monotonic time, ns, of the reading's last byte."""
+    """Of the reading's last byte, ns."""
     names: tuple[str, ...]
     position_rad: Annotated[dict[str, float], _ANGLES]
-    """Angle of each joint that has a valid one, rad."""
+    """Valid angles, rad."""
 
     @classmethod
     def of(cls, reading: JointReading) -> Self:
-        """Return the message for `reading`."""
         pairs = zip(reading.names, reading.position_rad.tolist(), strict=True)
         angles = {name: angle for name, angle in pairs if angle == angle}
         return cls(
@@ -63,16 +55,15 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
     t_mono_ns: Count
     """Of the verdict."""
     grasp: Count
-    """Of the verdict. A grasp that is judged again has several messages; the last one holds."""
+    """Of the verdict. If it is judged again, the last message holds."""
     counts: list[list[Count]]
-    """By finger, in the header's order, and electrode 1 to 24: medians of fresh sweeps or one
-    reading, as the scene says; before any repair."""
+    """By finger and electrode, in the header's order, before any repair."""
     repaired: list[str] = []
-    """Electrodes that the verdict names as replaced before judging."""
+    """Electrodes that the verdict names as replaced."""
 
     @classmethod
     def of(cls, boot_id: str, judgement: Judgement) -> Self:
-        """Return the message for a judgement with `judged_counts`, in the run `boot_id`."""
+        """Return the message for a judgement with `judged_counts`."""
         counts = judgement.judged_counts
         return cls(
             boot_id=boot_id,
@@ -91,9 +82,7 @@ class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
     """A sensor was exchanged; empty unless the new one was known."""
 
     session: SessionState | None = None
-    """What was known of the new sensors."""
     learned: LearnerState | None = None
-    """What outcomes had taught of them."""
 
 
 class Topic(StrEnum):
@@ -118,23 +107,19 @@ class Topic(StrEnum):
     LOG = "log"
 
 
-MESSAGES: Final[dict[Topic, type[msgspec.Struct]]] = {
-    Topic.TACTILE: Tactile,
-    Topic.VERDICT: Verdict,
-    Topic.GATE: GateMessage,
-    Topic.STATUS: Status,
-    Topic.OUTCOME: OutcomeMessage,
-    Topic.JOINTS: Joints,
-    Topic.JUDGED: Judged,
-    Topic.ASKED: Event,
-    Topic.EXCHANGED: Exchanged,
-    Topic.SKIPPED: Event,
-    Topic.IMAGE: RawImage,
-    Topic.LOG: Log,
+MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
+    **messages.MESSAGES,
+    "joints": Joints,
+    "judged": Judged,
+    "asked": Event,
+    "exchanged": Exchanged,
+    "skipped": Event,
+    "image": RawImage,
+    "log": Log,
 }
+"""Messages by the first part of their topic."""
 EVENTS: Final = (Topic.ASKED, Topic.SKIPPED)
 EVENT: Final = b"{}"
-"""Payload of an event."""
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
 _decode = msgspec.json.Decoder(dict[str, Any]).decode
@@ -142,7 +127,7 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """Return name and JSON Schema of the messages of each topic.
+    """Return name and JSON Schema of each topic's messages.
 
     Viewers know `foxglove.RawImage` and `foxglove.Log` by name.
     """
@@ -150,22 +135,22 @@ def schemas() -> dict[str, tuple[str, bytes]]:
     for topic, message in MESSAGES.items():
         family = "foxglove" if message in (RawImage, Log) else "graspd"
         schema = json.dumps(schema_of(message)).encode()
-        described[topic.value] = f"{family}.{message.__name__}", schema
+        described[topic] = f"{family}.{message.__name__}", schema
     return described
 
 
 def decode_judged(payload: bytes) -> Judged:
-    """Decode a `judged` message. Raises `ValueError` for any other payload."""
+    """Decode a `judged` message. Raises `ValueError`."""
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
     return msgspec.convert(content, Judged)
 
 
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileReading, bool]:
-    """Return the reading of a `tactile` message, reduced to `fingers`, in their order.
+    """Return the reading of a `tactile` message, of these fingers.
 
-    The second value is True if an older recording says in it that a controller asked before it.
-    Raises `ValueError` or `OverflowError` for any other payload.
+    The second value is True if an older recording says that a controller asked before it. Raises
+    `ValueError` or `OverflowError`.
     """
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
@@ -181,7 +166,7 @@ def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileRead
 
 
 def joint_reading(payload: bytes) -> JointReading:
-    """Return the reading of a `joints` message. Raises `ValueError` for any other payload."""
+    """Return the reading of a `joints` message. Raises `ValueError`."""
     content = _decode(payload)
     angles = content.get("position_rad")
     if isinstance(angles, list):  # as older recordings have them

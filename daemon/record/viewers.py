@@ -1,5 +1,4 @@
-"""What viewers show without knowing graspd, made of its messages: tactile images as
-`foxglove.RawImage`, and changes as `foxglove.Log`."""
+"""Tactile images as `foxglove.RawImage`, and changes as `foxglove.Log`, for viewers."""
 
 from __future__ import annotations
 
@@ -12,8 +11,10 @@ from numpy.typing import NDArray
 
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import (
+    MESSAGES,
     Count,
     GateMessage,
+    Message,
     OutcomeMessage,
     State,
     Status,
@@ -21,12 +22,12 @@ from daemon.publish.messages import (
     Verdict,
 )
 from drivers.base import ELECTRODES
-from models.levels import FULL, HEIGHT, PIXELS, WIDTH, Rest, fall_of, levels_of
+from models.levels import FULL, HEIGHT, PIXELS, WIDTH, RestCounts, fall_of, levels_of
 
 INFO: Final = 2
 WARNING: Final = 3
 SCALE: Final = 4
-"""Pixels of an image per pixel of the tactile image, each way."""
+"""Pixels per pixel of the tactile image, each way."""
 _COLOURS: Final = {
     -100: (59, 125, 216),
     0: (38, 44, 54),
@@ -36,7 +37,7 @@ _COLOURS: Final = {
     80: (251, 180, 26),
     100: (252, 255, 190),
 }
-"""Colours by level: blue is risen, yellow pressed the most."""
+"""By level: blue is risen, yellow pressed the most."""
 _PALETTE = np.array(
     [
         np.interp(np.arange(-FULL, FULL + 1), list(_COLOURS), channel)
@@ -44,17 +45,9 @@ _PALETTE = np.array(
     ]
 ).T.astype(np.uint8)
 _MARK = np.array((0, 220, 220), np.uint8)
-"""Colour of an electrode whose count is faulty."""
+"""Of an electrode whose count is faulty."""
 
-Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
-_TYPES: Final[dict[str, type[Message]]] = {
-    "verdict": Verdict,
-    "gate": GateMessage,
-    "tactile": Tactile,
-    "outcome": OutcomeMessage,
-    "status": Status,
-}
-Line = tuple[int, str, str]
+LogLine = tuple[int, str, str]
 """Level, name and text."""
 
 
@@ -66,7 +59,6 @@ class Time(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, wall_ns: int) -> Time:
-        """Return the time `wall_ns`, ns since 1970."""
         return cls(*divmod(max(wall_ns, 0), 1_000_000_000))
 
 
@@ -105,37 +97,31 @@ class Viewer:
 
     def __init__(self, images_hz: float) -> None:
         """Draw at most `images_hz` images a second; 0 draws none."""
-        self._journal, self._painter = Journal(), Painter(images_hz)
+        self._painter = Painter(images_hz)
+        self._verdict: tuple[int, Decision, list[Reason]] | None = None
+        self._state: State | None = None
+        self._health: dict[str, Reason] = {}
 
     def of(self, kind: str, content: object, wall_ns: int) -> Iterator[tuple[str, bytes]]:
         """Yield kind and payload of what a message comes to; nothing for a malformed one.
 
         `content` is the message as JSON has it, `kind` the first part of its topic.
         """
-        if kind not in _TYPES:
+        if kind not in MESSAGES:
             return
         try:
-            message: Message = msgspec.convert(content, _TYPES[kind])
+            message = msgspec.convert(content, MESSAGES[kind])
             image = self._painter.paint(message, wall_ns)
         except ValueError:
             return
-        for level, name, text in self._journal.lines(message):
+        for level, name, text in self._changes(message):
             log = Log(timestamp=Time.of(wall_ns), level=level, name=name, message=text)
             yield "log", msgspec.json.encode(log)
         if image is not None:
             yield "image", msgspec.json.encode(image)
 
-
-class Journal:
-    """Says in words what changes from message to message."""
-
-    def __init__(self) -> None:
-        self._verdict: tuple[int, Decision, list[Reason]] | None = None
-        self._state: State | None = None
-        self._health: dict[str, Reason] = {}
-
-    def lines(self, message: Message) -> list[Line]:
-        """Return what the message changes."""
+    def _changes(self, message: Message) -> list[LogLine]:
+        """Return what a message changes."""
         match message:
             case GateMessage():
                 text = f"{message.former} to {message.state} ({message.cause})"
@@ -150,7 +136,7 @@ class Journal:
                 return self._of_status(message)
         return []
 
-    def _of_verdict(self, message: Verdict) -> list[Line]:
+    def _of_verdict(self, message: Verdict) -> list[LogLine]:
         verdict = message.grasp, message.verdict, message.reasons
         if verdict == self._verdict:
             return []
@@ -161,7 +147,7 @@ class Journal:
         level = WARNING if message.verdict is Decision.SLIP else INFO
         return [(level, "verdict", f"grasp {message.grasp}: {message.verdict} ({why})")]
 
-    def _of_status(self, message: Status) -> list[Line]:
+    def _of_status(self, message: Status) -> list[LogLine]:
         lines = []
         if message.state is not self._state:
             level = WARNING if message.state is State.SILENT else INFO
@@ -179,17 +165,13 @@ class Painter:
     """Draws readings by where each finger rests, which it learns."""
 
     def __init__(self, images_hz: float) -> None:
-        """Draw at most `images_hz` images a second; 0 draws none."""
         self._period_ns = round(1e9 / images_hz) if images_hz else None
         self._due_ns = 0
         self._gate: GateState | None = None
-        self._rests: dict[str, Rest] = {}
+        self._rest = RestCounts()
 
     def paint(self, message: Message, wall_ns: int) -> RawImage | None:
-        """Return the image of a reading of wall time `wall_ns`, ns, if one is due.
-
-        Raises `ValueError` for a reading whose parts do not fit.
-        """
+        """Return the image of a reading if one is due. Raises `ValueError`."""
         if isinstance(message, Verdict):
             self._gate = message.gate
         if not isinstance(message, Tactile) or self._period_ns is None:
@@ -224,11 +206,11 @@ class Painter:
     def _finger(
         self, name: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
-        """Draw one finger, shape (`HEIGHT`, `WIDTH`, 3); `counts`, `sound` have shape (24,)."""
-        rest = self._rests.setdefault(name, Rest())
+        """Draw one finger, shape (`HEIGHT`, `WIDTH`, 3)."""
         if self._gate is GateState.IDLE:
-            rest.learn(counts, sound)
-        fall = fall_of(counts, sound, rest.counts)
-        pixels = _PALETTE[levels_of(fall, from_rest=rest.counts is not None) + FULL]
+            self._rest.learn(name, counts, sound)
+        rest = self._rest.of(name)
+        fall = fall_of(counts, sound, rest)
+        pixels = _PALETTE[levels_of(fall, from_rest=rest is not None) + FULL]
         pixels[np.array(PIXELS)[~sound]] = _MARK
         return pixels.reshape(HEIGHT, WIDTH, 3)

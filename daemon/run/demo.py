@@ -23,7 +23,7 @@ class Demo(Companion):
     """Writes a line for every `GRASPS` grasps, and the sums at the end."""
 
     def __init__(self, published: TactileModel) -> None:
-        """`published` judges every grasp as it comes, without session, outcomes or refusal."""
+        """`published` judges every grasp without session, outcomes or refusal."""
         self._published = Network(published, 0.5)
         self._part = Tally(), Tally()
         self._whole = Tally(), Tally()
@@ -78,7 +78,7 @@ class Demo(Companion):
         self._write(f"{grasps:10}{''.join(self._cells(tally, allowed) for tally in tallies)}")
 
     def _cells(self, tally: Tally, allowed: float | None) -> str:
-        """Return the `stable` verdicts, the slips among them, and the good lifts among them."""
+        """Return the number of `stable`, the slips and the good lifts among them."""
         stable, slips = tally.stable
         worth = tally.worth() or {}
         share, kept = worth.get("slips_among_stable"), worth.get("coverage")

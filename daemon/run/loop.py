@@ -39,14 +39,11 @@ from drivers.base import Driver, JointReading, Reading, TactileReading
 STATUS_PERIOD_NS: Final = 1_000_000_000
 """Time between two statuses, ns, even when nothing happens."""
 SILENCE_PERIODS: Final = 10
-"""Readings that may be missing before the daemon reports silence, if that takes longer than the age
-limit. Subscribers apply the same rule to the daemon."""
+"""Missing readings before silence is reported, if that takes longer than the age limit."""
 DRAINS_MAX: Final = 8
-"""Extra reads of the driver in one round under overload: the kernel's backlog is emptied in fewer,
-and a flood cannot hold the loop."""
+"""Most extra reads of the driver in one round: a flood cannot hold the loop."""
 BLOCKED_NS: Final = 50_000
-"""A wait that takes this much longer than its processor time, ns, has put the thread to sleep.
-Input that is there already costs processor time alone, however slow the processor is."""
+"""A wait that takes this much longer than its processor time, ns, has put the thread to sleep."""
 
 
 class Ended(Enum):
@@ -58,8 +55,7 @@ class Ended(Enum):
     RELOAD = "reload"
     """The scene is to be read again."""
     SLEPT = "slept"
-    """The computer has slept: all that is known of the hand is from before, however fresh it
-    looks."""
+    """The computer has slept: readings from before may look fresh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,16 +65,16 @@ class LoopTiming:
     max_age_ns: int
     """Age limit of readings, ns."""
     clock: Callable[[], int] = time.monotonic_ns
-    """Gives monotonic ns."""
+    """Monotonic ns."""
     sleep: Sleep = field(default_factory=Sleep)
-    """Notices that the computer has slept."""
     rest: Callable[[float], None] = time.sleep
-    """Has the kernel put this thread to sleep, s."""
+    """Puts this thread to sleep, s."""
     selector: Callable[[], selectors.BaseSelector] = selectors.PollSelector
-    """Makes what waits for descriptors. A wait in poll(2) is rounded up to whole milliseconds.
+    """Waits for descriptors, in whole milliseconds (poll(2)).
 
-    Unlike epoll(7), poll takes a descriptor for what it is now: a driver that closes a device and
-    opens it again within a round mostly gets the same number."""
+    Unlike epoll(7), poll takes a descriptor for what it is now: a driver that reopens a device
+    mostly gets the same number.
+    """
 
 
 class Loop:
@@ -94,10 +90,9 @@ class Loop:
         timing: LoopTiming,
         keep: Callable[[Answer], None] = at_once,
     ) -> None:
-        """`drivers` are open, the tactile one first; the caller closes them.
+        """Run these open drivers, the tactile one first; the caller closes them.
 
-        `stop` says when to end and when to read the scene again. `companions` are called in their
-        order. `keep` calls its argument once all outcomes until now are on the disk.
+        `keep` calls its argument once all outcomes until now are on the disk.
         """
         self._drivers = drivers
         self._tactile = drivers[0]
@@ -136,9 +131,9 @@ class Loop:
         self._readings_since_status = 0
 
     def run(self) -> Ended:
-        """Run until something ends it; called again after `RELOAD`, continue.
+        """Run until something ends it; after `RELOAD`, continue. Raises `DriverError`.
 
-        Raises `DriverError` if a driver gives up. Call `close` after the last call.
+        Call `close` after the last call.
         """
         self._watched = []
         with closing(self._new_selector()) as selector:
@@ -243,7 +238,7 @@ class Loop:
     def _read(self) -> tuple[list[Reading], int]:
         """Return what the drivers have, and the number of tactile readings in it.
 
-        Under overload, read the tactile driver until it is empty, to get its newest reading.
+        Under overload, empty the tactile driver, to get its newest reading.
         """
         readings: list[Reading] = []
         for driver in self._drivers:
@@ -289,7 +284,6 @@ class Loop:
             self._report_silence(now_ns)
 
     def _report_silence(self, now_ns: int, *, is_answer: bool = False) -> None:
-        """Publish that nothing is known of the hand."""
         self._state = State.SILENT
         judgement = self._pipeline.silence(self._last_t_ns)
         self._publish(judgement, None, now_ns, is_answer=is_answer)
@@ -302,7 +296,7 @@ class Loop:
         *,
         is_answer: bool = False,
     ) -> Verdict:
-        """Publish a verdict; with `is_answer`, answer also those who wait for a judgement."""
+        """Publish a verdict. With `is_answer`, it answers those who wait for a judgement."""
         silence_ns = self._silence_ns
         self._silence_due_ns = received_ns + silence_ns
         verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)

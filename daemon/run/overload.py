@@ -1,8 +1,7 @@
 """Load shedding: what the loop does when readings arrive faster than it can judge them.
 
-A loop that judged the whole backlog would publish verdicts on the past. A loop that finds work in
-each round never sleeps: in realtime it would take the whole processor, until the kernel ends it
-(RLIMIT_RTTIME).
+Judging the whole backlog would give verdicts on the past. A realtime loop that never sleeps is
+ended by the kernel (RLIMIT_RTTIME).
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from drivers.base import ElectrodeFault, TactileReading
 BACKLOG_MAX_NS: Final = 10_000_000
 """Longest backlog, ns, that is judged completely; one sensor period if that is longer."""
 COST_SAMPLES: Final = 4
-"""The cost of a reading is the least of its last four times, so that a stall of the machine does
-not count."""
+"""The cost of a reading is the least of its last four times: a stall does not count."""
 REPORT_AFTER_NS: Final = 3_000_000_000
 """Skipping for this long, ns, is reported as overload."""
 PAUSE_NS: Final = 1_000_000_000
@@ -31,12 +29,11 @@ RECOVERED_AFTER_NS: Final = 5_000_000_000
 """Time without a skipped reading, ns, after which the overload is over."""
 YIELD_AFTER_NS: Final = 10_000_000
 YIELD_AFTER_RECORDED_NS: Final = 1_000_000_000
-"""After this long without waiting, ns, the loop yields the processor. Recordings yield less often:
-nothing else is urgent then."""
+"""Time without a wait, ns, after which the loop yields the processor; more for recordings."""
 YIELD_SHARE: Final = 10
 YIELD_MAX_NS: Final = 5_000_000
-"""The loop yields for a tenth of the time it has worked, ns. In realtime, the kernel takes 5 % away
-in one go if nothing is left to others (sched(7), sched_rt_runtime_us)."""
+"""The loop yields for a tenth of the time it has worked, ns: in realtime, the kernel takes 5 % away
+otherwise (sched(7), sched_rt_runtime_us)."""
 
 log = logging.getLogger("graspd")
 
@@ -47,10 +44,7 @@ class LoadShedder:
     def __init__(
         self, now_ns: int, *, live: bool, sleep: Callable[[float], None] = time.sleep
     ) -> None:
-        """`live` readings arrive whether they are judged or not; recorded ones are never skipped.
-
-        `sleep` takes seconds, and must have the kernel put this thread to sleep.
-        """
+        """Skip `live` readings only. `sleep` puts this thread to sleep, s."""
         self._live = live
         self._sleep = sleep
         self._yield_after_ns = YIELD_AFTER_NS if live else YIELD_AFTER_RECORDED_NS
@@ -58,7 +52,6 @@ class LoadShedder:
         self._costs_ns: deque[int] = deque(maxlen=COST_SAMPLES)
         self._skipping_since_ns = self._skipped_ns = now_ns - PAUSE_NS
         self.skipped_readings = 0
-        """Tactile readings that were skipped since the start."""
         self.overloaded = False
         """True while skipping lasts, and until `RECOVERED_AFTER_NS` after it."""
 
@@ -106,10 +99,7 @@ class LoadShedder:
 
 
 def mark_repeats(newest: TactileReading, skipped: TactileReading) -> TactileReading:
-    """Return `newest` with the fingers flagged HELD that only repeat `skipped`.
-
-    The judge never saw `skipped`, so it could not notice the repeat itself.
-    """
+    """Return `newest` with the fingers HELD that only repeat `skipped`, which no judge saw."""
     sound = (newest.faults | skipped.faults) == 0
     differs = newest.counts != skipped.counts
     held = sound.any(axis=1) & ~(differs & sound).any(axis=1)

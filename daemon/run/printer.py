@@ -16,7 +16,7 @@ from daemon.trust.trust import Trust
 from drivers.base import Annotation
 
 NAME_MAX = 80
-"""Longest name of an object that is shown, characters."""
+"""Most characters of an object's name."""
 COLOURS = {Decision.STABLE: Colour.GREEN, Decision.SLIP: Colour.RED}
 
 
@@ -24,7 +24,7 @@ class Printer(Companion):
     """Writes verdicts as they come, and a summary at the end."""
 
     def __init__(self, *, as_json: bool) -> None:
-        """With `as_json`, write messages to stdout as they are, and the summary to stderr."""
+        """With `as_json`, write messages as they are, and the summary to stderr."""
         self._as_json = as_json
         self.result = RunSummary()
         self._start_s = time.monotonic()
@@ -49,7 +49,6 @@ class Printer(Companion):
         return False
 
     def on_outcome(self, report: Report) -> None:
-        """Count the outcome of a lift that was judged before."""
         self.result.outcome(report.grasp.grasp, slipped=report.outcome == "slip")
 
     def summary(self, trust: Trust | None) -> None:

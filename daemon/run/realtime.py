@@ -17,7 +17,6 @@ from daemon.scene.scene import Realtime
 log = logging.getLogger("graspd")
 
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
-"""Flags of mlockall(2)."""
 CAP_IPC_LOCK = 14
 """Bit of the capability to lock any amount of memory (linux/capability.h)."""
 
@@ -26,18 +25,17 @@ class RealtimeMode(Companion):
     """Runs the process in realtime from `__enter__` to `__exit__`.
 
     Only the loop's thread gets the priority, before libzmq's threads, which copy messages. One
-    warning says what the system refuses and which rights to grant.
+    warning says what is refused.
     """
 
     def __init__(self, wanted: Realtime) -> None:
-        """`wanted` is the scene's section `[realtime]`."""
         self._wanted = wanted
         self._processors = os.sched_getaffinity(0)
         self.lacking: dict[str, str] = {}
         """What was refused, and the right to grant."""
 
     def __enter__(self) -> Self:
-        """Take what the scene wants: the priority for this thread, the rest for the process."""
+        """Take the priority for this thread, the rest for the process."""
         wanted = self._wanted
         if wanted.cpus is not None:
             self._pin(set(wanted.cpus))
@@ -54,7 +52,6 @@ class RealtimeMode(Companion):
         return self
 
     def __exit__(self, *_details: object) -> None:
-        """Be an ordinary process again."""
         gc.enable()
         gc.unfreeze()
         with suppress(OSError):
@@ -101,12 +98,10 @@ class RealtimeMode(Companion):
 
 
 def _threads() -> list[int]:
-    """Return the threads of this process."""
     return [int(name) for name in os.listdir("/proc/self/task")]
 
 
 def _may_lock() -> bool:
-    """Return True if this process has the capability to lock any amount of memory."""
     with open("/proc/self/status", encoding="utf-8") as file:
         effective = next((line for line in file if line.startswith("CapEff:")), "CapEff: 0")
     return bool(int(effective.split()[1], 16) >> CAP_IPC_LOCK & 1)

@@ -17,7 +17,7 @@ PERIOD_NS = 10_000_000
 REST = 110
 """Untouched readings before the first grasp; a tare takes 100."""
 GRASP_EVERY, CLOSING, HELD = 65, 5, 45
-"""Readings from one grasp to the next, and of it closing (and opening) and held."""
+"""Readings of a grasp in all, while it closes or opens, and while it is held."""
 FALL_COUNTS = 150.0
 """An electrode falls by 0, 1, 2 or 3 times this in a typical grasp."""
 COUNTS_MAX = 4000.0
@@ -25,10 +25,7 @@ COUNTS_MAX = 4000.0
 
 
 def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
-    """Counts (fingers, 24) of a hand at rest, long enough to tare, and then `readings` of grasps.
-
-    `seen` is what the model was trained on.
-    """
+    """Yield counts (fingers, 24): a hand at rest, long enough to tare, then grasps."""
     # One standard deviation along each axis of the training: its very centre was never grasped.
     sides = 1.0 - 2.0 * (np.arange(np.size(seen.centre)) % 2)
     away = np.linalg.solve(seen.whitening_matrix().T, sides)
@@ -47,10 +44,9 @@ def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
 
 
 def rehearse(make: Callable[[Callable[[], int]], Pipeline], seen: SeenCounts) -> Pipeline:
-    """Judge one synthetic grasp: imports and allocations of the first real one are done then.
+    """Judge one synthetic grasp, so that the first real one needs no import or allocation.
 
-    `make` takes a clock, monotonic ns, and makes the pipeline that is returned. `seen` is what its
-    model was trained on.
+    `make` makes the pipeline that is returned, from a clock, monotonic ns.
     """
     now_ns = 0
     pipeline = make(lambda: now_ns)

@@ -1,4 +1,4 @@
-"""Prepares the scene file again while the former scene runs: one preparation after another."""
+"""Prepares the scene file again while the former scene runs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from daemon.process.worker import Worker
 from daemon.publish.companion import Companion
 
 PERIOD_NS: Final = 1_000_000_000
-"""Shortest time from the start of one preparation to that of the next, ns."""
+"""Shortest time between the starts of two preparations, ns."""
 END_S: Final = 0.5
-"""How long `close` waits for a preparation, s: its result is of no use any more."""
+"""How long `close` waits for a preparation, s."""
 
 
 class Reload(Companion):
@@ -38,15 +38,12 @@ class Reload(Companion):
 
     @property
     def received(self) -> signal.Signals | None:
-        """The signal that stops the process; None before it."""
         return self._stop.received
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when a signal arrives."""
         return self._stop.fileno()
 
     def filenos(self) -> list[int]:
-        """Return the descriptor that becomes readable when a preparation has ended."""
         return self._worker.filenos()
 
     def due_ns(self) -> int | None:
@@ -67,17 +64,13 @@ class Reload(Companion):
         return False
 
     def take(self) -> Parts | Exception:
-        """Return the prepared parts, or what was raised, after `take_reload` has returned True.
-
-        Raises `RuntimeError` otherwise.
-        """
+        """Return the prepared parts, or what was raised, after `take_reload` was True."""
         result, self._result = self._result, None
         if result is None:
             raise RuntimeError("nothing has been prepared")
         return result
 
     def close(self) -> None:
-        """Give up the current preparation."""
         self._worker.close(END_S)
 
     def _start(self) -> None:

@@ -25,10 +25,7 @@ class _Lift(NamedTuple):
 
 
 class Controller(Companion):
-    """Tells the recorded outcome of each judged grasp after its verdict, before the next grasp.
-
-    A robot's controller does so over `[ask]`.
-    """
+    """Tells the recorded outcome of each judged grasp before the next grasp, as a robot would."""
 
     def __init__(self, *, only_lifted: bool) -> None:
         """With `only_lifted`, tell outcomes of `stable` verdicts and supervised lifts only."""
@@ -37,7 +34,6 @@ class Controller(Companion):
         self._lift: _Lift | None = None
 
     def before_wait(self, requests: Requests) -> None:
-        """Keep `requests` for the outcomes."""
         self._requests = requests
 
     def on_verdict(self, published: PublishedVerdict) -> None:
@@ -73,7 +69,7 @@ class Controller(Companion):
 
 
 def _sent(object_name: str | None) -> str | None:
-    """Return the name if an outcome may have it. Tables may have any text."""
+    """Return the name if an outcome may have it: tables may have any text."""
     return object_name if re.fullmatch(OBJECT_PATTERN, object_name or "") else None
 
 
@@ -81,8 +77,7 @@ class Comparison(Companion):
     """Judges every judged grasp once more in another way, for the summary alone."""
 
     def __init__(self, how: str, pipeline: Pipeline, result: RunSummary) -> None:
-        """`how` is a key of `RunSummary.compared`. To `pipeline` each reading is a grasp; it has
-        the clock of the pipeline that made the verdicts."""
+        """`how` is a key of `RunSummary.compared`. To `pipeline` each reading is a grasp."""
         self._how = how
         self._pipeline = pipeline
         self._result = result
@@ -103,11 +98,12 @@ class Comparison(Companion):
 
 
 def trained_on(recordings: Sequence[Path], model: TactileModel) -> list[str]:
-    """Names of the recordings that a model was trained on."""
-    digests, found = {dataset.sha256 for dataset in model.contract.datasets}, []
+    """Return the names of the recordings that a model was trained on."""
+    digests = {dataset.sha256 for dataset in model.contract.datasets}
+    names = []
     for path in recordings:
         if path.is_file():
             with path.open("rb") as file:
                 if hashlib.file_digest(file, "sha256").hexdigest() in digests:
-                    found.append(path.name)
-    return found
+                    names.append(path.name)
+    return names

@@ -1,4 +1,4 @@
-"""Runs a scene file until told to stop, and reads it again when told to."""
+"""Runs a scene file until told to stop."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ AWAKE_RETRY_S, AWAKE_LOOK_S = 1.0, 0.1
 
 
 def prepare(path: Path) -> Parts:
-    """Read a scene, load its model and warm it; in realtime, rehearse a grasp too.
+    """Read a scene and load its model; in realtime, rehearse a grasp too.
 
     Raises `SceneError`, `ModelError` or `RecordingError`.
     """
@@ -59,7 +59,7 @@ def rehearse_grasp(parts: Parts) -> None:
 
 
 def enter_realtime(wanted: scene.Scene, stack: ExitStack) -> RealtimeMode | None:
-    """Enter realtime until `stack` closes; return None if the scene does not want that."""
+    """Enter realtime until `stack` closes, if the scene wants it."""
     if wanted.realtime is None:
         return None
     from daemon.run.realtime import RealtimeMode  # only where a scene wants realtime
@@ -78,7 +78,7 @@ class Runner:
         printer: Printer | None = None,
         manager: Systemd | None = None,
     ) -> None:
-        """`stop` ends the run or has the scene read again; `manager` started this process."""
+        """`manager` started this process."""
         self._path = path
         self._stop = stop
         self._printer = printer
@@ -92,10 +92,9 @@ class Runner:
         """What outcomes taught in the scene that ran last."""
 
     def run(self) -> None:
-        """Run until stopped or until a recording ends.
+        """Run until stopped or until a recording ends. Errors of a reload are logged.
 
-        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`. Errors
-        of a reload are logged, and the former scene goes on.
+        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`.
         """
         try:
             self._run(prepare(self._path))
@@ -215,7 +214,6 @@ def _is_told(error: Exception) -> bool:
 
 
 def _announce(wanted: scene.Scene) -> None:
-    """Say where everything is."""
     log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
     if wanted.ask_endpoint is not None:
         log.info("questions on %s", wanted.ask_endpoint)

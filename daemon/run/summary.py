@@ -17,7 +17,7 @@ from daemon.trust.trust import Trust
 WINDOW: Final = 50
 """Length of the worst run of lifts of `stable` verdicts."""
 WAITING_MAX: Final = 1024
-"""Most grasps whose outcome can still come; older ones have none."""
+"""Most grasps whose outcome can still come."""
 WITHOUT_SESSION, WITHOUT_LEARNING = "without session calibration", "without learning"
 WORTH: Final = {
     "coverage": "coverage",
@@ -26,7 +26,7 @@ WORTH: Final = {
     "slips_called_stable": "slips called stable",
     "stable_called_slip": "stable called slip",
 }
-"""What the figures of `Tally.worth` are called, in their order."""
+"""Texts for the figures of `Tally.worth`, in their order."""
 
 
 class Tally:
@@ -40,13 +40,12 @@ class Tally:
         self.held = self.slipped = 0
         """Lifts whose outcome is known, judged or not."""
         self._latest: deque[bool] = deque(maxlen=WINDOW)
-        """Whether the latest lifts of `stable` verdicts slipped."""
+        """True for each of the latest lifts of `stable` verdicts that slipped."""
         self.worst: int | None = None
         """Most slips in `WINDOW` lifts of `stable` verdicts in a row; None before that many."""
 
     @property
     def labelled(self) -> int:
-        """Lifts whose outcome is known, judged or not."""
         return self.held + self.slipped
 
     @property
@@ -56,7 +55,7 @@ class Tally:
         return slips + self.confusion[False, False], slips
 
     def add(self, decision: Decision, reasons: Iterable[Reason], slipped: bool | None) -> None:
-        """Count one verdict; `slipped` is how the lift ended, None where it is not known yet."""
+        """Count one verdict; `slipped` is None if the outcome is not known yet."""
         self.decisions[decision] += 1
         self.reasons.update(reasons)
         if slipped is not None:
@@ -74,9 +73,9 @@ class Tally:
                 self.worst = max(sum(self._latest), self.worst or 0)
 
     def scores(self) -> dict[str, float] | None:
-        """Accuracy, precision, recall and F1 over judged, labelled grasps; None if there are none.
+        """Return accuracy, precision, recall and F1, slip positive, of judged and labelled grasps.
 
-        Slip is the positive class, as in the paper. A score whose denominator is zero is left out.
+        A score whose denominator is zero is left out.
         """
         hit, miss = self.confusion[True, True], self.confusion[True, False]
         false_alarm, rest = self.confusion[False, True], self.confusion[False, False]
@@ -93,10 +92,7 @@ class Tally:
         )
 
     def worth(self) -> dict[str, float] | None:
-        """Return how good `stable` is, by lifts of known outcome; None without any.
-
-        `coverage` is the share of the lifts that held which were called `stable`.
-        """
+        """Return how good `stable` is, by lifts of known outcome; None without any."""
         if not self.labelled:
             return None
         (stable, slips), held = self.stable, self.confusion[False, False]
@@ -111,7 +107,6 @@ class Tally:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything as JSON-ready values."""
         return {
             "verdicts": {decision.value: self.decisions[decision] for decision in Decision},
             "reasons": {reason.value: number for reason, number in self.reasons.items()},
@@ -122,7 +117,6 @@ class Tally:
         }
 
     def counts(self) -> str:
-        """Return the number of each decision, for people."""
         return ", ".join(f"{self.decisions[decision]} {decision}" for decision in Decision)
 
     def lines(self) -> Iterator[str]:
@@ -157,18 +151,16 @@ class RunSummary:
         self.compared = {WITHOUT_SESSION: Tally(), WITHOUT_LEARNING: Tally()}
         """The same grasps judged in another way; empty unless tried."""
         self.trained_on: Sequence[str] = ()
-        """Recordings that the model was trained on."""
         self._waiting: dict[int, list[tuple[Tally, Decision]]] = {}
-        """Decisions on grasps whose outcome is not known yet, by grasp."""
+        """By grasp."""
         self.repaired = 0
         """Verdicts made with at least one repaired electrode."""
         self.latency = LatencyHistogram()
         self.readings = 0
         """Verdicts behind a gate; 0 where each reading is a grasp."""
         self.grasps = 0
-        """Grasps that began, of these."""
         self.again = 0
-        """Further judgements of a grasp, after a change."""
+        """Further judgements of a grasp."""
         self._judged_grasp: int | None = None
 
     def add(self, verdict: Verdict, slipped: bool | None) -> None:
@@ -187,7 +179,6 @@ class RunSummary:
         self.repaired += verdict.valid and bool(verdict.repaired)
 
     def compare(self, how: str, judgement: Judgement, slipped: bool | None, grasp: int) -> None:
-        """Count the judgement of a grasp by one of the ways in `compared`."""
         tally = self.compared[how]
         self._add(tally, grasp, judgement.decision, judgement.reasons, slipped)
 
@@ -243,7 +234,6 @@ class RunSummary:
         return {"readings": self.readings, "grasps": self.grasps, "judged_again": self.again}
 
     def lines(self, wall_s: float, trust: Trust | None) -> list[str]:
-        """Return the lines of the summary, for people."""
         total = self.tally.decisions.total()
         if self.readings:
             lines = [

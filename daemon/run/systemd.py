@@ -14,7 +14,7 @@ from daemon.publish.messages import Status
 log = logging.getLogger("graspd")
 
 FEEDINGS_PER_TIMEOUT = 4
-"""Feedings within the watchdog's timeout; systemd asks for at least two."""
+"""Feedings within the watchdog's timeout; systemd asks for two."""
 RELOAD_PATIENCE_US = 60_000_000
 """Watchdog's timeout while a scene is read and its model loaded, us."""
 NS_PER_US = 1000
@@ -29,10 +29,7 @@ class Systemd(Companion):
         watchdog_us: int | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`address` is a socket's path, or `@` and an abstract name; `clock` gives monotonic ns.
-
-        `watchdog_us` is how long the manager waits for a sign of life, us; None if it does not.
-        """
+        """`address` is a path, or `@` and an abstract name; `watchdog_us` a timeout."""
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self._watchdog_us = watchdog_us
         self._clock = clock
@@ -53,7 +50,7 @@ class Systemd(Companion):
         return cls(address, int(timeout) if mine else None)
 
     def ready(self, what: str) -> None:
-        """Say that the daemon runs, at the start and after a reload; `what` is for people."""
+        """Say that the daemon runs; `what` is for people."""
         lines = ["READY=1", f"STATUS={what}"]
         if self._watchdog_us is not None:
             lines += [f"WATCHDOG_USEC={self._watchdog_us}", "WATCHDOG=1"]
@@ -67,11 +64,10 @@ class Systemd(Companion):
         self._send(*lines)
 
     def stopping(self) -> None:
-        """Say that the process is about to end."""
         self._send("STOPPING=1", "STATUS=stopping")
 
     def on_status(self, status: Status) -> None:
-        """Show in `systemctl status` how it goes."""
+        """Show the status in `systemctl status`."""
         self._send(f"STATUS={in_a_line(status)}")
 
     def due_ns(self) -> int | None:
@@ -85,7 +81,6 @@ class Systemd(Companion):
             self._send("WATCHDOG=1")
 
     def close(self) -> None:
-        """Let go of the socket."""
         self._socket.close()
 
     def _send(self, *lines: str) -> None:
@@ -98,7 +93,7 @@ class Systemd(Companion):
 
 
 def in_a_line(status: Status) -> str:
-    """A status in one line, for people."""
+    """Return a status in one line, for people."""
     parts = [f"{status.state}: {status.readings_hz:.1f} readings/s"]
     parts += [f"{number} {outcome}" for outcome, number in status.verdicts.items() if number]
     if status.gate is not None:

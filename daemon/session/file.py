@@ -1,5 +1,4 @@
-"""The session between two starts of the daemon: its statistics, what outcomes have taught, and the
-sensors that both belong to, in one file that is always whole, beside the one before it."""
+"""The session between two starts of the daemon, in a file that is always whole."""
 
 from __future__ import annotations
 
@@ -23,31 +22,30 @@ from models.session_statistics import SessionState
 log = logging.getLogger("graspd")
 
 MAX_BYTES: Final = 2 << 20
-"""A kept session has 7 kB, and up to 330 kB more with what outcomes have taught."""
+"""A session has 7 kB; what outcomes have taught, up to 330 kB."""
 DIGITS: Final = 12
-"""Of the digest of their serial numbers, in the name of the file of other sensors."""
+"""Digits of the digest of serial numbers, in a file's name."""
 OTHERS_MAX: Final = 4
 """Sessions of other sensors that are kept, the newest."""
 
 
 class SessionFileError(Exception):
-    """The kept session cannot be read or written; one line says why."""
+    """The kept session cannot be read or written."""
 
 
 class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Content of the file."""
 
     fingers: tuple[str, ...]
-    """Order of the fingers in the statistics."""
+    """In the order of the statistics."""
     serials: dict[str, str]
-    """Serial number of each finger's sensor, as far as it was known."""
+    """By finger, where known."""
     saved_at: Annotated[float, msgspec.Meta(ge=0.0, le=1e11)]
     """Wall-clock seconds since 1970, for people."""
     statistics: SessionState | None
     """None if no model has needed any."""
     trust: bytes | None = None
-    """What outcomes have taught, as `daemon.trust.trust.encode` gives it; None if nothing learns.
-    """
+    """From `daemon.trust.trust.encode`; None if nothing learns."""
 
 
 class _Version1(KeptSession, frozen=True, tag_field="version", tag=1):
@@ -64,13 +62,13 @@ class _Version2(
 
 
 class SessionFile:
-    """One hand's file; whoever has it open has it alone."""
+    """One hand's file, locked while it is open."""
 
     def __init__(self, path: Path) -> None:
-        """Take the file. Raises `SessionFileError` if it is in use or its folder is not there."""
+        """Take the file. Raises `SessionFileError` if it is in use or has no folder."""
         self.path = path
         self._newest_is_whole = False
-        """Only what was found whole, or was written, may take the place of the former one."""
+        """Only a whole file may take the place of the former one."""
         lock = path.with_name(path.name + ".lock")
         try:
             flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
@@ -90,7 +88,7 @@ class SessionFile:
                     part.unlink()
 
     def close(self) -> None:
-        """Let others have it. May be called more than once."""
+        """Unlock the file. May be called more than once."""
         lock, self._lock = self._lock, None
         if lock is not None:
             os.close(lock)
@@ -102,7 +100,7 @@ class SessionFile:
         self.close()
 
     def load(self) -> KeptSession | None:
-        """As the function `load`."""
+        """Return what is kept, as the function `load` does."""
         self._newest_is_whole = False
         found = _newest_whole(self.path)
         if found is None:
@@ -119,11 +117,13 @@ class SessionFile:
         self._newest_is_whole = True
 
     def put_aside(self, kept: KeptSession) -> None:
-        """Keep the session of sensors that are others than today's beside it, and of such ones the
-        newest `OTHERS_MAX`. Raises `SessionFileError`."""
+        """Keep the session of other sensors beside the file, and the newest `OTHERS_MAX` of them.
+
+        Raises `SessionFileError`.
+        """
         _write(_beside(self.path, kept.serials), kept, None)
-        newest = {path for _, path in _others(self.path)[:OTHERS_MAX]}
-        for path in set(self.path.parent.glob(_beside_any(self.path))) - newest:
+        newest = list(others(self.path))[:OTHERS_MAX]
+        for path in set(self.path.parent.glob(_beside_any(self.path))) - set(newest):
             self._remove(path)
 
     def remove(self) -> bool:
@@ -132,8 +132,10 @@ class SessionFile:
         return bool(self.remove_former() + self._remove(self.path))
 
     def remove_former(self) -> bool:
-        """Forget what was kept before, of other sensors too; False if nothing was. Raises
-        `SessionFileError`."""
+        """Forget what was kept before, and of other sensors; False if nothing was.
+
+        Raises `SessionFileError`.
+        """
         paths = [former_of(self.path), *self.path.parent.glob(_beside_any(self.path))]
         return bool(sum([self._remove(path) for path in paths]))
 
@@ -148,7 +150,7 @@ class SessionFile:
 
 
 def former_of(path: Path) -> Path:
-    """Where what was kept at `path` before is kept."""
+    """Return the path of what was kept at `path` before."""
     return path.with_name(path.name + ".former")
 
 
@@ -158,18 +160,14 @@ def kept_now(
     serials: Mapping[str, str],
     trust: TrustState | None = None,
 ) -> KeptSession:
-    """What is to be kept at this time."""
+    """Return what to keep at this time."""
     learned = None if trust is None else encode(trust)
     return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned)
 
 
-def others(path: Path) -> list[KeptSession]:
-    """Sessions of other sensors beside `path`, the newest first; a warning for a damaged one."""
-    return [kept for kept, _ in _others(path)]
-
-
-def _others(path: Path) -> list[tuple[KeptSession, Path]]:
-    found = []
+def others(path: Path) -> dict[Path, KeptSession]:
+    """Return the sessions of other sensors beside `path`, the newest first."""
+    sessions = {}
     for each in path.parent.glob(_beside_any(path)):
         try:
             kept = read(each)
@@ -177,8 +175,9 @@ def _others(path: Path) -> list[tuple[KeptSession, Path]]:
             log.warning("%s; it counts for nothing", error)
             continue
         if kept is not None:
-            found.append((kept, each))
-    return sorted(found, key=lambda both: both[0].saved_at, reverse=True)
+            sessions[each] = kept
+    newest = sorted(sessions, key=lambda each: sessions[each].saved_at, reverse=True)
+    return {each: sessions[each] for each in newest}
 
 
 def _beside(path: Path, serials: Mapping[str, str]) -> Path:
@@ -187,7 +186,7 @@ def _beside(path: Path, serials: Mapping[str, str]) -> Path:
 
 
 def _beside_any(path: Path) -> str:
-    """As a pattern; not of files that are still being written."""
+    """Return a pattern; not of files that are still being written."""
     return f"{glob.escape(path.name)}.of-{'[0-9a-f]' * DIGITS}"
 
 
@@ -201,17 +200,16 @@ def _write(path: Path, kept: KeptSession, former: Path | None) -> None:
 
 
 def load(path: Path) -> KeptSession | None:
-    """What is kept at `path`, None if nothing is.
+    """Return what is kept at `path`, or what was kept before if that is damaged; None: nothing.
 
-    If that is damaged or not there, what was kept before, and a warning. Raises `SessionFileError`
-    if that is neither.
+    Raises `SessionFileError` if both are damaged.
     """
     found = _newest_whole(path)
     return None if found is None else found[0]
 
 
 def _newest_whole(path: Path) -> tuple[KeptSession, Path] | None:
-    """What is kept, and which of the two files holds it. Raises `SessionFileError`."""
+    """Return what is kept, and the file that holds it. Raises `SessionFileError`."""
     problem: SessionFileError | None = None
     for each in (path, former_of(path)):
         try:
@@ -230,7 +228,7 @@ def _newest_whole(path: Path) -> tuple[KeptSession, Path] | None:
 
 
 def read(path: Path) -> KeptSession | None:
-    """What one file holds, None if there is none. Raises `SessionFileError`."""
+    """Return what one file holds, None if there is none. Raises `SessionFileError`."""
     try:
         data = read_regular(path, MAX_BYTES)
     except FileNotFoundError:
@@ -249,7 +247,7 @@ def read(path: Path) -> KeptSession | None:
 
 
 def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
-    """What is kept of these fingers. Raises `SessionFileError` if it is of others, or nothing."""
+    """Return the statistics of these fingers. Raises `SessionFileError` without them."""
     of_fingers(kept, fingers)
     if kept.statistics is None:
         raise SessionFileError("the kept session is of a model that needs no statistics")
@@ -257,7 +255,7 @@ def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
 
 
 def of_fingers(kept: KeptSession, fingers: Sequence[str]) -> None:
-    """Raise `SessionFileError` if what is kept is of others."""
+    """Raise `SessionFileError` if the session is of other fingers."""
     if kept.fingers != tuple(fingers):
         raise SessionFileError(
             f"the kept session is of the fingers {', '.join(kept.fingers)}, "

@@ -1,5 +1,4 @@
-"""Keeps the session of a running daemon, and what outcomes taught in it, in a file; starts a new
-one for other sensors, and answers outcomes once they are on the disk."""
+"""Keeps the session of a running daemon in a file; answers outcomes once they are on the disk."""
 
 from __future__ import annotations
 
@@ -32,9 +31,9 @@ from models.session_statistics import SessionState
 log = logging.getLogger("graspd")
 
 WAIT_S: Final = 0.4
-"""How long the end waits for the disk, s: the daemon is given a second to stop."""
+"""How long the end waits for the disk, s: the daemon has a second to stop."""
 SAVE_PERIOD_NS: Final = 10_000_000_000
-"""Time between two saves that no outcome waits for, ns: a power cut costs ten seconds of grasps."""
+"""Time between two saves, ns, while no outcome waits."""
 WAITING_MAX: Final = 64
 """Answers that wait for the disk; a newer one replaces the oldest."""
 BUSY: Final = "busy: too many wait for the disk, tell it again"
@@ -43,7 +42,7 @@ HANGS: Final = "not kept: the disk does not answer"
 
 
 class SavedState(NamedTuple):
-    """What the file holds, as it is at one moment."""
+    """What the file holds at one moment, decoded."""
 
     serials: dict[str, str]
     statistics: SessionState | None = None
@@ -51,13 +50,13 @@ class SavedState(NamedTuple):
 
     @property
     def is_empty(self) -> bool:
-        """True if there is no grasp and no outcome in it."""
+        """True without a grasp and an outcome."""
         no_grasps = self.statistics is None or not self.statistics.grasps
         return no_grasps and (self.trust is None or not self.trust.learner.outcomes)
 
 
 class SessionKeeper(SensorWatch):
-    """Restores, saves and drops one session; a file that fails costs a warning, not the run."""
+    """Restores, saves and drops one session; a file that fails costs a warning."""
 
     def __init__(
         self,
@@ -70,13 +69,10 @@ class SessionKeeper(SensorWatch):
         trust: Trust | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Restore what `file` holds; if that is no session of these fingers, warn and start a new
-        one.
+        """Restore what `file` holds; warn, and start a new session, if it is of other fingers.
 
         `session` is None for a model without one, `trust` where nothing learns: what the file has
-        for those stays as it is. `tactile` knows the serial numbers of the sensors. `on_exchange`
-        is called when one of them is another than before, with what the file has of the new ones,
-        and must reset session and trust to that.
+        for those stays. `on_exchange` must reset session and trust to what it is given.
         """
         self._session = session
         self._trust = trust
@@ -85,28 +81,27 @@ class SessionKeeper(SensorWatch):
         self._file = file
         self._clock = clock
         self._unused = SavedState({})
-        """What the file has and this run has no use for."""
+        """What the file has and this run does not use."""
         self._restore()
         self._others = [
-            _state_of(kept) for kept in others(file.path) if kept.fingers == self._fingers
+            _state_of(kept) for kept in others(file.path).values() if kept.fingers == self._fingers
         ]
-        """What the disk has of other sensors, the newest first."""
+        """Sessions of other sensors, the newest first."""
         self._leaving: deque[SavedState] = deque(maxlen=OTHERS_MAX)
-        """Of these, what is not yet on the disk."""
+        """Those of them that are not on the disk yet."""
         self._saved = self._now()
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._warned = False
         self._waiting: deque[Answer] = deque()
         self._in_writing = 0
-        """How many of them, the first ones, wait for the current save."""
+        """Answers, the first ones, that wait for the current save."""
         self._worker: Worker[SavedState] = Worker("session")
 
     def filenos(self) -> list[int]:
-        """Return the descriptor that becomes readable when a save has ended."""
         return self._worker.filenos()
 
     def before_wait(self, requests: Requests) -> None:
-        """Answer outcomes whose save has ended; start the next one if others wait or it is due."""
+        """Answer outcomes that are saved; start the next save if it is due."""
         self.wait(0.0)
         if self._waiting or self._clock() >= self._save_due_ns:
             self._start_save()
@@ -120,7 +115,7 @@ class SessionKeeper(SensorWatch):
         self._start_save()
 
     def save(self) -> None:
-        """Save for the last time, and answer all who wait. Takes `2 * WAIT_S` at most."""
+        """Save for the last time, and answer all who wait, within `2 * WAIT_S`."""
         self.wait(WAIT_S)
         self._start_save()
         self.wait(WAIT_S)
@@ -128,7 +123,7 @@ class SessionKeeper(SensorWatch):
         self._worker.close(0.0)
 
     def wait(self, seconds: float) -> None:
-        """Wait up to `seconds` for the current save, then answer the outcomes that are in it."""
+        """Wait up to `seconds` for the current save, then answer the outcomes in it."""
         result = self._worker.take(seconds)
         if result is None:
             return
@@ -158,7 +153,7 @@ class SessionKeeper(SensorWatch):
             self._answer(len(self._waiting), f"not kept: {UNEXPECTED}")
 
     def _write(self, state: SavedState) -> SavedState:
-        """Write `state` and return it; called in the worker. Raises `SessionFileError`."""
+        """Write `state` in the worker, and return it. Raises `SessionFileError`."""
         while self._leaving:  # first, so that a session is always in one of the files
             left = self._leaving.popleft()
             try:
@@ -218,7 +213,7 @@ class SessionKeeper(SensorWatch):
             log.warning("%s: what was learned %s; learning begins anew", self._file.path, error)
 
     def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
-        """Put the session aside, and take up that of the sensors that are there now, if any."""
+        """Put the session aside, and take up that of the new sensors, if any."""
         grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
         log.warning("new sensor on %s: the session%s no longer count", ", ".join(changed), grasps)
         now = serials.items()
@@ -234,7 +229,7 @@ class SessionKeeper(SensorWatch):
         self._save_due_ns = self._clock()
 
     def _take_up(self, former: SavedState) -> bool:
-        """Go on with the session of sensors that were there before; False if it is of no use."""
+        """Go on with a session of the new sensors; False if it is of no use."""
         trust = former.trust
         if trust is not None and self._trust is not None and not self._trust.fits(trust):
             trust = None
@@ -255,7 +250,7 @@ class SessionKeeper(SensorWatch):
 
 
 def _state_of(kept: KeptSession) -> SavedState:
-    """What a file holds; without what was learned where that cannot be read."""
+    """Return what a file holds, without what cannot be read."""
     learned = None
     if kept.trust is not None:
         with contextlib.suppress(ValueError):

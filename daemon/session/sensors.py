@@ -20,17 +20,15 @@ log = logging.getLogger("graspd")
 
 
 class SensorWatch(Companion):
-    """Has the judge forget sensors that were exchanged, before it judges the new ones."""
+    """Has the judge forget exchanged sensors, before it judges the new ones."""
 
     def __init__(self, tactile: Driver, on_exchange: OnExchange) -> None:
-        """`tactile` knows the serial numbers; `on_exchange` is called when one is another."""
         self._tactile = tactile
         self._on_exchange = on_exchange
         self._serials: dict[str, str] = {}
-        """Last known serial number by finger."""
+        """Last known, by finger."""
 
     def on_reading(self, reading: Reading) -> None:
-        """Compare the sensors with those before."""
         serials = self._tactile.serials
         if serials == self._serials:
             return
@@ -45,5 +43,5 @@ class SensorWatch(Companion):
 
 
 def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Return the fingers whose sensor is known to be another one than before."""
+    """Return the fingers whose sensor is known to be another one."""
     return [finger for finger in now if before.get(finger, now[finger]) != now[finger]]

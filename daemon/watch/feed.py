@@ -1,4 +1,4 @@
-"""The subscriber of `graspd watch`: connects to a daemon and takes its messages."""
+"""The subscriber of `graspd watch`."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from daemon.publish.keys import load_pair, load_public
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX: Final = 2000
-"""Messages that wait in the socket: seven seconds of them. Later ones are lost, and counted."""
+"""Messages that wait in the socket: seven seconds of them."""
 TAKEN_MAX: Final = 5000
-"""Messages taken at once, more than can wait: after a pause the newest is there at once."""
+"""Messages taken at once, more than can wait."""
 PAUSE_NS: Final = 1_000_000_000
-"""After a pause of this length, ns, connect again: waiting messages are old, newer ones lost."""
+"""After a pause of this length, ns, connect again: waiting messages are old."""
 RETRY_NS: Final = 5_000_000_000
-"""Time, ns, from a refusal to the next try. libzmq does not try again; the key may be known then.
-"""
+"""Time from a refusal to the next try, ns: the key may be known then."""
 MESSAGE_MAX_BYTES: Final = 1 << 20
-"""Largest message; a status has some kilobytes."""
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
-"""Heartbeats on TCP, as the daemon has them, ms."""
+"""Heartbeats on TCP, as the daemon's, ms."""
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 """Shortest and longest time before connecting again, ms."""
 NOT_CONNECTED: Final = "not connected"
@@ -56,19 +54,17 @@ class Feed:
         keys: tuple[bytes, bytes, bytes] | None = None,
         clock: Callable[[], int] = boottime_ns,
     ) -> None:
-        """`keys`: own public and secret key and the daemon's public one, Z85; `clock` gives ns,
-        also while the computer sleeps.
+        """`keys`: own public and secret key and the daemon's public one, Z85.
 
-        Raises `zmq.ZMQError` for a malformed endpoint.
+        `clock` gives ns, also while the computer sleeps. Raises `zmq.ZMQError`.
         """
         self.link = "connecting"
-        """State of the connection, in words."""
         self._endpoint = endpoint
         self._keys = keys
         self._clock = clock
         self._taken_ns = self._opened_ns = clock()
         self.empty_ns = self._opened_ns
-        """When no message waited; those that `take` gives have come since, and may be as old."""
+        """When no message waited last; those that `take` gives may be as old."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._events = EVENTS if keys is None else EVENTS_WITH_KEYS
         self._follow = 0
@@ -97,7 +93,7 @@ class Feed:
             self._socket.subscribe(topic)
 
     def take(self) -> Iterator[tuple[bytes, bytes]]:
-        """Yield topic and payload of each message that has come; never wait."""
+        """Yield topic and payload of each message that has come."""
         self._reconnect_if_needed()
         self._update_link()
         for _ in range(TAKEN_MAX):
@@ -121,7 +117,6 @@ class Feed:
 
     @property
     def is_turned_away(self) -> bool:
-        """True if the daemon refused the connection."""
         return self.link.startswith("turned away")
 
     def _update_link(self) -> None:
@@ -135,7 +130,6 @@ class Feed:
             self._follow = FOLLOW if self.is_turned_away else 0
 
     def close(self) -> None:
-        """Disconnect. May be called again."""
         self._close_sockets()
         self._context.term()
 
@@ -153,8 +147,5 @@ class Feed:
 
 
 def load_keys(own: Path, daemon: Path) -> tuple[bytes, bytes, bytes]:
-    """Return own public and secret key, and the daemon's public one, Z85.
-
-    `own` is a `.key_secret` file of mode 0600, `daemon` the daemon's `.key`. Raises `KeysError`.
-    """
+    """Return own public and secret key, and the daemon's public one, Z85. Raises `KeysError`."""
     return *load_pair(own), load_public(daemon, "the daemon's key")

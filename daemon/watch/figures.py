@@ -1,14 +1,81 @@
-"""Figures of a daemon in words: how learning goes, how fast it is, its session and drivers."""
+"""Verdicts, their evidence and the figures of a daemon, in words."""
 
 from __future__ import annotations
 
+from daemon.judge.reasons import Decision
+from daemon.judge.windows import LONG_NS
 from daemon.publish.messages import Status, Verdict
-from daemon.watch.evidence import counted, percent
 from daemon.watch.snapshot import Line
+
+SURE_MS = LONG_NS / 1e6
+"""Time without motion, ms, after which a slow slide is excluded."""
+LIKELY = 0.25
+"""A likelier slip is never shown as a promise."""
+NO_OUTCOME = "no outcome told yet"
+SUPERVISED = Line(
+    "supervised", "lift only while a person watches, and tell the outcome: it teaches"
+)
+
+
+def doubt(verdict: Verdict) -> str | None:
+    """Return why `stable` is not a promise yet; None if lifts have shown that it is."""
+    risk, p_slip = verdict.risk, verdict.p_slip
+    if verdict.early:
+        return "judged early: it may still slide slowly, and is judged once more"
+    if p_slip is None or p_slip > LIKELY:
+        return "a slip is too likely for a promise: grasp again, or watch the lift"
+    if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
+        return f"{NO_OUTCOME}, so what `stable` is worth here is not known"
+    if risk.target is None:
+        return "no target is set that would keep slips among `stable` few: [risk]"
+    if risk.lifts * risk.target < 1.0:
+        return f"too few `stable` lifts are told yet to show the target, {percent(risk.target)}"
+    if risk.slips > risk.lifts * risk.target:
+        return "more `stable` lifts slipped than the target so far"
+    return None
+
+
+def rests_on(verdict: Verdict) -> str:
+    """Return in one line what the verdict rests on."""
+    network, risk = verdict.p_slip_model, verdict.risk
+    said = "" if network is None else f"network {percent(network)}, "
+    if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
+        return said + NO_OUTCOME
+    said += f"rests on {counted(verdict.outcomes, 'lift')}; "
+    slipped = f"of {risk.lifts} `stable` ones {risk.slips} slipped"
+    said += slipped if risk.lifts else "no `stable` one told yet"
+    return said + ("" if risk.target is None else f", target {percent(risk.target)}")
+
+
+def stillness(still_ms: float | None) -> str:
+    """Return how long a hand has been still; `-` if that is not known."""
+    if still_ms is None:
+        return "-"
+    whole_ms = int(still_ms)
+    if still_ms < SURE_MS:
+        return f"{whole_ms} ms" + (", may slide" if whole_ms else "")
+    return f"{whole_ms} ms" if still_ms < 10_000.0 else f"{whole_ms // 1000} s"
+
+
+def lift(verdict: Verdict, ended: str | None) -> str:
+    """Return how a lift ended; `-`: it was not to be made."""
+    if ended is not None:
+        return "held" if ended == "stable" else "slipped"
+    return "not told" if verdict.verdict is Decision.STABLE or verdict.supervised else "-"
+
+
+def percent(share: float) -> str:
+    """Return a share as percent, with two digits below 10 %."""
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+
+
+def counted(count: int, what: str) -> str:
+    """Return a count with its noun."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Say how learning goes, what matters most first."""
+    """Return how learning goes, what matters most first."""
     risk = None if verdict is None else verdict.risk
     lines = []
     if status is not None and status.lifts is not None:
@@ -33,10 +100,7 @@ def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
 def timing(
     verdict: Verdict | None, status: Status | None, verdicts_hz: float, lost: int, unreadable: int
 ) -> list[Line]:
-    """Give rates, delays and losses; `-` stands for what is not known.
-
-    `lost` counts gaps of `seq`; `unreadable` counts messages that are not graspd's.
-    """
+    """Return rates, delays and losses; `lost` counts gaps of `seq`."""
     lines = [
         Line("readings", "-" if status is None else f"{status.readings_hz:.0f} /s"),
         Line("verdicts", f"{verdicts_hz:.0f} /s"),
@@ -59,7 +123,7 @@ def timing(
 
 
 def session(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Say whether the session is calibrated, and which electrodes are repaired."""
+    """Return whether the session is calibrated, and which electrodes are repaired."""
     said = "this model needs none"
     if status is None:
         said = "-"
@@ -71,7 +135,7 @@ def session(verdict: Verdict | None, status: Status | None) -> list[Line]:
 
 
 def drivers(status: Status | None) -> list[Line]:
-    """Give the counters of the drivers that are not 0, and versions."""
+    """Return the counters of the drivers that are not 0, and versions."""
     if status is None:
         return []
     lines = [

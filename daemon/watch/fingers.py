@@ -1,4 +1,4 @@
-"""The tactile image of each finger for the page, what is wrong in it, and how the finger moves."""
+"""The tactile image of each finger, and how the finger moves."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from daemon.publish.messages import Tactile, Verdict
 from models.contract import Finger
 from models.layout import ELECTRODES
-from models.levels import PIXELS, Rest, fall_of, levels_of
+from models.levels import PIXELS, RestCounts, fall_of, levels_of
 
 OLD_NS = 1_000_000_000
-"""Older images are not shown: they would look alive."""
+"""Older images are not shown."""
 
 
 class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
     """Motion of a finger, in units of its own noise."""
 
     now: float | None
-    """None: not known, which is not 0."""
+    """None: not known."""
     limit: float
     """Most motion of a finger that is still."""
 
@@ -32,15 +32,15 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     touches: bool | None
     """None: not known."""
     from_rest: bool
-    """True if levels are falls below the rest, else deviations from the finger's own median."""
+    """True if levels are falls below the rest."""
     levels: list[int]
-    """By pixel, 12 rows of 11: 0 at rest, 100 pressed the most, below 0 risen."""
+    """By pixel, 12 rows of 11; see `levels_of`."""
     deepest: int
-    """Largest fall of an electrode, counts."""
+    """Largest fall, counts."""
     marked: list[int]
-    """Pixels of the electrodes that are faulty or were repaired."""
+    """Pixels of electrodes that are faulty or repaired."""
     motion: FingerMotion | None
-    """None if each reading is a grasp of its own."""
+    """None if each reading is a grasp."""
 
 
 class Fingers:
@@ -49,10 +49,10 @@ class Fingers:
     def __init__(self) -> None:
         self._tactile: Tactile | None = None
         self._tactile_ns = 0
-        self._rests: dict[str, Rest] = {}
+        self._rest = RestCounts()
 
     def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
-        """Take a reading that arrived at `now_ns`; return False if its parts do not fit.
+        """Take a reading; return False if its parts do not fit.
 
         `resting` names the fingers that touch nothing and are tared.
         """
@@ -63,25 +63,27 @@ class Fingers:
         self._tactile, self._tactile_ns = tactile, now_ns
         for index, finger in enumerate(tactile.fingers):
             if finger in resting:
-                rest = self._rests.setdefault(finger, Rest())
-                rest.learn(np.array(tactile.counts[index]), np.array(tactile.faults[index]) == 0)
+                counts, sound = (
+                    np.array(tactile.counts[index]),
+                    np.array(tactile.faults[index]) == 0,
+                )
+                self._rest.learn(finger, counts, sound)
         return True
 
     def images(self, verdict: Verdict, now_ns: int) -> list[FingerImage]:
-        """Draw the newest reading; nothing if it is old by `now_ns`."""
+        """Return images of the newest reading; none if it is old."""
         tactile = self._tactile
         if tactile is None or now_ns - self._tactile_ns > OLD_NS:
             return []
         return [self._image(tactile, index, verdict) for index in range(len(tactile.fingers))]
 
     def _image(self, tactile: Tactile, index: int, verdict: Verdict) -> FingerImage:
-        """Draw one finger. Electrodes that are not sound get the median of the others."""
         name = tactile.fingers[index]
         counts = np.array(tactile.counts[index], dtype=np.float64)
         sound = np.array(tactile.faults[index]) == 0
         electrodes = range(1, ELECTRODES + 1)
         repaired = [f"{name}_{number}" in verdict.repaired for number in electrodes]
-        rest = self._rests[name].counts if name in self._rests else None
+        rest = self._rest.of(name)
         fall = fall_of(counts, sound, rest)
         return FingerImage(
             name=name,
@@ -95,7 +97,6 @@ class Fingers:
 
     @property
     def joints(self) -> dict[str, float]:
-        """Angles of the newest reading, rad."""
         return {} if self._tactile is None else self._tactile.joints
 
 

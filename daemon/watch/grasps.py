@@ -1,4 +1,4 @@
-"""The grasps of a hand: how each was judged, how its lift ended, and how many there were."""
+"""The grasps of a hand: verdicts, ends of lifts, and counts."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from collections import Counter
 
 from daemon.judge.reasons import Decision, GateState
 from daemon.publish.messages import OutcomeMessage, Verdict
-from daemon.watch.evidence import lift
+from daemon.watch.figures import lift
 from daemon.watch.snapshot import JudgedGrasp
 
 GRASPS_MAX = 8
-"""Judged grasps that are shown."""
 OPEN = {GateState.IDLE, GateState.RELEASED}
 """States of the gate without a grasp."""
 
@@ -19,23 +18,21 @@ Key = tuple[str, int]
 
 
 class GraspLog:
-    """Takes verdicts and outcomes. A grasp is one number of the gate, with many readings."""
+    """Takes verdicts and outcomes."""
 
     def __init__(self) -> None:
-        """Start without a grasp."""
         self._judged: dict[Key, tuple[Verdict, int]] = {}
         """Last verdict of each grasp and when it came, ns; the newest last."""
         self._ended: dict[Key, str] = {}
-        """How the lifts ended whose outcome was told."""
+        """Outcomes that were told."""
         self._past: Counter[Decision] = Counter()
         self._current: Key | None = None
-        """The grasp that is counted next; it stays the current one until another begins."""
+        """The grasp that is counted next, until another begins."""
         self._decision: Decision | None = None
-        """Last verdict of the current grasp; None: not judged yet."""
+        """Last verdict of the current grasp."""
         self._is_held = False
 
     def take(self, verdict: Verdict, now_ns: int) -> None:
-        """Take a verdict that arrived at `now_ns`."""
         key = verdict.boot_id, verdict.grasp
         self._is_held = verdict.gate not in OPEN
         if self._is_held and verdict.grasp > 0 and key != self._current:
@@ -56,16 +53,12 @@ class GraspLog:
             self._ended.pop(oldest, None)
 
     def end(self, told: OutcomeMessage) -> None:
-        """Take how a lift ended, if its grasp is still shown."""
         key = told.grasp_boot_id or told.boot_id, told.grasp
         if key in self._judged:
             self._ended[key] = told.outcome
 
     def counts(self) -> dict[str, int]:
-        """Count the grasps by the last verdict of each.
-
-        A grasp that was let go without a verdict is `unknown`; one that is held counts when judged.
-        """
+        """Count the grasps by their last verdict; one without a verdict is `unknown`."""
         counted = self._counted(over=not self._is_held)
         return {decision.value: counted[decision] for decision in Decision}
 
@@ -75,7 +68,7 @@ class GraspLog:
         return self._past + Counter([self._decision or Decision.UNKNOWN])
 
     def last(self, now_ns: int, held: Key | None) -> list[JudgedGrasp]:
-        """Return the last judged grasps, the newest first; `held` is in the hand."""
+        """Return the last judged grasps, the newest first."""
         return [
             JudgedGrasp(
                 verdict=verdict.verdict.value,

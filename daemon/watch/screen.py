@@ -1,4 +1,4 @@
-"""The terminal: draws ten times a second until `q`, Ctrl-C or SIGTERM; Ctrl-Z stops it."""
+"""The terminal view: draws until `q`, Ctrl-C or SIGTERM; Ctrl-Z stops it."""
 
 from __future__ import annotations
 
@@ -22,17 +22,16 @@ from daemon.watch.terminal import draw
 from daemon.watch.view import TICK_S, HandFeed, snapshots
 
 SIGNALS_MAX = 64
-"""Most bytes taken at once from the pipe of signals."""
 
 
 def can_draw() -> bool:
-    """Return True if standard output is a terminal with a cursor that can be moved."""
+    """Return True if standard output is a terminal with a movable cursor."""
     console = Console()
     return console.is_terminal and not console.is_dumb_terminal
 
 
 def show(hands: Sequence[HandFeed]) -> None:
-    """Draw on standard output, which must be a terminal, until told to stop."""
+    """Draw on the terminal until told to stop."""
     console = Console(highlight=False)
     with StopSignal() as stop, Suspension() as suspension:
         keyboard = Keyboard(stop)
@@ -57,7 +56,7 @@ class Suspension:
         self.asked = False
 
     def __enter__(self) -> Self:
-        """Take over SIGTSTP, unless it is ignored. Only the main thread can."""
+        """Take over SIGTSTP, unless it is ignored."""
         self._former = signal.getsignal(signal.SIGTSTP)
         if self._former is not signal.SIG_IGN:
             signal.signal(signal.SIGTSTP, self._ask)
@@ -81,7 +80,7 @@ class Keyboard:
     """Typed keys: `q` ends, Tab shows the next hand."""
 
     def __init__(self, stop: StopSignal) -> None:
-        """Wait for `stop` too; read no keys before `unbuffered`."""
+        """Wait for `stop` too."""
         self.tabs = 0
         """How often Tab was typed."""
         self._stop = stop
@@ -104,7 +103,7 @@ class Keyboard:
 
     @contextlib.contextmanager
     def unbuffered(self) -> Iterator[None]:
-        """Read keys at once and without echo, if standard input is a terminal."""
+        """Read keys at once and without echo, if there is a terminal."""
         if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
             yield
             return

@@ -1,4 +1,4 @@
-"""Everything that is shown of one hand at one moment: the terminal draws it, the page gets JSON."""
+"""Everything that is shown of one hand at one moment."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ class Tone(StrEnum):
 
     STABLE = "stable"
     LEANS = "leans"
-    """`stable`, but lifts have not yet shown that this promise is kept."""
+    """`stable`, but lifts have not shown it yet."""
     SLIP = "slip"
     LEARNING = "learning"
-    """Unknown, and to be lifted while a person watches."""
+    """Unknown, and to be lifted under supervision."""
     WAITING = "waiting"
-    """Unknown as expected: nothing is grasped, or the grasp has not settled yet."""
+    """Unknown as expected: nothing is grasped, or not settled."""
     TROUBLE = "trouble"
-    """Unknown, because something is wrong or unusual."""
+    """Unknown: something is wrong or unusual."""
     SILENT = "silent"
-    """Unknown, because no message arrives."""
+    """Unknown: no message arrives."""
 
 
 class Line(msgspec.Struct, frozen=True):
-    """A label and its text: a reason and advice, or a figure and its value."""
+    """A reason and advice, or a figure and its value."""
 
     what: str
     advice: str
@@ -41,13 +41,11 @@ class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
     grasp: int
     ago_s: float
     ended: str | None
-    """How the lift ended, if the controller has told it: `stable` or `slip`."""
+    """`stable` or `slip`, if it was told."""
     lift: str
-    """The same in short words: `held`, `slipped`, `not told`, or `-`."""
+    """`held`, `slipped`, `not told`, or `-`."""
     supervised: bool
-    """True if it was to be lifted while a person watches."""
     held: bool
-    """True while the hand still holds it."""
 
 
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,46 +53,43 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
 
     endpoint: str
     link: str
-    """State of the connection, in words."""
     hand: str | None
     t: float
-    """Wall-clock seconds since 1970 on this computer."""
+    """Wall-clock seconds since 1970."""
     last_t: float | None
-    """Arrival of the last verdict, likewise; the figures of a silent hand are of that time."""
+    """Arrival of the last verdict, and time of a silent hand's figures."""
     tone: Tone
     verdict: str
-    """`stable`, `slip` or `unknown`; unknown too when no message arrives."""
+    """`stable`, `slip` or `unknown`."""
     headline: str
-    """The verdict as it is shown: a `stable` without evidence only leans to stable."""
+    """The verdict, or that it leans to stable."""
     evidence: str
-    """What the verdict rests on; empty before the first message."""
+    """Empty before the first message."""
     p_slip: float | None
     why: list[Line]
-    """Reasons of the verdict, with advice."""
     grasp: int | None
     gate: str | None
     contact: list[str] | None
     """Fingers that touch; None: not known."""
     still: str
-    """How long the hand has been still, in words; `-`: not known."""
+    """In words; `-`: not known."""
     grasps: list[JudgedGrasp]
-    """The last judged grasps, the newest first."""
+    """Judged ones, the newest first."""
     counts: dict[str, int]
-    """Grasps since watch began, by the last verdict of each."""
+    """Since watch began, by the last verdict of each."""
     fingers: list[FingerImage]
     joints: dict[str, float]
-    """Angles, rad."""
+    """rad."""
     health: list[Line]
-    """What is wrong with the hand, and what to do."""
+    """What is wrong, and what to do."""
     state: str | None
-    """Of the daemon: `running`, `silent` or `stopping`."""
+    """`running`, `silent` or `stopping`."""
     model: str | None
     learning: list[Line]
     timing: list[Line]
     session: list[Line]
     drivers: list[Line]
-    """Counters of the drivers that are not 0, and versions."""
     history: list[str]
-    """Tones of each of the last 300 seconds, the oldest first, as letters; see `TONE_CODE`."""
+    """Tones of the last 300 seconds, the oldest first; see `TONE_CODE`."""
     history_p: list[int]
-    """Highest probability of slip of each of these seconds, %; -1: none."""
+    """Highest probability of slip in each, %; -1: none."""

@@ -1,4 +1,4 @@
-"""Snapshots as tables for a terminal. Tactile images and the last five minutes are on the page."""
+"""Snapshots as tables for a terminal."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ STYLES = {
     Tone.TROUBLE: "bold #ffffff on #d98e00",
     Tone.SILENT: "bold #ffffff on #8250df",
 }
-"""Colours differ in lightness too, for people who cannot tell red from green."""
+"""They differ in lightness too, for people who cannot tell red from green."""
 OLD = "dim italic"
-"""Figures of a daemon that is silent."""
 HAND_COLUMNS = 80
-"""Columns that a hand needs beside another one."""
+"""Columns of a hand beside another one."""
 HALF_BAR = 10
-"""Columns of a bar up to its mark, and from there to its end."""
+"""Columns of a bar up to its mark."""
 NAME_MAX = 40
-"""Characters of a name that came in a message."""
+"""Most characters of a received name."""
 
 Row = tuple[str, str]
 """Label and text."""
@@ -40,7 +39,7 @@ Row = tuple[str, str]
 def draw(hands: Sequence[Snapshot], width: int, chosen: int = 0) -> RenderableType:
     """Return tables of the hands for a terminal of `width` columns.
 
-    Hands without room beside each other have a line each; only the `chosen` one has a table.
+    Without room beside each other, only the `chosen` hand has a table.
     """
     if len(hands) == 1:
         return _hand(hands[0], "q ends")
@@ -55,7 +54,6 @@ def draw(hands: Sequence[Snapshot], width: int, chosen: int = 0) -> RenderableTy
 
 
 def _hand(seen: Snapshot, keys: str) -> RenderableType:
-    """Return the table of a hand, what matters most first."""
     table = Table.grid(padding=(0, 2, 0, 0))
     table.add_column(style="dim", no_wrap=True)
     for label, text in [*_verdict_rows(seen), *_health(seen)]:
@@ -70,7 +68,7 @@ def _hand(seen: Snapshot, keys: str) -> RenderableType:
 
 
 def _verdict(seen: Snapshot) -> Text:
-    """Return the verdict in its colour, between the name of the hand and the first reason."""
+    """Return the verdict in its colour, with the first reason."""
     name = printable(seen.hand or "-", NAME_MAX)
     why = seen.why[0].what if seen.why else ""
     word = f" {seen.headline.upper()} "
@@ -81,7 +79,6 @@ def _verdict(seen: Snapshot) -> Text:
 
 
 def _verdict_rows(seen: Snapshot) -> list[Row]:
-    """Return the rows of the verdict, of the grasp in the hand, and of its fingers."""
     touches = "not known" if seen.contact is None else " ".join(seen.contact) or "nothing"
     number = "-" if seen.grasp is None else seen.grasp
     grasp = f"{number}, gate {seen.gate or '-'}, touches {touches}, still {seen.still}"
@@ -112,7 +109,7 @@ def _finger(finger: FingerImage) -> str:
 
 
 def _motion(motion: FingerMotion) -> str:
-    """Return a bar: up to the mark the finger is still, at the end it moves twice as much."""
+    """Return a bar: up to the mark the finger is still."""
     if motion.now is None:
         return "motion not known"
     share = min(motion.now / motion.limit, 2.0)
@@ -123,7 +120,6 @@ def _motion(motion: FingerMotion) -> str:
 
 
 def _figures(seen: Snapshot) -> list[Row]:
-    """Return the rows of figures, which stay in view when the daemon is silent."""
     rows = []
     if seen.tone is Tone.SILENT and seen.last_t is not None:
         then = time.strftime("%H:%M:%S", time.localtime(seen.last_t))

@@ -1,4 +1,4 @@
-"""The state of one hand, from the messages of its feed and the time since the last one."""
+"""The state of one hand, from its messages and the time since the last one."""
 
 from __future__ import annotations
 
@@ -12,27 +12,22 @@ import msgspec
 from daemon.judge.reasons import ADVICE, WATCHED_LIFT, Decision, GateState, Reason
 from daemon.process.sleep import boottime_ns
 from daemon.publish.messages import (
+    MESSAGES,
     GateMessage,
     OutcomeMessage,
     Status,
     Tactile,
     Verdict,
-    decode_gate,
-    decode_outcome,
-    decode_status,
-    decode_tactile,
-    decode_verdict,
 )
 from daemon.watch import figures
-from daemon.watch.evidence import SUPERVISED, doubt, rests_on, stillness
 from daemon.watch.feed import Feed
+from daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
 from daemon.watch.fingers import Fingers
 from daemon.watch.grasps import OPEN, GraspLog
-from daemon.watch.history import History
 from daemon.watch.snapshot import Line, Snapshot, Tone
 
 TICK_S = 0.02
-"""Time between two looks at the feeds, s; silence is timed this exactly."""
+"""Time between two looks at the feeds, s: silence is timed this exactly."""
 SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
 EXPECTED = {
@@ -42,23 +37,55 @@ EXPECTED = {
     Reason.NOT_TARED,
     Reason.NOT_ASKED,
 }
-"""Reasons of a hand that is open, or of a grasp that settles."""
+"""Reasons of an open hand, or of a grasp that settles."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
-
-Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
-DECODERS: dict[str, Callable[[bytes], Message]] = {
-    "verdict": decode_verdict,
-    "gate": decode_gate,
-    "tactile": decode_tactile,
-    "outcome": decode_outcome,
-    "status": decode_status,
+SECONDS = 300
+SECOND_NS = 1_000_000_000
+NO_SHARE = -1
+"""A second without a probability of slip."""
+TONE_CODE = {
+    Tone.SLIP: "x",
+    Tone.TROUBLE: "t",
+    Tone.SILENT: ".",
+    Tone.LEARNING: "u",
+    Tone.STABLE: "s",
+    Tone.LEANS: "l",
+    Tone.WAITING: "w",
 }
-"""By first part of a topic."""
+"""Letter of each tone in `Snapshot.history`."""
+
+
+class History:
+    """Remembers the tones and the highest probability of slip of each second."""
+
+    def __init__(self) -> None:
+        self._first: int | None = None
+        self._seconds: dict[int, tuple[str, int]] = {}
+        """By number, the newest last: letters of its tones; highest probability, %."""
+
+    def add(self, now_ns: int, tone: Tone, p_slip: float | None) -> None:
+        second, code = now_ns // SECOND_NS, TONE_CODE[tone]
+        share = NO_SHARE if p_slip is None else round(100 * p_slip)
+        if self._first is None:
+            self._first = second
+        codes, highest = self._seconds.get(second, ("", NO_SHARE))
+        self._seconds[second] = codes.replace(code, "") + code, max(share, highest)
+        while len(self._seconds) > SECONDS:
+            del self._seconds[next(iter(self._seconds))]
+
+    def seconds(self) -> list[tuple[str, int]]:
+        """Return five minutes, the oldest second first; one without a call was silent."""
+        if self._first is None:
+            return []
+        newest = max(self._seconds)
+        oldest = max(self._first, newest - SECONDS + 1)
+        silent = TONE_CODE[Tone.SILENT], NO_SHARE
+        return [self._seconds.get(second, silent) for second in range(oldest, newest + 1)]
 
 
 class View:
-    """Takes messages and gives a `Snapshot` at any time. Uses constant memory and no socket."""
+    """Takes messages and gives a `Snapshot` at any time, in constant memory."""
 
     def __init__(
         self, endpoint: str, hand: str | None = None, wall: Callable[[], float] = time.time
@@ -79,13 +106,12 @@ class View:
         self._history = History()
 
     def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
-        """Take one message that arrived at `now_ns`, monotonic ns of this computer."""
+        """Take a message that arrived at `now_ns`, monotonic."""
         kind, _, hand = topic.decode("ascii", "replace").partition(".")
-        decode = DECODERS.get(kind)
-        if decode is None or (self._hand is not None and hand != self._hand):
+        if kind not in MESSAGES or (self._hand is not None and hand != self._hand):
             return
         try:
-            message = decode(payload)
+            message = msgspec.json.decode(payload, type=MESSAGES[kind])
         except (msgspec.DecodeError, UnicodeDecodeError):
             self._unreadable += 1
             return
@@ -114,7 +140,7 @@ class View:
         self._grasps.take(verdict, now_ns)
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return what is to be seen at `now_ns`. Call it `SNAPSHOTS_HZ` times a second."""
+        """Return what is to be seen. Call it `SNAPSHOTS_HZ` times a second."""
         tone, why = self._verdict_now(now_ns)
         silent = tone is Tone.SILENT
         last, status = self._verdict, self._status
@@ -186,7 +212,7 @@ class View:
         return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
 
     def _resting(self) -> Sequence[str]:
-        """Return the fingers that are tared, while the gate says that nothing touches."""
+        """Return the tared fingers, while the gate says that nothing touches."""
         if self._status is None or self._gate is not GateState.IDLE:
             return ()
         return self._status.tared or ()
@@ -218,7 +244,7 @@ class HandFeed(NamedTuple):
 
 
 def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
-    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits `TICK_S`."""
+    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits."""
     due_s = 0.0
     while not is_over():
         for feed, view in hands:

@@ -1,4 +1,4 @@
-"""The page: an HTTP server for browsers of this computer, live by Server-Sent Events."""
+"""The page: an HTTP server for browsers of this computer."""
 
 from __future__ import annotations
 
@@ -27,38 +27,33 @@ log = logging.getLogger("graspd.watch")
 
 ADDRESS: Final = "127.0.0.1"
 HOSTS: Final = {"127.0.0.1", "localhost", "[::1]"}
-"""Names of this computer. A foreign page may bring another name to reach loopback (DNS rebinding).
-"""
+"""A foreign page may bring another name to reach loopback (DNS rebinding)."""
 SITES: Final = {None, "none", "same-origin"}
-"""`Sec-Fetch-Site` of requests that no other site's page has made."""
+"""`Sec-Fetch-Site` of requests that no other site has made."""
 PAGES_MAX: Final = 8
-"""Pages that may be open at a time."""
 CONNECTIONS_MAX: Final = 16
-"""Connections, each with a thread; a browser keeps one for its page and needs others to ask."""
+"""Connections, each with a thread; a browser may need two."""
 PATIENCE_S: Final = 5.0
-"""Longest time for a request and its answer, or for one snapshot, s."""
+"""Longest time for a request, or for one snapshot, s."""
 GIVES_WAY_S: Final = 0.25
-"""Age, s, from which a request that is not answered gives way to a new connection. A browser of
-this computer has its page within milliseconds."""
+"""Age, s, from which an unanswered request gives way to a new connection."""
 SEND_BUFFER_BYTES: Final = 32 * 1024
-"""Send buffer of a connection: some snapshots. A slow browser misses the later ones."""
+"""Some snapshots. A slow browser misses the later ones."""
 RETRY_MS: Final = 1000
 """Time after which a browser connects again, ms."""
 
 
 class Newest:
-    """The newest snapshot, for threads that wait for it. Slow threads miss those between."""
+    """The newest snapshot, for threads that wait for it."""
 
     def __init__(self) -> None:
-        """Start without a snapshot."""
         self._changed = threading.Condition()
         self._payload = b""
         self.number = 0
-        """Number of the newest; 0 before the first."""
+        """0 before the first."""
         self.closed = False
 
     def put(self, payload: bytes) -> None:
-        """Replace the snapshot."""
         with self._changed:
             self._payload, self.number = payload, self.number + 1
             self._changed.notify_all()
@@ -90,12 +85,12 @@ class Server(ThreadingHTTPServer):
         self.pages = threading.BoundedSemaphore(PAGES_MAX)
         self._places = threading.BoundedSemaphore(CONNECTIONS_MAX)
         self._ends: dict[socket.socket, float] = {}
-        """By connection, the oldest first: when it is cut off at the latest, monotonic s."""
+        """When each connection is cut off, monotonic s; the oldest first."""
         self._lock = threading.Lock()
         super().__init__((ADDRESS, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Serve a connection in a thread of its own, if one is free or another gives way."""
+        """Serve a connection in a thread, if one is free or another gives way."""
         if not self._places.acquire(blocking=False):
             self._cut_off(time.monotonic() + PATIENCE_S - GIVES_WAY_S, at_most=1)
             if not self._places.acquire(timeout=GIVES_WAY_S):
@@ -106,7 +101,6 @@ class Server(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Serve one connection."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -115,7 +109,7 @@ class Server(ThreadingHTTPServer):
             self._places.release()
 
     def service_actions(self) -> None:
-        """Cut off connections that take too long; called several times a second."""
+        """Cut off slow connections; called several times a second."""
         self._cut_off(time.monotonic())
 
     def keep(self, request: socket.socket) -> None:
@@ -124,7 +118,7 @@ class Server(ThreadingHTTPServer):
             self._ends[request] = math.inf
 
     def _cut_off(self, due_s: float, at_most: int = CONNECTIONS_MAX) -> None:
-        """Cut off connections that end by `due_s`, the oldest first; their threads end soon."""
+        """Cut off connections that end by `due_s`, the oldest first."""
         with self._lock:
             late = [request for request, end_s in self._ends.items() if end_s <= due_s][:at_most]
             for request in late:
@@ -136,7 +130,6 @@ class Server(ThreadingHTTPServer):
                 log.debug("a browser had gone already")
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Log a failure; a browser that has gone is no error."""
         failure = sys.exception()
         gone = isinstance(failure, OSError)
         log.log(logging.DEBUG if gone else logging.ERROR, "%s: %r", client_address, failure)
@@ -178,7 +171,6 @@ class _Handler(BaseHTTPRequestHandler):
         return False
 
     def do_GET(self) -> None:
-        """Send the page, or the snapshots as they come."""
         path = self.path.partition("?")[0]
         if path == "/":
             self._begin("text/html; charset=utf-8")
@@ -217,7 +209,6 @@ class _Handler(BaseHTTPRequestHandler):
             self.server.pages.release()
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        """Write nothing to the terminal, only to the log."""
         log.debug(format, *args)
 
 

@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from daemon.process.signals import StopSignal
-from daemon.publish.door import QUESTIONS_MAX, Door, Message
+from daemon.publish.door import QUESTIONS_MAX, Door, Frames
 from daemon.publish.listener import Listener, PublishError
 from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message
 from tests.ports import free_port
@@ -58,10 +58,10 @@ def has_ipv6() -> bool:
     return True
 
 
-def receive(door: Door, wanted: int) -> list[Message]:
+def receive(door: Door, wanted: int) -> list[Frames]:
     """Questions, once there are enough."""
     deadline_s = time.monotonic() + WAIT_MS / 1e3
-    received: list[Message] = []
+    received: list[Frames] = []
     while len(received) < wanted:
         assert time.monotonic() < deadline_s
         received += door.receive()

@@ -11,7 +11,7 @@ import pytest
 import zmq
 
 from daemon.judge.reasons import Decision, Reason
-from daemon.publish.door import Message
+from daemon.publish.door import Frames
 from daemon.publish.messages import Verdict, decode_verdict
 from daemon.publish.questions import WAITING_MAX, Questions
 from drivers.recordings.csv_player import DEMO_RECORDING
@@ -22,13 +22,13 @@ PATIENCE_NS = 1_000_000_000
 
 
 @pytest.fixture
-def sent() -> list[Message]:
+def sent() -> list[Frames]:
     """What was answered."""
     return []
 
 
 @pytest.fixture
-def questions(sent: list[Message]) -> Questions:
+def questions(sent: list[Frames]) -> Questions:
     def send(frames: Sequence[bytes]) -> bool:
         sent.append([*frames])
         return True
@@ -59,7 +59,7 @@ def connect() -> Iterator[Connect]:
 @pytest.mark.parametrize("text", [b"judge", b"lift"])
 @pytest.mark.parametrize("delimiter", [[], [b""]], ids=["DEALER", "REQ"])
 def test_a_question_gets_one_answer(
-    questions: Questions, sent: list[Message], delimiter: list[bytes], text: bytes
+    questions: Questions, sent: list[Frames], delimiter: list[bytes], text: bytes
 ) -> None:
     requests = Asked()
     questions.take([[b"asker", *delimiter, text]], 0, requests)
@@ -85,7 +85,7 @@ def test_a_question_gets_one_answer(
     ],
 )
 def test_what_is_no_question_is_counted_and_not_answered(
-    questions: Questions, sent: list[Message], frames: list[bytes]
+    questions: Questions, sent: list[Frames], frames: list[bytes]
 ) -> None:
     requests = Asked()
     questions.take([[b"asker", *frames]], 0, requests)
@@ -97,7 +97,7 @@ def test_what_is_no_question_is_counted_and_not_answered(
 
 
 def test_a_flood_of_questions_is_bounded_and_each_peers_newest_is_answered(
-    questions: Questions, sent: list[Message]
+    questions: Questions, sent: list[Frames]
 ) -> None:
     for _ in range(5):
         questions.take([[b"%d" % peer, b"judge"] for peer in range(10)], 0, Asked())
@@ -108,7 +108,7 @@ def test_a_flood_of_questions_is_bounded_and_each_peers_newest_is_answered(
 
 
 def test_the_oldest_question_makes_place_for_a_newer_one(
-    questions: Questions, sent: list[Message]
+    questions: Questions, sent: list[Frames]
 ) -> None:
     for peer in range(WAITING_MAX + 20):
         questions.take([[b"%d" % peer, b"judge"]], 0, Asked())
@@ -118,7 +118,7 @@ def test_the_oldest_question_makes_place_for_a_newer_one(
 
 
 def test_when_time_is_up_only_the_peers_that_waited_that_long_are_answered(
-    questions: Questions, sent: list[Message]
+    questions: Questions, sent: list[Frames]
 ) -> None:
     questions.take([[b"first", b"judge"]], 0, Asked())
     questions.take([[b"second", b"judge"]], 500, Asked())

@@ -153,7 +153,7 @@ def test_of_other_sensors_the_newest_four_are_kept(tmp_path: Path) -> None:
             read_once(keeper)
             keeper.save()
             assert session.grasps == 0
-        kept = [(each.serials["ff"], grasps_of(each)) for each in others(file.path)]
+        kept = [(each.serials["ff"], grasps_of(each)) for each in others(file.path).values()]
         assert kept == [(str(6 - at), 37 - at) for at in range(4)]
         for number in (2, 6):
             driver.known = {"ff": str(number)}

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daemon.judge.reasons import Decision, GateState
 from daemon.watch.fingers import FingerImage
 from daemon.watch.view import View
 from models.layout import D1
-from models.levels import Rest
+from models.levels import RestCounts
 from tests.daemon.watch.watch_fakes import MS, RESTING, a_view, after, status, tactile, verdict
 
 SOUND = np.ones(24, dtype=np.bool_)
@@ -64,19 +65,19 @@ def test_a_rest_is_learned_only_while_idle_and_tared() -> None:
     assert view.snapshot(0).fingers[1].levels == [100] * 132
 
 
-def learned(*counts: float) -> Rest:
+def learned(*counts: float) -> NDArray[np.float64] | None:
     """The rest after a hundred readings of 3000 and these."""
-    rest = Rest()
+    rest = RestCounts()
     for count in [3000.0] * 100 + list(counts):
-        rest.learn(np.full(24, count), SOUND)
-    return rest
+        rest.learn("ff", np.full(24, count), SOUND)
+    return rest.of("ff")
 
 
 def test_the_rest_follows_a_drift_and_hardly_an_unseen_touch() -> None:
     drifted = learned(*[3010.0] * 500)  # ten times the fifty readings that a share of 2 % goes back
-    assert drifted.counts == pytest.approx(np.full(24, 3010.0), abs=0.01)
+    assert drifted == pytest.approx(np.full(24, 3010.0), abs=0.01)
     touched = learned(*[1400.0] * 3)
-    assert touched.counts == pytest.approx(np.full(24, 2998.8))  # three times 2 % of 20 counts
+    assert touched == pytest.approx(np.full(24, 2998.8))  # three times 2 % of 20 counts
 
 
 def test_without_a_rest_an_image_shows_how_electrodes_differ() -> None:

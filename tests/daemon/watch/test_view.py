@@ -15,9 +15,9 @@ from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
 from daemon.trust.lift_book import OutcomeStatus
 from daemon.trust.trust import RiskReport
-from daemon.watch.evidence import SUPERVISED
-from daemon.watch.history import History
+from daemon.watch.figures import SUPERVISED
 from daemon.watch.snapshot import Line, Snapshot, Tone
+from daemon.watch.view import History
 from tests.daemon.watch.watch_fakes import BOOT, MS, RISK, a_view, after, status, text_of, verdict
 
 GOLDEN = sorted((Path(__file__).parents[1] / "publish" / "golden").glob("*.json"))
