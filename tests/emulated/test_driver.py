@@ -17,11 +17,11 @@ from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.line import LineEvent
 from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.spi import SpiTwin
-from tests.drivers.spi.bridge_bench import Clock
 from tests.drivers.spi.bridge_c import pattern
 from tests.emulated.board import Board
 from tests.emulated.conftest import Image
 from tests.emulated.lockstep import EPOCH_NS, FINGERS, PATIENCE_S, LockStep
+from tests.kit.clock import Clock
 from tests.process_replay.verdicts import judged
 
 SWEEPS = 6000
