@@ -129,17 +129,6 @@ def grasp_verdicts(readings: Sequence[TactileReading]) -> list[tuple[int, str, f
     return found
 
 
-def test_a_daemon_that_opens_the_port_again_is_answered(linked: LockStep) -> None:
-    linked.serve(100.0)
-    linked.hang_up()
-    linked.board.run(50.0)
-    linked.readings.clear()
-    linked.open()
-    linked.serve(LINKED_MS, lambda: len(linked.readings) >= 20)
-    assert linked.driver.link_state is LinkState.UP
-    assert [reading.seq for reading in linked.readings] == list(range(20))
-
-
 @pytest.mark.parametrize("loss", ["unplug", "detach", "stick"])
 def test_a_link_that_is_lost_comes_back_and_no_reading_mixes_both(
     linked: LockStep, loss: str
