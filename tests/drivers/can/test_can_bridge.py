@@ -123,6 +123,11 @@ def test_arguments_out_of_range_are_refused(options: Mapping[str, Any]) -> None:
         CanBridgeDriver("virtual", "x", **options)
 
 
+@pytest.mark.parametrize("identifier", [0, (1 << 29) - 1])
+def test_the_lowest_and_the_highest_id_are_taken(identifier: int) -> None:
+    assert CanBridgeDriver("virtual", "x", arbitration_id=identifier).name == "can"
+
+
 def test_a_bit_rate_that_socketcan_would_ignore_is_refused() -> None:
     with pytest.raises(ValueError, match="ip link set"):
         CanBridgeDriver("socketcan", "can0", bitrate=1_000_000)

@@ -103,16 +103,21 @@ def test_a_sender_that_stalls_looks_like_a_loss(at: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "after_us", "is_next"),
-    [(5, 1_899, False), (5, 1_900, True), (9, 2_299, False), (9, 2_300, True)],
+    ("place", "after_ns", "is_next"),
+    [
+        (5, 1_899_999, False),
+        (5, 1_900_000, True),
+        (9, 2_299_999, False),
+        (9, 2_300_000, True),
+    ],
 )
 def test_before_the_period_is_known_it_is_taken_for_that_of_the_fastest_board(
-    place: int, after_us: int, is_next: bool
+    place: int, after_ns: int, is_next: bool
 ) -> None:
     """100 us a sample: three quarters of a sweep are 1800 us, after the time to that place."""
     sweeps, _ = assembler()
     begun, late = samples(0)[:5], samples(0)[place]
-    readings = feed(sweeps, [*begun, (*late[:2], begun[-1][2] + after_us * 1000)])
+    readings = feed(sweeps, [*begun, (*late[:2], begun[-1][2] + after_ns)])
     assert len(readings) == is_next
 
 
