@@ -138,25 +138,23 @@ def scene_text(tactile: str, endpoint: str, model: str, *, realtime: bool, settl
 
 
 def promote(pid: int, priority: int) -> None:
-    """Run all threads of a process in realtime, or with 0 no more. Raises `PermissionError`."""
-    policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
+    """Run all threads of a process in realtime. Raises `PermissionError`."""
     for thread in os.listdir(f"/proc/{pid}/task"):
-        os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
+        os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
 
 
 class Hand:
     """One publisher, daemon or echo, and its twin."""
 
-    def __init__(self, folder: Path, *, ends: int = 0, settled: bool = False) -> None:
-        """`ends`: priority in realtime of the twin; 0 for none. `settled`: whole grasps, each of
-        which is judged once it has settled, and not each reading of one that lasts, as `ask`ed."""
+    def __init__(self, folder: Path, *, settled: bool = False) -> None:
+        """With `settled` whole grasps, each judged once it has settled; else a grasp that lasts,
+        each reading of which is `ask`ed for."""
         self.folder = folder
         self.log = folder / "log"
         self.where = where_of("spi", folder)
         self.endpoint = f"ipc://{self.folder}/graspd"
         self.record = Record()
         self.settled = settled
-        self._ends = ends
         self._stack = ExitStack()
         self._asker: zmq.Socket[bytes] | None = None
 
@@ -207,8 +205,6 @@ class Hand:
             stamps=str(self.folder / "stamps.npy"),
         )
         self._twin = self._stack.enter_context(start_twin(plan))
-        if self._ends:
-            promote(self._twin.pid, self._ends)
 
     def stop(self) -> NDArray[np.int64]:
         """End twin and publisher; the `Stamp` of each sweep, shape (sweeps, 3), ns."""
@@ -232,7 +228,7 @@ def hear(subscriber: Subscriber, hand: Hand, seconds: float, *, echo: bool = Fal
             hand.ask()
 
 
-def measure(hand: Hand, seconds: float, *, ends: int = 0, echo: bool = False) -> float:
+def measure(hand: Hand, seconds: float, *, echo: bool = False) -> float:
     """Fill the hand's record for so long; return the share of a core that it used, %.
 
     Raises `RuntimeError` if not all that was to be judged was.
@@ -245,9 +241,7 @@ def measure(hand: Hand, seconds: float, *, ends: int = 0, echo: bool = False) ->
         hear(subscriber, hand, WARM_UP_S, echo=echo)
         record.clear()
         before = usage(hand.publisher.pid)
-        promote(os.getpid(), ends)
         hear(subscriber, hand, seconds, echo=echo)
-        promote(os.getpid(), 0)
         after = usage(hand.publisher.pid)
     is_enough = hand.settled or record.judged >= JUDGED_MIN_SHARE * record.readings
     if not record.judged or not is_enough:

@@ -15,7 +15,6 @@ all; neither picks a sample by a seed. Hence our own.
 from __future__ import annotations
 
 import argparse
-import ast
 import contextlib
 import dataclasses
 import importlib.util
@@ -34,7 +33,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import CodeType
 from typing import Final
 
 import coverage
@@ -42,6 +40,7 @@ import pytest
 from hypothesis import Phase, settings
 
 from tests.conftest import ROOT, data_dir
+from tests.kit.mutants import Mutant, mutants
 
 NUMBER = 200
 KILLED_SHARE = 0.9
@@ -50,9 +49,6 @@ LEFT_OUT = ("drivers/twins/",)
 """Test equipment."""
 KINDS = ("comparison", "operator", "logic", "number")
 """Of the mutants that are picked from."""
-BY_ONE_MAX, BY_ONE_MAX_FLOAT = 1_000_000, 100.0
-"""Numbers up to these differ by one, others by `SHARE`."""
-SHARE = 0.2
 TESTS_S = 60.0
 """Tests that a mutant gets, by the time that they take without it, s."""
 SLACK, SLACK_S = 5.0, 10.0
@@ -63,165 +59,6 @@ WARM = ("can", "msgspec", "numpy", "onnxruntime", "pydantic", "serial", "zmq")
 """Imported once for all mutants."""
 UNCHECKED: Final = (1).to_bytes(4, "little")
 """Flags of a compiled file that is never compared with its source (PEP 552)."""
-
-COMPARISONS: Final[dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]]] = {
-    ast.Lt: (ast.LtE, ast.Gt),
-    ast.LtE: (ast.Lt, ast.GtE),
-    ast.Gt: (ast.GtE, ast.Lt),
-    ast.GtE: (ast.Gt, ast.LtE),
-    ast.Eq: (ast.NotEq,),
-    ast.NotEq: (ast.Eq,),
-    ast.Is: (ast.IsNot,),
-    ast.IsNot: (ast.Is,),
-    ast.In: (ast.NotIn,),
-    ast.NotIn: (ast.In,),
-}
-OPERATORS: Final[dict[type[ast.operator], type[ast.operator]]] = {
-    ast.Add: ast.Sub,
-    ast.Sub: ast.Add,
-    ast.Mult: ast.Div,
-    ast.Div: ast.Mult,
-    ast.FloorDiv: ast.Mult,
-    ast.Mod: ast.FloorDiv,
-    ast.Pow: ast.Mult,
-    ast.LShift: ast.RShift,
-    ast.RShift: ast.LShift,
-    ast.BitAnd: ast.BitOr,
-    ast.BitOr: ast.BitAnd,
-    ast.BitXor: ast.BitAnd,
-}
-VERDICTS: Final = {"SLIP": "STABLE", "STABLE": "SLIP", "UNKNOWN": "STABLE"}
-
-Change = Callable[[ast.AST], None]
-"""Makes the mistake in a node."""
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """One mistake in one module."""
-
-    source: str
-    place: int
-    """Of the changed node among those of the module."""
-    line: int
-    begin: int
-    """First line of the statement around it: what runs them runs the mistake."""
-    kind: str
-    what: str
-    change: Change
-    file: str = ""
-    """From the root, where it is one of a tree."""
-
-    def code(self) -> CodeType:
-        """The module with the mistake, compiled."""
-        tree = ast.parse(self.source)
-        for place, (node, _) in enumerate(_nodes(tree, None)):
-            if place == self.place:
-                self.change(node)
-                break
-        return compile(ast.fix_missing_locations(tree), self.file or "mutant", "exec")
-
-    def __str__(self) -> str:
-        text = self.source.splitlines()[self.line - 1].strip()
-        return f"{self.file}:{self.line}: {self.what} in `{text}`"
-
-
-def mutants(source: str, *, within: str | None = None, file: str = "") -> Iterator[Mutant]:
-    """All mutants of a module, or of its function `within`."""
-    tree = ast.parse(source)
-    lines: Collection[int] | None = None
-    if within is not None:
-        (body,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == within]
-        lines = range(body.lineno, (body.end_lineno or body.lineno) + 1)
-    for place, (node, statement) in enumerate(_nodes(tree, None)):
-        line = getattr(node, "lineno", 0)
-        if lines is None or line in lines:
-            for kind, what, change in _changes(node):
-                yield Mutant(source, place, line, statement.lineno, kind, what, change, file)
-
-
-def _nodes(
-    parent: ast.AST, statement: ast.stmt | None
-) -> Iterator[tuple[ast.expr | ast.stmt, ast.stmt]]:
-    """What may be changed, and the statement around it: no annotations, no messages."""
-    for name, value in ast.iter_fields(parent):
-        if name in ("annotation", "returns", "decorator_list"):
-            continue
-        for node in value if isinstance(value, list) else [value]:
-            if not isinstance(node, ast.AST) or _is_message(node):
-                continue
-            around = node if isinstance(node, ast.stmt) else statement
-            if isinstance(node, ast.expr | ast.stmt) and around is not None:
-                yield node, around
-            yield from _nodes(node, around)
-
-
-def _is_message(node: ast.AST) -> bool:
-    """Text for people: formatted strings and the log."""
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-        node = node.func.value
-        return isinstance(node, ast.Name) and node.id == "_log"
-    return isinstance(node, ast.JoinedStr)
-
-
-def _changes(node: ast.AST) -> Iterator[tuple[str, str, Change]]:
-    """Kind, description and function of everything that can go wrong in a node."""
-    match node:
-        case ast.Compare():
-            for place, operator in enumerate(node.ops):
-                for other in COMPARISONS[type(operator)]:
-                    what = f"{type(operator).__name__} becomes {other.__name__}"
-                    yield "comparison", what, _setter("ops", other(), place)
-        case ast.BoolOp():
-            both = isinstance(node.op, ast.And)
-            yield "logic", "and and or change places", _setter("op", (ast.And, ast.Or)[both]())
-            for place in range(len(node.values)):
-                dropped = _setter("values", ast.Constant(both), place)
-                yield "operand", f"operand {place} is dropped", dropped
-        case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as sign, operand=operand):
-            kind = "logic" if isinstance(sign, ast.Not) else "operator"
-            twice = ast.UnaryOp(sign, operand)
-            yield kind, f"{type(sign).__name__} is dropped", _setter("operand", twice)
-        case ast.BinOp(op=sign) | ast.AugAssign(op=sign) if type(sign) in OPERATORS:
-            wrong = OPERATORS[type(sign)]
-            what = f"{type(sign).__name__} becomes {wrong.__name__}"
-            yield "operator", what, _setter("op", wrong())
-        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
-            for changed in _numbers(number):
-                yield "number", f"{number} becomes {changed}", _setter("value", changed)
-        case ast.Attribute(attr=verdict) if verdict in VERDICTS:
-            what = f"{verdict} becomes {VERDICTS[verdict]}"
-            yield "verdict", what, _setter("attr", VERDICTS[verdict])
-    match node:
-        case ast.If() | ast.IfExp():
-            for truth in (True, False):
-                what = f"the condition is {truth}"
-                yield "condition", what, _setter("test", ast.Constant(truth))
-        case ast.Expr(value=value) if not isinstance(value, ast.Constant):
-            yield "statement", "a statement is dropped", _setter("value", ast.Constant(None))
-        case ast.AugAssign():  # of a list
-            nothing = ast.Tuple([], ast.Load())
-            yield "statement", "a statement is dropped", _setter("value", nothing)
-
-
-def _setter(field: str, value: object, place: int | None = None) -> Change:
-    def change(node: ast.AST) -> None:
-        if place is None:
-            setattr(node, field, value)
-        else:
-            getattr(node, field)[place] = value
-
-    return change
-
-
-def _numbers(number: float) -> tuple[float, ...]:
-    """What a number may be by mistake: by one where that is little, else by a share."""
-    if isinstance(number, int):
-        if abs(number) <= BY_ONE_MAX:
-            return number + 1, number - 1
-        return round(number * (1.0 + SHARE)), round(number * (1.0 - SHARE))
-    larger = number + 1.0 if abs(number) <= BY_ONE_MAX_FLOAT else number * (1.0 + SHARE)
-    return (larger, number * (1.0 - SHARE)) if number else (larger,)
 
 
 @dataclass(eq=False)

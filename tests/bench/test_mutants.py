@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.bench import mutants as bench
+from tests.kit.mutants import Mutant, mutants
 
 SOURCE = '''"""In 2 sentences."""
 LONG_NS = 2_000_000_000
@@ -62,14 +63,14 @@ def test_the_first_is_found():
 
 
 def test_numbers_operators_and_conditions_are_changed_and_nothing_that_is_only_said() -> None:
-    found = [each for each in bench.mutants(SOURCE) if each.kind in bench.KINDS]
+    found = [each for each in mutants(SOURCE) if each.kind in bench.KINDS]
     assert sorted(f"{each.line}: {each.what}" for each in found) == sorted(CHANGES)
     assert len({marshal.dumps(each.code()) for each in found}) == len(CHANGES)
 
 
 def test_a_mutant_has_its_one_mistake_and_no_other() -> None:
     source = "def far(x):\n    return not x > 2\ndef near(x):\n    return x < 2\n"
-    found = list(bench.mutants(source, within="far"))
+    found = list(mutants(source, within="far"))
     assert [each.what for each in found] == [
         *("Not is dropped", "Gt becomes GtE", "Gt becomes Lt"),
         *("2 becomes 3", "2 becomes 1"),
@@ -131,7 +132,7 @@ def test_a_run_that_is_cut_off_is_not_taken_for_noticed(
 
 def run(
     tree: Path, module: str, tests: str, only: str = "limit.py"
-) -> tuple[list[bench.Mutant], list[bench.Mutant]]:
+) -> tuple[list[Mutant], list[Mutant]]:
     """All mutants of `module`, and those that `tests` do not notice."""
     for file, content in {
         "speeds/limit.py": module,

@@ -90,7 +90,6 @@ class Options:
     """How to measure."""
 
     seconds: float
-    ends: int
     settled: bool
 
 
@@ -98,10 +97,10 @@ def daemon_turn(options: Options, model: str, times: Times, realtime: bool) -> N
     """One turn of the daemon."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        Hand(Path(folder), ends=options.ends, settled=options.settled) as hand,
+        Hand(Path(folder), settled=options.settled) as hand,
     ):
         hand.start_daemon(model, realtime=realtime)
-        cpu = measure(hand, options.seconds, ends=options.ends)
+        cpu = measure(hand, options.seconds)
         times.add(hand.record, hand.stop(), cpu)
 
 
@@ -109,12 +108,12 @@ def echo_turn(options: Options, times: Times, realtime: bool) -> None:
     """One turn of the empty echo."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        Hand(Path(folder), ends=options.ends) as hand,
+        Hand(Path(folder)) as hand,
     ):
         hand.publish(Child([*AS_ECHO, hand.where, hand.endpoint], hand.log))
         if realtime:
             promote(hand.publisher.pid, PRIORITY)
-        cpu = measure(hand, options.seconds, ends=options.ends, echo=True)
+        cpu = measure(hand, options.seconds, echo=True)
         times.add(hand.record, hand.stop(), cpu)
 
 
@@ -201,7 +200,7 @@ def turns(models: Sequence[str], options: Options) -> dict[str, Turn]:
 
 def run_all(given: argparse.Namespace) -> dict[Case, Times]:
     """Every case in every round."""
-    options = Options(given.seconds, given.ends, given.settled)
+    options = Options(given.seconds, given.settled)
     found: dict[Case, Times] = {}
     for number in range(given.rounds):
         for load_name in given.loads:
@@ -253,9 +252,6 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=MODELS, choices=zoo.names())
     parser.add_argument("--loads", nargs="+", default=LOADS, choices=LOADS)
     parser.add_argument("--no-realtime", dest="realtime", action="store_false")
-    parser.add_argument(
-        "--ends", type=int, default=0, help="realtime priority of twin and subscriber; 0: none"
-    )
     parser.add_argument(
         "--settled",
         action="store_true",

@@ -81,6 +81,20 @@ def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return slept
 
 
+def asked(program: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end."""
+    command = [str(program), *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+
+
+def cpp_lifts(lift_gate: Path, *words: object) -> bool:
+    """Ask the C++ example whether to lift; its exit code and its words must agree."""
+    result = asked(lift_gate, *words)
+    assert result.returncode in (0, 1), result.stderr
+    assert ("\nlift after" in result.stdout) is (result.returncode == 0)
+    return result.returncode == 0
+
+
 def compiled_probe() -> Path:
     """The probe that tells what the header's rules say."""
     skip_unless_it_can_be_compiled()

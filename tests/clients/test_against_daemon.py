@@ -108,18 +108,6 @@ def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -
     assert (bool(answer), answer.verdict.reasons) == (False, ("silent",))
 
 
-def test_a_new_start_forgets_the_former(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Client(daemon.endpoint) as graspd:
-        until(lambda: graspd.verdict(0.1).p_slip is not None)
-        former = graspd.verdict(0.1)
-        daemon.kill()
-        daemon.start()
-        until(lambda: graspd.verdict(0.1).boot_id not in (None, former.boot_id))
-        assert graspd.counts.restarts == 1
-        assert graspd.counts.malformed == 0
-        until(lambda: graspd.verdict(0.1).p_slip is not None)
-
-
 def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with (

@@ -22,6 +22,7 @@ from deploy.clients.python.graspd_client import (
     OutcomeAnswer,
     Verdict,
 )
+from tests.clients.building import asked, cpp_lifts
 from tests.clients.messages import ADDED, TOPIC, verdict
 from tests.threads import at_work
 
@@ -61,11 +62,11 @@ def _serve(
     with (
         zmq.Context() as context,
         context.socket(zmq.PUB) as out,
-        context.socket(zmq.ROUTER) as asked,
+        context.socket(zmq.ROUTER) as questions,
     ):
-        out.linger = asked.linger = 0
+        out.linger = questions.linger = 0
         out.bind(f"ipc://{folder}/out")
-        asked.bind(f"ipc://{folder}/ask")
+        questions.bind(f"ipc://{folder}/ask")
         seq = 0
         while not stop.is_set():
             grasp = 1 + seq // more.get("messages_each", 10**6)
@@ -73,11 +74,11 @@ def _serve(
             message = verdict(seq, time.monotonic_ns(), outcome, **fields)
             out.send_multipart([TOPIC, json.dumps(message).encode()])
             seq += 1
-            if asked.poll(PERIOD_MS):
-                who, *question = asked.recv_multipart()
+            if questions.poll(PERIOD_MS):
+                who, *question = questions.recv_multipart()
                 told_of = question[0].startswith(b"outcome ")
                 assert told_of or question == [b"lift"]
-                asked.send_multipart([who, *(TAKEN_FRAMES if told_of else answer(message))])
+                questions.send_multipart([who, *(TAKEN_FRAMES if told_of else answer(message))])
 
 
 ANSWERS: dict[str, tuple[Answer, str]] = {
@@ -106,9 +107,7 @@ def test_only_an_answer_that_fits_allows_a_lift(
         Client(places[0], ask_endpoint=places[2]) as graspd,
     ):
         said = graspd.may_i_lift(deadline_s)
-        result = subprocess.run(
-            [lift_gate, *places], capture_output=True, text=True, timeout=200, check=False
-        )
+        result = asked(lift_gate, *places)
     assert (bool(said), said.verdict.decision) == (expected == "stable", expected)
     assert result.stdout.split()[0] == expected
     assert (result.returncode == 0) == (expected == "stable")
@@ -138,29 +137,10 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
     ):
         said = graspd.may_i_lift(float(places[1]), supervised=True)
         assert (bool(said), said.supervised, bool(said.verdict)) == (may, may, False)
-        result = subprocess.run(
-            [lift_gate, "--supervised", *places],
-            capture_output=True,
-            text=True,
-            timeout=200,
-            check=False,
-        )
+        result = asked(lift_gate, "--supervised", *places)
         assert (result.returncode, "\nlift supervised after" in result.stdout) == (not may, may)
-        without = subprocess.run(
-            [lift_gate, places[0], str(DEADLINE_S), places[2]], capture_output=True, check=False
-        )
-        assert without.returncode == 1
+        assert not cpp_lifts(lift_gate, places[0], DEADLINE_S, places[2])
         assert not graspd.may_i_lift(DEADLINE_S)
-
-
-def cpp_lifts(lift_gate: Path, *words: str) -> bool:
-    """Whether the example says so."""
-    result = subprocess.run(
-        [lift_gate, *words], capture_output=True, text=True, timeout=200, check=False
-    )
-    assert result.returncode in (0, 1), result.stderr
-    assert ("\nlift after" in result.stdout) is (result.returncode == 0)
-    return result.returncode == 0
 
 
 STILL: dict[str, tuple[dict[str, Any], bool, bool]] = {
@@ -189,8 +169,8 @@ def test_who_wants_the_hand_to_have_been_still_lifts_only_when_the_daemon_says_s
             assert bool(answer) is allowed
             if may_at_once and not allowed:
                 assert answer.verdict.reasons == ("not-still",)
-            still = [] if still_ms is None else ["--still", str(still_ms)]
-            assert cpp_lifts(lift_gate, *still, out, str(deadline_s)) is allowed
+            still = [] if still_ms is None else ["--still", still_ms]
+            assert cpp_lifts(lift_gate, *still, out, deadline_s) is allowed
 
 
 @pytest.mark.parametrize("newest_ms", [130.0, 250.0, None])
@@ -220,8 +200,7 @@ def test_a_stillness_that_is_no_time_is_refused(
     with Client(out) as graspd, pytest.raises((ValueError, TypeError)):
         graspd.may_i_lift(DEADLINE_S, still_ms=still_ms)
     if isinstance(still_ms, float):
-        asked = [str(lift_gate), "--still", str(still_ms), out, str(DEADLINE_S)]
-        assert subprocess.run(asked, capture_output=True, check=False).returncode == 2
+        assert asked(lift_gate, "--still", still_ms, out, DEADLINE_S).returncode == 2
 
 
 @pytest.mark.parametrize("outcome", ["unknown", "slip"])
@@ -232,9 +211,7 @@ def test_an_answer_alone_allows_no_lift(lift_gate: Path, tmp_path: Path, outcome
         Client(places[0], ask_endpoint=places[2]) as graspd,
     ):
         assert not graspd.may_i_lift(DEADLINE_S)
-        assert (
-            subprocess.run([lift_gate, *places], capture_output=True, check=False).returncode == 1
-        )
+        assert not cpp_lifts(lift_gate, *places)
 
 
 @pytest.mark.parametrize("reasons", [["moving"], ["settling", "joints-late"]])
@@ -250,8 +227,7 @@ def test_where_nobody_answers_a_restless_hand_is_not_all_that_is_told(
         Client(out, ask_endpoint=ask) as graspd,
     ):
         answer = graspd.may_i_lift(deadline_s)
-        words = [str(lift_gate), out, str(deadline_s), ask]
-        result = subprocess.run(words, capture_output=True, text=True, timeout=200, check=False)
+        result = asked(lift_gate, out, deadline_s, ask)
     assert (bool(answer), list(answer.verdict.reasons)) == (False, expected)
     assert result.returncode == 1
     assert [word for word in result.stdout.split() if word in (*reasons, "no-answer")] == expected
@@ -265,17 +241,17 @@ LIFTED_ON = Verdict(Decision.STABLE, grasp=42, boot_id=BOOT)
 def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
     """What is told to a daemon that answers so, or not at all."""
     found: list[bytes] = []
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as asked:
-        asked.linger = 0
-        asked.bind(f"ipc://{folder}/ask")
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as door:
+        door.linger = 0
+        door.bind(f"ipc://{folder}/ask")
 
         def listen(stop: threading.Event) -> None:
             while not stop.is_set():
-                if asked.poll(PERIOD_MS):
-                    who, *words = asked.recv_multipart()
+                if door.poll(PERIOD_MS):
+                    who, *words = door.recv_multipart()
                     found.extend(words)
                     if frames:
-                        asked.send_multipart([who, *frames])
+                        door.send_multipart([who, *frames])
 
         with at_work(listen):
             yield found
@@ -289,13 +265,7 @@ def told_in_python(folder: Path, name: str | None) -> OutcomeAnswer:
 def told_in_cpp(lift_gate: Path, folder: Path, *words: str) -> tuple[int, str]:
     """Exit code and what it says."""
     places = [f"ipc://{folder}/out", f"ipc://{folder}/ask"]
-    result = subprocess.run(
-        [lift_gate, "--tell", *places, *words],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-    )
+    result = asked(lift_gate, "--tell", *places, *words)
     return result.returncode, (result.stdout + result.stderr).splitlines()[0]
 
 
@@ -391,12 +361,3 @@ def test_in_cpp_a_lift_that_was_never_told_is_counted_and_warned_of(
         probe.communicate(timeout=200)
         assert probe.returncode == 0, "the sanitizers found something"
     assert warned == ["1", "11"]
-
-
-@pytest.mark.parametrize(("word", "sent"), [("held", "stable"), ("slipped", "slip")])
-def test_in_cpp_an_outcome_has_a_name(
-    lift_gate: Path, tmp_path: Path, word: str, sent: str
-) -> None:
-    with heard(tmp_path, [b'{"v":1,"ok":true}']) as found:
-        assert told_in_cpp(lift_gate, tmp_path, BOOT, "42", word)[0] == 0
-    assert found == [f"outcome {BOOT} 42 {sent}".encode()]

@@ -14,18 +14,16 @@ import zmq
 
 from daemon.publish.keys import make
 from tests.clients.bench import Daemon, free_endpoint
-from tests.clients.building import sleep_at_will
+from tests.clients.building import asked, sleep_at_will
 from tests.clients.messages import frames, verdict
 
 MAY, MAY_NOT, WRONG = 0, 1, 2
 """Exit codes of `lift_gate`."""
 
 
-def asked(lift_gate: Path, *words: object) -> tuple[int, str]:
+def told(lift_gate: Path, *words: object) -> tuple[int, str]:
     """Exit code and output of one question."""
-    result = subprocess.run(
-        [lift_gate, *map(str, words)], capture_output=True, text=True, timeout=200, check=False
-    )
+    result = asked(lift_gate, *words)
     return result.returncode, result.stdout + result.stderr
 
 
@@ -61,7 +59,7 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(
         for ask in ([daemon.ask_endpoint], []):
             code, text = MAY_NOT, ""
             while code == MAY_NOT:
-                code, text = asked(lift_gate, daemon.endpoint, 1.0, *ask)
+                code, text = told(lift_gate, daemon.endpoint, 1.0, *ask)
                 assert text.startswith("stable") == (code == MAY) == ("\nlift after" in text)
             assert code == MAY, text
 
@@ -94,7 +92,7 @@ def test_only_who_has_keys_is_told(lift_gate: Path, tmp_path: Path) -> None:
     with Daemon(tmp_path, curve, endpoint=endpoint):
         with watching(lift_gate, endpoint, public, own_secret) as watch:
             line_with(watch, "stable", "slip")
-        code, text = asked(lift_gate, endpoint, 0.3)
+        code, text = told(lift_gate, endpoint, 0.3)
     assert (code, text.startswith("unknown [ no-message ]")) == (MAY_NOT, True)
 
 
@@ -124,6 +122,6 @@ def test_what_came_before_the_computer_slept_is_unknown_however_young_it_looks(
     "words", [[], ["ipc:///x"], ["ipc:///x", "-1"], ["nowhere", "1"], ["--watch"]]
 )
 def test_a_wrong_command_line_is_no_yes(lift_gate: Path, words: list[str]) -> None:
-    code, text = asked(lift_gate, *words)
+    code, text = told(lift_gate, *words)
     assert code == WRONG
     assert "lift_gate" in text

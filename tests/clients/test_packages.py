@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.clients.building import CPP, skip_unless_it_can_be_compiled
+from tests.clients.building import CPP, asked, skip_unless_it_can_be_compiled
 
 README = (CPP.parent / "README.md").read_text()
 PROGRAM = "lift_gate"
@@ -60,15 +60,9 @@ def project(tmp_path: Path) -> Path:
 
 def works(program: Path, folder: Path) -> None:
     """Where no daemon is, it may not lift, and says why."""
-    asked = subprocess.run(
-        [program, f"ipc://{folder}/nobody", "0.1"],
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
-    assert asked.returncode == 1, asked.stderr
-    assert asked.stdout.startswith("unknown [ no-message ]")
+    result = asked(program, f"ipc://{folder}/nobody", 0.1)
+    assert result.returncode == 1, result.stderr
+    assert result.stdout.startswith("unknown [ no-message ]")
 
 
 def test_cmake_finds_the_installed_client(prefix: Path, project: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from deploy.clients.python.graspd_client import (
 from tests.clients.messages import (
     ADDED,
     MS,
-    RISK,
     TOPIC,
     Event,
     events,
@@ -85,17 +83,6 @@ def test_what_a_verdict_rests_on_is_told() -> None:
     assert hash(found) == hash(said(verdict(0, START_NS, **ADDED)))
 
 
-def test_a_daemon_that_knows_nothing_of_outcomes_is_understood() -> None:
-    found = said(verdict(0, START_NS))
-    assert found
-    assert (found.p_slip_model, found.outcomes, found.supervised, found.risk) == (
-        *(None, 0, False),
-        None,
-    )
-    stillness = (found.early, found.still_ms, found.motion, found.motion_limits)
-    assert stillness == (False, None, None, None)
-
-
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("verdict_*.json")), ids=lambda path: path.stem)
 def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Path) -> None:
     """And who knows nothing of what was added finds all that it relied on as it was."""
@@ -111,21 +98,6 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Pa
         assert msgspec.json.decode(frames(message)[1], type=Former) == msgspec.convert(
             former, Former
         )
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("p_slip_model", math.nan),
-        ("risk", RISK | {"bound": math.nan}),
-        ("still_ms", math.nan),
-        ("still_ms", math.inf),
-        ("motion", {"ff": math.nan}),
-        ("motion_limits", {"ff": math.inf}),
-    ],
-)
-def test_nan_in_what_was_added_is_malformed(name: str, value: object) -> None:
-    assert said(verdict(0, START_NS, **ADDED | {name: value})).reasons == ("malformed",)
 
 
 def test_a_lift_under_supervision_is_not_stable() -> None:

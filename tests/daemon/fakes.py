@@ -24,6 +24,7 @@ from models.contract import (
 )
 from models.runtime import TactileModel
 from models.tactile_image import TactileImager
+from tests.kit.clock import Clock as Clock
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 MS = 1_000_000
@@ -82,16 +83,6 @@ class FakeModel:
 
 NO_LIFT = GraspId("", 0), LiftBook()
 """Ends a `PublishedVerdict` of no grasp."""
-
-
-class Clock:
-    """A clock that moves only when told to."""
-
-    def __init__(self, now_ns: int = 10**12) -> None:
-        self.now_ns = now_ns
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 def pipeline(

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.base import LinkCause
 from drivers.link import Link, LinkState
-from tests.drivers.spi.bridge_bench import Clock
+from tests.kit.clock import Clock
 
 
 def test_patience_grows_up_to_a_second_and_begins_anew_when_the_link_is_up() -> None:

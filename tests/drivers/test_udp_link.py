@@ -13,7 +13,8 @@ from drivers.base import Fact, LinkCause, LinkError, Reading
 from drivers.link import LinkState
 from drivers.udp.driver import DatagramCounters, DatagramDriver
 from drivers.udp.receiver import Datagram, DatagramReceiver, Endpoint
-from tests.drivers.spi.bridge_bench import MS, Clock
+from tests.drivers.spi.bridge_bench import MS
+from tests.kit.clock import Clock
 
 HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
 SILENCE_NS = 100 * MS

@@ -1,7 +1,4 @@
-"""Builds the firmware of the bridge for a Raspberry Pi Pico: the C port and the Arduino sketch.
-
-`python -m tests.emulated.build` builds both at each system clock and tells their sizes.
-"""
+"""Builds the firmware of the bridge for a Raspberry Pi Pico: the C port and the Arduino sketch."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import hashlib
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -170,21 +166,3 @@ def _run(*command: str | Path) -> None:
     if done.returncode != 0:
         told = (done.stdout + done.stderr).splitlines()[-40:]
         raise BuildError("\n".join([f"{command[0]}:", *(line[:300] for line in told)]))
-
-
-def main() -> int:
-    """Build both ports at each clock and write their sizes to standard output, as Markdown."""
-    sys.stdout.write("| image | system clock | flash | RAM |\n|---|---|---|---|\n")
-    try:
-        for port in TARGETS:
-            for clock_mhz in CLOCKS_MHZ:
-                flash, ram = flash_and_ram(image(port, clock_mhz=clock_mhz))
-                sys.stdout.write(f"| {port} | {clock_mhz} MHz | {flash} B | {ram} B |\n")
-    except (MissingError, BuildError) as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

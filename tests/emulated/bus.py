@@ -10,8 +10,6 @@ import numpy as np
 
 from tests.emulated.board import SELECT, Events
 
-READ_PROPERTY = 0x61
-
 
 @dataclass
 class Transaction:
@@ -26,7 +24,6 @@ class Transaction:
     hz: list[int] = field(default_factory=list)
     """Clock of each byte."""
     mosi: bytes = b""
-    miso: bytes = b""
 
     @property
     def is_command(self) -> bool:
@@ -51,7 +48,6 @@ def transactions(events: Events) -> list[Transaction]:
             open_.byte_ns.append(t_ns)
             open_.hz.append(int(event["hz"]))
             open_.mosi += bytes([event["value"]])
-            open_.miso += bytes([event["miso"]])
     return found
 
 
@@ -74,8 +70,6 @@ class Timing:
     """Shortest time from the end of an answer to the next chip select."""
     duration_us: tuple[float, float]
     """Shortest and longest sweep, from the first chip select to the last."""
-    jitter_us: float
-    """Most that two sweeps in a row began other than a period apart."""
     late_us: float
     """Most that a sweep began later on the grid of periods than another."""
 
@@ -95,6 +89,5 @@ def timing(whole: Sequence[Sequence[Transaction]], period_us: float) -> Timing:
         settle_us=min(settles) / 1e3,
         gap_us=min(gaps) / 1e3,
         duration_us=(min(durations) / 1e3, max(durations) / 1e3),
-        jitter_us=float(np.abs(np.diff(starts) - period_us).max()),
         late_us=float(np.ptp(grid)),
     )

@@ -17,17 +17,6 @@ def test_an_image_is_built_once(image: Image, monkeypatch: pytest.MonkeyPatch) -
     assert image("pico") == made
 
 
-def test_each_setting_makes_another_image(image: Image) -> None:
-    made = [
-        image(),
-        image("sketch"),
-        image(sensors=5),
-        image(clock_mhz=200),
-        image(sequence="interleaved"),
-    ]
-    assert len({path.read_bytes() for path in made}) == len(made)
-
-
 @pytest.mark.parametrize("port", ["pico", "sketch"])
 def test_an_image_leaves_most_of_the_chip_free(port: str, image: Image) -> None:
     flash, ram = build.flash_and_ram(image(port))

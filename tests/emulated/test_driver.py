@@ -17,11 +17,11 @@ from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.line import LineEvent
 from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.spi import SpiTwin
-from tests.drivers.spi.bridge_bench import Clock
 from tests.drivers.spi.bridge_c import pattern
 from tests.emulated.board import Board
 from tests.emulated.conftest import Image
 from tests.emulated.lockstep import EPOCH_NS, FINGERS, PATIENCE_S, LockStep
+from tests.kit.clock import Clock
 from tests.process_replay.verdicts import judged
 
 SWEEPS = 6000
@@ -127,17 +127,6 @@ def grasp_verdicts(readings: Sequence[TactileReading]) -> list[tuple[int, str, f
             found.append((at, entry["verdict"], entry.get("p_slip")))
         at += entry["n"]
     return found
-
-
-def test_a_daemon_that_opens_the_port_again_is_answered(linked: LockStep) -> None:
-    linked.serve(100.0)
-    linked.hang_up()
-    linked.board.run(50.0)
-    linked.readings.clear()
-    linked.open()
-    linked.serve(LINKED_MS, lambda: len(linked.readings) >= 20)
-    assert linked.driver.link_state is LinkState.UP
-    assert [reading.seq for reading in linked.readings] == list(range(20))
 
 
 @pytest.mark.parametrize("loss", ["unplug", "detach", "stick"])

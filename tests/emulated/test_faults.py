@@ -198,36 +198,3 @@ def test_an_spi_that_never_finishes_ends_in_a_reset_by_the_watchdog(sweeping: Bo
     status = board.status()
     assert (status.sweeps, status.rx_errors, status.spi_errors) == (0, 0, [0, 0, 0])
     assert not board.take(SWEEP)  # until START
-
-
-def test_power_that_goes_and_comes_back_begins_anew(sweeping: Board) -> None:
-    board = sweeping
-    sweep_on(board, 2)
-    board.cut("unplug")
-    board.run(100.0)
-    board.frames.clear()
-    board.do("plug")
-    board.run(40.0)
-    (hello,) = board.take(HELLO)
-    assert hello[5:9] == bytes(4)
-    board.hello()
-    board.start()
-    assert [seq_of(sweep) for sweep in sweep_on(board, 5)] == list(range(5))
-
-
-def test_a_board_with_its_own_supply_goes_on_when_the_cable_comes_back(sweeping: Board) -> None:
-    board = sweeping
-    sweep_on(board, 2)
-    board.cut("detach")
-    board.run(300.0)
-    made = board.do("state")["sweeps"]
-    assert not board.do("state")["configured"]
-    board.frames.clear()
-    board.do("attach")
-    board.run(100.0)
-    assert board.do("state")["configured"]
-    assert board.do("state")["sweeps"] > made  # it swept all the while
-    assert all(serials(board.hello()))
-    board.start()
-    board.take(SWEEP)
-    assert [seq_of(sweep) for sweep in sweep_on(board, 5)] == list(range(5))

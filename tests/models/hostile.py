@@ -25,40 +25,6 @@ def external(folder: Path) -> Path:
     return path
 
 
-def endless(folder: Path) -> Path:
-    """A zoo model that counts for ever before it answers."""
-    import onnx
-    from onnx import TensorProto, helper
-
-    model, path = _zoo_model(), folder / "endless.onnx"
-    graph = model.graph
-    node = next(node for node in graph.node if "probability" in node.output)
-    node.output[0] = "sound"
-    body = helper.make_graph(
-        [
-            helper.make_node("Identity", ["go"], ["go_on"]),
-            helper.make_node("Add", ["x", "nothing"], ["y"]),
-        ],
-        "body",
-        [
-            helper.make_tensor_value_info("i", TensorProto.INT64, []),
-            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
-        ],
-        [helper.make_tensor("nothing", TensorProto.FLOAT, [], [0.0])],
-    )
-    graph.initializer.append(helper.make_tensor("ever", TensorProto.INT64, [], [2**62]))
-    graph.initializer.append(helper.make_tensor("yes", TensorProto.BOOL, [], [True]))
-    loop = helper.make_node("Loop", ["ever", "yes", "sound"], ["probability"], body=body)
-    graph.node.append(loop)
-    onnx.save_model(model, path)
-    return path
-
-
 def giant(folder: Path, side: int = 5000) -> Path:
     """A zoo model of a few bytes more that multiplies matrices of so many rows for minutes."""
     import onnx

@@ -87,15 +87,6 @@ def test_an_electrode_is_implausible_from_eight_conditional_deviations_on(
     assert marked.ravel()[30] == found
 
 
-def test_several_wrong_electrodes_are_found_although_each_hides_the_others() -> None:
-    mean, covariance, seen = correlated()
-    values = np.random.default_rng(5).multivariate_normal(mean, covariance)
-    wrong = [3, 4, 5, 40, 71]
-    values[wrong] += [700.0, 900.0, -800.0, 1200.0, -900.0]
-    marked = Electrodes(seen).implausible(values.reshape(SHAPE), NOTHING, 12)
-    assert np.flatnonzero(marked).tolist() == wrong
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_the_search_takes_out_the_worst_of_those_left_one_by_one(seed: int) -> None:
     mean, covariance, seen = correlated(seed)

@@ -126,9 +126,3 @@ def test_a_model_that_contradicts_its_contract_is_refused(
     onnx.save(model, path)
     with pytest.raises(ModelError, match=says):
         TactileModel(path)
-
-
-def test_the_zoo_names_what_it_has() -> None:
-    assert "cnn1" in zoo.names()
-    with pytest.raises(ModelError, match="there are: cnn1"):
-        zoo.find("cnn9")

@@ -78,19 +78,6 @@ def test_what_is_not_finite_changes_nothing() -> None:
     np.testing.assert_array_equal(session.mean, mean)
 
 
-def test_a_restored_session_goes_on_as_if_it_had_never_stopped() -> None:
-    whole, first, second = statistics(), statistics(), statistics()
-    rows = grasps(400)
-    observe(whole, rows)
-    observe(first, rows[:333])
-    kept = msgspec.json.encode(first.state())
-    second.restore(msgspec.json.decode(kept, type=SessionState))
-    observe(second, rows[333:])
-    assert second.grasps == 400
-    np.testing.assert_array_equal(second.mean, whole.mean)
-    np.testing.assert_array_equal(second.spread, whole.spread)
-
-
 def test_a_reset_session_is_a_new_one() -> None:
     session = statistics()
     observe(session, grasps(10))

@@ -155,13 +155,6 @@ def test_a_finger_does_not_touch_the_channel_of_another(counts: np.ndarray) -> N
         np.testing.assert_allclose(single[..., 0], whole[..., finger], atol=1e-6)
 
 
-def test_equal_electrodes_have_no_image() -> None:
-    image = np.ones((12, 11, 3), dtype=np.float32)
-    spread = TactileImager(3).build(np.full((3, 24), 3000, dtype=np.uint16), image)
-    assert (spread < 1e-9).all()
-    assert not image.any()
-
-
 def test_not_a_number_has_no_image() -> None:
     counts = np.tile(np.arange(24.0) * 100, (3, 1))
     counts[1, 5] = np.nan
@@ -171,17 +164,6 @@ def test_not_a_number_has_no_image() -> None:
     assert np.isnan(spread[1])
     assert not image[..., 1].any()
     assert np.isfinite(image).all()
-
-
-def test_batch_and_single_images_are_equal_to_the_bit() -> None:
-    counts = np.random.default_rng(1).integers(1, 4095, (50, 3, 24), dtype=np.uint16)
-    imager = TactileImager(3)
-    images, spreads = imager.build_batch(counts)
-    single = np.empty((12, 11, 3), dtype=np.float32)
-    for index, reading in enumerate(counts):
-        spread = TactileImager(3).build(reading, single)
-        assert (single == images[index]).all()
-        assert (spread == spreads[index]).all()
 
 
 @pytest.mark.parametrize("shape", [(12, 11, 2), (11, 12, 3), (396,)])

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import time
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -101,15 +100,12 @@ def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
         trial.load(path)
 
 
-@pytest.mark.parametrize("make", [hostile.external, hostile.endless])
 def test_what_is_not_the_model_alone_is_refused_without_being_loaded(
-    tmp_path: Path,
-    make: Callable[[Path], Path],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="needs the train extra")
-    path = make(tmp_path)
+    path = hostile.external(tmp_path)
     monkeypatch.chdir(tmp_path)
     for load in (trial.load, TactileModel):
-        with pytest.raises(ModelError, match=r"in another file|no model may use|within its graph"):
+        with pytest.raises(ModelError, match="in another file"):
             load(path)

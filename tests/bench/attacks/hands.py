@@ -7,7 +7,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -44,13 +44,6 @@ UP_S = 15.0
 """Longest wait for a daemon's first verdict, s."""
 
 
-@dataclass
-class Heard:
-    """Verdicts, in the order in which they came."""
-
-    verdicts: list[Verdict] = field(default_factory=list)
-
-
 @contextmanager
 def daemon_of(folder: Path, tactile: str, model: str, more: str = "") -> Iterator[Subscriber]:
     """A daemon that judges settled grasps, and who hears it."""
@@ -65,13 +58,16 @@ def daemon_of(folder: Path, tactile: str, model: str, more: str = "") -> Iterato
         daemon.terminate()
 
 
-def hear(subscriber: Subscriber, until: Callable[[Heard], bool], seconds: float) -> Heard:
+def hear(
+    subscriber: Subscriber, until: Callable[[list[Verdict]], bool], seconds: float
+) -> list[Verdict]:
     """Verdicts until a condition holds or the time is over."""
-    heard, end_s = Heard(), time.monotonic() + seconds
+    heard: list[Verdict] = []
+    end_s = time.monotonic() + seconds
     while time.monotonic() < end_s and not until(heard):
         message = subscriber.take(min(0.1, max(end_s - time.monotonic(), 0.0)))
         if message is not None:
-            heard.verdicts.append(decode_verdict(message[1]))
+            heard.append(decode_verdict(message[1]))
     return heard
 
 
@@ -102,8 +98,8 @@ def second_palm(plan: Plan) -> Outcome:
             hear(subscriber, never, 0.02)
             with sending(judged_counts(), port):
                 second = hear(subscriber, never, HELD_S)
-            told += len(second.verdicts)
-            stable += sum(verdict.valid for verdict in second.verdicts)
+            told += len(second)
+            stable += sum(verdict.valid for verdict in second)
     happened = f"{stable} of {told} verdicts on the second hand by the first one's tare"
     return Outcome(tried, happened, stable == 0 and told > 50 and known == tried)
 
@@ -168,18 +164,18 @@ def misread_serial(plan: Plan) -> Outcome:
             bridge(MisreadTwin(folder / "bridge", partial(operator.eq, wrong))),
             daemon_of(folder, tactile, "small-session", session) as subscriber,
         ):
-            heard = hear(subscriber, lambda heard: len(heard.verdicts) >= SPI_VERDICTS, UP_S)
-        wiped += kept_grasps(file) < KEPT_GRASPS or len(heard.verdicts) < SPI_VERDICTS
+            heard = hear(subscriber, lambda heard: len(heard) >= SPI_VERDICTS, UP_S)
+        wiped += kept_grasps(file) < KEPT_GRASPS or len(heard) < SPI_VERDICTS
     happened = f"{wiped} of {tried} kept sessions of {KEPT_GRASPS} grasps wiped"
     return Outcome(tried, happened, wiped == 0)
 
 
-def any_valid(heard: Heard) -> bool:
+def any_valid(heard: list[Verdict]) -> bool:
     """Whether something was judged."""
-    return bool(heard.verdicts) and heard.verdicts[-1].valid
+    return bool(heard) and heard[-1].valid
 
 
-def never(_heard: Heard) -> bool:
+def never(_heard: list[Verdict]) -> bool:
     return False
 
 

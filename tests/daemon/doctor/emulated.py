@@ -26,7 +26,7 @@ from drivers.twins.joints import JointTwin
 from drivers.twins.palm import PalmTwin
 from drivers.twins.spi import SpiTwin
 from tests.drivers.can.can_standin import StampingTwin, channel
-from tests.drivers.can.can_words import Clock
+from tests.kit.clock import Clock
 
 MS = 1_000_000
 FINGERS = ("ff", "mf", "th")

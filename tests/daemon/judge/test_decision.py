@@ -16,7 +16,7 @@ import pytest
 from daemon.judge import decision
 from daemon.judge.decision import HELD, Limits, decide
 from daemon.judge.reasons import Decision, Moment, Reason
-from tests.bench.mutants import mutants
+from tests.kit.mutants import mutants
 
 LIMIT_NS = 100
 THRESHOLD = 0.4

@@ -9,7 +9,8 @@ from drivers.can.decoders import CanDecoder, make_decoder
 from drivers.can.formats import CanFormat, SweepFrame, encode_sample
 from drivers.can.frames import ERROR, FD, REMOTE, CanFrame, unpack_frame
 from drivers.can.readings import CanCounters
-from tests.drivers.can.can_words import Clock, pack_frame, samples, truth, word
+from tests.drivers.can.can_words import pack_frame, samples, truth, word
+from tests.kit.clock import Clock
 
 SAMPLE_ID = 0x100
 
@@ -42,7 +43,7 @@ def sweep_frames(frame_format: CanFormat, sweep: int) -> list[CanFrame]:
             SweepFrame(
                 finger,
                 sweep % (1 << 16),
-                sweep,
+                10_000 * sweep,
                 b"".join(word(int(count)) for count in truth(sweep)[row]),
             ).to_bytes(),
             FD,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Self
 from unittest import mock
 
@@ -20,8 +20,9 @@ from drivers.kernel_stamps import SO_TIMESTAMPNS
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts
-from tests.drivers.can.can_words import Clock, pack_frame, samples
+from tests.drivers.can.can_words import pack_frame, samples
 from tests.drivers.twins.signals import GeneratedContact
+from tests.kit.clock import Clock
 
 MS = 1_000_000
 CHANNELS = itertools.count()
@@ -83,18 +84,6 @@ class ScriptedBus:
             raise self.shutdown_error
 
 
-@contextlib.contextmanager
-def bus_options(**options: object) -> Iterator[None]:
-    """Have python-can open its buses with these options too."""
-    real: Callable[..., object] = can.Bus
-
-    def open_bus(**given: object) -> object:
-        return real(**{**given, **options})
-
-    with mock.patch("drivers.can.bus.can.Bus", open_bus):
-        yield
-
-
 Opener = Callable[[], object]
 
 
@@ -148,7 +137,8 @@ class StampingTwin(CanTwin):
     """A twin whose frames are stamped by its own clock."""
 
     def open(self) -> None:
-        with bus_options(preserve_timestamps=True):
+        stamped = partial(can.Bus, preserve_timestamps=True)
+        with mock.patch("drivers.can.bus.can.Bus", stamped):
             super().open()
 
 

@@ -26,16 +26,6 @@ SLOT_NS = 227_000
 ELECTRODE_CHANNELS = range(E1, E1 + 24)
 
 
-class Clock:
-    """A clock that only moves when told to."""
-
-    def __init__(self, now_ns: int = 10_000_000_000) -> None:
-        self.now_ns = now_ns
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-
 def word(count: int) -> bytes:
     """`D11..D5 P  D4..D0 0 0 P`, odd parity."""
     bits = f"{count:012b}"

@@ -95,19 +95,6 @@ def test_an_id_that_was_heard_is_forgotten_with_the_link(configured: int | None)
     assert counters.foreign_frames == (configured is not None)
 
 
-def test_two_boards_on_one_bus_are_never_mixed() -> None:
-    made, counters = decoder(CanFormat.SYNTOUCH, None)
-    readings: list[TactileReading] = []
-    for sweep in range(10):
-        for one, other in zip(samples(sweep), samples(sweep + 100), strict=True):
-            for identifier, (channel, words, t_ns) in ((0x200, one), (0x201, other)):
-                readings += made.push(CanFrame(identifier, encode_sample(channel, words)), t_ns)
-    assert len(readings) == 10
-    for sweep, reading in enumerate(readings):
-        assert (reading.counts == truth(sweep)).all()
-    assert counters.foreign_frames == 240
-
-
 def test_a_board_that_pads_its_frames_is_read_when_told_so() -> None:
     made, counters = decoder(CanFormat.SYNTOUCH, data_length=8)
     readings: list[TactileReading] = []
@@ -126,15 +113,3 @@ def test_a_tick_that_stands_and_a_sweep_that_began_late_are_counted() -> None:
     assert (counters.stuck_ticks, counters.faulty_readings) == (6, 2)
     assert counters.overruns == 9
     assert counters.readings == 3
-
-
-def test_a_sensor_reported_absent_gives_no_counts() -> None:
-    made, counters = decoder(CanFormat.SWEEP_FD)
-    readings: list[TactileReading] = []
-    for finger, status in ((0, SweepStatus.ABSENT), (1, SweepStatus.NONE), (4, SweepStatus.NONE)):
-        sweep = SweepFrame(finger, 0, 0, word(2602) * 24, status)
-        frame = CanFrame(SAMPLE_ID + finger, sweep.to_bytes(), FD)
-        readings += made.push(frame, 0)
-    assert (readings[0].faults[0] != 0).all()
-    assert not readings[0].faults[1:].any()
-    assert counters.unplugged_words == 24

@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.can.formats import CanFormat, SweepFrame
-from drivers.can.frames import FD, CanFrame
-from drivers.link import LinkState
-from drivers.twins.can import SAMPLE_ID
+from drivers.can.formats import CanFormat
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts
-from tests.drivers.can.can_fuzz import decoder
+from tests.drivers.can.can_fuzz import decoder, sweep_frames
 from tests.drivers.can.can_standin import (
     TwinLink,
     contact,
 )
-from tests.drivers.can.can_words import truth, word
+from tests.drivers.can.can_words import truth
 
 MS = 1_000_000
 
@@ -63,23 +60,6 @@ def test_link_faults_are_counted_one_by_one_and_invent_nothing(
     assert_same_tail(link.readings, after)
 
 
-def truth_frames(sweep: int) -> list[CanFrame]:
-    """Sweep frames of the tagged counts, at 100 Hz by the board's clock."""
-    return [
-        CanFrame(
-            SAMPLE_ID + finger,
-            SweepFrame(
-                finger,
-                sweep,
-                10_000 * sweep,
-                b"".join(word(int(count)) for count in truth(sweep)[row]),
-            ).to_bytes(),
-            FD,
-        )
-        for row, finger in enumerate((0, 1, 4))
-    ]
-
-
 @pytest.mark.parametrize("spoiled_row", [0, 1, 2])
 def test_a_flipped_bit_of_a_sweep_frame_shows_and_invents_nothing(
     spoiled_row: int,
@@ -88,7 +68,7 @@ def test_a_flipped_bit_of_a_sweep_frame_shows_and_invents_nothing(
         made, counters = decoder(CanFormat.SWEEP_FD)
         readings: list[TactileReading] = []
         for sweep in range(100, 130):
-            for row, frame in enumerate(truth_frames(sweep)):
+            for row, frame in enumerate(sweep_frames(CanFormat.SWEEP_FD, sweep)):
                 data = bytearray(frame.data)
                 if (sweep, row) == (110, spoiled_row):
                     data[bit // 8] ^= 1 << bit % 8
@@ -149,26 +129,6 @@ def test_an_unplugged_sensor_is_missing_and_the_others_are_not(frame_format: str
     assert link.driver.counters.unplugged_words == 20 * 24
 
 
-@pytest.mark.parametrize("frame_format", FORMATS)
-def test_a_dead_electrode_reads_zero(frame_format: str) -> None:
-    link = TwinLink(frame_format)
-    with link.driver:
-        link.send(contact(5), LinkFaults(dead_electrodes=((2, 17),)))
-    for reading in link.readings:
-        assert reading.counts[2, 17] == 0
-        assert np.count_nonzero(reading.counts) == 3 * 24 - 1
-        assert not reading.faults.any()
-
-
-def test_another_version_of_the_layout_gives_no_reading() -> None:
-    link = TwinLink("sweep_fd")
-    with link.driver:
-        link.send(contact(5), LinkFaults(wrong_version=True))
-        assert link.readings == []
-        assert link.driver.counters.unknown_versions == 15
-        assert link.driver.link_state is LinkState.GREETING
-
-
 def test_a_stuck_clock_is_counted() -> None:
     link = TwinLink("sweep_fd")
     with link.driver:
@@ -177,16 +137,3 @@ def test_a_stuck_clock_is_counted() -> None:
     assert not link.readings[0].faults.any()
     assert len(link.readings) == 5
     assert all((reading.faults == ElectrodeFault.HELD).all() for reading in link.readings[1:])
-
-
-@pytest.mark.parametrize("frame_format", FORMATS)
-def test_sweeps_that_nobody_sent_in_between_are_missed(frame_format: str) -> None:
-    link = TwinLink(frame_format)
-    with link.driver:
-        link.send(contact(20))
-        link.clock.now_ns += 30 * MS
-        link.send(contact(1))
-    counters = link.driver.counters
-    missed = 3 if frame_format == "syntouch" else 0  # sweep frames say that none was made
-    assert counters.missed_readings == missed
-    assert link.readings[-1].seq == 20 + missed

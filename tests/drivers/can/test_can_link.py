@@ -28,7 +28,8 @@ from tests.drivers.can.can_standin import (
     sweep_of_frames,
     tactile,
 )
-from tests.drivers.can.can_words import Clock, truth
+from tests.drivers.can.can_words import truth
+from tests.kit.clock import Clock
 
 FRAMES_PER_DRAIN = 512
 POLL_NS = 1_000_000
@@ -141,15 +142,6 @@ def test_one_call_takes_a_bounded_number_of_frames(monkeypatch: pytest.MonkeyPat
             assert driver.due_ns() == clock.now_ns
         driver.read_ready()
         assert driver.counters.frames == 2 * FRAMES_PER_DRAIN + 5
-        assert driver.due_ns() == clock.now_ns + POLL_NS
-
-
-def test_a_bus_without_a_descriptor_is_polled_every_millisecond() -> None:
-    clock = Clock()
-    with bridge(channel(), clock=clock) as driver:
-        assert driver.fileno() is None
-        assert driver.due_ns() == clock.now_ns
-        driver.read_ready()
         assert driver.due_ns() == clock.now_ns + POLL_NS
 
 

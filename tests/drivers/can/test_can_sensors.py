@@ -12,7 +12,8 @@ from drivers.base import ElectrodeFault, TactileReading
 from drivers.can.driver import CanBridgeDriver
 from drivers.can.formats import encode_sample
 from tests.drivers.can.can_standin import ScriptedBus, bridge, channel, message, stand_in, tactile
-from tests.drivers.can.can_words import SLOT_NS, Clock, samples, truth
+from tests.drivers.can.can_words import SLOT_NS, samples, truth
+from tests.kit.clock import Clock
 
 ORDER = ("th", "ff", "mf")
 """The board's sensors: its first word is the thumb's."""

@@ -16,7 +16,6 @@ from drivers.can.driver import (
 )
 from drivers.can.formats import CanFormat
 from drivers.can.frames import ERROR, CanFrame
-from drivers.kernel_stamps import SO_RXQ_OVFL
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from tests.drivers.can.can_standin import (
@@ -28,7 +27,8 @@ from tests.drivers.can.can_standin import (
     sweep_of_frames,
     tactile,
 )
-from tests.drivers.can.can_words import Clock, pack_frame, truth
+from tests.drivers.can.can_words import pack_frame, truth
+from tests.kit.clock import Clock
 
 MS = 1_000_000
 
@@ -104,18 +104,6 @@ def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
             assert (counters.bus_off, counters.link_losses, counters.error_frames) == (1, 1, 1)
 
 
-def test_other_error_frames_are_counted_only(socket_bus: SocketBus) -> None:
-    with over_socket() as driver:
-        frames = sweep_of_frames(0)
-        frames.insert(9, CanFrame(0x080, bytes(8), ERROR))
-        for frame in frames:
-            socket_bus.send(frame)
-        (reading,) = tactile(driver.read_ready())
-        assert not reading.faults.any()
-        assert (driver.counters.error_frames, driver.counters.controller_overflows) == (1, 0)
-        assert driver.link_state is LinkState.UP
-
-
 def test_an_overflow_of_the_controller_cuts_the_sweep_there(socket_bus: SocketBus) -> None:
     with over_socket() as driver:
         frames = sweep_of_frames(0)
@@ -157,31 +145,6 @@ def test_an_interface_that_goes_down_is_a_link_fault(monkeypatch: pytest.MonkeyP
             assert driver.link_state is LinkState.WAITING
             assert driver.stream.last_error is not None
             assert "Network is down" in driver.stream.last_error
-
-
-def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """UDP stands in: its sockets report drops in the same way as CAN sockets."""
-    bus = ScriptedBus()
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as near,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far,
-    ):
-        near.bind(("127.0.0.1", 0))
-        far.connect(near.getsockname())
-        bus.socket = near  # type: ignore[attr-defined]
-        stand_in(monkeypatch, lambda: bus)
-        with over_socket() as driver:
-            assert near.getsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL) == 1
-            near.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
-            record = pack_frame(CanFrame(0x7FF, b""))
-            for _ in range(200):
-                far.send(record)
-            driver.read_ready()
-            far.send(record)
-            driver.read_ready()
-            counters = driver.counters
-            assert counters.kernel_drops > 0
-            assert counters.frames + counters.kernel_drops == 201
 
 
 def test_frames_that_the_kernel_dropped_cut_the_sweep_there(

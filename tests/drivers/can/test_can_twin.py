@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import can
-import numpy as np
 import pytest
 
 from drivers.base import DriverError, TactileReading
@@ -18,11 +16,10 @@ from drivers.twins.faults import LinkFaults
 from tests.drivers.can.can_standin import (
     bridge,
     channel,
-    contact,
     tactile,
 )
-from tests.drivers.can.can_words import Clock
 from tests.drivers.twins.signals import GeneratedContact
+from tests.kit.clock import Clock
 
 MS = 1_000_000
 
@@ -67,24 +64,6 @@ def test_a_twin_serves_at_its_rate_until_stopped(monkeypatch: pytest.MonkeyPatch
     assert elapsed_ns == pytest.approx(290 * MS, rel=0.2)
 
 
-def test_a_twin_ends_with_its_counts_and_mends_its_link() -> None:
-    faults = LinkFaults(disconnect_every_frames=30)
-    where = channel()
-    twin = CanTwin(
-        "virtual", where, iter(contact(2)), sequence="electrodes", faults=faults, rate_hz=25.0
-    )
-    with bridge(where) as driver, twin:
-        twin.serve(threading.Event())
-        readings = tactile(driver.read_ready())
-    assert twin.injected["disconnect"] == 1
-    assert twin.frames_sent == 47
-    came = Counter(e for r in readings for e in np.flatnonzero(r.faults[0] == 0).tolist())
-    assert came == {electrode: 2 - (electrode == 5) for electrode in range(24)}
-    before = [reading for reading in readings if reading.faults[0, 4] == 0][-1]
-    assert before.faults[0, 5:].all()
-    assert readings[-1].faults[0, :6].all()
-
-
 @pytest.mark.parametrize("make", [CanTwin, CanBridgeDriver], ids=["twin", "driver"])
 def test_a_package_that_is_missing_is_named(
     monkeypatch: pytest.MonkeyPatch, make: Callable[..., CanTwin | CanBridgeDriver]
@@ -116,12 +95,3 @@ def test_packages_are_named_as_they_are_installed(
     monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
     with pytest.raises(DriverError, match=f"pip install {package}$"):
         CanTwin("slcan", "/dev/null", iter(())).open()
-
-
-def test_a_library_that_does_not_work_here_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: object) -> object:
-        raise can.CanInterfaceNotImplementedError("Windows only")
-
-    monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
-    with pytest.raises(DriverError, match="does not work here: Windows only"):
-        CanTwin("vector", "0", iter(())).open()

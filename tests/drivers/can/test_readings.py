@@ -37,23 +37,6 @@ def test_what_was_missed_leaves_a_gap_in_the_numbers() -> None:
     assert (made.seq, counters.missed_readings) == (7, 7)
 
 
-@pytest.mark.parametrize(
-    ("late_ns", "sweeps"),
-    # The fastest board takes 0.1 ms a sample, so 2.4 ms a sweep: three quarters are 1.8 ms.
-    [(1_900_000 - 1, 1), (1_900_000, 2)],
-)
-def test_before_the_period_is_known_it_is_taken_for_that_of_the_fastest_board(
-    late_ns: int, sweeps: int
-) -> None:
-    made, counters = assembler()
-    first, *rest = samples(0)
-    readings = list(made.push(*first))
-    for channel, words, t_ns in rest:
-        readings += made.push(channel, words, first[2] + late_ns + t_ns - SLOT_NS)
-    assert len(readings) == sweeps
-    assert counters.lost_frames == (0 if sweeps == 1 else 24)
-
-
 def missed_when_late(number: int, late_ns: int) -> int:
     """Sweeps said to be missed when after `number` of them all samples come so late."""
     made, counters = assembler()

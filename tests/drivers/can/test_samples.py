@@ -27,7 +27,6 @@ OUTAGE_NS = 2_000_000_000
 PERIODS_NEEDED = 5
 
 MISSING = ElectrodeFault.MISSING
-SWEEP_NS = 24 * SLOT_NS
 
 
 def feed(sweeps: SampleAssembler, stream: Iterable[Sample]) -> list[TactileReading]:
@@ -85,33 +84,6 @@ def test_a_lost_sample_flags_its_electrode_and_shifts_no_other(lost: int, timed:
         assert_true(reading, sweep)
     assert counters.lost_frames == counters.faulty_readings == 1
     assert counters.missed_readings == 0
-
-
-@pytest.mark.parametrize("burst", [2, 5, 12, 23])
-@pytest.mark.parametrize("first", [0, 11, 20])
-def test_a_burst_of_lost_samples_never_mixes_two_sweeps(first: int, burst: int) -> None:
-    sweeps, counters = assembler()
-    stream = concatenated([samples(n) for n in range(10)])
-    start = 7 * 24 + first
-    readings = feed(sweeps, stream[:start] + stream[start + burst :])
-    assert len(readings) == 10
-    for sweep, reading in enumerate(readings):
-        assert_true(reading, sweep)
-    assert counters.lost_frames == burst
-    assert [reading.seq for reading in readings] == list(range(10))
-
-
-@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("lost", [1, 2, 7])
-def test_sweeps_lost_as_a_whole_are_found_by_time(sequence: str, lost: int) -> None:
-    sweeps, counters = assembler(sequence)
-    before = [samples(n, sequence) for n in range(10)]
-    after = [samples(n, sequence) for n in range(10 + lost, 20 + lost)]
-    readings = feed(sweeps, concatenated(before + after))
-    assert len(readings) == 20
-    assert readings[10].seq == readings[9].seq + 1 + lost
-    assert counters.missed_readings == lost
-    assert counters.faulty_readings == 0
 
 
 @pytest.mark.parametrize("at", range(24))

@@ -212,19 +212,6 @@ def running(sweeps: FrameAssembler, sweep: int) -> int:
     return sweep * PERIOD_NS
 
 
-def test_a_finger_that_was_lacking_for_two_periods_is_of_another_sweep() -> None:
-    sweeps, counters = frame_sweeps()
-    due_ns = running(sweeps, 9)
-    push(sweeps, 0, 9, due_ns)
-    push(sweeps, 1, 9, due_ns)
-    (before,) = push(sweeps, 2, 9, due_ns + 2 * PERIOD_NS + 1)
-    assert (before.faults[2] == MISSING).all()
-    assert not before.faults[:2].any()
-    (after,) = push(sweeps, 0, 10, due_ns + 3 * PERIOD_NS)
-    assert (after.faults[:2] == MISSING).all()
-    assert counters.restarts == 1
-
-
 def test_a_frame_with_the_number_at_hand_and_another_tick_is_dropped() -> None:
     sweeps, counters = frame_sweeps()
     whole(sweeps, 2)
@@ -246,19 +233,6 @@ def test_a_tick_that_runs_backwards_is_a_new_start_and_its_wrap_is_none() -> Non
     assert (counters.restarts, counters.missed_readings) == (1, 1)
 
 
-def test_finger_faults_hold_for_all_its_electrodes() -> None:
-    sweeps, counters = frame_sweeps()
-    words = word(2602) * 24
-    sweeps.push(0, 0, 0, words, ElectrodeFault.MISSING, 0)
-    sweeps.push(1, 0, 0, words, ElectrodeFault.HELD, 0)
-    (reading,) = sweeps.push(2, 0, 0, words, 0, 0)
-    assert (reading.faults[0] == ElectrodeFault.MISSING).all()
-    assert not reading.counts[0].any()
-    assert (reading.faults[1] == ElectrodeFault.HELD).all()
-    assert not reading.faults[2].any()
-    assert (counters.faulty_readings, counters.unplugged_words) == (1, 24)
-
-
 def test_an_interrupted_frame_sweep_is_missed() -> None:
     sweeps, counters = frame_sweeps()
     (before,) = whole(sweeps, 0)
@@ -276,13 +250,6 @@ def test_no_period_is_learned_from_an_outage(gap_ns: int, learned: bool) -> None
     for sweep in range(PERIODS_NEEDED + 1):
         whole(sweeps, sweep, 1 + sweep * gap_ns)
     assert sweeps.period_ns == (gap_ns if learned else None)
-
-
-def test_the_frame_period_is_learned() -> None:
-    sweeps, _ = frame_sweeps()
-    for sweep in range(PERIODS_NEEDED + 1):
-        whole(sweeps, sweep, sweep * 10_000_000)
-    assert sweeps.period_ns == 10_000_000
 
 
 def test_no_period_is_learned_from_sweeps_that_were_lost_or_of_two_starts() -> None:

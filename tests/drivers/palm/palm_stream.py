@@ -20,22 +20,20 @@ from drivers.palm.stream import PalmStream
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.palm import PalmTwin
 from drivers.udp.receiver import Datagram, DatagramReceiver
+from tests.kit.clock import Clock
 
 FINGERS = ("ff", "mf", "th")
 MS = 1_000_000
 ROUND = 14
 
 
-class Clock:
-    """A clock that only moves when told to."""
+class DatagramClock(Clock):
+    """A clock that also says how old datagrams are."""
 
     def __init__(self) -> None:
-        self.now_ns = 10**12
+        super().__init__()
         self.age_ns = 0
         """Of each datagram that is received."""
-
-    def __call__(self) -> int:
-        return self.now_ns
 
     def rule(self, patch: pytest.MonkeyPatch) -> None:
         """Let datagrams be as old as this clock says: the kernel's stamps tell when a busy machine

@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.base import COUNT_MAX, ElectrodeFault
-from drivers.palm.driver import PalmDriver
+from drivers.base import COUNT_MAX
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import (
     MS,
     ROUND,
-    Clock,
     Played,
-    Sender,
     play,
     row_of,
     rows,
-    tactile,
 )
 
 ROUNDS = 300
@@ -88,14 +84,6 @@ def test_a_flipped_bit_is_seen_or_stays_within_the_range_of_a_count() -> None:
     assert len(played.readings) > 0.95 * ROUNDS
 
 
-def test_a_finger_pulled_out_has_no_electrode_left() -> None:
-    played, _, _ = run(LinkFaults(unplugged_fingers=(0, 2)))
-    assert played.counters.absent_fingers == 2 * ROUNDS
-    for reading in played.readings:
-        assert (reading.faults[[0, 2]] == ElectrodeFault.MISSING).all()
-        assert not reading.faults[1].any()
-
-
 def test_after_the_link_broke_readings_are_sound_within_two_rounds() -> None:
     played, twin, cycles = run(LinkFaults(disconnect_every_frames=1000))
     broken = twin.injected["disconnect"]
@@ -107,27 +95,3 @@ def test_after_the_link_broke_readings_are_sound_within_two_rounds() -> None:
         later = [reading.t_ns for reading in played.sound() if reading.t_ns >= index * MS]
         assert later[0] - index * MS < 2 * ROUND * MS
     expect_truth(played)
-
-
-@pytest.mark.parametrize("into_round", [0, 1, 7, 13])
-def test_a_second_palm_after_silence_is_never_mixed_in(
-    monkeypatch: pytest.MonkeyPatch, into_round: int
-) -> None:
-    """The first one breaks off in a round, the second is heard from anywhere in one of its own."""
-    clock, hands = Clock(), (rows(4, seed=1), rows(4, seed=2))
-    clock.rule(monkeypatch)
-    with (
-        PalmDriver("udp://127.0.0.1:0", clock=clock) as driver,
-        Sender(driver) as first,
-        Sender(driver) as second,
-    ):
-        for sender, hand in zip((first, second), hands, strict=True):
-            sent = [packet.to_bytes() for packet in PalmTwin(hand).packets()]
-            sender.send(*sent[into_round : 3 * ROUND + into_round])
-            readings = tactile(driver.read_ready())
-            assert len(readings) >= 2
-            assert all(row_of(reading, hand) is not None for reading in readings)
-            assert not any(reading.faults.any() for reading in readings)
-            assert driver.serials["ff"] == f"udp://127.0.0.1:{sender.port}"
-            clock.now_ns += PalmDriver.silence_ns
-            assert driver.read_ready() == []

@@ -24,7 +24,7 @@ from drivers.recordings.serial_log import (
 )
 from drivers.spi.line import LineEvent
 from drivers.spi.messages import FrameParser
-from tests.drivers.can.can_words import Clock
+from tests.kit.clock import Clock
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
 

@@ -13,7 +13,8 @@ from drivers.palm.packet import Palm
 from drivers.recordings.link_log_player import LinkLogDriver
 from drivers.recordings.palm_file import PalmFile
 from drivers.twins.palm import PalmTwin
-from tests.drivers.palm.palm_stream import MS, Clock, datagrams, rows, tactile
+from tests.drivers.palm.palm_stream import MS, datagrams, rows, tactile
+from tests.kit.clock import Clock
 
 
 def player(path: Path, clock: Clock) -> tuple[PalmFile, LinkLogDriver[bytes]]:

@@ -10,7 +10,8 @@ import pytest
 
 from drivers.base import JointReading, RecordingError
 from drivers.recordings.player import RecordedDriver
-from tests.drivers.palm.palm_stream import MS, Clock
+from tests.drivers.palm.palm_stream import MS
+from tests.kit.clock import Clock
 
 RECORDED_NS = (500 * MS, 510 * MS, 530 * MS)
 

@@ -21,21 +21,12 @@ from drivers.link import LinkState
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.messages import DIGEST, FrameParser, Hello, Message, Ping, Sweep, decode, encode
 from drivers.twins.spi import SpiTwin
+from tests.kit.clock import Clock
 
 MS = 1_000_000
 FINGERS = ("ff", "mf", "th")
 PATIENCE_S = 100.0
 """Real time that a test waits for bytes that must come."""
-
-
-class Clock:
-    """A clock that only moves when told to."""
-
-    def __init__(self, now_ns: int = 1_000_000 * MS) -> None:
-        self.now_ns = now_ns
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 class ScriptedBridge:

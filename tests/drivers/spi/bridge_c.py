@@ -64,10 +64,6 @@ def ask(probe: Path, requests: Sequence[str]) -> list[str]:
     return answers
 
 
-def hexed(data: bytes) -> str:
-    return data.hex() or "-"
-
-
 def frame(kind: int, payload: bytes = b"", digest: int = DIGEST) -> bytes:
     """A frame with its zero, computed with zlib and cobs alone."""
     body = bytes([kind]) + payload

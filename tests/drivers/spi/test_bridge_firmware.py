@@ -134,9 +134,6 @@ def test_exactly_the_4096_response_words_are_sound(bridge_probe: Path) -> None:
     assert not sound & {*ERROR_WORDS, 0x0000, 0xFFFF}
 
 
-SIZES = (0, 1, 2, 252, 253, 254, 255, 256, 507, 508, 509, 510, 668, 762, 763)
-
-
 def test_every_frame_agrees_with_an_independent_computation(bridge_probe: Path) -> None:
     rng = random.Random(3)
     requests, expected = [], []
@@ -162,19 +159,6 @@ def test_every_frame_agrees_with_an_independent_computation(bridge_probe: Path) 
         expected += [frame(HELLO, hello), frame(SWEEP, sweep), frame(STATUS, status)]
     assert ask(bridge_probe, requests) == [one.hex() for one in expected]
     assert max(map(len, expected)) <= 672
-
-
-@pytest.mark.parametrize(
-    ("slots", "sensors", "payload", "line"),
-    [(24, 3, 167, 174), (54, 3, 347, 355), (64, 5, 663, 672)],
-)
-def test_a_sweep_takes_the_documented_bytes(
-    bridge_probe: Path, slots: int, sensors: int, payload: int, line: int
-) -> None:
-    words = bytes.fromhex("A251") * (slots * sensors)
-    assert 23 + len(words) == payload
-    answer = ask(bridge_probe, [f"sweep 1 2 3 1 {sensors} {slots} {words.hex()}"])[0]
-    assert len(bytes.fromhex(answer)) == line
 
 
 def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(

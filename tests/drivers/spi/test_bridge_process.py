@@ -247,18 +247,3 @@ def test_the_driver_reads_no_finger_that_is_read_too_early(start_bridge: StartBr
     for reading in read(host.path, 5):
         assert (reading.faults[:2] == 0).all()
         assert (reading.faults[2] != 0).all()
-
-
-def test_the_driver_finds_a_bridge_that_was_replaced(
-    start_bridge: StartBridge, tmp_path: Path
-) -> None:
-    link = tmp_path / "bridge"
-    first = start_bridge("--link", link, "--period-us", 4000)
-    with SpiBridgeDriver(str(link), FINGERS) as driver:
-        before = drive(driver, lambda readings: len(readings) >= 20, 10.0)
-        first.stop()
-        start_bridge("--link", link, "--period-us", 4000)
-        after = drive(driver, lambda readings: len(readings) >= 100, 20.0)
-    assert driver.counters.link_losses == 1
-    assert after[-1].seq > before[-1].seq
-    assert not after[-1].faults.any()

@@ -31,6 +31,7 @@ from drivers.spi.messages import (
     layout_of,
 )
 from tests.conftest import ROOT
+from tests.drivers.spi.bridge_c import frame
 
 ENCODED_MAX_BYTES = 1024
 """As the document says."""
@@ -55,37 +56,6 @@ SWEEP = Sweep(
 STATUS = BridgeStatus(1 << 40, 70_000, 1, 2, 3, (4, 5, 6))
 
 
-def slow_crc32(data: bytes, start: int = 0) -> int:
-    """CRC-32 bit by bit, from its definition."""
-    crc = start ^ 0xFFFFFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
-    return crc ^ 0xFFFFFFFF
-
-
-def slow_cobs(data: bytes) -> bytes:
-    """COBS from its definition (Cheshire and Baker 1999): blocks of at most 254 bytes."""
-    encoded, block, block_open = bytearray(), bytearray(), True
-    for byte in data:
-        block_open = True
-        if byte:
-            block.append(byte)
-        if not byte or len(block) == 254:
-            encoded += bytes([len(block) + 1]) + block
-            block.clear()
-            block_open = not byte
-    if block_open:
-        encoded += bytes([len(block) + 1]) + block
-    return bytes(encoded)
-
-
-def slow_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
-    body = bytes([kind]) + payload
-    return slow_cobs(body + slow_crc32(body, digest).to_bytes(4, "little")) + b"\0"
-
-
 # The check value of CRC-32 is that of "123456789"; the other bytes are COBS by hand.
 @pytest.mark.parametrize(
     ("kind", "payload", "wire"),
@@ -104,7 +74,7 @@ def test_a_frame_has_its_golden_bytes(kind: int, payload: bytes, wire: str) -> N
 def test_frames_are_those_of_an_independent_encoder(length: int) -> None:
     for content in (bytes(length), b"\xff" * length, random.Random(length).randbytes(length)):
         wire = encode_frame(0x02, content, DIGEST)
-        assert wire == slow_frame(0x02, content, DIGEST)
+        assert wire == frame(0x02, content, DIGEST)
         assert FrameParser(DIGEST).feed(wire) == [(0x02, content)]
 
 
@@ -128,7 +98,7 @@ def test_a_frame_of_another_layout_fails_unless_its_type_has_none() -> None:
     assert parser.feed(encode_frame(0x02, b"abc")) == []
     assert parser.counters.bad_crc == 2
     for kind in (0x01, 0x81):
-        assert parser.feed(slow_frame(kind, b"abc")) == [(kind, b"abc")]
+        assert parser.feed(frame(kind, b"abc")) == [(kind, b"abc")]
     assert parser.feed(encode_frame(0x02, b"abc", 0x1234)) == [(0x02, b"abc")]
 
 
@@ -147,17 +117,6 @@ def test_damage_is_counted_and_the_next_frame_is_found(wire: str, counter: str) 
     assert parser.feed(bytes.fromhex(wire)) == []
     assert getattr(parser.counters, counter) == 1
     assert parser.feed(encode_frame(0x31, b"next")) == [(0x31, b"next")]
-
-
-def test_a_frame_with_a_flipped_bit_is_never_another_frame() -> None:
-    wire = encode_frame(0x02, bytes(range(40)), DIGEST)
-    good = encode_frame(0x03, b"next", DIGEST)
-    for bit in range(8 * len(wire)):
-        damaged = bytearray(wire)
-        damaged[bit // 8] ^= 1 << bit % 8
-        parser = FrameParser(DIGEST)
-        assert parser.feed(bytes(damaged)) == []
-        assert parser.feed(b"\0" + good) == [(0x03, b"next")]
 
 
 def test_an_overlong_frame_is_dropped_and_never_held() -> None:
@@ -194,7 +153,7 @@ def test_schema_and_digest_are_those_of_the_document() -> None:
     document = DOCUMENT.read_text(encoding="utf-8")
     _, schema, _ = re.split(r"^-{60,}\n", document, flags=re.MULTILINE)
     assert schema == SCHEMA
-    assert slow_crc32(schema.encode()) == DIGEST == zlib.crc32(schema.encode())
+    assert zlib.crc32(schema.encode()) == DIGEST
     assert f"**0x{DIGEST:08X}**" in document
 
 
@@ -239,8 +198,7 @@ def test_a_message_has_its_golden_bytes_and_comes_back(
     assert back.to_bytes() == wire
     if not isinstance(message, Sweep):
         assert back == message
-    seed = 0 if kind in (0x01, 0x81) else DIGEST
-    assert encode(message) == slow_frame(kind, wire, seed)
+    assert encode(message) == frame(kind, wire)
     assert FrameParser(DIGEST).feed(encode(message)) == [(kind, wire)]
     for length in range(len(wire)):
         assert decode(kind, wire[:length]) is None
@@ -381,14 +339,3 @@ def test_encoding_refuses_what_the_protocol_forbids(
     replace: Any = msgspec.structs.replace if isinstance(message, Sweep) else dataclasses.replace
     with pytest.raises(ValueError, match=r"protocol|format|at most|range"):
         encode(replace(message, **{field: value}))
-
-
-def test_random_payloads_never_raise() -> None:
-    seed = random.SystemRandom().randrange(1 << 32)
-    rng = random.Random(seed)
-    for _ in range(5_000):
-        payload = rng.randbytes(rng.randrange(200))
-        for kind in (0x01, 0x02, 0x03, 0x81, 0x82, 0x83):
-            message = decode(kind, payload)
-            if message is not None:
-                assert message.to_bytes() == payload or isinstance(message, Hello), seed

@@ -8,7 +8,6 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -18,16 +17,8 @@ from drivers.link import LinkState
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.line import SerialLine
 from drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
-from tests.drivers.spi.bridge_bench import (
-    FINGERS,
-    MS,
-    Clock,
-    Rig,
-    ScriptedBridge,
-    hello,
-    sweep,
-    take,
-)
+from tests.drivers.spi.bridge_bench import FINGERS, MS, Rig, ScriptedBridge, hello, sweep, take
+from tests.kit.clock import Clock
 
 
 @pytest.fixture
@@ -119,20 +110,6 @@ def test_a_bridge_with_too_few_sensors_is_refused(rig: Rig) -> None:
     assert rig.driver.counters.refused_bridges == 1
 
 
-def test_a_hello_that_was_damaged_is_asked_for_again(rig: Rig) -> None:
-    rig.driver.open()
-    (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
-    damaged = bytearray(encode(hello(ping.nonce)))
-    damaged[20] ^= 0x40
-    rig.bridge.send(bytes(damaged))
-    take(rig.driver, rig.bridge)
-    rig.wait(500)
-    for taken in (0, 1):
-        (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
-        rig.bridge.send(hello(ping.nonce), sweep(0, 100))
-        assert len(take(rig.driver, rig.bridge)) == taken
-
-
 def test_a_board_that_was_reset_by_opening_it_is_asked_again_at_once(rig: Rig) -> None:
     rig.driver.open()
     rig.bridge.heard(Ping)
@@ -172,25 +149,6 @@ def test_a_bridge_that_changes_its_sampling_is_greeted_again(rig: Rig) -> None:
     rig.bridge.send(hello(ping.nonce, 60_000, channels=SEQUENCE_ALL))
     take(rig.driver, rig.bridge)
     assert rig.driver.conversation.link.reason == "the bridge changed what it samples"
-
-
-def test_a_device_that_is_not_there_is_tried_again_with_growing_patience(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    clock = Clock()
-    port = str(tmp_path / "gone")
-    with caplog.at_level(logging.DEBUG), SpiBridgeDriver(port, FINGERS, clock=clock) as driver:
-        waits_ms = []
-        for _ in range(9):
-            due_ns = driver.due_ns()
-            assert due_ns is not None
-            waits_ms.append((due_ns - clock.now_ns) / MS)
-            clock.now_ns = due_ns
-            assert driver.read_ready() == ()
-        assert driver.conversation.link.reason == f"{port}: no such file or directory"
-    assert waits_ms == sorted(waits_ms)
-    assert (waits_ms[0], waits_ms[-1]) == (50, 1000)
-    assert [r.levelname for r in caplog.records].count("WARNING") == 1
 
 
 def test_a_port_that_another_program_has_is_said(rig: Rig) -> None:

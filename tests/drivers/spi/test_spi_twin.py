@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import random
-import select
-import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,17 +12,15 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from drivers.base import ElectrodeFault, TactileReading
+from drivers.base import TactileReading
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.messages import DIGEST
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.spi import SpiTwin
 from tests.conftest import data_dir
-from tests.drivers.spi.bridge_bench import FINGERS, MS, PATIENCE_S, Clock, replug_times_s, run
+from tests.drivers.spi.bridge_bench import FINGERS, replug_times_s, run
 from tests.drivers.twins.signals import GeneratedContact
-
-"""One latency timer of a USB serial adapter, 16 ms, and 4 ms for the rest."""
 
 SWEEPS = 600
 REPLUGS = 10
@@ -73,32 +69,6 @@ def test_a_real_recording_comes_out_count_for_count(tmp_path: Path, untouched: P
     assert (counters.readings, counters.missed_readings, counters.faulty_readings) == (977, 0, 0)
     assert counters.bad_cobs == counters.bad_crc == counters.too_long == 0
     assert counters.clock_faults == counters.clock_fallbacks == 0
-
-
-def test_at_its_rate_readings_come_in_time_and_are_young(tmp_path: Path) -> None:
-    clock, wire = Clock(), bytearray()
-    source, path = GeneratedContact(3), tmp_path / "b"
-    twin = SpiTwin(path, source, rate_hz=100.0, drift_ppm=80.0, clock=clock, tap=wire.extend)
-    ages_ms: list[float] = []
-    readings: list[TactileReading] = []
-    with twin, SpiBridgeDriver(str(path), FINGERS, clock=clock) as driver:
-        patient_until_s = time.monotonic() + PATIENCE_S
-        while len(readings) < 100:
-            assert time.monotonic() < patient_until_s, driver.counters
-            clock.now_ns += MS
-            sent = len(wire)
-            twin.run_once()
-            descriptor = driver.fileno()
-            if len(wire) > sent and descriptor is not None:
-                select.select([descriptor], [], [], 1.0)  # the terminal takes its time
-            found = [r for r in driver.read_ready() if isinstance(r, TactileReading)]
-            ages_ms += [(clock.now_ns - reading.t_ns) / MS for reading in found]
-            readings += found
-        assert driver.period_ns == 10 * MS
-    periods_ms = np.diff([reading.t_ns for reading in readings]) / MS
-    assert periods_ms.mean() == pytest.approx(10.0, abs=0.3)
-    assert min(ages_ms) >= 0.0
-    assert np.median(ages_ms) < 10.0
 
 
 def damaged_pieces(wire: bytes) -> int:
@@ -166,23 +136,6 @@ def test_faults_are_counted_one_by_one_and_no_reading_is_invented(
         assert lost == 0
 
 
-def test_a_dead_electrode_and_an_unplugged_finger_are_where_they_are(tmp_path: Path) -> None:
-    rows = generated(100)
-    faults = LinkFaults(dead_electrodes=((0, 7), (2, 17)), unplugged_fingers=(1,))
-    _, driver, readings, _ = together(tmp_path, rows, faults)
-    assert len(readings) == 100
-    for reading, row in zip(readings, rows, strict=True):
-        assert reading.counts[0, 7] == reading.counts[2, 17] == 0
-        assert (reading.faults[1] == ElectrodeFault.MISSING).all()
-        assert not reading.faults[[0, 2]].any()
-        same = reading.counts == row
-        same[0, 7] = same[2, 17] = True
-        assert same[[0, 2]].all()
-    assert driver.counters.absent_sensors == 100
-    assert driver.conversation.hello is not None
-    assert driver.conversation.hello.serials[1] == ""
-
-
 def test_a_link_that_breaks_in_the_middle_of_a_frame_comes_back(tmp_path: Path) -> None:
     faults = LinkFaults(disconnect_every_frames=40)
     rows = generated(100_000 // 24)
@@ -230,16 +183,3 @@ def test_a_source_without_counts_and_a_rate_of_nothing_are_refused(tmp_path: Pat
         SpiTwin(tmp_path / "b", empty)
     with pytest.raises(ValueError, match="rate_hz"):
         SpiTwin(tmp_path / "b", generated(1), rate_hz=0.0)
-
-
-def test_a_host_that_does_not_read_loses_whole_frames_and_is_told(tmp_path: Path) -> None:
-    rows = generated(5000)
-    twin = SpiTwin(tmp_path / "b", rows, rate_hz=20_000.0)
-    with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
-        run(twin, driver, lambda readings: len(readings) >= 3)
-        while twin.tx_dropped < 100:
-            twin.run_once()
-        readings = run(twin, driver, lambda _: driver.counters.missed_readings > 0)
-        for reading in readings:
-            assert np.array_equal(reading.counts, rows[reading.seq])
-        assert driver.counters.bad_cobs == driver.counters.bad_crc == 0

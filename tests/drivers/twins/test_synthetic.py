@@ -54,19 +54,6 @@ def test_the_demo_day_is_made_again_byte_for_byte_and_called_synthetic(tmp_path:
         assert all(row["object"].startswith("synthetic") for row in csv.DictReader(file))
 
 
-def test_a_day_begins_as_ever_drifts_and_then_stays() -> None:
-    model = synthetic.read_model()
-    day = synthetic.draw_day(model, np.random.default_rng(3), 3000)
-    drawn = synthetic.draw(model, np.random.default_rng(3), 3000)
-    np.testing.assert_array_equal(day.slipped, drawn.slipped)
-    np.testing.assert_array_equal(day.counts[0], drawn.counts[0])
-    moved = (day.counts.astype(float) - drawn.counts).reshape(10, 300, 72).mean(axis=1)
-    far = np.abs(moved).mean(axis=1)
-    assert (np.diff(far[:6]) > 0.0).all()
-    assert far[-1] > 60.0
-    np.testing.assert_allclose(far[6:], far[6], rtol=0.1)  # the gain is on other grasps
-
-
 def test_the_demo_is_small_labelled_and_called_synthetic() -> None:
     assert DEMO_TABLE.stat().st_size < 120_000
     with DEMO_TABLE.open(newline="") as file:

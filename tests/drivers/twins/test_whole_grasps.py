@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.twins.grasps import whole_grasps
-from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
+from drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.grasps.whole_grasps import (
     GraspRow,
@@ -21,7 +21,7 @@ from drivers.twins.grasps.whole_grasps import (
     synthetic_grasps,
 )
 from tests.drivers.recordings.tables import rows_of
-from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
+from tests.drivers.twins.signals import fresh_residuals, played, read_end_points
 
 REST = np.full((3, 24), 3000.0)
 SILENCE = np.zeros((1, 3, 24))
@@ -63,37 +63,6 @@ def test_every_grasp_passes_through_all_phases_in_order(
     assert {(m.slipped, m.object_name) for m in moments if m.grasp == 0} == {(None, None)}
 
 
-def test_nothing_deviates_from_the_rest_before_a_finger_touches(
-    silent: tuple[list[GraspRow], list[Timetable]],
-) -> None:
-    moments, timetables = silent
-    for finger in range(3):
-        free = [
-            moment.counts[finger]
-            for moment, timetable in ((m, timetables[m.grasp - 1]) for m in moments if m.grasp)
-            if moment.t_s <= timetable.touched_s[finger] or moment.t_s >= timetable.open_s
-        ]
-        assert (np.array(free) == 3000).all()
-
-
-def test_the_creep_falls_to_a_rate_when_the_timetable_says(
-    silent: tuple[list[GraspRow], list[Timetable]],
-) -> None:
-    moments, timetables = silent
-    times = np.array([moment.t_s for moment in moments])
-    for timetable in timetables:
-        for rate in (100.0, 30.0):
-            when_s = crept_s(timetable, rate)
-            assert timetable.closed_s < when_s < timetable.lift_s
-            middle = int(np.searchsorted(times, when_s))
-            window = counts_of(moments[middle - 20 : middle + 21])
-            measured = np.abs(window[-1] - window[0]).mean() / 0.04
-            # Whole counts over 40 ms: the mean of 72 electrodes is good to some counts/s.
-            assert measured == pytest.approx(rate, rel=0.05, abs=4.0)
-        assert crept_s(timetable, 1e6) == timetable.closed_s
-        assert crept_s(timetable, 1e-6) > timetable.lift_s
-
-
 def test_the_end_point_is_reached_when_the_lift_starts(
     silent: tuple[list[GraspRow], list[Timetable]],
 ) -> None:
@@ -102,63 +71,6 @@ def test_the_end_point_is_reached_when_the_lift_starts(
         last = [moment for moment in moments if moment.t_s < timetable.lift_s][-1]
         # 7 % of 900 counts, five sixths of a second or four time constants later: one count.
         assert np.abs(last.counts - end_point.counts.astype(float)).max() <= 2.0
-
-
-def test_a_stable_lift_loads_the_fingers_a_little_and_for_good(
-    silent: tuple[list[GraspRow], list[Timetable]],
-) -> None:
-    moments, timetables = silent
-    times = np.array([moment.t_s for moment in moments])
-    for timetable in timetables[::2]:
-        assert not timetable.slipped
-        before, loaded, after = (
-            moments[int(np.searchsorted(times, t_s)) - 1].counts.astype(float)
-            for t_s in (timetable.lift_s, timetable.lift_s + 0.2, timetable.release_s)
-        )
-        largest = (before - after).max(axis=1)
-        assert ((largest >= 19) & (largest <= 61)).all()
-        assert np.abs(loaded - after).max() <= 1.0
-
-
-def test_a_slip_takes_a_part_of_the_deviation_from_some_electrodes_in_a_few_steps(
-    silent: tuple[list[GraspRow], list[Timetable]],
-) -> None:
-    moments, timetables = silent
-    for timetable, end_point in zip(timetables[1::2], GRASPS[1::2], strict=True):
-        assert timetable.slipped
-        lift = [m for m in moments if m.grasp == timetable.grasp and m.phase is Phase.LIFT]
-        counts = counts_of(lift)
-        deep = REST - end_point.counts > 300
-        lost = ((counts[-1] - counts[0]) / (REST - end_point.counts))[deep]
-        losing = lost > 0.1
-        assert 0.25 < losing.mean() < 0.75
-        assert lost[losing].min() > 0.29
-        assert lost[losing].max() < 0.61
-        assert np.abs(lost[~losing]).max() < 0.01
-        steps = int((np.diff(counts, axis=0).max(axis=(1, 2)) > 20).sum())
-        assert 1 <= steps <= 4, "two of the two to four may fall on the same millisecond"
-
-
-def test_joints_move_until_closing_ends_and_are_still_until_the_release(
-    silent: tuple[list[GraspRow], list[Timetable]],
-) -> None:
-    moments, timetables = silent
-    by_phase = {
-        (grasp, phase): np.array([moment.position_rad for moment in group])
-        for (grasp, phase), group in itertools.groupby(moments, lambda m: (m.grasp, m.phase))
-    }
-    assert moments[0].joint_names == ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
-    for grasp in range(1, len(timetables) + 1):
-        for still in (Phase.SETTLE, Phase.LIFT, Phase.REST):
-            spread = by_phase[grasp, still].std(axis=0)
-            np.testing.assert_allclose(spread, 0.0003, rtol=0.2)
-        settled = by_phase[grasp, Phase.SETTLE].mean(axis=0)
-        assert ((settled > 0.79) & (settled < 1.01)).all()
-        np.testing.assert_allclose(by_phase[grasp, Phase.REST].mean(axis=0), 0.2, atol=1e-4)
-        for moving in (Phase.APPROACH, Phase.TOUCH, Phase.CLOSE):
-            change = by_phase[grasp, moving][-1] - by_phase[grasp, moving][0]
-            assert (change > 0.002).all()
-        assert (by_phase[grasp, Phase.RELEASE][-1] < settled - 0.5).all()
 
 
 def test_the_same_seed_gives_the_same_stream_and_another_seed_another_one() -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.contract import Dataset
 from models.training.data.datasets import Grasps, concatenate
-from tests.models.training.training_samples import HEADER, separable_counts
+from tests.models.training.training_samples import separable_counts, write_table
 
 UNKNOWN = ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case",
            "train")  # fmt: skip
@@ -31,30 +29,23 @@ def table(name: str, grasps: int, seed: int, drift: int = 0) -> Grasps:
 
 def sessions(grasps: int) -> Grasps:
     """Three tables of so many grasps each."""
-    return concatenate(
-        [
-            table(name, grasps, seed, drift=800 if name == "palm_45" else 0)
-            for seed, name in enumerate(TABLES)
-        ]
-    )
+    return concatenate(_tables(grasps))
 
 
 def write_sessions(folder: Path, grasps: int) -> None:
     """The same as tables in the published form."""
     folder.mkdir(parents=True, exist_ok=True)
-    for seed, name in enumerate(TABLES):
-        made = table(name, grasps, seed, drift=800 if name == "palm_45" else 0)
-        write(folder / f"{name}.csv", made)
+    for made in _tables(grasps):
+        write(folder / f"{made.files[0].name}.csv", made)
+
+
+def _tables(grasps: int) -> list[Grasps]:
+    return [
+        table(name, grasps, seed, drift=800 if name == "palm_45" else 0)
+        for seed, name in enumerate(TABLES)
+    ]
 
 
 def write(path: Path, made: Grasps) -> None:
     """Grasps as a table in the published form."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEADER)
-        for row in zip(made.objects, made.slipped, made.counts, strict=True):
-            writer.writerow([row[0], int(row[1]), *_flat(row[2])])
-
-
-def _flat(counts: NDArray[np.uint16]) -> list[int]:
-    return [int(count) for count in counts.ravel()]
+    write_table(path, made.counts, made.slipped, made.objects)

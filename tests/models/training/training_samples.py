@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +25,16 @@ def separable_counts(grasps: int, seed: int = 7) -> tuple[NDArray[np.uint16], ND
     return counts.astype(np.uint16), slipped
 
 
-def write_table(path: Path, counts: NDArray[np.uint16], slipped: NDArray[np.bool_]) -> None:
-    """Write a grasp table in the published form."""
+def write_table(
+    path: Path,
+    counts: NDArray[np.uint16],
+    slipped: NDArray[np.bool_],
+    objects: Sequence[str] | None = None,
+) -> None:
+    """Write a grasp table in the published form; without `objects`, of balls."""
+    names = ["ball"] * len(counts) if objects is None else objects
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(HEADER)
-        for reading, slip in zip(counts, slipped, strict=True):
-            writer.writerow(["ball", int(slip), *reading.ravel()])
+        for name, slip, reading in zip(names, slipped, counts, strict=True):
+            writer.writerow([name, int(slip), *reading.ravel()])

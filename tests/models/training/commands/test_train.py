@@ -108,14 +108,6 @@ def test_the_contract_holds_the_statistics_that_the_session_starts_from(
     assert sharpness[-1] >= 1.0
 
 
-def test_the_same_seed_makes_the_same_file(data: Path, tmp_path: Path) -> None:
-    for out in ("one", "two"):
-        options = ["--data", str(data), "--out", str(tmp_path / out), "--folds", "2", "--quiet"]
-        assert graspd_train(*options, system="svm") == 0
-    for name in ("svm.onnx", "svm.json"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-
-
 def test_a_model_of_the_later_session_needs_its_table(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -366,31 +358,25 @@ def test_a_number_out_of_range_is_exit_code_2(
     assert f"argument {option}: '{value}' is not a whole number from" in capsys.readouterr().err
 
 
-def test_ctrl_c_ends_cleanly_with_130(
-    data: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(make_model, "make_model", interrupted)
-    assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 130
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        "graspd train: interrupted; the same command goes on from here"
-    )
-
-
-def test_a_failed_export_is_exit_code_1(
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted; the same command goes on from here"),
+        (ExportError("the exported file differs"), 1, "the exported file differs"),
+    ],
+)
+def test_a_training_that_does_not_end_says_why(
+    error: BaseException,
+    code: int,
+    says: str,
     data: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def failing(*_: object) -> None:
-        raise ExportError("the exported file differs")
+        raise error
 
     monkeypatch.setattr(make_model, "make_model", failing)
-    assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 1
-    assert capsys.readouterr().err.splitlines()[-1] == "graspd train: the exported file differs"
+    assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == code
+    assert capsys.readouterr().err.splitlines()[-1] == f"graspd train: {says}"

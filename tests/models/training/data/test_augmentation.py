@@ -54,13 +54,6 @@ def test_rotations_go_ten_degrees_to_either_side() -> None:
     assert 4 <= sum(turned) <= 16
 
 
-def test_a_rotation_by_a_right_angle_is_exact() -> None:
-    square = IMAGES[:, :11]
-    images, _ = augment(square, SLIPPED, Augmentation(rotation_deg=90.0), seed=1)
-    for image, actual in zip(square, images[60:], strict=True):
-        assert any(np.allclose(np.rot90(image, turns), actual, atol=1e-5) for turns in (1, 3))
-
-
 def test_the_sides_are_chosen_by_the_seed() -> None:
     first, _ = augment(IMAGES, SLIPPED, Augmentation(), seed=5)
     assert np.array_equal(first, augment(IMAGES, SLIPPED, Augmentation(), seed=5)[0])

@@ -43,15 +43,6 @@ def test_a_positive_margin_says_slip(config: ClassicalConfig) -> None:
     assert classical_margins(model, vectors[:0]).shape == (0,)
 
 
-@pytest.mark.parametrize("config", KINDS)
-def test_the_same_seed_gives_the_same_margins(config: ClassicalConfig) -> None:
-    once, again = (
-        classical_margins(fit_classical(config, VECTORS, SLIPPED, seed=2), VECTORS)
-        for _ in range(2)
-    )
-    assert np.array_equal(once, again)
-
-
 def test_an_svm_decides_by_the_radial_kernel() -> None:
     model = fit_classical(SvmConfig(3.0, "auto"), VECTORS, SLIPPED, seed=0)
     vectors = model.support_vectors_  # type: ignore[attr-defined]

@@ -46,12 +46,6 @@ def test_an_offset_is_of_means_and_spreads_alone() -> None:
     assert shifted[:, 24:].std(dim=0).numpy() == pytest.approx(0.7, abs=0.04)
 
 
-def test_what_is_given_is_not_changed() -> None:
-    features = torch.ones(3, 26)
-    on_another_day(features, DayShift())
-    assert torch.equal(features, torch.ones(3, 26))
-
-
 @pytest.mark.parametrize("shape", [(2, 72), (2, 3, 26), (2, 3, 12, 11)])
 def test_other_inputs_have_no_other_day(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="no session features"):
