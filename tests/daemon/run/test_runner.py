@@ -186,16 +186,6 @@ def test_a_wrong_scene_changes_nothing_and_is_told(
     assert "the former scene goes on" in said
 
 
-def test_a_broken_file_changes_nothing_not_even_the_count(running: Running) -> None:
-    before = running.verdict()
-    running.scene.write_text("[hand\n")
-    running.hang_up()
-    running.told("READY=1")
-    after = running.verdict()
-    assert after.boot_id == before.boot_id
-    assert running.stop()[0] == 0
-
-
 def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
