@@ -292,24 +292,6 @@ def play(path: Path) -> list[object]:
     return found
 
 
-def test_what_was_recorded_is_played_with_its_questions(tmp_path: Path) -> None:
-    counts = np.arange(48).reshape(2, 24)
-    writing = recorder(tmp_path)
-    angles = JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan]))
-    writing.on_reading(angles)
-    writing.on_event(LoopEvent.ASKED)
-    writing.send(b"tactile.right", tactile(0, *counts.tolist()))
-    writing.close()
-    (path,) = tmp_path.glob("*.mcap")
-    joints, asked, played = play(path)
-    assert isinstance(joints, JointReading)
-    assert joints.names == angles.names
-    assert np.array_equal(joints.position_rad, angles.position_rad, equal_nan=True)
-    assert asked is Topic.ASKED
-    assert isinstance(played, TactileReading)
-    assert played.counts.tolist() == counts[::-1].tolist()
-
-
 def test_an_older_recording_is_played_alike(tmp_path: Path) -> None:
     counts = np.arange(48).reshape(2, 24)
     path = tmp_path / "old.mcap"
