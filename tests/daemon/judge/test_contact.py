@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from daemon.judge.contact import Contact
 from daemon.judge.decision import ContactLimits
 from daemon.judge.hand import FreshMedian
-from drivers.twins.grasps.grasps import recorded_counts
-from tests.conftest import data_dir
 
 FF, MF, TH = 0, 1, 2
 PERIOD_NS = 10_000_000
@@ -77,15 +75,6 @@ def as_sampled(recorded: Counts, changed: NDArray[np.int64]) -> Counts:
         held = recorded[sweep] == recorded[sweep - 1]
         sampled[sweep][held] = sampled[sweep - 1][held]
     return sampled.astype(np.uint16)
-
-
-@pytest.fixture(scope="module")
-def untouched() -> Counts:
-    """9.8 s of three untouched sensors at 100 Hz, shape (977, 3, 24)."""
-    folder = data_dir()
-    if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
-        pytest.skip("the real recording of an untouched hand is not there")
-    return np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
 
 
 @pytest.mark.parametrize("direction", [1, -1], ids=["forward", "backward"])

@@ -7,22 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.hand import FreshMedian
-from drivers.twins.grasps.grasps import recorded_counts
-from tests.conftest import data_dir
 
 SHAPE = (3, 24)
 ALL = np.ones(SHAPE, dtype=np.bool_)
 
 Counts = NDArray[np.uint16]
-
-
-@pytest.fixture(scope="module")
-def untouched() -> Counts:
-    """9.8 s of three untouched sensors at 100 Hz, held values of 71.43 Hz: shape (977, 3, 24)."""
-    folder = data_dir()
-    if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
-        pytest.skip("the real recording of an untouched hand is not there")
-    return np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
 
 
 def play(fresh: FreshMedian, sweeps: Counts, usable: NDArray[np.bool_] = ALL) -> Counts:

@@ -24,7 +24,8 @@ from daemon.scene import SceneError
 from daemon.scene.scene import Record
 from drivers.recordings.csv_rows import open_recording
 from tests.bench import kill_recorder
-from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
+from tests.kit.waiting import wait_until
 
 TOPIC = b"verdict.right"
 

@@ -21,9 +21,9 @@ from daemon.run import runner
 from daemon.scene import Scene
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, put_first
+from tests.kit.waiting import PATIENCE_S
 
 DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
-PATIENCE_S = 100.0
 
 SCENE = """
 [hand]
