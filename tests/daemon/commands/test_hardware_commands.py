@@ -176,13 +176,6 @@ def test_the_doctor_finds_what_the_twin_broke(tmp_path: Path) -> None:
         assert what in people.stdout
 
 
-def test_the_doctor_says_that_a_port_is_not_there(tmp_path: Path) -> None:
-    result = graspd("doctor", scene_for("spi", tmp_path), "--listen", 0.3)
-    assert result.returncode == 1
-    assert "no reading in 0.3 s" in result.stdout
-    assert str(tmp_path / "bridge") in result.stdout
-
-
 def test_the_doctor_takes_a_recording_at_its_own_rate() -> None:
     scene = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
     report = json.loads(graspd("doctor", scene, "--listen", 2, "--json").stdout)

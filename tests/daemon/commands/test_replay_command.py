@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
 import os
-import pty
 import re
 import signal
 import subprocess
@@ -51,13 +49,6 @@ def test_each_grasp_of_the_demo_recording_is_judged_once() -> None:
     lines = people.stdout.splitlines()
     assert "12 grasps, 12 judged" in lines[lines.index("") + 1]
     assert any("  judged   " in line and "p_slip" in line for line in lines)
-
-
-def test_replay_says_so_when_streams_and_tables_are_mixed() -> None:
-    result = graspd("replay", DEMO_TABLE, DEMO_RECORDING)
-    assert result.returncode == 2
-    assert "both grasp tables and streams" in result.stderr
-    assert graspd("replay", DEMO_RECORDING, "--gate", "every", "--json").returncode == 0
 
 
 DEMO_LINE = re.compile(
@@ -111,34 +102,6 @@ def test_the_published_method_of_the_demo_is_its_network_on_every_grasp() -> Non
         if (match := DEMO_LINE.fullmatch(line)) and match["grasps"] == "all"
     ]  # fmt: skip
     assert (int(whole["stable"]), int(whole["slips"])) == (sum(stable), slips)
-
-
-@pytest.mark.parametrize("no_colour", [None, "1"])
-def test_the_demo_is_in_colour_on_a_terminal_unless_that_is_not_wanted(
-    no_colour: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if no_colour is None:
-        monkeypatch.delenv("NO_COLOR", raising=False)
-    else:
-        monkeypatch.setenv("NO_COLOR", no_colour)
-    own, terminal = pty.openpty()
-    with subprocess.Popen([*GRASPD, "replay"], stdout=terminal, stderr=terminal) as process:
-        os.close(terminal)
-        text = b""
-        with contextlib.suppress(OSError):  # the end of a terminal that nobody holds any more
-            while part := os.read(own, 1 << 16):
-                text += part
-    os.close(own)
-    assert process.returncode == 0
-    assert (b"\x1b[31m" in text) == (no_colour is None)
-
-
-def test_the_demo_shows_each_verdict_to_who_wants_it() -> None:
-    result = graspd("replay", "--verbose")
-    assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
-    assert lines.index("") == 300
-    assert any(line.startswith("risk: of ") for line in lines)
 
 
 def summary_of(*arguments: object) -> dict[str, Any]:
@@ -198,36 +161,12 @@ def test_the_outcome_of_a_grasp_in_a_stream_is_told_once_when_it_is_over() -> No
         assert len({v.outcomes for v in verdicts if v.grasp == grasp and v.judged}) == 1
 
 
-def test_less_sure_verdicts_are_unknown_if_that_is_wanted() -> None:
-    summary = summary_of(DEMO_DAY, "--min-confidence", "0.9")
-    assert summary["reasons"]["low-confidence"] > 0
-    assert summary_of(DEMO_DAY)["reasons"].get("low-confidence") is None
-
-
 def test_a_model_on_its_own_training_is_warned_of(bts3_dir: Path) -> None:
     table = bts3_dir / "palm_45.csv"
     assert "the model was trained on palm_45.csv" in graspd("replay", table).stdout
     assert summary_of(table)["trained_on"] == ["palm_45.csv"]
     assert summary_of(table, "--model", "cnn1")["trained_on"] == []
     assert summary_of(DEMO_TABLE)["trained_on"] == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("--warm-up", "5"), "need --max-slip-when-stable"),
-        (("--only-lifted",), "it needs --outcomes"),
-        (("--max-slip-when-stable", "0.6"), "not a number from 0.001 to 0.5"),
-        (("--max-slip-when-stable", "0.1", "--warm-up", "-1"), "risk.warm_up"),
-        (("--min-confidence", "1"), "not a number from"),
-    ],
-)
-def test_options_of_outcomes_and_risk_that_do_not_fit_are_one_line(
-    arguments: tuple[str, ...], says: str
-) -> None:
-    result = graspd("replay", DEMO_TABLE, *arguments)
-    assert result.returncode == 2
-    assert says in result.stderr.splitlines()[-1]
 
 
 def test_outcomes_of_a_table_that_has_none_are_one_line(tmp_path: Path) -> None:
@@ -242,20 +181,6 @@ def test_outcomes_of_a_table_that_has_none_are_one_line(tmp_path: Path) -> None:
     result = graspd("replay", bare, "--outcomes")
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr == f"graspd: {bare}: no column `slipped`: there are no outcomes to tell\n"
-
-
-def test_a_grasp_table_is_judged_row_by_row() -> None:
-    result = graspd("replay", DEMO_TABLE)
-    assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
-    blank = lines.index("")
-    verdicts, summary = lines[:blank], lines[blank + 1 :]
-    assert len(verdicts) == len(demo_rows())
-    assert summary[0].startswith(f"{len(verdicts)} verdicts in ")
-    assert any("recorded outcomes (slip positive): accuracy" in line for line in summary)
-    assert any(line.startswith("without session calibration: ") for line in summary)
-    assert summary[-1].startswith("reading to verdict: p50 ")
-    assert all("synthetic" in line for line in verdicts)
 
 
 def test_replay_json_gives_one_valid_verdict_per_real_grasp(bts3_dir: Path) -> None:
@@ -404,13 +329,6 @@ def test_a_bad_recording_is_one_clear_line(tmp_path: Path, name: str) -> None:
     (message,) = result.stderr.splitlines()
     assert message.startswith(f"graspd: {recording}")
     assert says in message
-
-
-def test_a_published_table_that_is_not_there_is_said_to_come_with_data(tmp_path: Path) -> None:
-    absent = graspd("replay", tmp_path / "palm_45.csv")
-    assert absent.returncode == 2
-    assert "no such file or directory; `graspd data` gets it" in absent.stderr
-    assert "graspd data" not in graspd("replay", tmp_path / "other.csv").stderr
 
 
 def test_the_end_of_the_reader_ends_the_replay_quietly() -> None:

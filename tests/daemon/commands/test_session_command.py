@@ -10,11 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.assembly import assembly
-from daemon.commands import session
-from daemon.scene import parse
 from daemon.session.file import SessionFile, kept_now
-from drivers.base import DriverError
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import graspd
 
@@ -131,23 +127,6 @@ def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:
     assert len(seeded.stderr.splitlines()) == 1
     assert "no grasps" in seeded.stderr or "unlike all grasps" in seeded.stderr
     assert graspd("session", "show", scene).stdout.count("no session is kept") == 1
-
-
-def test_recordings_unlike_the_training_are_told_with_how_much_that_was(tmp_path: Path) -> None:
-    counts = np.random.default_rng(0).integers(1, 4095, (20, 72))
-    header = [f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)]
-    recording = tmp_path / "garbage.csv"
-    recording.write_text("\n".join(",".join(map(str, row)) for row in [header, *counts]) + "\n")
-    wanted = parse(
-        {"tactile": {"driver": "replay", "recordings": [recording]}, "gate": {"mode": "every"}},
-        tmp_path / "scene.toml",
-    )
-    model = assembly.load_model(wanted)
-    nothing_learned = assembly.build_pipeline(wanted, model).session
-    assert nothing_learned is not None
-    said = "unlike all grasps that small-session was trained on, which were 4682: nothing is"
-    with pytest.raises(DriverError, match=said):
-        session._check(wanted, model, nothing_learned.state())  # noqa: SLF001
 
 
 def test_a_broken_session_file_is_one_line_in_a_replay(tmp_path: Path) -> None:

@@ -7,10 +7,16 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
+import os
 import socket
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import pytest
+
+from daemon.commands import doctor
 from daemon.commands.doctor import examine
 from daemon.doctor.electrodes import ElectrodeStatistics
 from daemon.doctor.finding import Finding, Level
@@ -157,3 +163,36 @@ def faults_told(driver: Driver, statistics: ElectrodeStatistics, seconds: float)
     felt = None if driver.name == JointStreamDriver.name else statistics
     told = examine(driver, felt, seconds)
     return [finding for finding in told if finding.level is not Level.OK]
+
+
+def published(folder: Path, more: str = "") -> str:
+    return f'[publish]\nendpoint = "ipc://{folder}/graspd"\n{more}'
+
+
+MODEL = '[model]\nname = "cnn1"\n'
+SPI = '[tactile]\ndriver = "spi"\nport = "{}"\n'
+CAN = '[tactile]\ndriver = "can"\nchannel = "{}"\n'
+
+
+def refused(number: int) -> Callable[..., object]:
+    def open_port(*_: object, **__: object) -> object:
+        raise OSError(number, os.strerror(number))
+
+    return open_port
+
+
+def arguments(scene: Path, *more: str) -> Namespace:
+    """Arguments of a doctor that listens for a moment."""
+    parser = ArgumentParser()
+    doctor.add_arguments(parser)
+    return parser.parse_args([str(scene), "--listen", "0.2", *more])
+
+
+def look(folder: Path, capsys: pytest.CaptureFixture[str], text: str) -> list[dict[str, str]]:
+    """What the doctor says of a scene that is wrong."""
+    scene = folder / "scene.toml"
+    scene.write_text(text)
+    code = doctor.run(arguments(scene, "--json"))
+    told = [f for f in json.loads(capsys.readouterr().out)["findings"] if f["level"] != "ok"]
+    assert code == int("error" in {finding["level"] for finding in told})
+    return told

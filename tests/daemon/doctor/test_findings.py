@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.doctor.computer import can_interfaces
 from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause, Level
-from daemon.doctor.link import counter_findings, device_findings, rate_finding
-from daemon.doctor.surroundings import can_finding
+from daemon.doctor.finding import Cause, Finding, Level
+from daemon.doctor.link import COUNTERS, counter_findings, device_findings, rate_finding
+from daemon.record.player import McapCounters
 from drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
+from drivers.can.readings import CanCounters
+from drivers.joints.message import JointCounters
 from drivers.link import LinkState
+from drivers.palm.packet import PalmCounters
+from drivers.recordings.faults import ReplayCounters
+from drivers.spi.sweeps import BridgeCounters
 
 FINGERS = ("ff", "mf", "th")
 Counts = NDArray[np.float64]
@@ -173,17 +177,6 @@ def test_joining_in_the_middle_of_a_sweep_is_no_trouble(number: int, findings: i
     assert len(counter_findings("palm", {"unsynchronised_packets": number})) == findings
 
 
-def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
-    for name, kind, state in (("can0", 280, "up"), ("can1", 280, "down"), ("eth0", 1, "up")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "type").write_text(f"{kind}\n")
-        (tmp_path / name / "operstate").write_text(f"{state}\n")
-    up, down = map(can_finding, can_interfaces(tmp_path))
-    assert up.what == "CAN interface can0 is up"
-    assert (down.level, down.what) == (Level.WARNING, "CAN interface can1 is down")
-    assert "ip link set can1 up" in (down.advice or "")
-
-
 @pytest.mark.parametrize(
     ("fault", "level", "cause", "advice"),
     [
@@ -249,3 +242,28 @@ def test_the_page_names_every_cause_once_and_nothing_else() -> None:
 def test_a_recording_has_no_link() -> None:
     (finding,) = device_findings("replay", {"recordings": Fact("a.csv")})
     assert finding.level is Level.OK
+
+
+def test_counters_that_are_told_exist_and_have_a_cause_and_advice() -> None:
+    kinds = (BridgeCounters, CanCounters, PalmCounters, JointCounters, ReplayCounters, McapCounters)
+    told = {name for names in COUNTERS for name in names}
+    names = {name for kind in kinds for name in kind().as_dict()}
+    assert told <= names
+    for name in names:
+        findings = counter_findings("x", {name: 1000})
+        assert len(findings) == (name in told), name
+        for finding in findings:
+            assert finding.cause
+            assert finding.advice
+            assert finding.what == f"x: 1000 {name.replace('_', ' ')}"
+
+
+def test_no_fault_can_be_said_to_be_fine_and_none_goes_without_advice() -> None:
+    for level, cause, advice in (
+        (Level.OK, Cause.SLOW, "wait"),
+        (Level.ERROR, None, "wait"),
+        (Level.ERROR, Cause.SLOW, ""),
+        (Level.WARNING, Cause.SLOW, None),
+    ):
+        with pytest.raises(ValueError, match="something"):
+            Finding(level, "something", cause, advice)

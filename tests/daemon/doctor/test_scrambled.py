@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import os
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from daemon.commands.doctor import examine
 from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause
+from daemon.doctor.finding import Cause, Level
 from drivers.base import DeviceFault, Fact, LinkCause, LinkError
 from drivers.can.frames import ERROR, CanFrame
 from drivers.spi.conversation import Conversation
@@ -20,13 +21,16 @@ from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.messages import FIRMWARE
 from drivers.twins import spi as spi_twin
 from drivers.twins.faults import LinkFaults
-from tests.daemon.doctor.emulated import FINGERS, LINKS, STEPS_PER_S, Hand, faults_told, listen
-from tests.daemon.doctor.test_causes import (
+from tests.daemon.doctor.emulated import (
     CAN,
-    LINK_FAULTS,
-    LOOK_S,
+    FINGERS,
+    LINKS,
     MODEL,
     SPI,
+    STEPS_PER_S,
+    Hand,
+    faults_told,
+    listen,
     look,
     published,
     refused,
@@ -37,6 +41,55 @@ from tests.drivers.spi.bridge_bench import MS, hello, sweep
 from tests.drivers.spi.test_conversation import T0, greeted, hear, opened, said, told
 
 XXX = "xxx"
+LOOK_S = 3
+
+LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
+    "damaged bytes": (
+        LinkFaults(bit_flip_probability=0.05),
+        {
+            "spi": Cause.DAMAGED,
+            "can": Cause.DAMAGED,
+            "can fd": Cause.DAMAGED,
+            "palm": Cause.DAMAGED,
+            "joints": Cause.JOINTS,
+        },
+    ),
+    "lost frames": (LinkFaults(drop_probability=0.05), dict.fromkeys(LINKS, Cause.FRAMES_LOST)),
+    "repeated frames": (
+        LinkFaults(duplicate_probability=0.05),
+        dict.fromkeys(LINKS, Cause.REPEATED),
+    ),
+    "frames out of order": (
+        LinkFaults(reorder_probability=0.05),
+        dict.fromkeys(("spi", "can", "can fd", "palm"), Cause.OUT_OF_ORDER),
+    ),
+    "a link that breaks": (
+        LinkFaults(disconnect_every_frames=50),
+        dict.fromkeys(("spi", "palm"), Cause.LINK_LOST),
+    ),
+    "another protocol version": (
+        LinkFaults(wrong_version=True),
+        dict.fromkeys(("spi", "can fd", "palm"), Cause.VERSION),
+    ),
+    "a dead electrode": (
+        LinkFaults(dead_electrodes=((2, 23),)),
+        dict.fromkeys(("spi", "can", "can fd", "palm"), Cause.ELECTRODE_DEAD),
+    ),
+    "one sensor unplugged": (
+        LinkFaults(unplugged_fingers=(1,)),
+        dict.fromkeys(("spi", "can", "can fd", "palm"), Cause.SENSOR_ABSENT),
+    ),
+    "all sensors unplugged": (
+        LinkFaults(unplugged_fingers=(0, 1, 2)),
+        dict.fromkeys(("spi", "can fd", "palm"), Cause.SENSOR_ABSENT),
+    ),
+    "a clock that stands": (
+        LinkFaults(stuck_clock=True),
+        {"spi": Cause.CLOCK, "can fd": Cause.CLOCK, "palm": Cause.REPEATED},
+    ),
+    "a silent board": (LinkFaults(drop_probability=1.0), dict.fromkeys(LINKS, Cause.SILENT)),
+}
+"""Faults of a link, and which cause is told of each link that can have them."""
 
 
 @pytest.fixture(autouse=True)
@@ -58,14 +111,19 @@ def scrambled(monkeypatch: pytest.MonkeyPatch) -> None:
     ("fault", "kind"),
     [(fault, kind) for fault, (_, causes) in LINK_FAULTS.items() for kind in causes],
 )
-def test_a_fault_of_a_link_is_told_without_words(fault: str, kind: str, tmp_path: Path) -> None:
+def test_a_fault_of_a_link_is_told_without_words_and_nothing_else_is(
+    fault: str, kind: str, tmp_path: Path
+) -> None:
     faults, expected = LINK_FAULTS[fault]
     statistics = ElectrodeStatistics(FINGERS)
     with LINKS[kind](Hand(100.0), tmp_path, faults) as (driver, step):
         listen(driver, step, LOOK_S * STEPS_PER_S[kind], statistics)
         assert {fact.text for fact in driver.describe().values()} == {XXX}
-        causes = {finding.cause for finding in faults_told(driver, statistics, float(LOOK_S))}
-    assert causes == {expected[kind]}
+        told = faults_told(driver, statistics, float(LOOK_S))
+    assert {finding.cause for finding in told} == {expected[kind]}, told
+    assert all(finding.advice for finding in told)
+    if not statistics.readings and kind != "joints":
+        assert Level.ERROR in {finding.level for finding in told}
 
 
 @pytest.mark.parametrize(
@@ -79,8 +137,8 @@ def test_a_fault_of_a_bridge_is_told_without_words(
     with LINKS["spi"](Hand(100.0), tmp_path, LinkFaults()) as (driver, step):
         monkeypatch.setattr(spi_twin, attribute, value)
         listen(driver, step, 2000 if cause is Cause.CLOCK else 300, statistics)
-        causes = [each.cause for each in faults_told(driver, statistics, 3.0)]
-    assert cause in causes
+        told = faults_told(driver, statistics, statistics.readings / 100.0)
+    assert [finding.cause for finding in told] == [cause], told
 
 
 def silent() -> Conversation:
@@ -189,8 +247,10 @@ def test_a_port_that_cannot_be_opened_is_told_without_words(
 
 
 def test_an_address_and_a_port_that_cannot_be_had_are_told_without_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pid = os.getpid()
+    monkeypatch.setattr("os.getpid", lambda: 1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
         held.bind(("127.0.0.1", 0))
         here = f"127.0.0.1:{held.getsockname()[1]}"
@@ -198,10 +258,4 @@ def test_an_address_and_a_port_that_cannot_be_had_are_told_without_words(
             text = f'[tactile]\ndriver = "palm"\nsource = "udp://{source}"\n'
             (finding,) = look(tmp_path, capsys, text + MODEL + published(tmp_path))
             assert finding["cause"] == cause
-
-
-def test_an_interface_that_is_missing_is_told_without_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (finding,) = look(tmp_path, capsys, CAN.format("can7") + MODEL + published(tmp_path))
-    assert finding["cause"] == "interface-missing"
+            assert (f"PID {pid}, " in finding["what"]) == (cause == "port-held")

@@ -162,7 +162,6 @@ SETTLES = (0.41, 0.45)
 no more than noise."""
 REQUEST = replace(LIMITS, on_request=True)
 JOINTS = replace(LIMITS, joints=JointLimits())
-THREE_HUNDRED_MS = HandLimits(gate=replace(GATE, gap_ns=300 * MS))
 SUBSET = replace(LIMITS, required=("ff", "th"))
 
 
@@ -177,11 +176,6 @@ def spike(*electrodes: tuple[int, int], at_s: float, sweeps: int) -> Callable[..
     return spoil
 
 
-def one_percent_of_spikes(t_s: float, counts: NDArray[np.float64]) -> None:
-    random = np.random.default_rng(round(t_s * 1000) + 10_000)
-    counts -= (random.random(SHAPE) < 0.01) * random.uniform(25.0, 150.0, SHAPE)
-
-
 SCENARIOS = [
     Scenario("nothing touches", ((0, 0),), "", judged=0, grasp=0),
     Scenario("firm grasp", OPENED, f"{UP} closing:changed {DOWN}", settled_s=SETTLES),
@@ -190,8 +184,6 @@ SCENARIOS = [
         {"ff": LIGHT, "mf": LIGHT, "th": ((0, 0), (0.2, 40), (0.9, 40), (0.95, 0))},
         f"{UP} closing:contact-lost {DOWN}",
     ),
-    Scenario("held for half a minute of warming up", GRASPED, UP, seconds=30.0, drift=0.7),
-    Scenario("spiky sensors", GRASPED, UP, seconds=5.0, spoil=one_percent_of_spikes),
     Scenario(
         "grasped twice",
         (*OPENED, (1.5, 0), (1.7, 300)),
@@ -208,27 +200,7 @@ SCENARIOS = [
         seconds=2.5,
     ),
     Scenario(
-        "regrasp of a light touch",
-        {
-            "ff": LIGHT[:2],
-            "mf": (*LIGHT, (1.4, 0), (1.6, 40)),
-            "th": LIGHT[:2],
-        },
-        f"{UP} closing:contact-lost {AGAIN}",
-        judged=2,
-        seconds=2.5,
-    ),
-    Scenario(
         "pressed harder", (*GRASPED, (1.0, 300), (1.2, 600)), f"{UP} closing:changed {AGAIN}", 2
-    ),
-    Scenario(
-        "pressed a little harder than before", (*GRASPED, (1.0, 300), (1.2, 350)), UP, seconds=2.0
-    ),
-    Scenario(
-        "two fingers only",
-        {"ff": OPENED, "mf": OPENED},
-        f"closing:contact {DOWN}",
-        judged=0,
     ),
     Scenario(
         "required fingers of which the third is none",
@@ -250,11 +222,6 @@ SCENARIOS = [
         limits=SUBSET,
     ),
     Scenario(
-        "object dropped",
-        (*GRASPED, (1.0, 300), (1.02, 0)),
-        f"{UP} closing:changed {DOWN}",
-    ),
-    Scenario(
         # By hand: 21.43 counts/s of depth are 10 counts/s in the mean; 40 counts take 4 s.
         "slow creep",
         (*GRASPED, (0.4, 300), (10.4, 514.3)),
@@ -263,26 +230,14 @@ SCENARIOS = [
         seconds=10.0,
     ),
     Scenario(
-        "brief touch", ((0, 0), (0.02, 300), (0.1, 300), (0.12, 0)), f"closing:contact {DOWN}", 0
-    ),
-    Scenario(
         "touched again within the release time",
         (*GRASPED, (1.0, 300), (1.02, 0), (1.07, 0), (1.09, 300)),
         f"{UP} closing:changed released:contact-lost {UP}",
         judged=2,
         grasp=2,
     ),
-    Scenario("spike of one electrode", GRASPED, UP, spoil=spike((0, 1), at_s=1.0, sweeps=1)),
     Scenario(
         "long spike of two electrodes", GRASPED, UP, spoil=spike((0, 1), (0, 8), at_s=1.0, sweeps=9)
-    ),
-    Scenario(
-        "spikes of an open hand",
-        ((0, 0),),
-        "",
-        judged=0,
-        grasp=0,
-        spoil=spike((0, 1), (2, 8), at_s=0.5, sweeps=1),
     ),
     Scenario("sensor lost in mid-grasp, for less than a gap", GRASPED, UP, unusable=(0.8, 0.885)),
     Scenario(
@@ -293,23 +248,13 @@ SCENARIOS = [
         unusable=(0.8, 1.2),
     ),
     Scenario(
-        "sensor lost for good", GRASPED, f"{UP} closing:gap", unusable=(0.8, 9.0), seconds=3.0
-    ),
-    Scenario(
         "sensor lost while the hand closes",
         GRASPED,
         UP,
         unusable=(0.1, 0.5),
         settled_s=(0.73, 0.76),
     ),
-    Scenario(
-        "sensor lost, and the object too",
-        OPENED,
-        f"{UP} closing:gap {DOWN}",
-        unusable=(0.8, 1.2),
-    ),
     Scenario("gap", GRASPED, f"{UP} closing:gap {AGAIN}", judged=2, missing=(0.8, 0.95)),
-    Scenario("a single reading lost", GRASPED, UP, missing=(0.8, 0.81)),
     Scenario(
         "burst after a stall: old readings bear the time of their arrival",
         GRASPED,
@@ -339,24 +284,7 @@ SCENARIOS = [
         rate_hz=10.0,
         seconds=4.0,
     ),
-    Scenario(
-        "10 Hz that wavers, with a gap of 300 ms",
-        ((0, 0), (0.2, 300), (2, 300), (2.5, 0)),
-        f"{UP} closing:changed {DOWN}",
-        rate_hz=10.0,
-        seconds=4.0,
-        retime=lambda t_s: t_s + 0.001 * np.sin(7.0 * t_s),
-        limits=THREE_HUNDRED_MS,
-    ),
     Scenario("1 kHz", OPENED, f"{UP} closing:changed {DOWN}", rate_hz=1000.0, settled_s=SETTLES),
-    Scenario(
-        "joints still",
-        OPENED,
-        f"{UP} closing:changed {DOWN}",
-        settled_s=SETTLES,
-        joint=lambda t_s: 0.7,
-        limits=JOINTS,
-    ),
     Scenario(
         # The joint stops at 0.6 s; a window of 80 ms at 0.5 rad/s fades below 0.1 rad/s in 64 ms.
         "joints moving",
@@ -426,7 +354,6 @@ SCENARIOS = [
         asks_s=(0.5,),
         limits=REQUEST,
     ),
-    Scenario("asked twice before it settled", GRASPED, UP, asks_s=(0.1, 0.2), limits=REQUEST),
     Scenario(
         "asked too early",
         GRASPED,
@@ -443,10 +370,6 @@ SCENARIOS = [
         asks_s=(-9.0,),
         limits=REQUEST,
     ),
-    Scenario("asked too early, and again", GRASPED, UP, asks_s=(-0.8, 0.9), limits=REQUEST),
-    Scenario(
-        "asked for an open hand", ((0, 0),), "", judged=0, grasp=0, asks_s=(0.5,), limits=REQUEST
-    ),
     Scenario("asked where every grasp is judged", GRASPED, UP, asks_s=(0.1, 0.7, 1.1)),
 ]
 
@@ -461,14 +384,9 @@ def test_gate_follows(scenario: Scenario) -> None:
         earliest, latest = scenario.settled_s
         assert earliest <= played.first_s(GateState.SETTLED) <= latest
     check_chain(played.changes)
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)
-def test_no_verdict_that_stands_is_older_than_100_ms(scenario: Scenario) -> None:
-    played = play(scenario)
     for stood_s in played.stood_s:
         judged_s = max(each for each in played.judged_s if each <= stood_s)
-        assert stood_s - judged_s <= 0.1 + 1e-9
+        assert stood_s - judged_s <= 0.1 + 1e-9, "a verdict that stands is older than 100 ms"
 
 
 def check_chain(changes: list[GateChange]) -> None:

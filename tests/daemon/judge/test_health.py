@@ -259,16 +259,3 @@ def test_a_fault_that_is_not_of_one_electrode_speaks_against_the_reading(flag: i
     found = Health(FINGERS).check(TactileReading(0, 0, counts, flags))
     assert found.reasons == ((Reason.PARITY, named) if named else (Reason.PARITY,))
     assert np.argwhere(broken_of(found)).tolist() == [[0, 1], [2, 23]]
-
-
-def test_a_sweep_that_repeats_one_that_was_flagged_as_a_whole_is_frozen() -> None:
-    random = np.random.default_rng(5)
-    first, second, third = random.integers(500, 3000, (3, 3, 24)).astype(np.uint16)
-    third[0] = second[0]
-    faults = np.zeros((3, 24), dtype=np.uint8)
-    flagged = faults.copy()
-    flagged[0] = int(ElectrodeFault.HELD)
-    health = Health(3)
-    assert health.check(TactileReading(0, 0, first, faults)).reasons == ()
-    assert health.check(TactileReading(1, 1, second, flagged)).reasons == (Reason.HELD,)
-    assert health.check(TactileReading(2, 2, third, faults)).reasons == (Reason.FROZEN,)

@@ -32,12 +32,6 @@ def test_a_sound_reading_is_judged(p_slip: float, decision: Decision) -> None:
     assert judgement.moment.grasp == 1
 
 
-def test_each_reading_is_a_grasp_of_its_own() -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(), clock)
-    assert [judge.judge(reading(clock(), seed)).moment.grasp for seed in range(3)] == [1, 2, 3]
-
-
 OF_AN_ELECTRODE = (
     ElectrodeFault.MISSING,
     ElectrodeFault.NOT_A_COUNT,
@@ -138,52 +132,6 @@ def test_counts_that_cannot_be_judged_are_unknown(
     assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (reason,)
     assert model.runs == 0
-
-
-@pytest.mark.parametrize("count", [0, 4095, 65535])
-def test_an_electrode_at_a_rail_is_repaired(count: int) -> None:
-    clock = Clock()
-    bad = reading(clock())
-    bad.counts[0, 6] = count
-    judgement = pipeline(FakeModel(), clock).judge(bad)
-    assert judgement.decision is Decision.STABLE
-    assert judgement.opinion.repaired == ("ff_7",)
-
-
-@pytest.mark.parametrize("count", [0, 4095])
-def test_too_many_electrodes_at_a_rail_are_unknown(count: int) -> None:
-    clock, model = Clock(), FakeModel()
-    bad = reading(clock())
-    bad.counts[0, :9] = count
-    judgement = pipeline(model, clock).judge(bad)
-    assert judgement.reasons == (Reason.SATURATED, Reason.ELECTRODES_BROKEN)
-    assert model.runs == 0
-
-
-@pytest.mark.parametrize(
-    ("p_slip", "reasons"),
-    [(0.1, ()), (0.2, ()), (0.21, (Reason.LOW_CONFIDENCE,)), (0.79, (Reason.LOW_CONFIDENCE,))],
-)
-def test_a_verdict_that_is_not_sure_enough_is_unknown(
-    p_slip: float, reasons: tuple[Reason, ...]
-) -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(p_slip), clock, min_confidence=0.8)
-    judgement = judge.judge(reading(clock()))
-    assert judgement.reasons == reasons
-    assert (judgement.decision is Decision.UNKNOWN) is bool(reasons)
-
-
-@pytest.mark.parametrize(
-    ("p_slip", "reasons"),
-    [(0.05, ()), (0.1, ()), (0.15, (Reason.LOW_CONFIDENCE,)), (0.94, (Reason.LOW_CONFIDENCE,))],
-)
-def test_the_confidence_is_that_of_the_verdict_given(
-    p_slip: float, reasons: tuple[Reason, ...]
-) -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(p_slip), clock, slip_threshold=0.95, min_confidence=0.9)
-    assert judge.judge(reading(clock())).reasons == reasons
 
 
 @pytest.mark.parametrize("count", [LOW - MARGIN, HIGH + MARGIN])

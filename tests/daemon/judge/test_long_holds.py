@@ -6,10 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import HandLimits
-from daemon.judge.hand import HandTracker
-from daemon.judge.health import Checked
-from daemon.judge.reasons import GateState
 from tests.daemon.judge.test_contact import PRESSED, Hand, at_rest, noisy, still
 
 SLOPES = np.random.default_rng(5).normal(0.0, 0.2, (3, 24))
@@ -41,13 +37,6 @@ def test_a_hand_that_opens_after_a_long_hold_touches_nothing(seconds: int, drift
     assert hand.play(noisy(held(2, 0.0) + (drift + SLOPES) * seconds, 2))[10:].all()
 
 
-@pytest.mark.parametrize("drift", [0.7, -0.7])
-def test_all_fingers_are_felt_for_ten_minutes_of_a_hold(drift: float) -> None:
-    hand = Hand()
-    hand.play(still(1.5))
-    assert hand.play(noisy(held(600, drift, 1000.0)))[10:].all()
-
-
 def test_a_hand_that_regrasps_at_once_after_a_short_hold_is_felt() -> None:
     hand = Hand()
     hand.play(still(1.5))
@@ -75,18 +64,3 @@ def test_a_hand_that_was_closed_at_the_start_is_tared_when_it_opens(higher: floa
     assert hand.contact.memory.tared.all()
     assert not hand.contact.memory.touching.any()
     assert hand.play(noisy(held(2, 0.0), 2))[10:].all()
-
-
-def test_sensors_that_were_away_are_tared_anew() -> None:
-    hand = HandTracker(("ff", "mf", "th"), HandLimits())
-    usable = Checked((), np.zeros((3, 24), dtype=np.bool_))
-    other = at_rest() - np.abs(np.random.default_rng(3).normal(0.0, 60.0, (3, 24)))
-    states, t_ns = [], 10**12
-    for pause_s, mean in ((0.0, at_rest()), (1.5, other)):
-        t_ns += round(pause_s * 1e9)
-        for counts in noisy(np.broadcast_to(mean, (300, 3, 24))):
-            moment, _ = hand.step(t_ns, counts, usable)
-            states.append(moment.state)
-            t_ns += 10_000_000
-    assert set(states) == {GateState.IDLE}
-    assert hand.tared == ("ff", "mf", "th")

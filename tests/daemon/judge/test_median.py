@@ -7,24 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.hand import FreshMedian
-from drivers.twins.grasps.grasps import recorded_counts
-from tests.conftest import data_dir
 
 SHAPE = (3, 24)
 ALL = np.ones(SHAPE, dtype=np.bool_)
-PAIRS = [(2 * pair + 1, 2 * pair + 2) for pair in range(11)]
-"""Places of E2 and E3 to E22 and E23, which a palm asks for together (facts, section 5.2)."""
 
 Counts = NDArray[np.uint16]
-
-
-@pytest.fixture(scope="module")
-def untouched() -> Counts:
-    """9.8 s of three untouched sensors at 100 Hz, held values of 71.43 Hz: shape (977, 3, 24)."""
-    folder = data_dir()
-    if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
-        pytest.skip("the real recording of an untouched hand is not there")
-    return np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
 
 
 def play(fresh: FreshMedian, sweeps: Counts, usable: NDArray[np.bool_] = ALL) -> Counts:
@@ -53,13 +40,6 @@ def fresh_values(values: list[int]) -> list[int]:
     return kept
 
 
-def held_pairs(untouched: Counts) -> NDArray[np.bool_]:
-    """Which pairs were not sampled in each sweep: all six values stayed; shape (977, 11)."""
-    same = np.zeros(untouched.shape, dtype=np.bool_)
-    same[1:] = untouched[1:] == untouched[:-1]
-    return np.stack([same[:, :, pair].all(axis=(1, 2)) for pair in PAIRS], axis=1)
-
-
 def test_median_of_three_is_that_of_numpy_on_fresh_values() -> None:
     sweeps = never_repeating(300)
     medians = play(FreshMedian(SHAPE), sweeps)
@@ -85,25 +65,6 @@ def test_every_median_of_a_real_stream_follows_from_the_definition(untouched: Co
             for sweep in range(20, len(values), 31):
                 last = fresh_values(values[: sweep + 1])[-3:]
                 assert medians[sweep, finger, electrode] == sorted(last)[1]
-
-
-def test_a_palm_leaves_two_of_seven_sweeps_out_and_never_two_in_a_row(untouched: Counts) -> None:
-    held = held_pairs(untouched)
-    np.testing.assert_allclose(held.mean(axis=0), 2 / 7, atol=0.003)
-    assert not (held[1:] & held[:-1]).any()
-
-
-def test_no_sample_of_a_palm_counts_twice(untouched: Counts) -> None:
-    held = held_pairs(untouched)
-    counter = np.cumsum(~held, axis=0)  # of each pair: the number of the sample
-    sweeps = np.zeros(untouched.shape, dtype=np.uint16)
-    for pair, places in enumerate(PAIRS):
-        sweeps[:, :, places] = counter[:, pair, None, None]
-    medians = play(FreshMedian(SHAPE), sweeps)
-    # Of three samples that count up, the middle one is the second to last.
-    for pair, places in enumerate(PAIRS):
-        expected = np.broadcast_to(counter[5:, pair, None, None] - 1, (len(sweeps) - 5, 3, 2))
-        np.testing.assert_array_equal(medians[5:][:, :, places], expected)
 
 
 @pytest.mark.parametrize("holds", [False, True])

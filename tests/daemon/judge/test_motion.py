@@ -38,22 +38,6 @@ def moves(motion: Motion) -> NDArray[np.float64]:
     return np.array((motion.fast, motion.slow))
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.1, 61), (0.05, 66), (0.01, 77)])
-def test_the_limit_is_the_quantile_of_the_slopes_of_real_held_touches(
-    share: float, expected: float
-) -> None:
-    # At 100 ms, between those measured at 80 and at 120 ms: 78 and 49, 83 and 53, 97 and 63
-    # counts/s. Deviation and correlation as measured: 3.5 counts from sweep to sweep, 0.32.
-    random = np.random.default_rng(3)
-    white = random.normal(0.0, 3.5 / np.sqrt(0.68) / np.hypot(1.0, 0.36), (4001, 1, 24))
-    counts = 2000.0 + white[1:] + 0.36 * white[:-1]
-    motion = Motion(1, share, early=True)
-    fed(motion, counts, 100.0)
-    windows = np.lib.stride_tricks.sliding_window_view(counts[:, 0], 10, axis=0)
-    noise = np.abs(np.polyfit(0.01 * np.arange(10), windows.reshape(-1, 10).T, 1)[0]).mean()
-    assert motion.fast_limits[0] * noise == pytest.approx(expected, rel=0.12)
-
-
 def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
     """Sweeps of generated streams called still, early and surely; without a slide's standstill."""
     standstill_s = STANDSTILL_S[1] if any(sliding) else 0.0
@@ -153,16 +137,6 @@ def test_fast_motion_is_no_noise_and_is_excluded_soon_after_it_ends() -> None:
     assert motion.sure
 
 
-def test_motion_after_long_stillness_is_seen_by_the_short_window_first() -> None:
-    motion = Motion(1, 0.05, early=True)
-    begin_ns = fed(motion, wavering(2.0, 100.0, 3.5, 9), 100.0)
-    assert motion.sure
-    moving = wavering(0.05, 100.0, 3.5, 10) + np.linspace(0, 40, 5)[:, None, None]
-    fed(motion, moving, 100.0, begin_ns)
-    assert not motion.early
-    assert not motion.sure
-
-
 @pytest.mark.parametrize("repeats", [1, 2])
 def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(2.5, 100.0, 3.5, 11)
@@ -205,19 +179,6 @@ def test_electrodes_that_are_lost_for_longer_tell_nothing_until_a_window_has_pas
     # a finger is still, for as long as a window goes back to it.
     assert set(known[110:203]) == {(True, True)}
     assert known[203:] == [(False, False)] * 10 + [(True, False)] * 14 + [(True, True)] * 73
-
-
-def test_each_finger_is_measured_by_its_own_noise() -> None:
-    random = np.random.default_rng(13)
-    sigmas = np.array([2.0, 4.0, 8.0])[:, None]
-    motion, found = Motion(3, 0.05, early=True), []
-    for index in range(1500):
-        sweep = np.rint(2000.0 + random.normal(0.0, sigmas, (3, 24))).astype(np.uint16)
-        motion.add(index * 10_000_000, sweep, HAND)
-        if index > 500:
-            found.append(moves(motion))
-    # Noise alone makes 1 of all of them.
-    np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.035)
 
 
 def test_memory_is_bounded_however_fast_readings_come() -> None:

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision
-from drivers.base import ElectrodeFault, JointReading, TactileReading
+from drivers.base import JointReading, TactileReading
 from models.contract import Finger
-from models.tactile_image import TactileImager
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeModel, pipeline
 from tests.daemon.judge.necessity import (
     AGE_MAX_MS,
@@ -326,16 +325,7 @@ HELD = Feel(times=35, asks=True)
 SCENARIOS = {
     "two fingers of three": (Feel("two", times=40),),
     "let go without a large change": (Feel("faint", times=35), Feel("rest", times=20)),
-    "let go and taken again": (
-        Feel("faint", times=35),
-        Feel("rest", times=4),
-        Feel("faint", times=20),
-    ),
-    "lifted": (HELD, Feel("lifted", times=20)),
-    "another object": (HELD, Feel("other", times=40)),
     "old readings": (HELD, Feel(times=20, lag_ns=PERIOD_NS)),
-    "a gap": (HELD, Feel(step_ns=101 * MS), Feel(times=35)),
-    "time back": (HELD, Feel(step_ns=-PERIOD_NS), Feel(times=35)),
     "joints late, then lost": (HELD, Feel(times=90, joints="none")),
     "joints away and back": (
         HELD,
@@ -401,45 +391,6 @@ def test_a_hand_that_closes_and_keeps_still_gets_a_verdict() -> None:
     assert said[first].judged_counts is not None
     assert not said[first].moment.early
     assert set(decisions[first:]) == {Decision.STABLE}
-
-
-class Checked(TactileImager):
-    """Keeps what was judged last."""
-
-    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        self.counts = counts.copy()
-        return super().build(counts, out)
-
-
-def test_electrodes_that_come_back_are_not_judged_by_an_earlier_grasp() -> None:
-    hand = tared(limits())
-    hand.model.inputs = watched = Checked(3)
-    assert hand.play(Feel("grasp", times=40))[-1].decision is Decision.STABLE
-    lost = (Flaw(0, 0, 8, int(ElectrodeFault.MISSING), 0),)
-    hand.play(Feel("rest", times=40, flaws=lost))
-    closing = Feel("other", times=40, flaws=lost)
-    number = [said.moment.judged for said in copy.deepcopy(hand).play(closing)].index(True)
-    hand.play(dataclasses.replace(closing, times=number))
-    watched.counts = POSES["other"]
-    [said] = hand.play(Feel("other"))
-    assert "ff_1" not in said.opinion.repaired
-    assert np.abs(watched.counts - POSES["other"]).max() <= NOISE
-
-
-def test_joints_that_come_back_moving_are_not_taken_for_still() -> None:
-    hand = tared(limits())
-    assert hand.play(Feel(times=40))[-1].decision is Decision.STABLE
-    assert hand.play(Feel(times=50, joints="none"))[-1].decision is Decision.UNKNOWN
-    decisions = {said.decision for said in hand.play(Feel(times=8, joints="moving"))}
-    assert decisions == {Decision.UNKNOWN}
-
-
-def test_fingers_that_repeat_themselves_are_frozen_with_a_flagged_electrode_too() -> None:
-    hand = tared(limits())
-    assert hand.play(Feel(times=40))[-1].decision is Decision.STABLE
-    missing = tuple(Flaw(finger, 0, 1, int(ElectrodeFault.MISSING), 0) for finger in range(3))
-    _, *repeated = hand.play(Feel(times=10, repeats=True, flaws=missing))
-    assert {said.decision for said in repeated} == {Decision.UNKNOWN}
 
 
 def test_only_a_hand_with_a_gate_that_waits_is_asked() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
 from collections.abc import Sequence
 from functools import cache
@@ -21,7 +20,7 @@ from drivers.palm.packet import ROUND, PalmPacket
 from drivers.palm.stream import PalmStream
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, Sampling, synthetic_grasps
+from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
 from drivers.twins.palm import PalmTwin
 from tests.bench.recurrence import TABLES, UNTOUCHED, again
 from tests.daemon.fakes import FINGERS, MS, Clock
@@ -210,18 +209,6 @@ def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
         counts = random.integers(500, 3500, (3, 24)).astype(np.uint16)
         counts[1] = 0
         assert not past.recurs(counts, sound)
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "sampling"),
-    [(PALM_RATE_HZ, Sampling.FRESH), (RATE_HZ, Sampling.FRESH), (RATE_HZ, Sampling.HELD)],
-)
-def test_a_hand_with_measured_noise_never_recurs(rate_hz: float, sampling: Sampling) -> None:
-    """A minute of grasps; held values are those of a palm's rounds, read at 100 Hz."""
-    past = PastSweeps.none(3)
-    moments = synthetic_grasps(rate_hz=rate_hz, sampling=sampling, loop=True, seed=4)
-    for moment in itertools.islice(moments, round(60 * rate_hz)):
-        assert not past.recurs(moment.counts)
 
 
 def test_memory_does_not_grow() -> None:

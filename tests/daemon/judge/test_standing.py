@@ -118,15 +118,6 @@ def test_what_was_slip_is_stable_only_when_it_was_not_for_a_second() -> None:
     assert {each.decision for each in said[first:]} == {Decision.STABLE}
 
 
-def test_around_the_threshold_a_verdict_does_not_flicker() -> None:
-    hand, said = tared(limits()), []
-    hand.play(HELD)
-    for number in range(100):
-        said += hand.play(Feel(times=5, answer=0.49 + 0.02 * (number % 2)))
-    decisions = [each.decision for each in said]
-    assert set(decisions[20:]) == {Decision.SLIP}
-
-
 def test_a_slip_says_nothing_of_the_next_grasp() -> None:
     hand = tared(limits())
     hand.play(Feel("faint", times=35, answer=0.9))

@@ -126,11 +126,6 @@ def test_no_name_covers_a_point_or_another_name() -> None:
     assert not any(box.contains(*point) for box in boxes for point in points)
 
 
-def test_the_default_is_marked_in_the_table(folder: Path) -> None:
-    text = (folder / "error-vs-time.md").read_text()
-    assert "\n| `small-session`, the default | ff mf th | 92.3 (" in text
-
-
 def test_the_front_is_what_none_is_both_faster_and_more_exact_than() -> None:
     # By hand: c is slower and worse than b; the peer is no model of graspd's.
     given = [("a", "model", 9.0, 8.0), ("b", "model", 20.0, 5.0), ("c", "model", 30.0, 6.0)]

@@ -234,16 +234,6 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     assert found.timed["judged"].number > 0
 
 
-def test_joints_from_a_stream_need_no_hall_sensors(tmp_path: Path, measured: Measured) -> None:
-    text = (
-        '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9870"\n'
-        '[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:9871"\n'
-    )
-    found = measured(written(tmp_path, text))
-    assert set(found.modules) >= JOINTS
-    assert below(HALL, found.modules) == []
-
-
 def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training() -> None:
     code = (
         "import json, sys; from daemon.__main__ import main; sys.argv[1:] = ['replay']; main(); "

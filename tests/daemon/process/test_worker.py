@@ -14,8 +14,7 @@ from collections.abc import Iterator
 import pytest
 
 from daemon.process.worker import SWITCH_S, Worker
-
-PATIENCE_S = 100.0
+from tests.kit.waiting import PATIENCE_S
 
 
 @pytest.fixture

@@ -82,12 +82,6 @@ def test_readings_go_on_after_a_pause_and_do_not_catch_up(tmp_path: Path) -> Non
         assert [sockets.wanted(b"tactile.right") for _ in range(3)] == [True, False, False]
 
 
-def test_all_other_topics_are_always_wanted(tmp_path: Path) -> None:
-    with Sockets(wanted(tmp_path, tactile_hz=0.0)) as sockets:
-        assert sockets.wanted(b"verdict.right")
-        assert sockets.wanted(b"verdict.right")
-
-
 def test_questions_and_outcomes_reach_the_loop_and_are_answered(
     tmp_path: Path, peers: Peers
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -30,13 +29,6 @@ IGNORED_FIELDS = frozenset(
 )
 """Fields of a verdict that are of the run and not of the readings: a recording that is played again
 gives all others bit for bit."""
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 def compared(verdict: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -156,14 +155,6 @@ def test_the_summary_of_a_replay_counts_the_outcomes_in_the_recording(rotated: L
     assert without["labelled"] == summary["labelled"]
     assert "unproven" not in without["reasons"]
     assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
-
-
-def test_people_are_told_the_score_of_a_recording_against_its_outcomes(rotated: Lab) -> None:
-    text = graspd("replay", *rotated.files).stdout
-    score = (
-        r"^against [1-9] recorded outcomes \(slip positive\): accuracy [0-9.]+ %, .*f1 [0-9.]+ %$"
-    )
-    assert re.search(rf"{score}\ncoverage [0-9.]+ %, ", text, re.MULTILINE), text
 
 
 def test_outcomes_are_not_those_of_grasps_that_are_told_apart_otherwise(rotated: Lab) -> None:

@@ -34,7 +34,8 @@ from daemon.scene.scene import Record
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from tests.daemon.fakes import NO_LIFT
-from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
+from tests.kit.waiting import wait_until
 
 STATUS, VERDICT = b"status.right", b"verdict.right"
 START_NS = 10**12

@@ -6,8 +6,6 @@ import errno
 import json
 import logging
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,10 +22,10 @@ from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
 from daemon.scene import SceneError
 from daemon.scene.scene import Record
-from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording
 from tests.bench import kill_recorder
-from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
+from tests.kit.waiting import wait_until
 
 TOPIC = b"verdict.right"
 
@@ -244,68 +242,6 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
     recorder.close()
     counted = recorder.counters["record"]
     assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
-
-
-FULL = """
-import resource, signal, sys
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
-from daemon.cli import main
-sys.exit(main(["run", sys.argv[1]]))
-"""
-"""The daemon where no file may have more than 60 kB, as on a disk that is full."""
-
-
-def test_a_full_disk_stops_the_recording_and_not_the_daemon(tmp_path: Path) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_RECORDING}"]\nspeed = 4.0\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
-        '[record]\ndirectory = "record"\nflush_ms = 100\n'
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", FULL, str(path)],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    assert "Traceback" not in result.stderr
-    assert result.stderr.count("nothing is recorded") == 1
-    assert "File too large" in result.stderr
-    (written,) = (tmp_path / "record").iterdir()
-    kept = [content["seq"] for kind, content in messages(written) if kind == "tactile"]
-    assert kept == list(range(len(kept)))
-    assert len(kept) > 50
-
-
-WITHOUT = """
-import sys
-sys.modules["mcap"] = sys.modules["zstandard"] = None
-from daemon.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
-"""graspd where the extra `record` is not installed."""
-
-
-@pytest.mark.parametrize("command", [["run", "scene.toml"], ["replay", "a.mcap"]])
-def test_without_the_extra_it_is_said_what_to_install(tmp_path: Path, command: list[str]) -> None:
-    (tmp_path / "scene.toml").write_text(
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_RECORDING}"]\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n[record]\n'
-    )
-    (tmp_path / "a.mcap").write_bytes(b"")
-    result = subprocess.run(
-        [sys.executable, "-c", WITHOUT, command[0], str(tmp_path / command[1])],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-    )
-    assert result.returncode == 2
-    assert "pip install '.[record]'" in result.stderr
-    assert "Traceback" not in result.stderr
 
 
 def test_a_daemon_that_is_killed_loses_no_more_than_the_flush_interval(tmp_path: Path) -> None:

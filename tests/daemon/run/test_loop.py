@@ -24,7 +24,7 @@ from daemon.publish.companion import (
 from daemon.publish.messages import Lifts, State, decode_tactile
 from daemon.run.loop import Ended
 from daemon.session.sensors import SensorWatch
-from daemon.trust.lift_book import NOT_YOURS, UNKNOWN_START, GraspId, OutcomeStatus, Report
+from daemon.trust.lift_book import UNKNOWN_START, GraspId, OutcomeStatus, Report
 from daemon.trust.trust import Trust
 from drivers.base import DriverError, JointReading, LinkCause, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, reading
@@ -316,16 +316,6 @@ def test_an_outcome_is_answered_when_it_is_kept_and_repeated_only_then() -> None
     assert [topic for topic, _ in bench.output.sent].count(b"outcome.right") == 1
 
 
-def test_an_outcome_of_a_peer_that_does_not_own_the_grasp_changes_nothing() -> None:
-    clock = Clock()
-    bench = LoopBench(FakeDriver([reading(clock())], clock), clock, boot_id=BOOT)
-    bench.run()
-    bench.pipeline.lifts.claim(GraspId(BOOT, 1), b"controller")
-    assert told(bench, "slip", b"dashboard") == [NOT_YOURS]
-    assert not bench.pipeline.lifts.is_told(GraspId(BOOT, 1))
-    assert told(bench, "stable") == [None]
-
-
 def test_a_replay_takes_outcomes_by_its_own_name_of_the_start() -> None:
     """It enters its grasps in the book by the start that was recorded."""
     clock = Clock()
@@ -372,23 +362,6 @@ def test_an_outcome_of_a_grasp_of_an_earlier_start_is_taken_once_it_is_known() -
         expected = [None, "repeated"] if taken else [UNKNOWN_START] * 2
         assert peer.refused == expected
         assert trust.learner.outcomes == int(taken)
-
-
-def test_the_opposite_of_what_an_earlier_start_was_told_is_counted_and_not_published() -> None:
-    clock, earlier, trust = Clock(), GraspId("e" * 32, 1), Trust("fake", 0)
-    trust.note(earlier, trust.judge(earlier, 0.1, -2.0, np.empty(0)), stable=True)
-    assert trust.outcome(earlier, slipped=True) is OutcomeStatus.TAKEN
-    bench = LoopBench(FakeDriver([], clock), clock, boot_id="b" * 32, trust=trust)
-    bench.run()
-    answers: list[str | None] = []
-    bench.loop.outcome(Report(earlier, "stable"), answers.append)
-    assert answers[0] is not None
-    assert answers[0].startswith("contradicts")
-    assert trust.lifts.told[OutcomeStatus.CONTRADICTS] == 1
-    assert not [topic for topic, _ in bench.output.sent if topic.startswith(b"outcome.")]
-    bench.loop.outcome(Report(earlier, "slip"), answers.append)
-    assert answers[1:] == [None]
-    assert bench.output.topics == [b"status.right"]
 
 
 class Exchanging(FakeDriver):

@@ -21,9 +21,9 @@ from daemon.run import runner
 from daemon.scene import Scene
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, put_first
+from tests.kit.waiting import PATIENCE_S
 
 DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
-PATIENCE_S = 100.0
 
 SCENE = """
 [hand]
@@ -184,16 +184,6 @@ def test_a_wrong_scene_changes_nothing_and_is_told(
     assert code == 0
     assert word in said
     assert "the former scene goes on" in said
-
-
-def test_a_broken_file_changes_nothing_not_even_the_count(running: Running) -> None:
-    before = running.verdict()
-    running.scene.write_text("[hand\n")
-    running.hang_up()
-    running.told("READY=1")
-    after = running.verdict()
-    assert after.boot_id == before.boot_id
-    assert running.stop()[0] == 0
 
 
 def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket(

@@ -137,17 +137,3 @@ def test_what_was_told_last_is_answered_before_the_socket_closes(
         assert lab.at_the_end is None
         assert lab.controller.answer == {"v": 1, "ok": True}
     assert load(lab.path) is not None
-
-
-def test_a_full_disk_is_the_answer_and_verdicts_go_on(
-    tmp_path: Path, disk: Disk, stop: StopSignal
-) -> None:
-    disk.is_full = True
-    with closing(Lab(tmp_path, disk, READINGS + 1, stop)) as lab:
-        assert lab.controller.verdicts == READINGS
-        assert lab.at_the_end is not None
-        assert lab.at_the_end["ok"] is False
-        assert lab.at_the_end["why"].startswith("not kept: ")
-        assert lab.at_the_end["why"].endswith("No space left on device")
-    assert lab.trust.learner.outcomes == 1
-    assert load(lab.path) is None

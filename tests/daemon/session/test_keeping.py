@@ -206,21 +206,6 @@ def test_a_disk_that_hangs_holds_neither_the_loop_nor_too_many_answers(
     assert kept_trust(file) == part.state()
 
 
-def test_at_the_end_what_was_told_is_written_and_answered(
-    file: SessionFile, disk: Disk, keeper_of: KeeperOf
-) -> None:
-    part: Trust = trust()
-    found: list[str | None] = []
-    keeper = keeper_of(part)
-    for grasp in range(3):
-        judge(part, grasp)
-        tell(part, grasp)
-        keeper.keep(found.append)
-    keeper.save()
-    assert found == [None] * 3
-    assert kept_trust(file) == part.state()
-
-
 def test_a_disk_that_hangs_does_not_hold_up_the_end(
     file: SessionFile, disk: Disk, keeper_of: KeeperOf
 ) -> None:

@@ -69,29 +69,6 @@ def test_it_is_the_information_filter_in_long_double(inputs: int) -> None:
     np.testing.assert_allclose(covariance(learner), expected, rtol=0.0, atol=1e-14)
 
 
-def test_float64_is_long_double_after_2000_outcomes_of_three_fingers() -> None:
-    learner = Learner(THREE_FINGERS)
-    prior = np.array([0.3**2, 0.5**2] + [0.3**2] * THREE_FINGERS, dtype=np.longdouble)
-    mean = np.zeros(len(prior), dtype=np.longdouble)
-    mean[0] = 1.0
-    spread, drift = np.diag(prior), np.longdouble(2e-3) * prior
-    worst = 0.0
-    for margin, x, slipped in lifts(2000, THREE_FINGERS):
-        f = np.concatenate(([margin / 1.5, 1.0], x)).astype(np.longdouble)
-        found, features = learner.judge(margin, x)
-        expected = f @ mean / np.sqrt(1 + np.longdouble(math.pi) / 8 * (f @ spread @ f))
-        worst = max(worst, abs(found - float(expected)))
-        learner.learn(features, slipped=slipped)
-        p = 1 / (1 + np.exp(-(f @ mean)))
-        w, seen = p * (1 - p), spread @ f
-        spread = spread - np.outer(seen, seen) * (w / (1 + w * (f @ seen)))
-        mean = mean + spread @ f * (slipped - p)
-        spread = spread + np.diag(drift)
-        scale = np.sqrt(np.minimum(1, prior / np.diag(spread)))
-        spread = scale[:, None] * spread * scale
-    assert worst < 1e-11
-
-
 def test_without_drift_it_ends_where_a_batch_fit_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "DRIFT", 0.0)
     learner = Learner(6)
@@ -185,7 +162,7 @@ KINDS: tuple[Stream, ...] = (constant, at_the_clip, contradicting, separable, ag
 
 
 @pytest.mark.parametrize(
-    ("kind", "number"), [*((kind, 4000) for kind in KINDS), (all_in_turns, 100_000)]
+    ("kind", "number"), [*((kind, 4000) for kind in KINDS), (all_in_turns, 10_000)]
 )
 def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(
     kind: Stream, number: int

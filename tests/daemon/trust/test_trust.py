@@ -223,35 +223,6 @@ def test_no_adversary_breaks_the_bound(
         assert part.risk.slips <= part.risk.bound + 1e-9
 
 
-@pytest.mark.parametrize("alpha", [0.02, 0.05, 0.1])
-@pytest.mark.parametrize("wrong", [0.0, 0.03])
-def test_under_drift_and_wrong_outcomes_the_share_of_told_slips_is_kept(
-    alpha: float, wrong: float
-) -> None:
-    random = np.random.default_rng(3)
-    weights = random.normal(0.0, 0.5, INPUTS)
-    part, waiting = trust(RiskLimits(alpha)), []
-    for grasp in range(1500):
-        weights += random.normal(0.0, 0.02, INPUTS)
-        if grasp == 750:
-            weights = -weights  # a jump: the opposite of what was learned
-        truth = random.random() < sigmoid(-1.0 + 2.0 * float(inputs(grasp) @ weights))
-        judge(part, grasp, float(random.normal(-1.0 + 2.0 * (2 * truth - 1), 1.5)))
-        waiting.append((grasp, bool(truth != (random.random() < wrong))))
-        if random.random() < 0.7:
-            which, slipped = waiting.pop(int(random.integers(len(waiting))))
-            assert part.outcome(named(which), slipped=slipped) in (
-                OutcomeStatus.TAKEN,
-                OutcomeStatus.UNKNOWN,
-            )
-        assert part.risk.bound is not None
-        assert part.risk.slips <= part.risk.bound + 1e-9
-    assert part.risk.lifts > 15
-    assert part.risk.overdue == 0
-    excess = part.risk.slips - alpha * part.risk.lifts
-    assert excess <= math.log(2 * alpha / (1 - 2 * alpha)) + 6.0 + 1.0
-
-
 def test_a_restart_in_the_middle_changes_nothing() -> None:
     whole, part = trust(), trust()
     for grasp in range(300):

@@ -18,9 +18,8 @@ from daemon.watch.view import View
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Publisher
 from tests.daemon.watch.watch_fakes import MS, verdict
+from tests.kit.waiting import PATIENCE_S
 from tests.ports import free_port
-
-PATIENCE_S = 100.0
 
 
 @pytest.fixture

@@ -23,9 +23,9 @@ import pytest
 from daemon.judge.reasons import Decision
 from tests.daemon.processes import GRASPD, graspd, start
 from tests.daemon.watch.watch_fakes import Talker
+from tests.kit.waiting import PATIENCE_S
 from tests.ports import free_port
 
-PATIENCE_S = 100.0
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
 """Of the alternate screen (xterm)."""
 

@@ -22,8 +22,7 @@ from daemon.watch.web import (
     Server,
     load_page,
 )
-
-PATIENCE_S = 100.0
+from tests.kit.waiting import PATIENCE_S
 
 
 @pytest.fixture
