@@ -71,8 +71,8 @@ def write_json(content: object) -> None:
     sys.stdout.write(json.dumps(content) + "\n")
 
 
-def write_lines(lines: Iterable[str]) -> None:
-    """Write lines to stdout. They have no untrusted text that is not `printable`."""
+def write_lines(*lines: str) -> None:
+    """Write lines to stdout. The caller makes untrusted text in them `printable`."""
     sys.stdout.writelines(f"{line}\n" for line in lines)
 
 
