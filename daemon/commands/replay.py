@@ -48,10 +48,8 @@ Source: TypeAlias = "_Tables | LinkLogs | RecordedRun"
 
 MAX_AGE_MS = 1000.0
 """Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
-
 NO_SILENCE_NS = 3_600_000_000_000
 """A recording has its own silences: those of this machine must not count."""
-
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
