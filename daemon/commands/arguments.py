@@ -1,4 +1,4 @@
-"""The command line: a parser that suggests what was probably meant, and numbers on it."""
+"""The command line: a parser that suggests what was probably meant, and numbers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from daemon.process.text import did_you_mean
 
 
 class Parser(argparse.ArgumentParser):
-    """As `argparse` has it, but what is mistyped is answered with the nearest that there is."""
+    """A parser that answers a mistyped word with the nearest one."""
 
     @property
     def actions(self) -> Sequence[argparse.Action]:
-        """All that it takes: options, positional arguments, and the choice of a subcommand."""
+        """Options, positional arguments, and the choice of a subcommand."""
         return self._actions
 
     @property
@@ -27,7 +27,7 @@ class Parser(argparse.ArgumentParser):
         return next((each for each in choices if isinstance(each, Mapping)), {})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
-        """Parse; an option that there is not is an error before those that are missing."""
+        """Parse. An unknown option is reported before a missing argument."""
         words: Sequence[str] = sys.argv[1:] if args is None else args
         is_mine = (lambda word: word.startswith("-")) if self.subparsers else lambda _word: True
         for word in takewhile(lambda word: word != "--" and is_mine(word), words):

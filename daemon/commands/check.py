@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
+
+import msgspec
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.process.text import Colour, coloured, complain, printable, progress
+from daemon.commands.models import f1_percent
+from daemon.commands.operating_points import operating_points
+from daemon.judge.stillness import Tails
+from daemon.process.text import (
+    Colour,
+    coloured,
+    complain,
+    printable,
+    progress,
+    write_json,
+    write_lines,
+)
 from daemon.scene import drivers as scene_drivers
 from daemon.scene.scene import Realtime, Record, RiskSection
 from drivers.base import DriverError
@@ -27,21 +37,13 @@ if TYPE_CHECKING:
     from daemon.measure.cost import Footprint
 
 TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
-"""Of each tactile driver, as a scene may name it."""
+"""Section types of the tactile drivers."""
 
 WRONG, FAILED = 2, 1
 USUAL_PERIOD_NS = 10_000_000
-"""Between readings, where only the device knows."""
+"""Time between readings where only the device knows it, ns."""
 COIN = 0.5
-"""Every verdict is as sure as this, to two digits: a threshold below refuses nothing."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Checked:
-    """What became of one scene."""
-
-    code: int
-    cost: Footprint | None = None
+"""Lowest possible confidence: a smaller `min_confidence` has no effect."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,17 +61,17 @@ def run(args: argparse.Namespace) -> int:
     Whether devices and socket are there is for `graspd doctor`. A scene that is right and whose
     cost cannot be measured gives 1.
     """
-    found = [(path, _check(path, args)) for path in args.scene]
-    costs = [(path, checked.cost) for path, checked in found if checked.cost is not None]
-    if len(found) > 1 and costs and not args.json:
+    costs: list[tuple[Path, Footprint]] = []
+    codes = [_check(path, args, costs) for path in args.scene]
+    if len(codes) > 1 and costs and not args.json:
         from daemon.measure.cost import markdown
 
-        sys.stdout.writelines(f"{line}\n" for line in markdown(costs))
-    return max(checked.code for _, checked in found)
+        write_lines(*markdown(costs))
+    return max(codes)
 
 
-def _check(path: Path, args: argparse.Namespace) -> _Checked:
-    """Check one scene and write what there is to write about it alone."""
+def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footprint]]) -> int:
+    """Check one scene and write what there is to write about it alone; its cost joins `costs`."""
     try:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
@@ -79,31 +81,43 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         _try_keys(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
-        return _Checked(WRONG)
-    cost = None
+        return WRONG
+    document: dict[str, Any] = {
+        "scene": str(path),
+        "in": _what_is_in(wanted, model, limits, period_ns),
+        "left_out": _what_is_left_out(wanted, model, limits),
+        "warnings": _warnings(wanted),
+    }
+    cost_lines: Iterable[str] = ()
     if args.cost:
-        from daemon.measure.cost import CostError, measure
+        from daemon.measure import cost
 
         try:
             progress(f"measuring what {path} costs, some seconds")
-            cost = measure(path)
-        except CostError as error:
+            footprint = cost.measure(path)
+        except cost.CostError as error:
             complain(error)
-            return _Checked(FAILED)
+            return FAILED
         finally:
             progress("")
-    parts = {
-        "in": _what_is_in(wanted, model, limits, period_ns),
-        "left_out": _what_is_left_out(wanted, model, limits),
-    }
-    warnings = _warnings(wanted)
-    for warning in warnings:
+        costs.append((path, footprint))
+        document["cost"] = msgspec.to_builtins(footprint)
+        cost_lines = cost.lines(footprint)
+    for warning in document["warnings"]:
         complain(f"{path}: {warning}")
     if args.json:
-        _write_json(path, {**parts, "warnings": warnings}, cost)
-    elif cost is None or len(args.scene) == 1:
-        _write(path, parts, cost)
-    return _Checked(0, cost)
+        write_json(document)
+    elif not args.cost or len(args.scene) == 1:
+        write_lines(*_lines(document), *cost_lines)
+    return 0
+
+
+def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{printable(document['scene'])}: {coloured('fine', Colour.GREEN)}"
+    for title, key in (("in", "in"), ("left out", "left_out")):
+        yield title
+        for name, text in document[key].items():
+            yield f"  {name:9} {printable(text)}"
 
 
 def _warnings(wanted: scene.Scene) -> list[str]:
@@ -121,31 +135,10 @@ def _warnings(wanted: scene.Scene) -> list[str]:
     return warnings
 
 
-def _write_json(path: Path, parts: Mapping[str, object], cost: Footprint | None) -> None:
-    content: dict[str, object] = {"scene": str(path), **parts}
-    if cost is not None:
-        import msgspec
-
-        content["cost"] = msgspec.to_builtins(cost)
-    sys.stdout.write(json.dumps(content) + "\n")
-
-
-def _write(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None) -> None:
-    sys.stdout.write(f"{printable(str(path))}: {coloured('fine', Colour.GREEN)}\n")
-    for title, entries in (("in", parts["in"]), ("left out", parts["left_out"])):
-        sys.stdout.write(f"{title}\n")
-        for key, value in entries.items():
-            sys.stdout.write(f"  {key:9} {printable(value)}\n")
-    if cost is not None:
-        from daemon.measure.cost import lines
-
-        sys.stdout.writelines(f"{line}\n" for line in lines(cost))
-
-
 def _try_drivers(wanted: scene.Scene) -> int | None:
-    """Construct them all, and open what reads nothing but files: those are part of the scene.
+    """Construct all drivers, and open those that only read files.
 
-    The time between readings, ns; None where only the device knows.
+    Return the time between readings, ns; None where only the device knows.
     """
     tactile, joints = wanted.tactile, wanted.joints
     driver, *_ = assembly.build_drivers(wanted)
@@ -179,8 +172,7 @@ def _what_is_in(
 ) -> dict[str, str]:
     contract = model.contract
     figures = ", ".join(
-        f"{measured.protocol} {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} %"
-        for measured in contract.measured
+        f"{measured.protocol} {f1_percent(measured)} %" for measured in contract.measured
     )
     parts = {
         "hand": f"{wanted.hand.name}: {', '.join(wanted.hand.fingers)}",
@@ -190,7 +182,7 @@ def _what_is_in(
             f"{wanted.model.slip_threshold:g} on{_rejects(wanted)}"
         ),
         "gate": _gate(wanted, limits),
-        "publish": (f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}"),
+        "publish": f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}",
     }
     if limits is not None:
         parts["still"] = _still(wanted, limits.gate, period_ns)
@@ -242,23 +234,21 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
 
 
 def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
-    """What is known of motion when, and what is judged then."""
-    from daemon.commands.operating_points import operating_points
-    from daemon.judge.stillness import Tails
-
+    """Say after what time which motion is excluded, and when a grasp is judged."""
     tails = Tails.of(len(wanted.hand.fingers), gate.false_alarms, early=gate.early)
-    soon, sure = operating_points(tails, period_ns or USUAL_PERIOD_NS)
+    usual = ", as usual" if period_ns is None else ""
+    period_ns = period_ns or USUAL_PERIOD_NS
+    soon, sure = operating_points(tails, period_ns)
     after, again = f"{soon.after_ns / 1e6:.0f} ms", f"{sure.after_ns / 1e6:.0f} ms"
     judged = (
         f"judged early after {after}, again after {again}"
         if gate.early
         else f"judged after {again}"
     )
-    rate = 1e9 / (period_ns or USUAL_PERIOD_NS)
     return (
         f"after {after} fast motion is excluded, {soon.counts_per_s:.0f} counts/s and more, after "
         f"{again} slow slides, {sure.counts_per_s:.0f} and more (mean of the electrodes that is "
-        f"seen in half of the readings; {rate:.0f}/s{', as usual' if period_ns is None else ''}, "
+        f"seen in half of the readings; {1e9 / period_ns:.0f}/s{usual}, "
         f"typical noise); a hand that holds may be said to move {100 * gate.false_alarms:g} % of "
         f"the time; {judged}"
     )

@@ -7,7 +7,6 @@ import hashlib
 import http.client
 import shlex
 import signal
-import sys
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,17 +14,17 @@ from pathlib import Path
 from types import FrameType
 
 from daemon.process.files import write_atomically
-from daemon.process.text import complain, printable
+from daemon.process.text import complain, printable, write_lines
 from models.bts3 import CITATIONS, LICENCE, TABLES, TableFile
 
 MAX_BYTES = 16 * 2**20
-"""No file of the set has more than 1 MB; an endless answer is cut here."""
+"""Longest answer that is read. No file of the set has more than 1 MB."""
 TIMEOUT_S = 30.0
-"""A server that sends nothing for so long is given up, s."""
+"""Longest silence of a server, s."""
 FETCH_MAX_S = 120.0
-"""And so is one that has not sent a whole file after so long, s."""
+"""Longest time for a whole file, s."""
 MESSAGE_MAX = 320
-"""Characters of an error, which may quote what the server sent."""
+"""Longest error, characters: it may quote what the server sent."""
 
 UPSTREAM = "https://raw.githubusercontent.com/3dperceptionlab/biotacsp-stability-set-v2/master"
 """Where GitHub serves the files of `models.bts3.REPOSITORY`."""
@@ -57,13 +56,13 @@ def run(args: argparse.Namespace) -> int:
         except (DataError, OSError) as error:
             complain(error)
             return 1
-        sys.stdout.write(printable(said) + "\n")
-    sys.stdout.write(f"licence: {LICENCE}; please cite\n  " + "\n  ".join(CITATIONS) + "\n")
+        write_lines(printable(said))
+    write_lines(f"licence: {LICENCE}; please cite", *(f"  {text}" for text in CITATIONS))
     return 0
 
 
 def _get(args: argparse.Namespace, file: TableFile) -> str:
-    """Get one file unless it is there; what became of it."""
+    """Get one file unless it is there; return what was done."""
     target: Path = args.to / f"{file.name}.csv"
     args.to.mkdir(parents=True, exist_ok=True)
     if target.exists():
@@ -82,16 +81,13 @@ def _from_folder(folder: Path, file: TableFile) -> bytes:
         if (folder / name).is_file():
             return _checked(_read(folder / name), file, str(folder / name))
     below = (f"{deeper}/{name}" for deeper in ("*", "*/*") for name in names)
-    found = next((path for each in below for path in folder.glob(each)), None)
-    hint = "" if found is None else f"; try --from {shlex.quote(str(found.parent))}"
+    nearest = next((path for each in below for path in folder.glob(each)), None)
+    hint = "" if nearest is None else f"; try --from {shlex.quote(str(nearest.parent))}"
     raise DataError(f"{folder}: has neither {' nor '.join(names)}{hint}")
 
 
 def fetch(base: str, file: TableFile, limit_s: float = FETCH_MAX_S) -> bytes:
-    """The file from below an address, checked, within `limit_s` seconds. Raises `DataError`.
-
-    In the main thread only.
-    """
+    """Return the file, checked. Call it in the main thread. Raises `DataError`."""
     address = f"{base.rstrip('/')}/{file.upstream_name}"
     if not address.startswith(("https://", "http://")):
         raise DataError(f"{address}: only http and https addresses can be fetched")
@@ -106,10 +102,7 @@ def fetch(base: str, file: TableFile, limit_s: float = FETCH_MAX_S) -> bytes:
 
 @contextmanager
 def _at_most(limit_s: float) -> Iterator[None]:
-    """Raise `TimeoutError` after so long, whatever a server sends meanwhile.
-
-    The timeout of a socket begins anew with every byte, in the head of an answer too.
-    """
+    """Raise `TimeoutError` after `limit_s`: the timeout of a socket restarts with every byte."""
 
     def give_up(_number: int, _frame: FrameType | None) -> None:
         raise TimeoutError(f"took longer than {limit_s:g} s")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import logging
 import select
 import shutil
@@ -20,7 +19,7 @@ from daemon.assembly import assembly
 from daemon.commands.arguments import within
 from daemon.doctor import computer
 from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause, Finding, Level, fine, roots
+from daemon.doctor.finding import Cause, Finding, Level, fine, roots, warning
 from daemon.doctor.link import counter_findings, device_findings, rate_finding
 from daemon.doctor.surroundings import (
     can_finding,
@@ -30,7 +29,7 @@ from daemon.doctor.surroundings import (
     shared_findings,
     socket_findings,
 )
-from daemon.process.text import Colour, coloured, complain, printable
+from daemon.process.text import Colour, coloured, complain, printable, write_json, write_lines
 from drivers.base import Driver, DriverError, Fact, LinkError, TactileReading
 
 LISTEN_S = 3.0
@@ -38,21 +37,21 @@ LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0
 WAIT_S = 0.02
 """Longest sleep between two looks at a driver, s."""
 SHORTEST_WAIT_S = 0.001
-"""Shortest one, s, where a driver should have been looked at already: it may ask for that on and
-on."""
+"""Shortest one, s: a driver may be due again at once."""
 BRIDGE_NAME = "graspd"
 BRIDGE_VENDOR = 0x2E8A
-"""Raspberry Pi, whose Pico the bridge's sketch is for. Only ports of this vendor, or with the name
-above in their description, are greeted unasked: other devices may not like it."""
+"""Raspberry Pi, which makes the Pico. Other ports are greeted only if their name is the bridge's:
+unknown devices may not like it."""
 MARKS = {Level.OK: "ok ", Level.WARNING: "!  ", Level.ERROR: "!! "}
 COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
-"""Of a mark at the beginning of a line."""
 NARROWEST = 40
-"""Columns of a terminal that lines are broken for."""
+"""Lines are not wrapped to fewer columns."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
-"""Of a device, these explain that no finger is felt."""
-FINGER_COLUMNS, USUAL_COLUMNS = 25, 80
-"""Of a finger in the table of electrodes, and of that where there is no terminal."""
+"""Faults of a device that explain why no finger is felt."""
+FINGER_COLUMNS = 25
+"""Width of a finger in the table of electrodes."""
+USUAL_COLUMNS = 80
+"""Width of that table where there is no terminal."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,12 +90,12 @@ def run(args: argparse.Namespace) -> int:
         logging.disable(logging.NOTSET)
     if args.json:
         report["findings"] = [dataclasses.asdict(finding) for finding in findings]
-        sys.stdout.write(json.dumps(report) + "\n")
+        write_json(report)
     else:
         columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-        sys.stdout.writelines(f"{_coloured(line)}\n" for line in in_words(findings, columns))
+        write_lines(*map(_coloured, in_words(findings, columns)))
         if args.all and report.get("readings"):
-            sys.stdout.writelines(f"{line}\n" for line in _table(report, columns or USUAL_COLUMNS))
+            write_lines(*_table(report["electrodes"], columns or USUAL_COLUMNS))
     return int(any(finding.level is Level.ERROR for finding in findings))
 
 
@@ -108,9 +107,9 @@ def _coloured(line: str) -> str:
 def examine(
     driver: Driver, statistics: ElectrodeStatistics | None, seconds: float
 ) -> list[Finding]:
-    """What is wrong with an open driver, without what follows from something else of it.
+    """Return what is wrong with an open driver, causes only.
 
-    `statistics` are of what it brought in `seconds`; None for joint angles.
+    `statistics`: of its readings in `seconds`; None for joint angles.
     """
     device, counters = driver.describe(), driver.counters.as_dict()
     told = device_findings(driver.name, device, counters)
@@ -130,7 +129,7 @@ def examine(
 
 
 def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
-    """The findings for people, in lines of at most `columns`; with None a line for each."""
+    """Yield the findings in lines of at most `columns`; with None, one line each."""
     for finding in findings:
         what, mark = printable(finding.what), MARKS[finding.level]
         advice = printable(finding.advice or "")
@@ -140,12 +139,9 @@ def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
         width = max(columns, NARROWEST)
         yield from _wrapped(what, mark, "   ", width)
         yield from _wrapped(advice, "   -> ", "      ", width)
-    wrong, warnings = (
-        sum(finding.level is level for finding in findings)
-        for level in (Level.ERROR, Level.WARNING)
-    )
+    levels = [finding.level for finding in findings]
     yield ""
-    yield f"{wrong} wrong, {warnings} to look at"
+    yield f"{levels.count(Level.ERROR)} wrong, {levels.count(Level.WARNING)} to look at"
 
 
 def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
@@ -165,7 +161,7 @@ def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
     if not findings:
         what = "no USB serial port and no CAN interface"
         advice = "plug the bridge or the CAN adapter in; no hardware: graspd twin"
-        findings.append(Finding(Level.WARNING, what, Cause.PORT_MISSING, advice))
+        findings.append(warning(what, Cause.PORT_MISSING, advice))
     return findings
 
 
@@ -221,7 +217,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed the statistics for `listen_s`; seconds from the first reading to the last."""
+    """Feed the statistics for `listen_s`; return the time that the readings took, s."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         descriptors = [driver.fileno() for driver in drivers]
@@ -238,25 +234,24 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
 
 
 def _sleep_s(drivers: Sequence[Driver]) -> float:
-    """How long to wait for bytes, s: a recording has none, but a time for its next reading."""
+    """Return how long to wait, s: for bytes, or for the next reading of a recording."""
     dues_ns = [due_ns for driver in drivers if (due_ns := driver.due_ns()) is not None]
     wait_s = min(((due_ns - time.monotonic_ns()) / 1e9 for due_ns in dues_ns), default=WAIT_S)
     return min(max(wait_s, SHORTEST_WAIT_S), WAIT_S)
 
 
 def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:
-    """What was told of a device, and what its electrodes say; where no finger is felt and the
-    device as a whole explains it, that is the error, and not every finger."""
-    found = statistics.findings()
-    absent = [finding for finding in found if finding.cause is Cause.SENSOR_ABSENT]
+    """Add what electrodes say. A fault of the whole device replaces all absent fingers."""
+    electrodes = statistics.findings()
+    absent = [finding for finding in electrodes if finding.cause is Cause.SENSOR_ABSENT]
     whole = [finding for finding in told if finding.cause in WHOLE_DEVICE]
     if not whole or len(absent) < len(statistics.fingers):
-        return told + found
+        return told + electrodes
     raised = [
         dataclasses.replace(finding, level=Level.ERROR) if finding in whole else finding
         for finding in told
     ]
-    return raised + [finding for finding in found if finding not in absent]
+    return raised + [finding for finding in electrodes if finding not in absent]
 
 
 def _wrapped(text: str, first: str, further: str, width: int) -> list[str]:
@@ -270,10 +265,9 @@ def _wrapped(text: str, first: str, further: str, width: int) -> list[str]:
     )
 
 
-def _table(report: dict[str, Any], columns: int) -> Iterator[str]:
-    """Mean, deviation and faulty readings of every electrode, as many fingers abreast as fit."""
+def _table(electrodes: dict[str, dict[str, list[float]]], columns: int) -> Iterator[str]:
+    """Yield mean, deviation and faulty readings, as many fingers abreast as fit."""
     abreast = max(1, (columns - 4) // FINGER_COLUMNS)
-    electrodes = report["electrodes"]
     fingers = list(electrodes)
     for first in range(0, len(fingers), abreast):
         shown = fingers[first : first + abreast]
@@ -282,5 +276,5 @@ def _table(report: dict[str, Any], columns: int) -> Iterator[str]:
         yield "    " + "".join(f"{head:>{FINGER_COLUMNS}}" for head in heads)
         cells = [zip(*electrodes[finger].values(), strict=True) for finger in shown]
         for number, row in enumerate(zip(*cells, strict=True), start=1):
-            text = "".join(f"{mean:11.1f}{sd:7.1f}{faulty:7d}" for mean, sd, faulty in row)
+            text = "".join(f"{mean:11.1f}{sd:7.1f}{faulty:7.0f}" for mean, sd, faulty in row)
             yield f"{number:<4d}{text}"

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import io
 import re
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.process.files import write_atomically
-from daemon.process.text import complain
+from daemon.process.text import complain, write_lines
 from daemon.publish.messages import OBJECT_PATTERN
 from drivers.base import RecordingError
 
@@ -47,52 +46,41 @@ def run(args: argparse.Namespace) -> int:
     if args.out.exists() and not args.force:
         complain(f"{args.out} is there already: --force replaces it")
         return WRONG
-    from daemon.record.export import collect
+    from daemon.record.export import collect, write
 
     try:
-        found = collect(args.recordings)
+        export = collect(args.recordings)
     except RecordingError as error:
         complain(error)
         return WRONG
-    sys.stdout.write(_summary(found) + "\n")
-    if not found.grasps:
+    write_lines(_summary(export))
+    if not export.grasps:
         complain("no judged grasp with an outcome: nothing is written")
         return FAILED
     try:
-        _store(found, args.out, args.object)
+        table = io.StringIO(newline="")
+        write(table, export, args.object)
+        write_atomically(args.out, table.getvalue().encode(), mode=0o644)
     except OSError as error:
         complain(f"{args.out}: {error.strerror or error}")
         return FAILED
     return 0
 
 
-def _summary(found: Export) -> str:
-    grasps = found.grasps.values()
+def _summary(export: Export) -> str:
+    grasps = export.grasps.values()
     slipped = sum(grasp.slipped for grasp in grasps)
-    parts = [f"{len(grasps)} grasps, {slipped} slipped"]
-    parts += [
-        f"{number} {what}"
-        for number, what in (
-            (len({grasp.object_name for grasp in grasps} - {None}), "objects by name"),
-            (sum(grasp.object_name is None for grasp in grasps), "grasps without an object"),
-            (found.without_outcome, "left out without an outcome"),
-            (found.repaired, "left out with repaired electrodes"),
-            (found.repeated, "left out with the very counts of one before"),
-            (found.unjoined, "outcomes of grasps that are not in the recordings"),
-            (found.cut_off, "files that were cut off"),
-        )
-        if number
-    ]
-    return "; ".join(parts)
-
-
-def _store(found: Export, target: Path, object_name: str) -> None:
-    """Replace the table in one step. Raises `OSError`."""
-    from daemon.record.export import write
-
-    table = io.StringIO(newline="")
-    write(table, found, object_name)
-    write_atomically(target, table.getvalue().encode(), mode=0o644)
+    further = {
+        "objects by name": len({grasp.object_name for grasp in grasps} - {None}),
+        "grasps without an object": sum(grasp.object_name is None for grasp in grasps),
+        "left out without an outcome": export.without_outcome,
+        "left out with repaired electrodes": export.repaired,
+        "left out with the very counts of one before": export.repeated,
+        "outcomes of grasps that are not in the recordings": export.unjoined,
+        "files that were cut off": export.cut_off,
+    }
+    counted = [f"{count} {what}" for what, count in further.items() if count]
+    return "; ".join([f"{len(grasps)} grasps, {slipped} slipped", *counted])
 
 
 def _name(text: str) -> str:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from pathlib import Path
 
-from daemon.process.text import complain, printable
+from daemon.process.text import complain, printable, write_json, write_lines
 from daemon.publish import keys
 from daemon.publish.keys import KeysError
 
@@ -49,34 +47,35 @@ def _make(args: argparse.Namespace) -> int:
     except KeysError as error:
         complain(error)
         return WRONG
-    sys.stdout.write(
-        f"{printable(str(public))}: public; a client's goes into {CLIENTS}/ beside the daemon's\n"
-        f"{printable(str(secret))}: secret; stays with its owner\n"
+    write_lines(
+        f"{printable(str(public))}: public; a client's goes into {CLIENTS}/ beside the daemon's",
+        f"{printable(str(secret))}: secret; stays with its owner",
     )
     return 0
 
 
 def _list(args: argparse.Namespace) -> int:
-    found: dict[str, dict[str, str]] = {"own": {}, CLIENTS: {}}
+    own: dict[str, str] = {}
+    clients: dict[str, str] = {}
     problems = []
     for path in sorted(args.dir.glob(f"*{keys.SECRET}")):
         try:
-            found["own"][path.stem] = keys.load_own(path)[0].decode()
+            own[path.stem] = keys.load_own(path)[0].decode()
         except KeysError as error:
             problems.append(str(error))
     folder = args.dir / CLIENTS
     try:
         if folder.is_dir():
-            clients = keys.load_clients(folder)
-            found[CLIENTS] = {name: key.decode() for key, name in clients.admitted.items()}
-            problems += clients.refused
+            loaded = keys.load_clients(folder)
+            clients = {name: key.decode() for key, name in loaded.admitted.items()}
+            problems += loaded.refused
     except KeysError as error:
         problems.append(str(error))
     if args.json:
-        sys.stdout.write(json.dumps({**found, "wrong": problems}) + "\n")
+        write_json({"own": own, CLIENTS: clients, "wrong": problems})
     else:
-        for kind, entries in found.items():
-            sys.stdout.writelines(f"{kind:8} {printable(n)}  {key}\n" for n, key in entries.items())
+        for kind, entries in (("own", own), (CLIENTS, clients)):
+            write_lines(*(f"{kind:8} {printable(name)}  {key}" for name, key in entries.items()))
     for problem in problems:
         complain(problem)
     return WRONG if problems else 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,9 +14,9 @@ import msgspec
 
 from daemon.assembly.assembly import DEFAULT_MODEL
 from daemon.process.files import write_atomically
-from daemon.process.text import complain, printable
+from daemon.process.text import complain, printable, write_json, write_lines
 from models import own, zoo
-from models.contract import ModelContract, ModelError
+from models.contract import MeasuredError, ModelContract, ModelError
 from models.runtime import read
 
 TITLES = {
@@ -29,7 +28,6 @@ TITLES = {
     "days": "other objects, each day by others",
 }
 """What each protocol asks, for people."""
-
 SHOWN = {
     "known objects": ("cv",),
     "other objects": ("objects", "objects-whole"),
@@ -37,8 +35,6 @@ SHOWN = {
     "each other day": ("days",),
 }
 """Columns of the list: the first of these protocols that a card has."""
-
-
 ADD, REMOVE = "add", "remove"
 WRONG, FAILED = 2, 1
 
@@ -79,8 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the models, show a card, add or remove one; 2 for what is wrong with it, 1 if a folder
-    cannot be written."""
+    """List, show, add or remove; 2 for a wrong model, 1 if a folder cannot be written."""
     try:
         if args.what in (ADD, REMOVE):
             if args.which is None:
@@ -100,32 +95,35 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
-    added = own.added()
     if args.what is None:
-        cards = {name: zoo.card(name) for name in zoo.names()}
+        added = own.added()
+        contents = {name: zoo.card(name) for name in zoo.names()}
+        cards = {name: _parsed(content) for name, content in contents.items()}
         for name, path in added.items():
             try:
-                cards[name] = _checked(zoo.read_card(path.with_suffix(".json")))
+                content = zoo.read_card(path.with_suffix(".json"))
+                cards[name] = _parsed(content)
             except ModelError as error:
                 complain(error)
-        lines = _listing(cards, added)
-        content: object = cards
+            else:
+                contents[name] = content
+        lines, document = _listing(cards, added), contents
     else:
-        content = card = _card_of(args.what)
-        lines = _card(card)
+        document = _content_of(args.what)
+        lines = _details(_parsed(document))
     if args.json:
-        sys.stdout.write(json.dumps(content) + "\n")
+        write_json(document)
     else:
-        sys.stdout.write("\n".join(printable(line) for line in lines) + "\n")
+        write_lines(*map(printable, lines))
     return 0
 
 
-def _card_of(what: str) -> dict[str, Any]:
-    """Of a name or a file."""
+def _content_of(what: str) -> dict[str, Any]:
+    """Return the card of a name or a file, as it is."""
     if what in zoo.names():
         return zoo.card(what)
     is_file = what.endswith(".onnx") or os.sep in what
-    return _checked(own.card(Path(what) if is_file else own.find(what)))
+    return own.card(Path(what) if is_file else own.find(what))
 
 
 class _Size(msgspec.Struct):
@@ -136,32 +134,32 @@ class _Data(msgspec.Struct):
     licence: str
 
 
-class _Shown(msgspec.Struct):
-    """What is shown of a card; one of your own may lack what has a default."""
+class _ShownCard(msgspec.Struct):
+    """What is shown of a card. Cards of added models may lack what has a default."""
 
     what: str
     contract: ModelContract
     file: _Size
     parameters: int | None = None
-    weak_points: tuple[str, ...] = ()
+    weak_points: tuple[str, ...] = ("nobody has said",)
     data: _Data | None = None
-    command: str = ""
+    command: str | None = None
 
 
-def _checked(card: dict[str, Any]) -> dict[str, Any]:
-    """A card of which all that is shown has its form. Raises `ModelError`."""
+def _parsed(content: dict[str, Any]) -> _ShownCard:
+    """Raise `ModelError` if a part that is shown has another form."""
     try:
-        msgspec.convert(card, _Shown)
+        return msgspec.convert(content, _ShownCard)
     except msgspec.ValidationError as error:
         raise ModelError(f"a card is wrong: {error}") from error
-    return card
 
 
 def _add(args: argparse.Namespace) -> int:
     source = Path(args.which)
     file = read(source)
-    card = _checked(own.card(source, file))
-    name = card["contract"]["name"] if args.name is None else args.name
+    content = own.card(source, file)
+    card = _parsed(content)
+    name = card.contract.name if args.name is None else args.name
     if name in zoo.names():
         raise ModelError(f"graspd ships a model '{name}': give yours another --name")
     if not own.is_name(name) or name in (ADD, REMOVE):
@@ -176,14 +174,13 @@ def _add(args: argparse.Namespace) -> int:
     if not folder.is_dir():
         folder.mkdir(parents=True)
         folder.chmod(0o755)  # whatever the umask: the service reads it as another user
-    write_atomically(target.with_suffix(".json"), json.dumps(card).encode(), mode=0o644)
+    write_atomically(target.with_suffix(".json"), json.dumps(content).encode(), mode=0o644)
     write_atomically(target, file.data, mode=0o644)
-    sys.stdout.write(
-        f'{printable(str(target))}: added; in a scene, below [model]: name = "{name}"\n'
-    )
-    found = own.find(name)
-    if found != target:
-        complain(f"{found} has this name too, and comes first for you")
+    where = printable(str(target))
+    write_lines(f'{where}: added; in a scene, below [model]: name = "{name}"')
+    first = own.find(name)
+    if first != target:
+        complain(f"{first} has this name too, and comes first for you")
     elif not args.is_system:
         complain(f"for you alone; for a service: sudo graspd models add --system --name {name} ...")
     return 0
@@ -198,7 +195,7 @@ def _remove(args: argparse.Namespace) -> int:
     target.unlink()
     with suppress(FileNotFoundError):
         target.with_suffix(".json").unlink()
-    sys.stdout.write(f"{printable(str(target))}: removed\n")
+    write_lines(f"{printable(str(target))}: removed")
     return 0
 
 
@@ -209,55 +206,56 @@ def _folder(args: argparse.Namespace) -> Path:
     return folder
 
 
-def _listing(cards: dict[str, dict[str, Any]], added: dict[str, Path]) -> Iterator[str]:
+def _listing(cards: dict[str, _ShownCard], added: dict[str, Path]) -> Iterator[str]:
     titles = "".join(f"{title:>16}" for title in SHOWN)
     yield f"{'F1, %':26}{'fingers':10}{'MB':>6}{'numbers':>10}{titles}"
     for name, card in cards.items():
-        f1 = {
-            measured["protocol"]: f"{100 * measured['f1_mean']:.1f} +- "
-            f"{100 * measured['f1_std']:.1f}"
-            for measured in card["contract"]["measured"]
-        }
+        contract = card.contract
+        f1 = {measured.protocol: f1_percent(measured) for measured in contract.measured}
         mark = " (default)" if name == DEFAULT_MODEL else " (own)" if name in added else ""
         chosen = (next(filter(None, map(f1.get, group)), "-") for group in SHOWN.values())
         figures = "".join(f"{text:>16}" for text in chosen)
-        size = f"{card['file']['size_bytes'] / 1e6:.1f}"
-        parameters = card.get("parameters") or "-"
-        fingers = " ".join(card["contract"]["fingers"])
-        yield f"{name + mark:26}{fingers:10}{size:>6}{parameters:>10}{figures}"
+        size = f"{card.file.size_bytes / 1e6:.1f}"
+        fingers = " ".join(contract.fingers)
+        yield f"{name + mark:26}{fingers:10}{size:>6}{card.parameters or '-':>10}{figures}"
     yield ""
     for name, card in cards.items():
         where = f" ({added[name]})" if name in added else ""
-        yield f"{name}: {card['what']}{where}"
+        yield f"{name}: {card.what}{where}"
 
 
-def _card(card: dict[str, Any]) -> Iterator[str]:
-    contract = card["contract"]
-    yield f"{contract['name']}: {card['what']}"
+def f1_percent(measured: MeasuredError) -> str:
+    """Return F1 with its standard deviation, such as `83.5 +- 1.2`."""
+    return f"{100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f}"
+
+
+def _details(card: _ShownCard) -> Iterator[str]:
+    contract = card.contract
+    yield f"{contract.name}: {card.what}"
     yield ""
-    for measured in contract["measured"]:
-        title = TITLES.get(measured["protocol"], measured["protocol"])
+    for measured in contract.measured:
+        title = TITLES.get(measured.protocol, measured.protocol)
         yield (
-            f"{title + ' (' + measured['protocol'] + ')':44}"
-            f"F1 {100 * measured['f1_mean']:.1f} +- {100 * measured['f1_std']:.1f} %, "
-            f"accuracy {100 * measured['accuracy_mean']:.1f} % ({measured['folds']} folds)"
+            f"{title + ' (' + measured.protocol + ')':44}F1 {f1_percent(measured)} %, "
+            f"accuracy {100 * measured.accuracy_mean:.1f} % ({measured.folds} folds)"
         )
-    if contract["confidence"]:
+    steps = contract.confidence
+    if steps:
         yield ""
         yield "accuracy by coverage, on other objects of the same days:"
-        for step in contract["confidence"][:: max(1, len(contract["confidence"]) // 6)]:
-            yield (
-                f"  confidence {step['confidence']:.2f}: {100 * step['accuracy']:.1f} % right, "
-                f"{100 * step['coverage']:.0f} % judged"
-            )
+    for step in steps[:: max(1, len(steps) // 6)]:
+        yield (
+            f"  confidence {step.confidence:.2f}: {100 * step.accuracy:.1f} % right, "
+            f"{100 * step.coverage:.0f} % judged"
+        )
     yield ""
     yield "known weak points:"
-    for point in card.get("weak_points", ("nobody has said",)):
+    for point in card.weak_points:
         yield f"  - {point}"
     yield ""
-    for dataset in contract["datasets"]:
-        yield f"trained on {dataset['name']} ({dataset['rows']} grasps, {dataset['sha256'][:12]})"
-    if card.get("data"):
-        yield f"licence of the data: {card['data']['licence']}"
-    if "command" in card:
-        yield f"made by: {card['command']}"
+    for dataset in contract.datasets:
+        yield f"trained on {dataset.name} ({dataset.rows} grasps, {dataset.sha256[:12]})"
+    if card.data is not None:
+        yield f"licence of the data: {card.data.licence}"
+    if card.command is not None:
+        yield f"made by: {card.command}"

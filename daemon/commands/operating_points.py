@@ -1,4 +1,4 @@
-"""The motions that the gate can tell from noise, for `graspd check`."""
+"""The slowest motions that the gate can tell from noise, for `graspd check`."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
 from daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
 
 TYPICAL_COUNTS, TYPICAL_CORRELATIONS = 3.5 / math.sqrt(1.0 - 0.32), (0.32, 0.03)
-"""Standard deviation of a held touch's electrode, and its correlation at one and two sweeps; by the
-differences of sweeps, which the correlation makes less, it is 3.5 counts (2.9 to 4.2)."""
+"""Standard deviation of a held touch's electrode, and its correlation at one and two sweeps.
+
+Measured from differences of sweeps, which the correlation makes smaller: 3.5 counts (2.9 to 4.2).
+"""
 
 
 class OperatingPoint(NamedTuple):
     """What one window can tell."""
 
     after_ns: int
-    """Its length: it tells that a motion has ended this much later."""
+    """Length of the window, ns."""
     counts_per_s: float
-    """Steady motion, mean of a finger's electrodes, that is seen in every other sweep; a faster one
-    is seen in more."""
+    """Steady motion, mean of a finger's electrodes, that is seen in every other sweep."""
 
 
 def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, OperatingPoint]:
-    """Return what the short and the long window can tell of a finger of typical noise.
-
-    `period_ns`: time between sweeps.
-    """
+    """Return what the short and the long window tell of a finger of typical noise."""
     sweeps = max(math.ceil(STEP_NS / period_ns), 1)
     step_ns = sweeps * period_ns
     short, long = (
@@ -50,6 +48,6 @@ def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, Oper
     )
 
 
-def _extent(number: int, step_ns: int) -> float:
-    times_s = centred(np.arange(number) * step_ns / 1e9)
+def _extent(steps: int, step_ns: int) -> float:
+    times_s = centred(np.arange(steps) * step_ns / 1e9)
     return float(times_s @ times_s)

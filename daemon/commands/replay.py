@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daemon import scene
 from daemon.assembly import assembly
@@ -43,18 +43,17 @@ if TYPE_CHECKING:
     from daemon.assembly.link_logs import LinkLogs
     from daemon.assembly.recordings import RecordedRun
 
-    Recorded = LinkLogs | RecordedRun
-    """What graspd has recorded: it says itself how it was judged, as far as it knows."""
+Source: TypeAlias = "_Tables | LinkLogs | RecordedRun"
+"""Plays recordings. What graspd has recorded says itself how it was judged."""
 
 MAX_AGE_MS = 1000.0
 """Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
-
 NO_SILENCE_NS = 3_600_000_000_000
-"""A recording of graspd has its own silences: that this machine is busy now is none of them."""
-
+"""A recording has its own silences: those of this machine must not count."""
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
+RISK_OPTIONS = ("max_slip_when_stable", "warm_up", "explore")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -176,7 +175,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _where_from(error: Exception) -> str:
-    """Where a recording comes from that is not there, if it is one of the published ones."""
+    """Say how to get a published recording that is not there."""
     if not isinstance(error, RecordingError) or error.path.exists():
         return ""
     published = error.path.name in {f"{table.name}.csv" for table in TABLES}
@@ -187,25 +186,24 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     is_demo = not args.recordings
     if is_demo:
         _choose_demo(args)
-    recorded = _recorded(args)
-    wanted = _scene(args, recorded)
-    parts = _parts(args, wanted, assembly.load_model(wanted), recorded)
-    wanted, model, pipeline = parts.scene, parts.model, parts.pipeline
+    source = _source(args)
+    parts = _parts(args, source)
+    model, pipeline = parts.model, parts.pipeline
     shown: Printer | Demo
     if is_demo and not (args.json or args.verbose) and model.contract.fingers == FINGERS:
         shown = Demo(TactileModel(zoo.find(PUBLISHED)))
         told: list[Companion] = [shown]
     else:
         shown = Printer(as_json=args.json)
-        shown.result.trained_on = [] if recorded else trained_on(args.recordings, model)
-        told = [shown, *_comparisons(args, wanted, pipeline, recorded, shown.result)]
+        if isinstance(source, _Tables):
+            shown.result.trained_on = trained_on(args.recordings, model)
+        told = [shown, *_comparisons(args, source, parts, shown.result)]
     controller = Controller(only_lifted=args.only_lifted)
     if args.outcomes:
         told.append(controller)
-    if recorded is not None:
-        recorded.tell(shown)
+    source.tell(shown)
     timing = LoopTiming(
-        wanted.max_age_ns if recorded is None else NO_SILENCE_NS,
+        parts.scene.max_age_ns if isinstance(source, _Tables) else NO_SILENCE_NS,
         sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
     )
     with ExitStack() as stack:
@@ -213,7 +211,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         sockets = None
         if args.publish is not None:
             waits = args.wait is not None
-            sockets = stack.enter_context(Sockets(wanted, awaits_subscriber=waits))
+            sockets = stack.enter_context(Sockets(parts.scene, awaits_subscriber=waits))
             around.add_sockets(sockets)
         around.open_drivers()
         if sockets is not None and args.wait is not None:
@@ -228,57 +226,70 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _choose_demo(args: argparse.Namespace) -> None:
-    """What is replayed, and how, where nobody says it."""
     args.recordings = [DEMO_DAY]
     args.outcomes = True
     if args.max_slip_when_stable is None:
         args.max_slip_when_stable = DEMO_RISK
 
 
-def _need_labels(args: argparse.Namespace, wanted: Scene) -> None:
-    """Raise `SceneError` if outcomes are to be told and a recording has none."""
-    for path in args.recordings if args.outcomes else ():
-        if not columns_of(path, wanted.hand.fingers).has_labels:
-            raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
+class _Tables:
+    """Grasp tables and streams. They are judged as the command line says."""
 
-
-def _comparisons(
-    args: argparse.Namespace,
-    wanted: Scene,
-    pipeline: Pipeline,
-    recorded: Recorded | None,
-    result: RunSummary,
-) -> Iterator[Companion]:
-    """What judges the same grasps without a session, and without what outcomes teach."""
-    # What they judge is what the other one judged: they have no joints to know the moment by.
-    update = {
-        "gate": wanted.gate.model_copy(update={"mode": "every"}),
-        "learn": wanted.learn.model_copy(update={"enabled": False}),
-        "risk": None,
-    }
-    alone = wanted.model_copy(update=update)
-    if pipeline.session is not None and args.session != OFF:
-        other = assembly.load_model(wanted)
-        found = assembly.build_pipeline(alone, other, pipeline.clock, learns=False)
-        yield Comparison(WITHOUT_SESSION, found, result)
-    if pipeline.trust is not None and (args.outcomes or recorded is not None):
-        other, learns = assembly.load_model(wanted), wanted.session.learn
-        found = assembly.build_pipeline(alone, other, pipeline.clock, learns=learns)
-        _begin(args, found, wanted, recorded)
-        yield Comparison(WITHOUT_LEARNING, found, result)
-
-
-def _recorded(args: argparse.Namespace) -> Recorded | None:
-    """What graspd has recorded, if that is replayed. Imported only where it is."""
-    endings = {path.suffix for path in args.recordings}
-    if endings.isdisjoint({assembly.MCAP, *assembly.LINK_LOGS}):
+    def __init__(self, args: argparse.Namespace) -> None:
+        """Raise `SceneError` for options that do not fit."""
         if args.scene is not None:
             raise SceneError("--scene is for what came over a link")
         if args.max_slip_when_stable is None and (args.warm_up or args.explore) is not None:
             raise SceneError("--warm-up and --explore need --max-slip-when-stable")
-        return None
-    given = args.max_slip_when_stable, args.warm_up, args.explore, args.min_confidence
-    if args.outcomes or given != (None, None, None, None):
+        self._args = args
+
+    def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
+        """Return the scene that plays them. Raises `SceneError`."""
+        args = self._args
+        model = model or {"name": assembly.DEFAULT_MODEL}
+        if args.min_confidence is not None:
+            model["min_confidence"] = args.min_confidence
+        sections = {
+            "tactile": {
+                "driver": "replay",
+                "recordings": [path.absolute() for path in args.recordings],
+                "pace": "realtime" if args.speed else "fast",
+                "speed": args.speed or 1.0,
+                "rate_hz": args.rate,
+                "loop": args.loop,
+                "strict": args.strict,
+            },
+            "model": model,
+            "gate": {"max_age_ms": MAX_AGE_MS, "mode": mode},
+            "publish": publish,
+        }
+        if args.max_slip_when_stable is not None:
+            options = {name: getattr(args, name) for name in RISK_OPTIONS}
+            sections["risk"] = {name: value for name, value in options.items() if value is not None}
+        return scene.parse(sections, Path("command line"))
+
+    def parts(self, wanted: Scene, model: TactileModel, _speed: float | None) -> Parts:
+        """Make the parts for the model's fingers. Raises `SceneError` or `RecordingError`."""
+        wanted = wanted.model_copy(update={"hand": Hand(fingers=model.contract.fingers)})
+        for path in self._args.recordings if self._args.outcomes else ():
+            if not columns_of(path, wanted.hand.fingers).has_labels:
+                raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
+        return Parts.of(wanted, model)
+
+    def restore(self, pipeline: Pipeline) -> None:
+        """Nothing: a table does not know the session."""
+
+    def tell(self, companion: Companion) -> None:
+        """Nothing: the controller tells the outcomes of a table."""
+
+
+def _source(args: argparse.Namespace) -> Source:
+    """Return what plays the recordings. Imports only what this kind of them needs."""
+    endings = {path.suffix for path in args.recordings}
+    if endings.isdisjoint({assembly.MCAP, *assembly.LINK_LOGS}):
+        return _Tables(args)
+    given = [getattr(args, name) for name in (*RISK_OPTIONS, "min_confidence")]
+    if args.outcomes or any(value is not None for value in given):
         raise SceneError(
             "what graspd has recorded is judged under its own risk: no --outcomes, "
             "--max-slip-when-stable, --warm-up, --explore or --min-confidence"
@@ -296,32 +307,31 @@ def _recorded(args: argparse.Namespace) -> Recorded | None:
     return RecordedRun(args.recordings)
 
 
-def _parts(
-    args: argparse.Namespace, wanted: Scene, model: TactileModel, recorded: Recorded | None
-) -> Parts:
-    """What plays and judges; a session model's begins with the kept session if `--session` is a
-    file.
+def _parts(args: argparse.Namespace, source: Source) -> Parts:
+    """Make what plays and judges.
 
-    Raises `SessionFileError` if that is no session of this hand.
+    Raises `SessionFileError` if the file of `--session` is no session of this hand.
     """
-    if recorded is None:
-        wanted = wanted.model_copy(update={"hand": Hand(fingers=model.contract.fingers)})
-        _need_labels(args, wanted)
-        parts = Parts.of(wanted, model)
-    else:
-        parts = recorded.parts(wanted, model, args.speed)
+    chosen = {}
+    if args.model is not None:
+        chosen["path" if args.model.endswith(".onnx") else "name"] = args.model
+    wanted = source.scene({"endpoint": args.publish}, chosen, args.gate)
+    learns = wanted.session.learn and args.session != OFF
+    session = wanted.session.model_copy(update={"learn": learns})
+    wanted = wanted.model_copy(update={"session": session})
+    parts = source.parts(wanted, assembly.load_model(wanted), args.speed)
     if args.session not in (RUNNING, OFF) and parts.pipeline.session is None:
-        raise ModelError(f"the model {model.contract.name} keeps no session")
-    _begin(args, parts.pipeline, wanted, recorded)
+        raise ModelError(f"the model {parts.model.contract.name} keeps no session")
+    _restore_session(args, source, parts.pipeline, wanted.hand.fingers)
     return parts
 
 
-def _begin(
-    args: argparse.Namespace, pipeline: Pipeline, wanted: Scene, recorded: Recorded | None
+def _restore_session(
+    args: argparse.Namespace, source: Source, pipeline: Pipeline, fingers: Sequence[str]
 ) -> None:
-    """Give a judge the session that it begins with, if it begins with any."""
-    if args.session == RUNNING and recorded is not None:
-        recorded.restore(pipeline)
+    """Give a judge the session that it begins with: the recorded one, or that of a file."""
+    if args.session == RUNNING:
+        source.restore(pipeline)
     if args.session in (RUNNING, OFF) or pipeline.session is None:
         return
     path = Path(args.session)
@@ -329,52 +339,38 @@ def _begin(
     if kept is None:
         raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
     try:
-        pipeline.session.restore(statistics_of(kept, wanted.hand.fingers))
+        pipeline.session.restore(statistics_of(kept, fingers))
     except ValueError as error:
         raise SessionFileError(f"{path}: {error}") from error
+
+
+def _comparisons(
+    args: argparse.Namespace, source: Source, parts: Parts, result: RunSummary
+) -> Iterator[Companion]:
+    """Yield judges of the same grasps: without a session, and without learning from outcomes."""
+    wanted, pipeline = parts.scene, parts.pipeline
+    # They judge each reading that the replay judges: without joints they cannot choose it.
+    update = {
+        "gate": wanted.gate.model_copy(update={"mode": "every"}),
+        "learn": wanted.learn.model_copy(update={"enabled": False}),
+        "risk": None,
+    }
+    alone = wanted.model_copy(update=update)
+    if pipeline.session is not None and args.session != OFF:
+        other = assembly.load_model(wanted)
+        judge = assembly.build_pipeline(alone, other, pipeline.clock, learns=False)
+        yield Comparison(WITHOUT_SESSION, judge, result)
+    if pipeline.trust is not None and (args.outcomes or not isinstance(source, _Tables)):
+        other, learns = assembly.load_model(wanted), wanted.session.learn
+        judge = assembly.build_pipeline(alone, other, pipeline.clock, learns=learns)
+        _restore_session(args, source, judge, wanted.hand.fingers)
+        yield Comparison(WITHOUT_LEARNING, judge, result)
 
 
 def _wait(sockets: Sockets, timeout_s: float, stop: StopSignal) -> None:
     """Wait for a subscriber. Raises `PublishError` if there is none in time."""
     if not sockets.wait_for_subscriber(timeout_s, stop) and stop.received is None:
         raise PublishError(f"nobody subscribed to {sockets.endpoint} within {timeout_s:g} s")
-
-
-def _scene(args: argparse.Namespace, recorded: Recorded | None) -> Scene:
-    publish = {"endpoint": args.publish}
-    model = {} if args.model is None else _model(args.model)
-    if recorded is not None:
-        wanted = recorded.scene(publish, model, args.gate)
-        learns = wanted.session.learn and args.session != OFF
-        session = wanted.session.model_copy(update={"learn": learns})
-        return wanted.model_copy(update={"session": session})
-    if args.min_confidence is not None:
-        model["min_confidence"] = args.min_confidence
-    data = {
-        "tactile": {
-            "driver": "replay",
-            "recordings": [path.absolute() for path in args.recordings],
-            "pace": "realtime" if args.speed else "fast",
-            "speed": args.speed or 1.0,
-            "rate_hz": args.rate,
-            "loop": args.loop,
-            "strict": args.strict,
-        },
-        "model": {"name": assembly.DEFAULT_MODEL} | model if args.model is None else model,
-        "gate": {"max_age_ms": MAX_AGE_MS, "mode": args.gate},
-        "session": {"learn": args.session != OFF},
-        "publish": publish,
-    }
-    if args.max_slip_when_stable is not None:
-        given = {"warm_up": args.warm_up, "explore": args.explore}
-        data["risk"] = {"max_slip_when_stable": args.max_slip_when_stable} | {
-            name: value for name, value in given.items() if value is not None
-        }
-    return scene.parse(data, Path("command line"))
-
-
-def _model(name: str) -> dict[str, Any]:
-    return {"path": name} if name.endswith(".onnx") else {"name": name}
 
 
 def _endpoint(text: str) -> str:

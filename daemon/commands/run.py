@@ -21,7 +21,6 @@ from drivers.base import DriverError, LinkCause, LinkError, RecordingError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
-    from daemon.run.printer import Printer
     from daemon.run.systemd import Systemd
 
 DESCRIPTORS = 65_536
@@ -37,14 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording.
 
-    SIGHUP reads the scene again, and a wrong one changes nothing. On a terminal it means that the
-    terminal is gone, as for any other command.
+    SIGHUP reads the scene again, but ends a daemon that has a terminal.
     """
     _allow_descriptors()
     try:
         with ExitStack() as stack:
             stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
-            printer = _printer() if args.print else None
+            printer = None
+            if args.print:
+                from daemon.run.printer import Printer
+
+                printer = Printer(as_json=False)
             Runner(args.scene, stop, printer=printer, manager=_manager(stack)).run()
     except (SceneError, ModelError, RecordingError) as error:
         complain(error)
@@ -73,12 +75,11 @@ def _held_by(endpoint: str | None) -> str:
 
 
 def _allow_descriptors() -> None:
-    """Have enough of them, as far as this process may."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
+    limit = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
+    if soft != resource.RLIM_INFINITY and soft < limit:
         with contextlib.suppress(OSError):  # a service manager that forbids it has set its own
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
 
 
 def _on_terminal() -> bool:
@@ -86,7 +87,7 @@ def _on_terminal() -> bool:
 
 
 def _manager(stack: ExitStack) -> Systemd | None:
-    """Whoever started this process, if it wants to be told how it goes."""
+    """Return systemd if it started this process and waits for notifications."""
     if "NOTIFY_SOCKET" not in os.environ:
         return None
     from daemon.run.systemd import Systemd
@@ -97,9 +98,3 @@ def _manager(stack: ExitStack) -> Systemd | None:
         stack.callback(manager.close)
         stack.callback(manager.stopping)
     return manager
-
-
-def _printer() -> Printer:
-    from daemon.run.printer import Printer
-
-    return Printer(as_json=False)

@@ -1,12 +1,9 @@
-"""`graspd session show|reset|seed SCENE`: what the daemon knows of today's sensors, and has learned
-from how lifts ended."""
+"""`graspd session show|reset|seed SCENE`: calibration of the sensors, and what outcomes taught."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -21,7 +18,7 @@ from daemon.assembly import assembly
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Reason
 from daemon.process.extras import needs
-from daemon.process.text import complain, printable
+from daemon.process.text import complain, printable, write_json, write_lines
 from daemon.run.replaying import trained_on
 from daemon.scene import drivers as scene_drivers
 from daemon.session.file import (
@@ -68,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do it. Returns 0, or 2 if scene, model, recording or the kept session is wrong."""
+    """Return 0, or 2 if scene, model, recording or the kept session is wrong."""
     try:
         wanted = scene.load(args.scene)
         model = assembly.load_model(wanted)
@@ -92,21 +89,23 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
     kept = load(path)
     from_on = given.calibrated_from if isinstance(given, SessionInput) else None
     if as_json:
-        calibrated = kept is not None and from_on is not None and _grasps(kept) >= from_on
-        known = None if kept is None else msgspec.to_builtins(kept)
+        session = None
+        if kept is not None:
+            session = {**msgspec.to_builtins(kept), "trust": _learned(kept)}
+        former = _former(path)
         document = {
             "file": str(path),
-            "calibrated": calibrated,
-            "session": None if known is None else {**known, "trust": _learned(kept)},
-            "former_saved_at": None if (former := _former(path)) is None else former.saved_at,
+            "calibrated": kept is not None and from_on is not None and _grasps(kept) >= from_on,
+            "session": session,
+            "former_saved_at": None if former is None else former.saved_at,
             "put_aside": [
                 {"serials": each.serials, "grasps": _grasps(each), "saved_at": each.saved_at}
                 for each in others(path).values()
             ],
         }
-        sys.stdout.write(json.dumps(document) + "\n")
-        return
-    sys.stdout.write("\n".join(_lines(path, kept, from_on)) + "\n")
+        write_json(document)
+    else:
+        write_lines(*_lines(path, kept, from_on))
 
 
 def _grasps(kept: KeptSession) -> int:
@@ -114,7 +113,7 @@ def _grasps(kept: KeptSession) -> int:
 
 
 def _former(path: Path) -> KeptSession | None:
-    """What was kept before, if that is whole."""
+    """Return the save before the last one; None if it cannot be read."""
     with contextlib.suppress(SessionFileError):
         return read(former_of(path))
     return None
@@ -154,9 +153,9 @@ def _when(kept: KeptSession) -> str:
     return f"{saved}, {max(time.time() - kept.saved_at, 0.0) / 60.0:.0f} minutes ago"
 
 
-def _learned(kept: KeptSession | None) -> dict[str, Any] | None:
-    """What outcomes have taught; None if that is nothing, or cannot be read."""
-    if kept is None or kept.trust is None:
+def _learned(kept: KeptSession) -> dict[str, Any] | None:
+    """Return what outcomes have taught; None if that is nothing, or cannot be read."""
+    if kept.trust is None:
         return None
     try:
         state = decode(kept.trust)
@@ -179,51 +178,53 @@ def _learned(kept: KeptSession | None) -> dict[str, Any] | None:
 def _reset(wanted: scene.Scene) -> None:
     with SessionFile(wanted.session_path) as file:
         was_kept = file.remove()
-    where = printable(str(wanted.session_path))
-    sys.stdout.write(f"{where}: {'forgotten' if was_kept else 'no session was kept'}\n")
+    result = "forgotten" if was_kept else "no session was kept"
+    write_lines(f"{printable(str(wanted.session_path))}: {result}")
 
 
 def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
-    """Judge the recordings as the daemon does, tell their outcomes, and keep what comes out."""
+    """Judge the recordings as the daemon does, tell their outcomes, and keep the session."""
     wanted = _on_recordings(wanted, recordings)
     pipeline = assembly.build_pipeline(wanted, model)
     session, trust = pipeline.session, pipeline.trust
     with SessionFile(wanted.session_path) as file:
         judgements = _judge(wanted, pipeline)
-        read = len(judgements)
+        readings = len(judgements)
         outcomes = 0 if trust is None else trust.learner.outcomes
-        if session is None and not outcomes:
-            raise DriverError(f"of {read} readings none is a grasp whose outcome is known")
+        grasps, state = outcomes, None
         if session is not None:
+            grasps, state = session.grasps, session.state()
             if not session.calibrated:
                 raise DriverError(
-                    f"{session.grasps} grasps of {read} readings are too few, or they are no grasps"
+                    f"{grasps} grasps of {readings} readings are too few, or they are no grasps"
                 )
-            _check(wanted, model, session.state())
-        # Of which sensors they are is not known before the daemon hears from them.
-        state = None if session is None else session.state()
+            _check(wanted, model, state)
+        elif not outcomes:
+            raise DriverError(f"of {readings} readings none is a grasp whose outcome is known")
         learned = _learned_before(file) if trust is None else _taught(trust)
-        file.save(kept_now(state, wanted.hand.fingers, {}, learned))
+        serials: dict[str, str] = {}  # not known before the daemon hears from the sensors
+        file.save(kept_now(state, wanted.hand.fingers, serials, learned))
         file.remove_former()
-    grasps = outcomes if session is None else session.grasps
-    sys.stdout.write(
-        f"{printable(str(wanted.session_path))}: {grasps} grasps of {read} readings taken in, each "
-        f"once for as long as it was held, {outcomes} outcomes learned\n"
+    write_lines(
+        f"{printable(str(wanted.session_path))}: {grasps} grasps of {readings} readings taken in, "
+        f"each once for as long as it was held, {outcomes} outcomes learned"
     )
-    if refused := Counter(
+    refused = Counter(
         reason for each in judgements if each.p_slip is None for reason in each.reasons
-    ):
-        why = ", ".join(f"{reason} {number}" for reason, number in refused.most_common())
-        sys.stdout.write(f"  nothing was learned from readings that were not judged: {why}\n")
-    if known := trained_on(recordings, model):
+    )
+    if refused:
+        why = ", ".join(f"{reason} {count}" for reason, count in refused.most_common())
+        write_lines(f"  nothing was learned from readings that were not judged: {why}")
+    datasets = trained_on(recordings, model)
+    if datasets:
         complain(
-            f"warning: the model was trained on {', '.join(known)}: it judges other grasps worse, "
-            "so what these outcomes taught promises too much; better seed with other grasps"
+            f"warning: the model was trained on {', '.join(datasets)}: it judges other grasps "
+            "worse, so what these outcomes taught promises too much; better seed with other grasps"
         )
 
 
 def _learned_before(file: SessionFile) -> TrustState | None:
-    """What is kept stays where nothing learns: it is of use once something does again."""
+    """Return what was kept, for a scene that may learn again later."""
     try:
         kept = file.load()
         return None if kept is None or kept.trust is None else decode(kept.trust)
@@ -233,10 +234,9 @@ def _learned_before(file: SessionFile) -> TrustState | None:
 
 
 def _taught(trust: Trust) -> TrustState:
-    """What recorded outcomes have taught, also that the warm-up is over.
+    """Return what recorded outcomes have taught, also that the warm-up is over.
 
-    None of their lifts counts as one of a `stable` verdict: they were not made on one, and `[risk]`
-    had no say. So the bound begins with the first lift that the daemon is told of.
+    Their lifts were not made on a `stable` verdict: the bound of `[risk]` does not count them.
     """
     state = trust.state()
     risk = msgspec.structs.replace(state.risk, lifts=0, slips=0)
@@ -244,25 +244,22 @@ def _taught(trust: Trust) -> TrustState:
 
 
 def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> None:
-    """Raise `DriverError` if the session does not know its own recordings again."""
+    """Raise `DriverError` if most recorded grasps are `never-seen` under the new session."""
     pipeline = assembly.build_pipeline(wanted, model, learns=False)
     if pipeline.session is not None:
         pipeline.session.restore(state)
     again = _judge(wanted, pipeline)
     unlike = sum(Reason.NEVER_SEEN in judgement.reasons for judgement in again)
     if 2 * unlike > len(again):
-        contract, trained = model.contract, sum(file.rows for file in model.contract.datasets)
+        trained = sum(file.rows for file in model.contract.datasets)
         raise DriverError(
-            f"{unlike} of {len(again)} readings are unlike all grasps that {contract.name} was "
-            f"trained on, which were {trained}: nothing is written"
+            f"{unlike} of {len(again)} readings are unlike all grasps that {model.contract.name} "
+            f"was trained on, which were {trained}: nothing is written"
         )
 
 
 def _on_recordings(wanted: scene.Scene, recordings: list[Path]) -> scene.Scene:
-    """The scene with recordings in place of its sensors: tables are judged row by row.
-
-    Without its `[risk]`, which has no say in lifts that are over.
-    """
+    """Return the scene with recordings in place of its sensors, and without `[risk]`."""
     replay = scene_drivers.ReplayTactile(
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
@@ -273,7 +270,7 @@ def _on_recordings(wanted: scene.Scene, recordings: list[Path]) -> scene.Scene:
 
 
 def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
-    """What is judged of the recordings, grasp by grasp; then its outcome is told if it is known."""
+    """Judge the recordings; tell each known outcome after its grasp."""
     judgements: list[Judgement] = []
     for reading in _readings(wanted):
         if isinstance(reading, JointReading):
@@ -303,18 +300,16 @@ def _readings(wanted: scene.Scene) -> Iterator[Reading]:
 
 
 def _recorded_grasps(paths: Sequence[Path], fingers: Sequence[str]) -> Iterator[TactileReading]:
-    """The grasps of recordings whose outcome was told. Raises `SceneError` or `RecordingError`."""
+    """Yield grasps with an outcome. Raises `SceneError` or `RecordingError`."""
     try:
         from daemon.record.export import collect
     except ModuleNotFoundError as error:
         raise scene.SceneError(needs("seeding from MCAP", "record", error)) from error
-    found = collect(paths)
-    if found.fingers != tuple(fingers):
-        raise scene.SceneError(
-            f"{paths[0]}: is of the fingers {', '.join(found.fingers)}, "
-            f"the hand has {', '.join(fingers)}"
-        )
-    for number, grasp in enumerate(found.grasps.values(), 1):
+    export = collect(paths)
+    if export.fingers != tuple(fingers):
+        theirs, ours = ", ".join(export.fingers), ", ".join(fingers)
+        raise scene.SceneError(f"{paths[0]}: is of the fingers {theirs}, the hand has {ours}")
+    for number, grasp in enumerate(export.grasps.values(), 1):
         told = Annotation(paths[0], number, grasp.object_name, grasp.slipped)
         faults = np.zeros(grasp.counts.shape, dtype=np.uint8)
         yield TactileReading(time.monotonic_ns(), number, grasp.counts, faults, told)

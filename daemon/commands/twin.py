@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import signal
-import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from types import FrameType
 
-from drivers.base import DriverError
+from daemon.process.signals import STOPPING
+from daemon.process.text import complain, write_json
+from drivers.base import ELECTRODES, DriverError
 from drivers.biotac import SEQUENCES
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts, recorded_counts
@@ -98,18 +99,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_faults(parser: argparse.ArgumentParser) -> None:
+    """Declare the faults, each by the name of its field in `LinkFaults`."""
     faults = parser.add_argument_group("faults, none by default; chances are per frame")
     for name, text in PROBABILITIES.items():
-        help_text = f"chance, from 0 to 1, that {text}"
-        faults.add_argument(f"--{name}", type=float, default=0.0, metavar="P", help=help_text)
+        faults.add_argument(
+            f"--{name}",
+            dest=f"{name.replace('-', '_')}_probability",
+            type=float,
+            default=0.0,
+            metavar="P",
+            help=f"chance, from 0 to 1, that {text}",
+        )
     faults.add_argument(
         "--one-byte-at-a-time", action="store_true", help="write every byte on its own (spi)"
     )
     faults.add_argument(
-        "--burst", type=int, default=1, metavar="FRAMES", help="hold back and send so many at once"
+        "--burst",
+        dest="burst_frames",
+        type=int,
+        default=1,
+        metavar="FRAMES",
+        help="hold back and send so many at once",
     )
     faults.add_argument(
         "--disconnect-every",
+        dest="disconnect_every_frames",
         type=int,
         metavar="FRAMES",
         help="break the link in the middle of every such frame",
@@ -122,6 +136,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
     )
     faults.add_argument(
         "--dead",
+        dest="dead_electrodes",
         action="append",
         default=[],
         metavar="ELECTRODE",
@@ -129,6 +144,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
     )
     faults.add_argument(
         "--unplugged",
+        dest="unplugged_fingers",
         action="append",
         default=[],
         choices=FINGERS,
@@ -146,20 +162,17 @@ def run(args: argparse.Namespace) -> int:
     def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
         stop.set()
 
-    former = {number: signal.signal(number, ask_to_stop) for number in STOP_SIGNALS}
+    former = {number: signal.signal(number, ask_to_stop) for number in STOPPING}
     try:
         injected = SERVE[args.kind](args, _faults(args), stop)
     except (DriverError, ValueError, OSError) as error:
-        sys.stderr.write(f"graspd: {error}\n")
+        complain(error)
         return 2
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
-    sys.stdout.write(json.dumps({"injected": injected}) + "\n")
+    write_json({"injected": injected})
     return 0
-
-
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _counts(args: argparse.Namespace, rate_hz: float) -> Iterator[Counts]:
@@ -174,54 +187,36 @@ def _counts(args: argparse.Namespace, rate_hz: float) -> Iterator[Counts]:
 
 
 def _faults(args: argparse.Namespace) -> LinkFaults:
-    chances = {
-        f"{name.replace('-', '_')}_probability": _given(args, name) for name in PROBABILITIES
-    }
-    return LinkFaults(
-        **chances,
-        one_byte_at_a_time=args.one_byte_at_a_time,
-        burst_frames=args.burst,
-        disconnect_every_frames=args.disconnect_every,
-        wrong_version=args.wrong_version,
-        stuck_clock=args.stuck_clock,
-        dead_electrodes=tuple(map(_electrode, args.dead)),
-        unplugged_fingers=tuple(FINGERS.index(finger) for finger in args.unplugged),
-        seed=args.seed,
-    )
-
-
-def _given(args: argparse.Namespace, name: str) -> float:
-    return float(getattr(args, name.replace("-", "_")))
+    options = vars(args)
+    values = {field.name: options[field.name] for field in fields(LinkFaults)}
+    values["dead_electrodes"] = tuple(map(_electrode, args.dead_electrodes))
+    values["unplugged_fingers"] = tuple(map(FINGERS.index, args.unplugged_fingers))
+    return LinkFaults(**values)
 
 
 def _electrode(text: str) -> tuple[int, int]:
-    finger, _, number = text.partition("_")
-    if finger not in FINGERS or not number.isdecimal() or not 1 <= int(number) <= 24:
+    finger, _, electrode = text.partition("_")
+    if finger not in FINGERS or not electrode.isdecimal() or not 1 <= int(electrode) <= ELECTRODES:
         raise ValueError(f"{text!r} is no electrode; th_24 would be one")
-    return FINGERS.index(finger), int(number) - 1
+    return FINGERS.index(finger), int(electrode) - 1
 
 
 def _serve_spi(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
-) -> dict[str, int]:
+) -> Mapping[str, int]:
     from drivers.twins.spi import SpiTwin
 
-    twin = SpiTwin(
-        args.path,
-        _counts(args, args.rate),
-        rate_hz=args.rate,
-        channels=SEQUENCES[args.sequence],
-        faults=faults,
-    )
-    with twin:
+    channels = SEQUENCES[args.sequence]
+    counts = _counts(args, args.rate)
+    with SpiTwin(args.path, counts, rate_hz=args.rate, channels=channels, faults=faults) as twin:
         log.info("SPI bridge on %s", args.path)
         twin.serve(lambda: stop.is_set() or twin.exhausted)
-    return dict(twin.injected)
+    return twin.injected
 
 
 def _serve_can(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
-) -> dict[str, int]:
+) -> Mapping[str, int]:
     from drivers.twins.can import CanTwin
 
     twin = CanTwin(
@@ -237,34 +232,28 @@ def _serve_can(
     with twin:
         log.info("CAN board on %s %s", args.interface, args.channel)
         twin.serve(stop)
-    return dict(twin.injected)
+    return twin.injected
 
 
-def _serve_palm(
+def _serve_datagrams(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
-) -> dict[str, int]:
+) -> Mapping[str, int]:
+    from drivers.twins.joints import JointTwin
     from drivers.twins.palm import PalmTwin
 
-    twin = PalmTwin(_counts(args, PALM_RATE_HZ), faults=faults)
-    log.info("palm to %s", args.to)
+    twin: JointTwin | PalmTwin
+    if args.kind == "palm":
+        twin = PalmTwin(_counts(args, PALM_RATE_HZ), faults=faults)
+    else:
+        twin = JointTwin(faults=faults)
+    log.info("%s to %s", args.kind, args.to)
     twin.serve(args.to, stop)
-    return dict(twin.injected)
-
-
-def _serve_joints(
-    args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
-) -> dict[str, int]:
-    from drivers.twins.joints import JointTwin
-
-    twin = JointTwin(faults=faults)
-    log.info("joints to %s", args.to)
-    twin.serve(args.to, stop)
-    return dict(twin.injected)
+    return twin.injected
 
 
 SERVE = {
     "spi": _serve_spi,
     "can": _serve_can,
-    "palm": _serve_palm,
-    "joints": _serve_joints,
+    "palm": _serve_datagrams,
+    "joints": _serve_datagrams,
 }

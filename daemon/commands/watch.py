@@ -22,14 +22,14 @@ from daemon.watch.feed import Feed, load_keys
 from daemon.watch.view import TICK_S, HandFeed, View
 
 ENDPOINT = "ipc:///run/graspd/right.ipc"
-"""Where the daemon publishes unless its scene says otherwise."""
+"""Default endpoint of the daemon."""
 PORT = 8377
 FOXGLOVE_PORT = 8765
-"""Where viewers look unless they are told otherwise."""
+"""Default port of Foxglove's viewers."""
 NICENESS = 10
-"""Drawing takes a tenth of a processor, and a daemon on the same one comes first."""
+"""A daemon on the same processor comes first: drawing takes a tenth of one."""
 HANDS_MAX = 8
-"""Hands in one page or terminal; more are seen by another `watch`."""
+"""Most hands in one page or terminal."""
 FAILED, WRONG = 1, 2
 
 
@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show until stopped; 2 for a wrong command line, 1 if the page's port is not to be had."""
+    """Show until stopped; 2 for a wrong command line, 1 if the port cannot be had."""
     os.nice(NICENESS)
     try:
         with contextlib.ExitStack() as stack:
@@ -117,16 +117,16 @@ def _port(text: str) -> int:
 
 def _targets(args: argparse.Namespace) -> list[Target]:
     endpoints = args.connect or ([] if args.scenes else [ENDPOINT])
-    found = [Target(endpoint, None, args.server_key) for endpoint in endpoints]
+    targets = [Target(endpoint, None, args.server_key) for endpoint in endpoints]
     for path in args.scenes:
         wanted = scene.load(path)
         server = args.server_key
         if server is None and wanted.curve is not None:
             server = wanted.curve.secret_key.with_suffix(".key")
-        found.append(Target(wanted.endpoint, wanted.hand.name, server))
-    if len(found) > HANDS_MAX:
-        raise UsageError(f"{len(found)} hands are more than the {HANDS_MAX} that can be watched")
-    return found
+        targets.append(Target(wanted.endpoint, wanted.hand.name, server))
+    if len(targets) > HANDS_MAX:
+        raise UsageError(f"{len(targets)} hands are more than the {HANDS_MAX} that can be watched")
+    return targets
 
 
 def _keys(args: argparse.Namespace, target: Target) -> tuple[bytes, bytes, bytes] | None:

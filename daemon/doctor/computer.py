@@ -103,28 +103,25 @@ def can_interfaces(
     folder: Path = NETWORK, ip: Sequence[str] = ("ip", "-json", "-details", "link")
 ) -> list[CanInterface]:
     """Every CAN interface below `/sys/class/net`; its controller as the command `ip` tells it."""
-    found = {}
+    states = {}
     for interface in sorted(folder.glob("*")):
         with suppress(OSError):
             if (interface / "type").read_text().strip() == ARPHRD_CAN:
                 state = (interface / "operstate").read_text().strip()
                 # Of an interface without a carrier (vcan), the kernel knows no more than that.
-                found[interface.name] = "up" if state == "unknown" else state
-    details = _details(ip) if found else {}
-    return [
-        CanInterface(name, state, None) if name not in details else _controlled(name, details[name])
-        for name, state in found.items()
-    ]
-
-
-def _controlled(name: str, info: dict[str, object]) -> CanInterface:
-    timing = info.get("bittiming")
-    bitrate = timing.get("bitrate") if isinstance(timing, dict) else None
-    return CanInterface(name, str(info["state"]).lower(), bitrate)
+                states[interface.name] = "up" if state == "unknown" else state
+    details = _details(ip) if states else {}
+    interfaces = []
+    for name, state in states.items():
+        controller = details.get(name, {"state": state})
+        timing = controller.get("bittiming")
+        bitrate = timing.get("bitrate") if isinstance(timing, dict) else None
+        interfaces.append(CanInterface(name, str(controller["state"]).lower(), bitrate))
+    return interfaces
 
 
 def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
-    """What `ip` tells of CAN controllers, by interface; nothing where it is missing or old."""
+    """Return what `ip` tells of CAN controllers, by interface; empty where it is missing or old."""
     try:
         answer = subprocess.run(ip, capture_output=True, timeout=IP_TIMEOUT_S, check=True).stdout
         links = [(link["ifname"], link.get("linkinfo", {})) for link in json.loads(answer)]
@@ -140,7 +137,7 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
 def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
     """Other processes that have locked a file, or else have it open, if /proc may be read.
 
-    A pseudo-terminal is open in the program that made it, too: that one is not meant.
+    The program that made a pseudo-terminal has it open, too, and is left out.
     """
     try:
         there = os.stat(path)
@@ -174,7 +171,7 @@ def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
 
 
 def _with_open(wanted: Collection[object], proc: Path) -> set[int]:
-    """Processes with one of these files, (device, inode), or sockets, inode, open."""
+    """Return processes with one of these files (device, inode) or sockets (inode) open."""
     found = set()
     for descriptor in proc.glob("[0-9]*/fd/*"):
         with suppress(OSError):

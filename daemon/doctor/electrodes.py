@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.doctor.finding import Cause, Finding, Level, fine
+from daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
 from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 
 RAIL_COUNTS = 20
@@ -26,6 +26,31 @@ FAULTY_FRACTION = 0.5
 NAMED_MAX = 6
 """More electrodes than this are counted instead of named."""
 WORDS = ElectrodeFault.PARITY | ElectrodeFault.ERROR_WORD | ElectrodeFault.NOT_A_COUNT
+DEAD = Trouble(
+    Cause.ELECTRODE_DEAD,
+    "it is at the end of its range and has no noise: a dead electrode; refill or replace the "
+    "sensor, if it is so on another day too",
+    Level.ERROR,
+)
+FROZEN = Trouble(
+    Cause.ELECTRODE_FROZEN,
+    "its count never changes and others do: look longer (--listen 20); if it stays so, power-cycle "
+    "the sensor",
+    Level.ERROR,
+)
+NEAR_RAIL = Trouble(
+    Cause.ELECTRODE_RAIL,
+    "alive, for it has noise: let go of what the hand holds, and look again",
+)
+RESTLESS = Trouble(
+    Cause.ELECTRODE_RESTLESS,
+    "it jumps while its neighbours keep still: look again with the hand untouched and its motors "
+    "off; a loose contact stays",
+)
+WORDS_ADVICE = (
+    "words are damaged between sensor and board: look longer (--listen 20); if it stays one "
+    "sensor, its cable and the edges of the clock"
+)
 
 Mask = NDArray[np.bool_]
 
@@ -100,12 +125,12 @@ class ElectrodeStatistics:
         if still.all():
             advice = "reset the board; does a relay or a recording repeat old data?"
             what = f"{name}: all counts are frozen"
-            return [Finding(Level.ERROR, what, Cause.REPEATED, advice)]
+            return [error(what, Cause.REPEATED, advice)]
         # A dead electrode is at a rail and has no noise: one of the two alone is no such sign.
         found = [_missing(name, missing, faults)] if missing.any() else []
-        found += _named(name, rail & still, Level.ERROR, *_DEAD)
-        found += _named(name, still & ~rail, Level.ERROR, *_FROZEN)
-        found += _named(name, rail & ~still & enough, Level.WARNING, *_NEAR_RAIL)
+        found += _named(name, rail & still, "stuck at a rail", DEAD)
+        found += _named(name, still & ~rail, "frozen", FROZEN)
+        found += _named(name, rail & ~still & enough, "near the end of the range", NEAR_RAIL)
         unreliable = (self.faulty[finger] > 0) & ~missing
         if unreliable.any():
             found.append(_unreliable(name, unreliable, faults))
@@ -115,74 +140,41 @@ class ElectrodeStatistics:
             found.append(fine(f"{name} is touched or moves: {moved} of its electrodes do"))
         elif self.readings >= RESTLESS_READINGS:
             jumping = moving & (self.noise[finger] > QUIET_COUNTS)
-            found += _named(name, jumping, Level.WARNING, *_RESTLESS)
+            found += _named(name, jumping, "restless", RESTLESS)
         return found
-
-
-_DEAD = (
-    "stuck at a rail",
-    Cause.ELECTRODE_DEAD,
-    "it is at the end of its range and has no noise: a dead electrode; refill or replace the "
-    "sensor, if it is so on another day too",
-)
-_FROZEN = (
-    "frozen",
-    Cause.ELECTRODE_FROZEN,
-    "its count never changes and others do: look longer (--listen 20); if it stays so, power-cycle "
-    "the sensor",
-)
-_NEAR_RAIL = (
-    "near the end of the range",
-    Cause.ELECTRODE_RAIL,
-    "alive, for it has noise: let go of what the hand holds, and look again",
-)
-_RESTLESS = (
-    "restless",
-    Cause.ELECTRODE_RESTLESS,
-    "it jumps while its neighbours keep still: look again with the hand untouched and its motors "
-    "off; a loose contact stays",
-)
 
 
 def _absent(name: str, missing: Mask, faults: ElectrodeFault) -> Finding:
     if missing.any() and faults == ElectrodeFault.HELD:
         advice = "the board sends old values: reset it, and see whether its clock runs"
-        return Finding(Level.ERROR, f"{name}: old values repeat", Cause.REPEATED, advice)
+        return error(f"{name}: old values repeat", Cause.REPEATED, advice)
     why = _in_words(faults) if missing.any() else "each is at the end of its range, without noise"
     advice = "check the finger's plug, its chip select and its supply"
     what = f"{name}: no electrode can be read ({why})"
-    return Finding(Level.ERROR, what, Cause.SENSOR_ABSENT, advice)
+    return error(what, Cause.SENSOR_ABSENT, advice)
 
 
 def _missing(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
     advice = "does the board's sequence have it? if frames are lost, see there"
     what = f"{_names(name, which)} never or rarely sampled ({_in_words(faults)})"
     if faults & WORDS:
-        return Finding(Level.ERROR, what, Cause.SENSOR_WORDS, _WORDS_ADVICE)
-    return Finding(Level.ERROR, what, Cause.ELECTRODE_UNREAD, advice)
+        return error(what, Cause.SENSOR_WORDS, WORDS_ADVICE)
+    return error(what, Cause.ELECTRODE_UNREAD, advice)
 
 
 def _unreliable(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
     what = f"{_names(name, which)} now and then faulty ({_in_words(faults)})"
     if faults & WORDS:
-        return Finding(Level.WARNING, what, Cause.SENSOR_WORDS, _WORDS_ADVICE)
+        return warning(what, Cause.SENSOR_WORDS, WORDS_ADVICE)
     if faults & ElectrodeFault.HELD:
         advice = "the board repeats values now and then: see how long its sweep takes"
-        return Finding(Level.WARNING, what, Cause.REPEATED, advice)
+        return warning(what, Cause.REPEATED, advice)
     advice = "samples are lost on the way: see the load of the bus and of this computer"
-    return Finding(Level.WARNING, what, Cause.ELECTRODE_UNREAD, advice)
+    return warning(what, Cause.ELECTRODE_UNREAD, advice)
 
 
-_WORDS_ADVICE = (
-    "words are damaged between sensor and board: look longer (--listen 20); if it stays one "
-    "sensor, its cable and the edges of the clock"
-)
-
-
-def _named(
-    name: str, which: Mask, level: Level, what: str, cause: Cause, advice: str
-) -> list[Finding]:
-    return [Finding(level, f"{_names(name, which)} {what}", cause, advice)] if which.any() else []
+def _named(finger: str, which: Mask, what: str, trouble: Trouble) -> list[Finding]:
+    return [trouble.finding(f"{_names(finger, which)} {what}")] if which.any() else []
 
 
 def _in_words(bits: ElectrodeFault) -> str:
@@ -191,7 +183,7 @@ def _in_words(bits: ElectrodeFault) -> str:
 
 
 def _names(finger: str, which: Mask) -> str:
-    """Electrodes of a finger by name, such as `ff_7`, or their number where they are many."""
+    """Name up to six electrodes, such as `ff_7`, or count them."""
     numbers = np.flatnonzero(which) + 1
     if len(numbers) > NAMED_MAX:
         return f"{finger}: {len(numbers)} electrodes"

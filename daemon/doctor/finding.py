@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 
 class Level(StrEnum):
@@ -94,7 +95,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What is fine has neither cause nor advice; whatever is not has both."""
+    """A finding with level `OK` has no cause and no advice; any other has both."""
 
     level: Level
     what: str
@@ -108,16 +109,35 @@ class Finding:
             raise ValueError(f"{self.what!r} is {self.level}, {self.cause}, {self.advice!r}")
 
 
+class Trouble(NamedTuple):
+    """A cause, and what to do about it."""
+
+    cause: Cause
+    advice: str
+    level: Level = Level.WARNING
+
+    def finding(self, what: str) -> Finding:
+        """Return the finding that `what` is seen."""
+        return Finding(self.level, what, self.cause, self.advice)
+
+
 def fine(what: str) -> Finding:
-    """A finding that needs nothing done."""
+    """Return a finding that needs nothing done."""
     return Finding(Level.OK, what)
 
 
-def roots(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings without those that follow from another one's cause.
+def error(what: str, cause: Cause, advice: str) -> Finding:
+    """Return a finding that keeps graspd from working."""
+    return Finding(Level.ERROR, what, cause, advice)
 
-    A cause is as bad as what follows from it.
-    """
+
+def warning(what: str, cause: Cause, advice: str) -> Finding:
+    """Return a finding that graspd works with."""
+    return Finding(Level.WARNING, what, cause, advice)
+
+
+def roots(findings: Iterable[Finding]) -> list[Finding]:
+    """Drop findings that another cause explains. A cause is as bad as what follows from it."""
     findings = list(findings)
     causes = {finding.cause for finding in findings}
     follows = {effect for cause in causes for effect in EXPLAINS.get(cause, ())}

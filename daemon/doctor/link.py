@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
-from daemon.doctor.finding import Cause, Finding, Level, fine
+from daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
 from drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
@@ -20,14 +19,6 @@ VERSION_ADVICE = (
     "the board sends another version of the frame: flash the firmware that fits this graspd "
     "(deploy/can/PROTOCOL.md)"
 )
-
-
-class Trouble(NamedTuple):
-    """Cause of a fault, and what to do about it."""
-
-    cause: Cause
-    advice: str
-    level: Level = Level.WARNING
 
 
 NOT_OURS = {
@@ -214,14 +205,14 @@ def device_findings(
     found = [] if link is None else [fine(f"{driver}: link up")]
     for key, fact in facts.items():
         what = f"{driver}: {key} {fact.text}"
-        found.append(fine(what) if fact.fault is None else _finding(what, TROUBLES[fact.fault]))
+        found.append(fine(what) if fact.fault is None else TROUBLES[fact.fault].finding(what))
     return found
 
 
 def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
     """A warning for everything that counters of a link that is up say is going wrong."""
     return [
-        _finding(f"{driver}: {counted}", trouble)
+        trouble.finding(f"{driver}: {counted}")
         for names, trouble in COUNTERS.items()
         if (counted := _counted(names, counters))
     ]
@@ -233,14 +224,14 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
     if not readings:
         advice = "is it powered, connected, and the one that the scene names?"
         what = f"{driver}: no reading in {seconds:.1f} s"
-        return _finding(what, Trouble(Cause.SILENT, advice, Level.ERROR))
+        return error(what, Cause.SILENT, advice)
     if period_ns is None:
         return fine(f"{driver}: {rate_hz:.1f} readings/s")
     nominal_hz = 1e9 / period_ns
     what = f"{driver}: {rate_hz:.1f} readings/s of {nominal_hz:.1f}"
     if rate_hz < RATE_FRACTION * nominal_hz:
         advice = "none was lost on the way: the board is late, or this computer is busy (top)"
-        return _finding(what, Trouble(Cause.SLOW, advice))
+        return warning(what, Cause.SLOW, advice)
     return fine(what)
 
 
@@ -251,11 +242,7 @@ def _of_link(what: str, trouble: Trouble, counters: Mapping[str, int]) -> Findin
             if counted := _counted(names, counters):
                 what, trouble = f"{what}, but {counted}", other
                 break
-    return Finding(Level.ERROR, what, trouble.cause, trouble.advice)
-
-
-def _finding(what: str, trouble: Trouble) -> Finding:
-    return Finding(trouble.level, what, trouble.cause, trouble.advice)
+    return error(what, trouble.cause, trouble.advice)
 
 
 def _counted(names: Sequence[str], counters: Mapping[str, int]) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from daemon.assembly import assembly
 from daemon.doctor import computer
-from daemon.doctor.finding import Cause, Finding, Level, fine
+from daemon.doctor.finding import Cause, Finding, error, fine, warning
 from daemon.run.realtime import RealtimeMode
 from daemon.scene import Scene
 from daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
@@ -36,26 +36,23 @@ def model_finding(wanted: Scene) -> Finding:
     """Whether the scene's model is there and fits the hand."""
     try:
         path = assembly.model_path(wanted)
-    except ModelError as error:
+    except ModelError as problem:
         advice = "graspd models lists those that there are"
-        return Finding(Level.ERROR, str(error), Cause.MODEL_MISSING, advice)
+        return error(str(problem), Cause.MODEL_MISSING, advice)
     if not path.exists():
         advice = "[model] path is relative to the scene; graspd models lists those of the zoo"
-        return Finding(Level.ERROR, f"no model at {path}", Cause.MODEL_MISSING, advice)
+        return error(f"no model at {path}", Cause.MODEL_MISSING, advice)
     try:
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
-    except ModelError as error:
+    except ModelError as problem:
         advice = "choose a model that fits the hand: graspd models"
-        return Finding(Level.ERROR, str(error), Cause.MODEL_MISFIT, advice)
+        return error(str(problem), Cause.MODEL_MISFIT, advice)
     return fine(f"model {model.contract.name} ({model.sha256[:12]}) fits the hand")
 
 
 def explained(finding: Finding, section: Section) -> list[Finding]:
-    """A finding on a link with what this computer knows of its cause, and what else there is.
-
-    `section` is the one of the scene that names the link's driver.
-    """
+    """Return a finding on the link of `section` with what this computer knows of its cause."""
     match section, finding.cause:
         case CanTactile(interface="socketcan"), cause if cause in NOT_HEARD:
             return _on_socketcan(finding, section)
@@ -69,22 +66,16 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
         case PalmTactile(source=source) | StreamJoints(source=source), Cause.PORT_HELD:
             number = Endpoint.parse(source).port
             return [_held(finding, computer.port_holders("udp", number))]
-        case _:
-            return [finding]
+    return [finding]
 
 
 def shared_findings(section: Section) -> list[Finding]:
-    """Whether another program has a serial port open that could be opened all the same.
-
-    `explained` says which. `section` is the one of the scene that names the port's driver.
-    """
+    """Warn of another program that has the serial port open. `explained` says which."""
     match section:
-        case SpiTactile(port=port) | CanTactile(channel=port):
+        case SpiTactile(port=port) | CanTactile(channel=port) if computer.file_holders(port):
             what = f"{section.driver}: {port} is open in another program, which may take its bytes"
-            held = Finding(Level.WARNING, what, Cause.PORT_HELD, "end it")
-            return [held] if computer.file_holders(port) else []
-        case _:
-            return []
+            return [warning(what, Cause.PORT_HELD, "end it")]
+    return []
 
 
 def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:
@@ -93,9 +84,9 @@ def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = N
         return fine(str(interface))
     line = ip_link(interface.name, tactile)
     if interface.is_down:
-        return Finding(Level.WARNING, str(interface), Cause.INTERFACE_DOWN, line)
+        return warning(str(interface), Cause.INTERFACE_DOWN, line)
     advice = f"is its bit rate the board's? sudo ip link set {interface.name} down; {line}"
-    return Finding(Level.WARNING, str(interface), Cause.BUS_ERRORS, advice)
+    return warning(str(interface), Cause.BUS_ERRORS, advice)
 
 
 def ip_link(name: str, tactile: CanTactile | None) -> str:
@@ -112,7 +103,7 @@ def socket_findings(wanted: Scene) -> list[Finding]:
     ask = wanted.ask_endpoint
     sockets = [("publish", wanted.endpoint, wanted.publish.group)]
     sockets += [] if ask is None else [("ask", ask, wanted.ask_group)]
-    found: dict[Cause | None, Finding] = {}
+    by_cause: dict[Cause | None, Finding] = {}
     for name, endpoint, group in sockets:
         scheme, _, address = endpoint.partition("://")
         if scheme == "ipc":
@@ -120,8 +111,8 @@ def socket_findings(wanted: Scene) -> list[Finding]:
         else:
             told = tuple(_of_port(name, address))
         for finding in told:
-            found.setdefault(finding.cause, finding)
-    return list(found.values())
+            by_cause.setdefault(finding.cause, finding)
+    return list(by_cause.values())
 
 
 def realtime_findings(wanted: Scene) -> list[Finding]:
@@ -130,9 +121,8 @@ def realtime_findings(wanted: Scene) -> list[Finding]:
         return []
     with RealtimeMode(wanted.realtime) as mode:
         lacking = mode.lacking.items()
-    return [Finding(Level.WARNING, what, Cause.REALTIME, advice) for what, advice in lacking] or [
-        fine("realtime as the scene wants it may be had")
-    ]
+    warnings = [warning(what, Cause.REALTIME, advice) for what, advice in lacking]
+    return warnings or [fine("realtime as the scene wants it may be had")]
 
 
 def _denied(finding: Finding, port: str) -> Finding:
@@ -156,15 +146,15 @@ def _held(finding: Finding, holders: Sequence[computer.Process]) -> Finding:
 
 
 def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
-    """What the kernel says of the interface, which is sure, goes before what was guessed."""
+    """Prefer what the kernel says of the interface to what the driver concluded."""
     interfaces = {interface.name: interface for interface in computer.can_interfaces()}
     here, line = interfaces.get(tactile.channel), ip_link(tactile.channel, tactile)
     if here is None:
         others = [can_finding(other, tactile) for other in interfaces.values()]
-        missing = replace(finding, cause=Cause.INTERFACE_MISSING)
         advice = f"plug its adapter in, then: {line}"
+        missing = replace(finding, cause=Cause.INTERFACE_MISSING, advice=advice)
         names = [fine(finding.what) for finding in others] or [fine("no CAN interface is there")]
-        return [replace(missing, advice=advice), *names]
+        return [missing, *names]
     what = f"{finding.what}; {here}"
     if here.is_down:
         return [replace(finding, what=what, cause=Cause.INTERFACE_DOWN, advice=line)]
@@ -176,23 +166,23 @@ def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
 
 
 def _of_socket(name: str, path: Path) -> Iterator[Finding]:
-    warning, folder = Level.WARNING, path.parent
+    folder = path.parent
     if not folder.is_dir():
         what = f"{name}: there is no folder {folder}"
         advice = f"the service makes it; without: sudo install -d -o $USER {folder}"
-        yield Finding(warning, what, Cause.SOCKET_FOLDER, advice)
+        yield warning(what, Cause.SOCKET_FOLDER, advice)
         return
     holders = computer.file_holders(f"{path}.lock")
     if holders:
         what = f"{name}: {path} is in use: {'; '.join(map(str, holders))}"
-        yield Finding(warning, what, Cause.SOCKET_HELD, HELD_BY_GRASPD)
+        yield warning(what, Cause.SOCKET_HELD, HELD_BY_GRASPD)
     elif path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
         advice = f"name another one, or move it away: mv {path} {path}.old"
-        yield Finding(Level.ERROR, f"{name}: {path} is no socket", Cause.SOCKET_HELD, advice)
+        yield error(f"{name}: {path} is no socket", Cause.SOCKET_HELD, advice)
     elif not os.access(folder, os.W_OK | os.X_OK):
         what = f"{name}: you may not make {path}"
-        owner = folder.owner()
-        yield Finding(warning, what, Cause.SOCKET_DENIED, f"as its owner: sudo -u {owner} graspd")
+        advice = f"as its owner: sudo -u {folder.owner()} graspd"
+        yield warning(what, Cause.SOCKET_DENIED, advice)
 
 
 def _of_port(name: str, address: str) -> Iterator[Finding]:
@@ -203,15 +193,15 @@ def _of_port(name: str, address: str) -> Iterator[Finding]:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, int(port)))
-        except OSError as error:
-            what = f"{name}: tcp://{address}: {error.strerror}"
-            if error.errno != errno.EADDRINUSE:
+        except OSError as problem:
+            what = f"{name}: tcp://{address}: {problem.strerror}"
+            if problem.errno != errno.EADDRINUSE:
                 advice = "ip -brief address has those of this computer: name one of them"
-                yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
+                yield error(what, Cause.ADDRESS, advice)
                 return
             advice = f"sudo ss -tlpn 'sport = {port}' names who has it"
-            held = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
-            yield _held(held, computer.port_holders("tcp", int(port)))
+            finding = warning(what, Cause.SOCKET_HELD, advice)
+            yield _held(finding, computer.port_holders("tcp", int(port)))
 
 
 def _of_group(name: str, group: str | None) -> Iterator[Finding]:
@@ -221,9 +211,9 @@ def _of_group(name: str, group: str | None) -> Iterator[Finding]:
         number = grp.getgrnam(group).gr_gid
     except KeyError:
         what, advice = f"{name}: there is no group {group}", f"sudo groupadd --system {group}"
-        yield Finding(Level.ERROR, what, Cause.SOCKET_GROUP, advice)
+        yield error(what, Cause.SOCKET_GROUP, advice)
         return
     if os.geteuid() != 0 and number not in {os.getegid(), *os.getgroups()}:
         what = f"{name}: you are not in the group {group} and cannot give the socket to it"
         advice = f"sudo usermod -aG {group} $USER, then log in again"
-        yield Finding(Level.WARNING, what, Cause.SOCKET_GROUP, advice)
+        yield warning(what, Cause.SOCKET_GROUP, advice)

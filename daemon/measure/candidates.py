@@ -46,8 +46,7 @@ class Candidate:
 def candidates(folders: Sequence[Path], grasps: Grasps) -> list[Candidate]:
     """Return the models of these folders, and the published code if Keras is installed.
 
-    `grasps` are what is read. Raises `ModelError` for a file that is no model or has no
-    card.
+    Raises `ModelError` for a file that is no model or has no card.
     """
     paths = [path for folder in folders for path in sorted(folder.glob("*.onnx"))]
     models = [_model(path, grasps) for path in paths]
@@ -104,10 +103,7 @@ def errors(figures: dict[str, Any]) -> dict[str, float]:
 
 
 def loop_image(counts: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Return the image (12, 11, fingers) of counts (fingers, 24) as the authors' notebooks do.
-
-    It is the same as `TactileImager`'s, pixel by pixel and so slower.
-    """
+    """Return the image (12, 11, fingers) of counts (fingers, 24), as the authors' notebooks do."""
     height, width = D1.shape
     images = []
     for finger in counts:
@@ -136,8 +132,7 @@ def loop_image(counts: NDArray[np.uint16]) -> NDArray[np.float32]:
 
 
 def _published(counts: NDArray[np.uint16]) -> Step:
-    # Keras reads it once, when it is imported.
-    os.environ.setdefault("KERAS_BACKEND", "torch")
+    os.environ.setdefault("KERAS_BACKEND", "torch")  # read when Keras is imported
     import keras
 
     layers = keras.layers

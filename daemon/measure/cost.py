@@ -14,9 +14,9 @@ import msgspec
 from daemon.process.text import markdown_table, printable
 
 TIMEOUT_S = 120.0
-"""A scene takes a second; on a very busy machine a few."""
+"""Longest measurement, s. A scene takes about a second."""
 MESSAGE_MAX = 320
-"""Characters of an error that are shown."""
+"""Longest error that is shown, characters."""
 KIB_PER_MIB = 1024
 
 
@@ -45,7 +45,7 @@ class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What one scene costs. Drivers of hardware are constructed and not opened."""
 
     parts: tuple[Part, ...]
-    """In the order in which they come; what parts share is counted with the first of them."""
+    """In the order of the start. What parts share is counted with the first of them."""
     start: Part
     """From the start of the process to the first reading judged and reported."""
     peak_kib: int
@@ -61,9 +61,9 @@ class CostError(Exception):
 
 
 def measure(scene: Path) -> Footprint:
-    """Run the scene's parts in a process of their own. Raises `CostError`.
+    """Run the scene's parts in a process of their own, for about a second. Raises `CostError`.
 
-    Takes about a second. Nothing is published, and no device or kept session is touched.
+    Nothing is published, and no device or kept session is touched.
     """
     with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
         # -P, so that the files in the folder at hand are not taken for modules.

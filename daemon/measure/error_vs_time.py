@@ -1,7 +1,7 @@
-"""`graspd report error-vs-time`: how wrong each model is against how long it takes, measured here.
+"""`graspd report error-vs-time`: error of each model against its run time on this computer.
 
-Errors are those of the models' cards, measured on grasps that were left out; times are measured
-now, all candidates in turns, because machines are shared and noisy: compare ratios.
+Errors are those of the models' cards. Times are measured now, all candidates in turns: machines are
+noisy, so compare ratios.
 """
 
 from __future__ import annotations
@@ -59,10 +59,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> Report:
-    """Return the figures of all models in these folders, JSON-ready.
-
-    Raises `ModelError` for a file that is no model or has no card.
-    """
+    """Return the figures of all models in these folders. Raises `ModelError`."""
     if quick:
         chosen = np.linspace(0, len(grasps) - 1, min(QUICK_GRASPS, len(grasps)))
         grasps = grasps.rows(chosen.astype(np.int64))
@@ -90,7 +87,7 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> R
 
 
 def _rank(row: Row) -> tuple[str, float]:
-    """Models before peers, and the most exact first."""
+    """Order models before peers, and the most exact first."""
     return row["kind"], -error_of(row, PANELS[0][0]).get("f1", 0.0)
 
 

@@ -1,7 +1,7 @@
-"""What a scene costs, measured from within a process of its own that runs nothing else.
+"""The cost of a scene, measured in a process of its own, which `daemon.measure.cost` starts.
 
-`daemon.measure.cost` starts it. It takes up the parts one by one, in the order of `graspd run`, and
-notes after each what the process has become. Imports stand where they are measured.
+It adds the parts one by one, in the order of `graspd run`, and measures after each. Imports stand
+where they are measured.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CORE = (
     ("pydantic", ("pydantic.main", "pydantic.types")),
     ("graspd", ("daemon.commands.run",)),
 )
-"""Part and modules: what every scene imports."""
+"""Parts that every scene imports, with their modules."""
 READINGS = 300
 """Readings that are timed: three grasps."""
 SILENCE_NS = 100_000_000
@@ -50,21 +50,20 @@ class Meter:
         self.take("interpreter")
 
     def take(self, name: str) -> None:
-        """Count all that was added since the last call for the part `name`."""
+        """Count what was added since the last call for the part `name`."""
         now = _now()
         self.parts.append(_added(name, self._last, now))
         self._last = now
 
     def whole(self, name: str) -> dict[str, float | str]:
-        """Return all that was added until the last call of `take`."""
+        """Return what was added until the last call of `take`."""
         return _added(name, self._first, self._last)
 
 
 def main(arguments: list[str]) -> int:
-    """Measure; `arguments` are the scene, a folder for sockets, and the monotonic ns of the start.
+    """Measure and write a `cost.Footprint` to stdout; 2 if the scene or its files are wrong.
 
-    Writes one JSON object to stdout, as `cost.Footprint` reads it. Returns 2, with a line on
-    stderr, if the scene, its model or its files are wrong.
+    `arguments`: the scene, a folder for sockets, and the monotonic ns of the start.
     """
     path, folder, started_ns = arguments
     meter = Meter(int(started_ns))
@@ -132,16 +131,15 @@ def _apart(wanted: Scene, folder: Path) -> Scene:
     from daemon.scene.drivers import ReplayTactile
     from daemon.scene.scene import Ask
 
-    ask, tactile = wanted.ask, wanted.tactile
-    if wanted.ask_endpoint is not None:
-        ask = Ask(endpoint=f"ipc://{folder}/questions")
-    if isinstance(tactile, ReplayTactile):
-        tactile = tactile.model_copy(update={"pace": "fast"})
-    places = {
+    changes: dict[str, object] = {
         "publish": wanted.publish.model_copy(update={"endpoint": f"ipc://{folder}/verdicts"}),
         "session": wanted.session.model_copy(update={"file": folder / "session.json"}),
     }
-    return wanted.model_copy(update={"ask": ask, "tactile": tactile, **places})
+    if wanted.ask_endpoint is not None:
+        changes["ask"] = Ask(endpoint=f"ipc://{folder}/questions")
+    if isinstance(wanted.tactile, ReplayTactile):
+        changes["tactile"] = wanted.tactile.model_copy(update={"pace": "fast"})
+    return wanted.model_copy(update=changes)
 
 
 def _drivers(wanted: Scene, stack: ExitStack) -> list[Driver]:
@@ -207,10 +205,7 @@ def _readings(wanted: Scene, driver: Driver, seen: SeenCounts) -> Iterator[Readi
 
 
 def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, int, bool] | None:
-    """Return the CPU time of judging and reporting, ns, and True if the network ran.
-
-    None for joints.
-    """
+    """Return ns of CPU for judging and for reporting, and if the network ran; None for joints."""
     from drivers.base import JointReading
 
     if isinstance(reading, JointReading):
@@ -246,11 +241,11 @@ def _timed(
 
 
 def _quantiles(times_ns: list[int]) -> dict[str, float]:
-    ordered, number = sorted(times_ns), len(times_ns)
+    ordered, count = sorted(times_ns), len(times_ns)
     return {
-        "number": number,
-        "p50_us": ordered[number // 2] / 1e3,
-        "p99_us": ordered[(99 * number) // 100] / 1e3,
+        "number": count,
+        "p50_us": ordered[count // 2] / 1e3,
+        "p99_us": ordered[(99 * count) // 100] / 1e3,
     }
 
 
@@ -266,10 +261,7 @@ def _now() -> dict[str, float]:
 
 
 def _added(name: str, before: dict[str, float], after: dict[str, float]) -> dict[str, float | str]:
-    added: dict[str, float | str] = {"name": name}
-    for key, value in after.items():
-        added[key] = value - before[key]
-    return added
+    return {"name": name, **{key: value - before[key] for key, value in after.items()}}
 
 
 def _status(key: str) -> int:

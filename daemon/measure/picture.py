@@ -17,7 +17,7 @@ from matplotlib.textpath import TextPath
 from matplotlib.transforms import Bbox
 
 Report = dict[str, Any]
-"""Figures as `error-vs-time.json` has them."""
+"""Figures in `error-vs-time.json`."""
 Row = dict[str, Any]
 """One candidate of a report: `name`, `kind` (`model` or `peer`), `fingers`, `error`, `time`."""
 
@@ -27,9 +27,9 @@ PANELS = (
     (("objects", "objects-whole"), "other objects"),
     (("session",), "another day"),
 )
-"""Protocols, of which a model has one at most, and their question.
+"""Protocols and their question. A model has at most one of a group.
 
-A model without the first of them was measured on two palm poses only, and is drawn hollow."""
+A model without the first was measured on two palm poses only, and is drawn hollow."""
 COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
 MARKERS = {"model": "o", "peer": "s"}
 SIZE_IN = (9.5, 9.6)
@@ -56,12 +56,12 @@ class Point:
 
     @property
     def label(self) -> str:
-        """What stands beside it."""
+        """Text beside the point."""
         return f"{self.name} (default)" if self.name == DEFAULT else self.name
 
     @property
     def weight(self) -> str:
-        """Of the font of its name."""
+        """Weight of the label's font."""
         return "bold" if self.name == DEFAULT else "normal"
 
 
@@ -153,49 +153,43 @@ def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
     axes.grid(alpha=0.25)
 
 
-Box = tuple[float, float, float, float]
-"""Left, bottom, right, top, in points."""
-
-
 def name_points(axes: Axes, several: Sequence[Point]) -> None:
     """Put each name where it covers nothing, as near to its point as can be."""
     where = axes.get_window_extent()
     at = {point: axes.transData.transform((point.us, point.error)) for point in several}
     reach = 0.5 * MARKER_PT + 1.0
-    taken: list[Box] = [(x - reach, y - reach, x + reach, y + reach) for x, y in at.values()]
+    taken = [Bbox.from_extents(x - reach, y - reach, x + reach, y + reach) for x, y in at.values()]
     for point in sorted(several, key=lambda point: -at[point][1]):
         x, y = (float(each) for each in at[point])
         near, *others = _places(x, y, _width(point))
-        box = next((box for box in (near, *others) if _is_free(box, taken, where)), near)
+        free = (box for box in (near, *others) if _is_free(box, taken, where))
+        box = next(free, near)
         taken.append(box)
         axes.annotate(
             point.label, (point.us, point.error), fontsize=FONT_PT, color=COLOURS[point.kind],
             fontweight=point.weight, va="center", zorder=6,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.4},
-            xytext=(box[0] - x, 0.5 * (box[1] + box[3]) - y), textcoords="offset points",
+            xytext=(box.x0 - x, 0.5 * (box.y0 + box.y1) - y), textcoords="offset points",
             arrowprops={"arrowstyle": "-", "lw": 0.6, "color": "#999", "shrinkB": 4},
         )  # fmt: skip
 
 
 def _width(point: Point) -> float:
-    """Of its name, with a little air, in points."""
+    """Return the width of its name with a margin, in points."""
     font = FontProperties(size=FONT_PT, weight=point.weight)
     return float(TextPath((0.0, 0.0), point.label, prop=font).get_extents().width) + 3.0
 
 
-def _places(x: float, y: float, width: float) -> Iterator[Box]:
-    """Places for a name of this width, the nearest first."""
+def _places(x: float, y: float, width: float) -> Iterator[Bbox]:
+    """Yield places for a name of this width, the nearest first, in points."""
+    height = 1.2 * FONT_PT
     for distance in np.arange(MARKER_PT, 400.0, 4.0):
         for angle in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
             across, up = distance * np.cos(angle), distance * np.sin(angle)
             left = x + across - (0.0 if across >= 0.0 else width)
-            yield left, y + up - 0.6 * FONT_PT, left + width, y + up + 0.6 * FONT_PT
+            yield Bbox.from_bounds(left, y + up - 0.5 * height, width, height)
 
 
-def _is_free(box: Box, taken: Sequence[Box], within: Bbox) -> bool:
-    left, bottom, right, top = box
-    inside = within.x0 < left and right < within.x1 and within.y0 < bottom and top < within.y1
-    return inside and not any(
-        left < other[2] and other[0] < right and bottom < other[3] and other[1] < top
-        for other in taken
-    )
+def _is_free(box: Bbox, taken: Sequence[Bbox], within: Bbox) -> bool:
+    is_inside = within.contains(*box.min) and within.contains(*box.max)
+    return is_inside and not any(box.overlaps(other) for other in taken)

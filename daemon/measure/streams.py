@@ -1,8 +1,7 @@
-"""Grasps of another day, as they come, and what graspd says of them as their outcomes are told.
+"""Streams of grasps of another day, and what graspd says of them as outcomes are told.
 
 Networks saw neither the objects nor the pose of a stream. The days are those of the protocol
-`days`. Session statistics start empty, as in the daemon, but slips weigh as much as other grasps;
-every grasp is judged, none is refused.
+`days`. Session statistics start empty, as in the daemon. No grasp is refused.
 """
 
 from __future__ import annotations
@@ -28,19 +27,16 @@ from models.training.systems.system import SessionFeatures, System, with_recipes
 
 OWN, PUBLISHED = "small-session", "cnn1"
 """Systems that judge: graspd's default, and the published network on the plain image."""
-RANDOM, BY_OBJECT = "random", "object by object"
-ORDERS: Final = (RANDOM, BY_OBJECT)
 DRAWS: Final = 2
-"""Streams of each table, fold and order."""
+"""Streams of each table and fold, in random order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """The grasps of one table and fold, as they come."""
+    """The grasps of one table and fold in random order."""
 
     protocol: str
     table: str
-    order: str
     margins: NDArray[np.float64]
     """Log-odds of slip (N,) of graspd's network."""
     features: NDArray[np.float32]
@@ -70,20 +66,14 @@ class Plan:
 class Life:
     """What was said of a stream's grasps (N,), each after the outcomes of those before it."""
 
-    stream: Stream
     p_slip: NDArray[np.float64]
     stable: NDArray[np.bool_]
-    supervised: NDArray[np.bool_]
-    """Grasps that were not called stable and that the risk asked to lift all the same."""
-    excess: float
-    """Most slips among stable lifts at any time beyond the share that is allowed."""
     within: bool
-    """True if they never exceeded the bound."""
+    """True if slips among stable lifts never exceeded the bound."""
 
 
 def streams(grasps: Grasps, plan: Plan) -> Iterator[Stream]:
     """Train the networks of each day and fold; yield the streams of the three tables."""
-    objects = np.array(grasps.objects)
     names = np.array([file.name for file in grasps.files])[grasps.table_of]
     for seed, fold in itertools.product(range(plan.seeds), range(plan.folds)):
         fold_of = object_folds(grasps.objects, DAYS_FOLDS, seed)
@@ -94,30 +84,20 @@ def streams(grasps: Grasps, plan: Plan) -> Iterator[Stream]:
             others = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
             random = np.random.default_rng([seed, fold])
             kinds, rows = [], []
-            for table, order, _ in itertools.product(tables, ORDERS, range(DRAWS)):
+            for table, _ in itertools.product(tables, range(DRAWS)):
                 inside = np.flatnonzero((names == table) & (fold_of == fold))
-                kinds.append((table, order))
-                rows.append(_ordered(inside, objects, order, random))
+                kinds.append(table)
+                rows.append(random.permutation(inside))
             counts = [grasps.counts[chosen] for chosen in rows]
             own, published = (
                 judged(_system(name, plan), others, counts, fold_seed(seed, fold))
                 for name in (OWN, PUBLISHED)
             )
-            for (table, order), chosen, (margins, features), (theirs, _) in zip(
+            for table, chosen, (margins, features), (theirs, _) in zip(
                 kinds, rows, own, published, strict=True
             ):
                 slipped = grasps.slipped[chosen]
-                yield Stream(protocol, table, order, margins, features, theirs, slipped)
-
-
-def _ordered(
-    rows: NDArray[np.int64], objects: NDArray[np.str_], order: str, random: np.random.Generator
-) -> NDArray[np.int64]:
-    mixed = random.permutation(rows)
-    if order == RANDOM:
-        return mixed
-    own = objects[mixed]
-    return np.concatenate([mixed[own == name] for name in random.permutation(np.unique(own))])
+                yield Stream(protocol, table, margins, features, theirs, slipped)
 
 
 def _system(name: str, plan: Plan) -> System:
@@ -156,18 +136,14 @@ def live(stream: Stream, limits: RiskLimits, *, every: bool) -> Life:
     Without `every`, only stable and supervised grasps are lifted and their outcomes told.
     """
     trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
-    p_slip, stable = np.empty(count), np.zeros(count, np.bool_)
-    supervised, excess, within = stable.copy(), 0.0, True
-    alpha = limits.max_slip_when_stable or 0.0
+    p_slip, stable, within = np.empty(count), np.zeros(count, np.bool_), True
     for index, (margin, row, slipped) in enumerate(stream.rows()):
         grasp = GraspId(stream.table, index)
         assessed = trust.judge(grasp, sigmoid(margin), margin, row)
         p_slip[index] = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
-        supervised[index] = assessed.supervised
         stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5
         trust.note(grasp, assessed, stable=bool(stable[index]))
         if every or stable[index] or assessed.supervised:
             trust.outcome(grasp, slipped=slipped)
-        excess = max(excess, trust.risk.slips - alpha * trust.risk.lifts)
         within &= trust.risk.bound is None or trust.risk.slips <= trust.risk.bound + 1e-9
-    return Life(stream, p_slip, stable, supervised & ~stable, excess, within)
+    return Life(p_slip, stable, within)

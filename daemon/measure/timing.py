@@ -1,4 +1,4 @@
-"""How long things take: in a hot loop and paced, one candidate after the other in every round."""
+"""Time steps in a hot loop and paced, one candidate after the other in every round."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from daemon.process.text import progress
 
 WARM_UP = 20
 ROUNDS = 10
-"""Rounds of the hot loop: a second in which the machine is busy spoils one of them."""
+"""Rounds of the hot loop, so that a busy second spoils only one."""
 PERIOD_S = 0.01
-"""Time between paced readings, s: 100 Hz, with other work in between, so that caches are cold."""
+"""Time between paced readings, s. Other work in between makes caches cold."""
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 
 Step = Callable[[int], object]
-"""Does what is timed for the reading of this number."""
+"""Does the timed work for the reading of this number."""
 Times = dict[str, float]
 """`hot_p50_us`, `paced_p99_us` and so on, and `cpu_percent_at_100_hz`, the share of a core."""
 

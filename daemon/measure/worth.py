@@ -1,7 +1,7 @@
 """`graspd report worth`: what `stable` is worth on another day, by how many outcomes were told.
 
-Trains graspd's default and the published network on some days and judges another one with objects
-that nobody trained on, grasp by grasp, each outcome told before the next.
+Trains graspd's default and the published network on some days. Both judge grasps of another day and
+of other objects, each after the outcome of the one before.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from daemon.measure.streams import RANDOM, Plan, Stream, live, streams
+from daemon.measure.streams import Plan, Stream, live, streams
 from daemon.process.text import complain, markdown_table, progress
 from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import DatasetError, read_all
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             chosen = np.linspace(0, len(grasps) - 1, min(QUICK_GRASPS, len(grasps)))
             grasps = grasps.rows(chosen.astype(np.int64))
         args.out.mkdir(parents=True, exist_ok=True)
-        several = [one for one in streams(grasps, plan) if one.order == RANDOM]
+        several = list(streams(grasps, plan))
         progress("")
         curves = measured(several)
         text = "\n".join(table(curves)) + "\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -63,6 +64,16 @@ def complain(problem: object) -> None:
         sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)
     else:
         sys.stderr.write("graspd: " + "\n".join(lines) + "\n")
+
+
+def write_json(content: object) -> None:
+    """Write one JSON object to stdout, as a line."""
+    sys.stdout.write(json.dumps(content) + "\n")
+
+
+def write_lines(*lines: str) -> None:
+    """Write lines to stdout. The caller makes untrusted text in them `printable`."""
+    sys.stdout.writelines(f"{line}\n" for line in lines)
 
 
 def progress(doing: str) -> None:

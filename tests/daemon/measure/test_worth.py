@@ -18,7 +18,7 @@ pytest.importorskip("matplotlib")
 from daemon.commands.report import add_arguments
 from daemon.measure import streams as module
 from daemon.measure import worth
-from daemon.measure.streams import ORDERS, Plan, Stream, live, streams
+from daemon.measure.streams import Plan, Stream, live, streams
 from daemon.measure.worth import ALLOWED, ALONE, LEARNING, PUBLISHED, RISK, draw, measured
 from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import Grasps, read_all
@@ -34,7 +34,7 @@ def stream(seed: int = 0) -> Stream:
     features = random.normal(0.0, 1.0, (GRASPS, 6)).astype(np.float32)
     features[:, 0] = np.where(slipped, 1.0, -1.0) * random.uniform(0.5, 2.0, GRASPS)
     margins = random.normal(0.0, 1.0, GRASPS)
-    return Stream("A", "palm_45", "random", margins, features, np.full(GRASPS, -1.0), slipped)
+    return Stream("A", "palm_45", margins, features, np.full(GRASPS, -1.0), slipped)
 
 
 def test_the_figures_are_counted_over_all_streams_by_outcomes_told() -> None:
@@ -92,14 +92,9 @@ def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
     monkeypatch.setattr(module, "judged", watched)
     plan = Plan(seeds=1, folds=2, epochs=1)
     found = list(streams(grasps, plan))
-    assert {(one.protocol, one.table, one.order) for one in found} == {
-        *(("A", "palm_45", order) for order in ORDERS),
-        *(
-            (protocol, table, order)
-            for protocol in "BC"
-            for table in ("palm_down", "palm_side")
-            for order in ORDERS
-        ),
+    assert {(one.protocol, one.table) for one in found} == {
+        ("A", "palm_45"),
+        *((protocol, table) for protocol in "BC" for table in ("palm_down", "palm_side")),
     }
 
 
