@@ -175,7 +175,3 @@ def test_so_is_what_the_doctor_finds(
     assert b"ok " in text
     assert (b"\x1b[32mok \x1b[0m" in text) == is_coloured
     assert (b"\x1b" in text) == is_coloured
-
-
-def test_what_is_piped_is_not_coloured() -> None:
-    assert "\x1b" not in graspd("replay", "--verbose").stdout

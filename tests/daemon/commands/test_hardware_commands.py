@@ -119,17 +119,6 @@ def test_whole_grasps_on_the_wire_are_judged_once_each(tmp_path: Path, kind: str
     assert "no-contact" in {reason for verdict in before for reason in verdict.reasons}
 
 
-def test_an_unplugged_finger_is_unknown_at_the_subscriber(tmp_path: Path) -> None:
-    with start("run", scene_for("spi", tmp_path)) as daemon:
-        wait_for(tmp_path / "graspd")
-        with twin("spi", tmp_path, "--unplugged", "mf") as hardware:
-            verdicts = list(published(tmp_path, 60))
-            end(hardware)
-        end(daemon)
-    assert {verdict.verdict for verdict in verdicts} == {"unknown"}
-    assert "sensor-missing" in {reason for verdict in verdicts for reason in verdict.reasons}
-
-
 def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) -> None:
     with start("run", scene_for("spi", tmp_path)) as daemon:
         wait_for(tmp_path / "graspd")

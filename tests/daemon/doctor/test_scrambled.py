@@ -111,7 +111,7 @@ def scrambled(monkeypatch: pytest.MonkeyPatch) -> None:
     ("fault", "kind"),
     [(fault, kind) for fault, (_, causes) in LINK_FAULTS.items() for kind in causes],
 )
-def test_a_fault_of_a_link_is_told_without_words_and_nothing_else_is(
+def test_only_the_fault_of_a_link_is_told_without_words(
     fault: str, kind: str, tmp_path: Path
 ) -> None:
     faults, expected = LINK_FAULTS[fault]

@@ -87,7 +87,7 @@ def test_a_table_without_a_finger_of_the_model_is_refused(tmp_path: Path) -> Non
     assert "mf_biotac_1" in result.stderr
 
 
-@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize("name", SOME)
 def test_real_grasps_are_judged_better_than_others_of_another_day(
     name: str, bts3_dir: Path, tmp_path: Path
 ) -> None:

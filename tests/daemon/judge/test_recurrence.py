@@ -49,7 +49,7 @@ def under_ring(rate_hz: float, sweeps: int, fingers: tuple[int, ...]) -> list[Fi
     return held(rate_hz).under(ring(sweeps, fingers), GateState.JUDGED, periods=periods)
 
 
-@pytest.mark.parametrize("sweeps", [2, 3, 16, 64])
+@pytest.mark.parametrize("sweeps", [2, 64])
 @pytest.mark.parametrize("fingers", [(0, 1, 2), (0,), (2,)])
 @pytest.mark.parametrize("rate_hz", [PALM_RATE_HZ, RATE_HZ])
 def test_a_ring_is_frozen_from_the_first_sweep_that_comes_again(

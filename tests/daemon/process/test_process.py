@@ -182,14 +182,11 @@ def redirected(redirection: str, *arguments: object, **environment: str) -> tupl
 
 WRITERS = [
     ["replay"],
-    ["replay", "--json"],
     ["check", DEMO_SCENE],
     ["run", "--print", DEMO_SCENE],
     ["doctor", DEMO_SCENE, "--listen", "0.1"],
     ["schema"],
-    ["models"],
     ["--help"],
-    ["--version"],
 ]
 
 

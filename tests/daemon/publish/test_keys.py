@@ -174,7 +174,7 @@ def test_a_key_that_is_put_on_the_list_is_admitted_and_connections_stay(
     assert caplog.text.count("the key of controller") == 1
 
 
-def test_a_removal_counts_whatever_lies_beside_the_key_and_is_told_once(
+def test_a_removed_key_counts_whatever_lies_beside_it(
     door: Door, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     friend = door.admitted("friend", tmp_path / "friends")

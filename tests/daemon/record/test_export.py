@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -318,22 +317,3 @@ def test_without_any_outcome_nothing_is_written(tmp_path: Path) -> None:
     assert result.returncode == 1
     assert "no judged grasp with an outcome" in result.stderr
     assert not (tmp_path / "t.csv").exists()
-
-
-def test_what_was_recorded_of_a_table_is_that_table(
-    tmp_path: Path,
-) -> None:
-    with DEMO_TABLE.open(newline="") as file:
-        table = list(csv.DictReader(file))
-    known = read_table(DEMO_TABLE)
-    writer = Writer(tmp_path / "a.mcap")
-    for grasp, row in enumerate(table, 1):
-        writer.judged(grasp, known.counts[grasp - 1])
-        writer.outcome(grasp, "slip" if row["slipped"] == "1" else "stable")
-    writer.close()
-    out = tmp_path / "lab.csv"
-    result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out, "--object", "mug")
-    assert result.returncode == 0, result.stderr
-    grasps = read_table(out)
-    assert np.array_equal(grasps.counts, known.counts)
-    assert np.array_equal(grasps.slipped, known.slipped)

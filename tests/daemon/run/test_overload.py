@@ -211,17 +211,6 @@ def test_a_loop_at_work_sleeps_now_and_then_and_an_idle_one_is_left_alone() -> N
     assert slept == [pytest.approx(YIELD_AFTER_NS / 10 / 1e9, rel=0.2)]
 
 
-def test_a_finger_that_repeats_what_was_left_out_is_held() -> None:
-    former, newest = reading(0, 1), reading(PERIOD_NS, 2, 1)
-    assert mark_repeats(newest, former) is newest
-    newest.counts[1] = former.counts[1]
-    found = mark_repeats(newest, former)
-    assert found.faults[1].tolist() == [ElectrodeFault.HELD] * 24
-    assert not found.faults[[0, 2]].any()
-    assert not newest.faults.any()
-    assert (found.t_ns, found.seq) == (newest.t_ns, newest.seq)
-
-
 def test_a_sensor_that_freezes_among_what_is_left_out_is_never_stable() -> None:
     """Each reading is a grasp: the judge sees but the newest, and that differs from its last."""
     clock = Clock()
@@ -285,7 +274,7 @@ def busy(seed: int, clock: Clock) -> Iterator[int]:
             yield cost_ns
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_is_stable_in_overload_would_be_stable_without(seed: int) -> None:
     judged = []
     for live in (False, True):
