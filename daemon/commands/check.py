@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import msgspec
+import numpy as np
 
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.commands.models import f1_percent
-from daemon.commands.operating_points import operating_points
-from daemon.judge.stillness import Tails
+from daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
+from daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
 from daemon.process.text import (
     Colour,
     coloured,
@@ -44,6 +46,11 @@ USUAL_PERIOD_NS = 10_000_000
 """Time between readings where only the device knows it, ns."""
 COIN = 0.5
 """Lowest possible confidence: a smaller `min_confidence` has no effect."""
+TYPICAL_COUNTS, TYPICAL_CORRELATIONS = 3.5 / math.sqrt(1.0 - 0.32), (0.32, 0.03)
+"""Standard deviation of a held touch's electrode, and its correlation at one and two sweeps.
+
+Measured from differences of sweeps, which the correlation makes smaller: 3.5 counts (2.9 to 4.2).
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footprint]]) -> int:
-    """Check one scene and write what there is to write about it alone; its cost joins `costs`."""
+    """Check one scene and print the result; add its cost to `costs`. Return the exit code."""
     try:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
@@ -121,7 +128,6 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _warnings(wanted: scene.Scene) -> list[str]:
-    """What works and is not wise."""
     warnings = []
     for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
         if not isinstance(section, scene_drivers.PalmTactile | scene_drivers.StreamJoints):
@@ -174,12 +180,14 @@ def _what_is_in(
     figures = ", ".join(
         f"{measured.protocol} {f1_percent(measured)} %" for measured in contract.measured
     )
+    confidence = wanted.model.min_confidence
+    rejects = f", unknown below a confidence of {confidence:.2f}" if confidence > COIN else ""
     parts = {
         "hand": f"{wanted.hand.name}: {', '.join(wanted.hand.fingers)}",
         "tactile": _section(wanted.tactile),
         "model": (
             f"{contract.name} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
-            f"{wanted.model.slip_threshold:g} on{_rejects(wanted)}"
+            f"{wanted.model.slip_threshold:g} on{rejects}"
         ),
         "gate": _gate(wanted, limits),
         "publish": f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}",
@@ -254,9 +262,39 @@ def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
     )
 
 
-def _rejects(wanted: scene.Scene) -> str:
-    confidence = wanted.model.min_confidence
-    return f", unknown below a confidence of {confidence:.2f}" if confidence > COIN else ""
+class OperatingPoint(NamedTuple):
+    """What one window can tell."""
+
+    after_ns: int
+    """Length of the window, ns."""
+    counts_per_s: float
+    """Steady motion, mean of a finger's electrodes, that is seen in every other sweep."""
+
+
+def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, OperatingPoint]:
+    """Return what the short and the long window tell of a finger of typical noise."""
+    sweeps = max(math.ceil(STEP_NS / period_ns), 1)
+    step_ns = sweeps * period_ns
+    short = max(math.ceil(SHORT_NS / step_ns), STEPS_MIN)
+    long = max(math.ceil(LONG_NS / step_ns), STEPS_MIN)
+    variance, correlations = np.full(1, TYPICAL_COUNTS**2 / sweeps), np.array(TYPICAL_CORRELATIONS)
+    noise = Noise.of(variance, correlations[:, np.newaxis])
+    # The squares of noise and motion add up: how much motion brings the sum to the limit?
+    slope = noise.slope[short].item() / math.sqrt(_extent(short, step_ns))
+    (limit,) = fast_limit(tails.alone, [slope])
+    fast = slope * math.sqrt(limit**2 - 1.0)
+    square, extent = noise.variance[long].item() * (long - 1), _extent(long, step_ns)
+    (limit,) = slow_limit(tails.slow, extent, [square], noise.spread[long].tolist())
+    slow = MEAN_ABS * math.sqrt((limit**2 - 1.0) * square / extent)
+    return (
+        OperatingPoint(max(SHORT_NS, short * step_ns), fast),
+        OperatingPoint(max(LONG_NS, long * step_ns), slow),
+    )
+
+
+def _extent(steps: int, step_ns: int) -> float:
+    times_s = centred(np.arange(steps) * step_ns / 1e9)
+    return float(times_s @ times_s)
 
 
 def _risk(wanted: RiskSection) -> str:
@@ -276,7 +314,7 @@ def _session(wanted: scene.Scene, needs: SessionInput) -> str:
 
 
 def _section(section: scene_drivers.Section) -> str:
-    """The driver and whatever the scene says about it."""
+    """Return the driver and the options that the scene gives it."""
     options = section.model_dump(mode="json", exclude_unset=True)
     driver = options.pop("driver")
     return f"{driver}: " + ", ".join(f"{key} {value}" for key, value in options.items())
@@ -285,10 +323,9 @@ def _section(section: scene_drivers.Section) -> str:
 def _what_is_left_out(
     wanted: scene.Scene, model: TactileModel, limits: HandLimits | None
 ) -> dict[str, str]:
-    left_out = {}
     drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]
     others = [driver for driver in drivers if driver != wanted.tactile.driver]
-    left_out["drivers"] = f"{', '.join(others)}: not imported"
+    left_out = {"drivers": f"{', '.join(others)}: not imported"}
     if wanted.joints is None and (limits is None or limits.joints is None):
         left_out["joints"] = "no joint code"
     if limits is None:

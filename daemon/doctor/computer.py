@@ -1,4 +1,4 @@
-"""What this computer has: serial ports, CAN interfaces, and who holds a file or a port of it."""
+"""Serial ports and CAN interfaces of this computer, and processes that hold a file or a port."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ COMMAND_MAX = 400
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port that there is."""
+    """A serial port of this computer."""
 
     device: str
     description: str
     serial_number: str | None
     vendor: int | None
-    """USB vendor, None for a port that is not on USB."""
+    """USB vendor; None: not on USB."""
     product: str
-    """What it calls itself, and who made it."""
+    """Product and manufacturer."""
 
     def __str__(self) -> str:
         number = f", serial number {self.serial_number}" if self.serial_number else ""
@@ -47,9 +47,9 @@ class CanInterface:
 
     name: str
     state: str
-    """`up`, `down`, or what its controller says, such as `error-active` or `bus-off`."""
+    """`up`, `down`, or the controller's state, such as `error-active` or `bus-off`."""
     bitrate: int | None
-    """Bit/s, None where it is not known."""
+    """Bit/s; None: not known."""
 
     def __str__(self) -> str:
         rate = "" if self.bitrate is None else f", {self.bitrate} bit/s"
@@ -57,12 +57,12 @@ class CanInterface:
 
     @property
     def is_down(self) -> bool:
-        """Whether nothing can come over it."""
+        """True if it carries no frames."""
         return self.state in ("down", "stopped")
 
     @property
     def is_fine(self) -> bool:
-        """Whether its controller has nothing to complain of."""
+        """True if its controller reports no errors."""
         return self.state in ("up", "error-active")
 
 
@@ -78,13 +78,13 @@ class Process:
 
     @property
     def is_graspd(self) -> bool:
-        """Whether it is one of graspd's commands."""
+        """True if it is one of graspd's commands."""
         words = self.command.split()
         return "-m daemon" in self.command or any(Path(word).name == "graspd" for word in words[:3])
 
 
 def serial_ports() -> list[SerialPort]:
-    """All serial ports of this computer."""
+    """Return all serial ports of this computer."""
     from serial.tools import list_ports
 
     return [
@@ -102,13 +102,13 @@ def serial_ports() -> list[SerialPort]:
 def can_interfaces(
     folder: Path = NETWORK, ip: Sequence[str] = ("ip", "-json", "-details", "link")
 ) -> list[CanInterface]:
-    """Every CAN interface below `/sys/class/net`; its controller as the command `ip` tells it."""
+    """Return the CAN interfaces in `/sys/class/net`, with the controller's state from `ip`."""
     states = {}
     for interface in sorted(folder.glob("*")):
         with suppress(OSError):
             if (interface / "type").read_text().strip() == ARPHRD_CAN:
                 state = (interface / "operstate").read_text().strip()
-                # Of an interface without a carrier (vcan), the kernel knows no more than that.
+                # The kernel knows no more of an interface without a carrier (vcan).
                 states[interface.name] = "up" if state == "unknown" else state
     details = _details(ip) if states else {}
     interfaces = []
@@ -135,7 +135,7 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
 
 
 def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
-    """Other processes that have locked a file, or else have it open, if /proc may be read.
+    """Return other processes that have locked a file, or else have it open, if /proc may be read.
 
     The program that made a pseudo-terminal has it open, too, and is left out.
     """
@@ -150,15 +150,16 @@ def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
             words = line.split()  # 1: FLOCK ADVISORY WRITE 123 00:1a:3 0 EOF
             if len(words) > 5 and words[5] == device:
                 locked.add(int(words[4]))
-    found = locked - {os.getpid()} or _with_open({_identity(there)}, proc) - {os.getpid()}
-    if found and stat.S_ISCHR(there.st_mode):
+    own = {os.getpid()}
+    holders = locked - own or _with_open({_identity(there)}, proc) - own
+    if holders and stat.S_ISCHR(there.st_mode):
         with suppress(OSError):
-            found -= _with_open({_identity(os.stat(TERMINAL_MAKER))}, proc)
-    return _processes(found, proc)
+            holders -= _with_open({_identity(os.stat(TERMINAL_MAKER))}, proc)
+    return _processes(holders, proc)
 
 
 def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
-    """Other processes that listen on a port of `udp` or `tcp`, if /proc may be read."""
+    """Return other processes that listen on a `udp` or `tcp` port, if /proc may be read."""
     inodes = set()
     for table in (protocol, f"{protocol}6"):
         with suppress(OSError):
@@ -170,16 +171,16 @@ def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
     return _processes(_with_open(inodes, proc), proc)
 
 
-def _with_open(wanted: Collection[object], proc: Path) -> set[int]:
+def _with_open(files: Collection[object], proc: Path) -> set[int]:
     """Return processes with one of these files (device, inode) or sockets (inode) open."""
-    found = set()
+    pids = set()
     for descriptor in proc.glob("[0-9]*/fd/*"):
         with suppress(OSError):
             opened = descriptor.stat()
             is_socket = stat.S_ISSOCK(opened.st_mode)
-            if (opened.st_ino if is_socket else _identity(opened)) in wanted:
-                found.add(int(descriptor.parts[-3]))
-    return found
+            if (opened.st_ino if is_socket else _identity(opened)) in files:
+                pids.add(int(descriptor.parts[-3]))
+    return pids
 
 
 def _identity(file: os.stat_result) -> tuple[int, int]:
@@ -187,10 +188,10 @@ def _identity(file: os.stat_result) -> tuple[int, int]:
 
 
 def _processes(pids: Collection[int], proc: Path) -> list[Process]:
-    found = []
+    processes = []
     for pid in sorted(set(pids) - {os.getpid()}):
         with suppress(OSError):
             command = (proc / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ")
             text = command.decode(errors="replace").strip()
-            found.append(Process(pid, text[:COMMAND_MAX] or "(unnamed)"))
-    return found
+            processes.append(Process(pid, text[:COMMAND_MAX] or "(unnamed)"))
+    return processes

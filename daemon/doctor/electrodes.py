@@ -1,4 +1,4 @@
-"""What readings say about the health of every electrode, and which of it is a fault."""
+"""Statistics of every electrode over a few seconds, and their faults."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ RAIL_COUNTS = 20
 QUIET_COUNTS = 40.0
 """An untouched electrode's standard deviation is 3 to 12 counts; beyond this something moves."""
 TOUCH_ELECTRODES = 5
-"""A touch moves this many electrodes of a finger; fewer that jump from reading to reading, while
-the others keep still, are not touched but restless."""
+"""A touch moves this many electrodes of a finger; fewer that jump alone are restless."""
 STILL_READINGS = 10
-"""Equal counts in a row that do not happen with 3 counts of noise."""
+"""Noise of 3 counts never gives this many equal counts in a row."""
 RESTLESS_READINGS = 30
-"""In fewer a spike or two of a sound electrode weigh too much."""
+"""With fewer readings, one spike would look restless."""
 FAULTY_FRACTION = 0.5
-"""An electrode with more faulty readings than this is missing, with fewer it is unreliable."""
+"""Share of faulty readings from which an electrode is missing, not unreliable."""
 NAMED_MAX = 6
-"""More electrodes than this are counted instead of named."""
+"""Most electrodes that are named; more are counted."""
 WORDS = ElectrodeFault.PARITY | ElectrodeFault.ERROR_WORD | ElectrodeFault.NOT_A_COUNT
 DEAD = Trouble(
     Cause.ELECTRODE_DEAD,
@@ -93,25 +92,20 @@ class ElectrodeStatistics:
     @property
     def deviation(self) -> NDArray[np.float64]:
         """Standard deviation, counts, shape (fingers, 24)."""
-        deviation: NDArray[np.float64] = np.sqrt(self._squares / np.maximum(self._sound, 1))
-        return deviation
+        return np.sqrt(self._squares / np.maximum(self._sound, 1), dtype=np.float64)
 
     @property
     def noise(self) -> NDArray[np.float64]:
-        """Standard deviation from one reading to the next, counts, shape (fingers, 24).
-
-        A slow touch does not raise it.
-        """
-        noise: NDArray[np.float64] = np.sqrt(self._step_squares / np.maximum(self._steps, 1) / 2.0)
-        return noise
+        """Standard deviation between readings, counts; a slow touch does not raise it."""
+        variance = self._step_squares / np.maximum(self._steps, 1) / 2.0
+        return np.sqrt(variance, dtype=np.float64)
 
     def findings(self) -> list[Finding]:
         """What is wrong with the electrodes, finger by finger."""
-        if not self.readings:
-            return []
-        return [
-            found for finger, name in enumerate(self.fingers) for found in self._of(finger, name)
-        ]
+        findings: list[Finding] = []
+        for finger, name in enumerate(self.fingers if self.readings else ()):
+            findings += self._of(finger, name)
+        return findings
 
     def _of(self, finger: int, name: str) -> list[Finding]:
         missing = self.faulty[finger] > FAULTY_FRACTION * self.readings

@@ -8,9 +8,9 @@ from daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, w
 from drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
-"""Readings per nominal rate below which the link is slow."""
+"""Share of the nominal rate below which the link is slow."""
 JOINING, JOINING_MAX = "unsynchronised", 108
-"""A listener that joins in mid-sweep takes nothing up to two sweeps of 54 samples: no trouble."""
+"""A listener that joins in mid-sweep loses up to two sweeps of 54 samples: no trouble."""
 
 FLASH = "flash the firmware of this graspd: deploy/bridge/BUILD.md"
 AGAIN = "look longer (--listen 20); if it goes on"
@@ -54,7 +54,7 @@ NOT_OURS = {
         "what it sends); are sensors connected to it?",
     ),
 }
-"""What comes over a link that is silent for us, by counters."""
+"""Why a link brings no readings although something comes, by counters."""
 COUNTERS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
     ("link_losses",): Trouble(
@@ -120,8 +120,7 @@ COUNTERS = {
         Cause.RECORDING, "the recording is damaged or ends in the middle: record it again"
     ),
 }
-"""Counters that are trouble on a link that is up. Others are told by the electrodes that they
-befell, or are no trouble, and are not shown."""
+"""Counters that are trouble on a link that is up. Others show at the electrodes or are harmless."""
 TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     LinkCause.UNKNOWN: Trouble(
         Cause.LINK_DOWN, "is it powered, connected, and the one that the scene names?"
@@ -219,7 +218,7 @@ def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
 
 
 def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | None) -> Finding:
-    """Whether readings come, and as often as they should."""
+    """Judge whether readings come at their nominal rate."""
     rate_hz = readings / seconds
     if not readings:
         advice = "is it powered, connected, and the one that the scene names?"
@@ -236,7 +235,7 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
 
 
 def _of_link(what: str, trouble: Trouble, counters: Mapping[str, int]) -> Finding:
-    """Judge a link that is not up, by its trouble and by what came nevertheless."""
+    """Judge a link that is not up, by its trouble and by its counters."""
     if trouble.cause is Cause.SILENT and not counters.get("link_losses"):
         for names, other in NOT_OURS.items():
             if counted := _counted(names, counters):
@@ -246,9 +245,9 @@ def _of_link(what: str, trouble: Trouble, counters: Mapping[str, int]) -> Findin
 
 
 def _counted(names: Sequence[str], counters: Mapping[str, int]) -> str:
-    """Those of these counters that count something, such as `2 bad crc, 1 too long`."""
+    """Name the counters that are not 0, such as `2 bad crc, 1 too long`."""
     return ", ".join(
-        f"{number} {name.replace('_', ' ')}"
+        f"{count} {name.replace('_', ' ')}"
         for name in names
-        if (number := counters.get(name, 0)) > JOINING_MAX * name.startswith(JOINING)
+        if (count := counters.get(name, 0)) > JOINING_MAX * name.startswith(JOINING)
     )

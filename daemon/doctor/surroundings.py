@@ -1,4 +1,4 @@
-"""What of this computer stands in the way of a scene: model, port, interface, sockets, rights."""
+"""Findings on this computer for a scene: model, port, interface, sockets, rights."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from drivers.udp.receiver import Endpoint
 from models.contract import ModelError
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
-"""Of the boards in deploy/can/PROTOCOL.md, bit/s, unless the scene says otherwise."""
+"""Default bit rates of the boards in deploy/can/PROTOCOL.md, bit/s."""
 NOT_HEARD = frozenset(
     {Cause.INTERFACE_MISSING, Cause.INTERFACE_DOWN, Cause.LINK_DOWN, Cause.SILENT, Cause.BITRATE}
 )
-"""Where nothing comes over an interface, the kernel knows more of it."""
+"""Causes for which the kernel's state of the interface is asked."""
 HELD_BY_GRASPD = (
     "graspd itself runs: graspd watch shows what it sees; to look from here end it first "
     "(systemctl stop 'graspd@*')"
@@ -33,7 +33,7 @@ HELD_BY_GRASPD = (
 
 
 def model_finding(wanted: Scene) -> Finding:
-    """Whether the scene's model is there and fits the hand."""
+    """Judge whether the scene's model is there and fits the hand."""
     try:
         path = assembly.model_path(wanted)
     except ModelError as problem:
@@ -79,7 +79,7 @@ def shared_findings(section: Section) -> list[Finding]:
 
 
 def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:
-    """The state of a CAN interface, and how to bring it up for this section of a scene."""
+    """Judge a CAN interface; advise how to bring it up for this section of a scene."""
     if interface.is_fine:
         return fine(str(interface))
     line = ip_link(interface.name, tactile)
@@ -90,7 +90,7 @@ def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = N
 
 
 def ip_link(name: str, tactile: CanTactile | None) -> str:
-    """The command that brings a CAN interface up with the bit rates of a scene."""
+    """Return the command that brings a CAN interface up with the bit rates of a scene."""
     bitrate = BITRATE if tactile is None or tactile.bitrate is None else tactile.bitrate
     line = f"sudo ip link set {name} up type can bitrate {bitrate}"
     if tactile is not None and tactile.format == "sweep_fd":
@@ -99,7 +99,7 @@ def ip_link(name: str, tactile: CanTactile | None) -> str:
 
 
 def socket_findings(wanted: Scene) -> list[Finding]:
-    """Whether the daemon can publish and be asked where the scene says; each cause once."""
+    """Judge whether the sockets of the scene can be made; each cause once."""
     ask = wanted.ask_endpoint
     sockets = [("publish", wanted.endpoint, wanted.publish.group)]
     sockets += [] if ask is None else [("ask", ask, wanted.ask_group)]
@@ -116,7 +116,7 @@ def socket_findings(wanted: Scene) -> list[Finding]:
 
 
 def realtime_findings(wanted: Scene) -> list[Finding]:
-    """What of `[realtime]` this user may not have; tried for a moment."""
+    """Try `[realtime]` for a moment; return what this user may not have."""
     if wanted.realtime is None:
         return []
     with RealtimeMode(wanted.realtime) as mode:
@@ -130,7 +130,7 @@ def _denied(finding: Finding, port: str) -> Finding:
         group = grp.getgrgid(os.stat(port).st_gid).gr_name
     except (OSError, KeyError):
         return finding
-    if group == "root":  # whose groups are nobody's to join
+    if group == "root":  # not a group to join
         advice = "install deploy/udev/70-graspd.rules, and plug it in anew"
         return replace(finding, advice=advice)
     return replace(finding, advice=f"sudo usermod -aG {group} $USER, then log in again")

@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _missing(names: Sequence[str], data: Path | None) -> str | None:
-    """Say what is not there: the tests, a package, a model or a table."""
+    """Return what is missing: the tests, a package, a model or a table."""
     if not (CHECKOUT / CASES).is_dir():
         return f"report stability runs {CASES}: run it in a checkout of graspd, not as installed"
     for package in PACKAGES:
@@ -99,7 +99,7 @@ def _missing(names: Sequence[str], data: Path | None) -> str | None:
 
 
 def _measured(args: argparse.Namespace) -> list[Row]:
-    """Run the cases in a process of its own; return their rows, none if they cannot be run."""
+    """Run the cases in another process; return their rows, none if they cannot be run."""
     progress(f"running the cases of {CASES}, one to four minutes")
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder) / "results.xml"
@@ -120,7 +120,7 @@ def _measured(args: argparse.Namespace) -> list[Row]:
 
 
 def _rows(results: Path) -> Iterator[Row]:
-    """Rows that the tests noted in pytest's JUnit file, with what failed. NaN becomes None."""
+    """Yield the rows in pytest's JUnit file, with what failed. NaN becomes None."""
     for case in ElementTree.parse(results).iter("testcase"):
         noted = case.find("properties/property[@name='row']")
         failures = [*case.iter("failure"), *case.iter("error")]
@@ -137,7 +137,7 @@ def _rows(results: Path) -> Iterator[Row]:
 
 
 def _markdown(rows: Sequence[Row]) -> Iterator[str]:
-    """Two tables: each model on each case, and the steps that belong to no model."""
+    """Yield two tables: each model on each case, and the steps that belong to no model."""
     cases = sorted((row for row in rows if "case" in row), key=lambda row: str(row["model"]))
     steps = [row for row in rows if "case" not in row]
     for columns, chosen in ((CASE_COLUMNS, cases), (STEP_COLUMNS, steps)):

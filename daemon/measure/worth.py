@@ -26,9 +26,9 @@ from models.training.data.datasets import DatasetError, read_all
 
 ALLOWED: Final = 0.05
 TOLD: Final = (0, 10, 25, 50, 75, 100, 150, 200, 250, 300)
-"""Outcomes, between which the figures are means."""
+"""Ends of the parts that the figures are means of, outcomes."""
 LEAST: Final = 100
-"""Grasps of a part, of all streams together, below which it is left out."""
+"""Parts with fewer grasps in all streams are left out."""
 QUICK_GRASPS: Final = 240
 PUBLISHED, ALONE, LEARNING, RISK = (
     "the published method (cnn1)",
@@ -42,18 +42,18 @@ STYLES: Final = {PUBLISHED: "s-", ALONE: "o:", LEARNING: "o-", RISK: "o-"}
 
 @dataclass(frozen=True, slots=True)
 class CurvePoint:
-    """What was said of the grasps after so many outcomes."""
+    """Figures after `told` outcomes."""
 
     told: int
-    """Outcomes, in the mean."""
+    """Mean number of outcomes."""
     slips_among_stable: float
-    """Fraction; NaN where nothing was called so."""
+    """Fraction; NaN without stable grasps."""
     coverage: float
-    """Of the grasps that held, the fraction that was called stable."""
+    """Fraction of the grasps that held which were called stable."""
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, draw, print; 2 if data or folder are wrong."""
+    """Measure, draw and print; 2 if data or folder are wrong."""
     try:
         grasps = read_all(args.data)
         plan = Plan(args.seeds)
@@ -80,7 +80,7 @@ Curves = dict[str, list[CurvePoint]]
 
 
 def measured(several: Sequence[Stream]) -> Curves:
-    """How often `stable` was said and slipped, over all streams together."""
+    """Return how often `stable` was said and slipped, over all streams together."""
     learning = [live(one, RiskLimits(), every=True) for one in several]
     risk = [live(one, RiskLimits(ALLOWED), every=True) for one in several]
     said = {
@@ -108,7 +108,7 @@ def _curve(
 
 
 def table(curves: Curves) -> list[str]:
-    """Slips among stable / good lifts kept, in %."""
+    """Return a table of slips among stable / good lifts kept, in %."""
     told = [point.told for point in curves[PUBLISHED]]
     rows = [
         [name, *(f"{100 * p.slips_among_stable:.0f} / {100 * p.coverage:.0f}" for p in points)]
@@ -119,7 +119,7 @@ def table(curves: Curves) -> list[str]:
 
 
 def draw(curves: Curves) -> str:
-    """Both figures against outcomes told, as SVG."""
+    """Draw both figures against outcomes told, as SVG."""
     mpl.rcParams["svg.hashsalt"] = "graspd"
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from daemon.commands.operating_points import operating_points
+from daemon.commands.check import operating_points
 from daemon.judge.stillness import Motion, Tails
 
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
