@@ -41,7 +41,7 @@ STYLES: Final = {PUBLISHED: "s-", ALONE: "o:", LEARNING: "o-", RISK: "o-"}
 
 
 @dataclass(frozen=True, slots=True)
-class CurvePoint:
+class WorthPoint:
     """Figures after `told` outcomes."""
 
     told: int
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-Curves = dict[str, list[CurvePoint]]
+Curves = dict[str, list[WorthPoint]]
 """By method."""
 
 
@@ -95,7 +95,7 @@ def measured(several: Sequence[Stream]) -> Curves:
 
 def _curve(
     stable: Sequence[NDArray[np.bool_]], slipped: Sequence[NDArray[np.bool_]]
-) -> list[CurvePoint]:
+) -> list[WorthPoint]:
     points = []
     for first, last in itertools.pairwise(TOLD):
         said = np.concatenate([one[first:last] for one in stable])
@@ -103,7 +103,7 @@ def _curve(
         if len(said) < LEAST:
             break
         among = float(slips[said].mean()) if said.any() else float("nan")
-        points.append(CurvePoint((first + last) // 2, among, float(said[~slips].mean())))
+        points.append(WorthPoint((first + last) // 2, among, float(said[~slips].mean())))
     return points
 
 
