@@ -363,7 +363,7 @@ _shtab_graspd_twin_can_options=(
   "--wrong-version[speak a later version of the protocol]"
   "--stuck-clock[the device\'s clock does not move]"
   "*--dead[reads 0 for ever, such as ff_7\; may be given several times]:ELECTRODE:_files"
-  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged:(ff mf th)"
+  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged_fingers:(ff mf th)"
   "--seed[of chance\: the same faults again (default\: 0)]:seed:_files"
 )
 
@@ -383,7 +383,7 @@ _shtab_graspd_twin_joints_options=(
   "--wrong-version[speak a later version of the protocol]"
   "--stuck-clock[the device\'s clock does not move]"
   "*--dead[reads 0 for ever, such as ff_7\; may be given several times]:ELECTRODE:_files"
-  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged:(ff mf th)"
+  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged_fingers:(ff mf th)"
   "--seed[of chance\: the same faults again (default\: 0)]:seed:_files"
 )
 
@@ -405,7 +405,7 @@ _shtab_graspd_twin_palm_options=(
   "--wrong-version[speak a later version of the protocol]"
   "--stuck-clock[the device\'s clock does not move]"
   "*--dead[reads 0 for ever, such as ff_7\; may be given several times]:ELECTRODE:_files"
-  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged:(ff mf th)"
+  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged_fingers:(ff mf th)"
   "--seed[of chance\: the same faults again (default\: 0)]:seed:_files"
 )
 
@@ -429,7 +429,7 @@ _shtab_graspd_twin_spi_options=(
   "--wrong-version[speak a later version of the protocol]"
   "--stuck-clock[the device\'s clock does not move]"
   "*--dead[reads 0 for ever, such as ff_7\; may be given several times]:ELECTRODE:_files"
-  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged:(ff mf th)"
+  "*--unplugged[finger whose line nothing drives\; may be given several times]:unplugged_fingers:(ff mf th)"
   "--seed[of chance\: the same faults again (default\: 0)]:seed:_files"
 )
 

@@ -286,5 +286,5 @@ def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver
 def test_a_twin_with_nonsense_settings_is_refused() -> None:
     with pytest.raises(ValueError, match="rate_hz"):
         JointTwin(rate_hz=0.0)
-    with pytest.raises(ValueError, match="burst_frames"):
+    with pytest.raises(ValueError, match="burst-frames"):
         JointTwin(faults=LinkFaults(burst_frames=2))
