@@ -35,8 +35,9 @@ FLOOD_S = 1.5
 FLOODERS = 8
 KEEPING_RULES_S = 3.0
 """How long the loop's cost is measured, without and with peers that keep every rule."""
-ADDED_MAX_MS = 0.5
-"""Largest processor time, ms, that a flood may add to a round of the loop."""
+ADDED_MAX_MS = 2.0
+"""Processor time that a flood may add to a round of the loop, ms. It adds 0.05 to 0.5, by
+the machine; a server in the loop itself took 3.6 to 6.2."""
 VERDICTS_MIN = 0.95
 """Smallest share of the verdicts a second that a flood must leave."""
 QUESTIONS = 10
