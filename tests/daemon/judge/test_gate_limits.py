@@ -177,6 +177,8 @@ def test_a_request_expires_after_its_time(after_ms: float, judged: bool) -> None
 def test_what_others_say_against_it_keeps_a_grasp_from_settling(reason: Reason) -> None:
     steps = Steps()
     steps.rest()
+    steps.step(touching=NOTHING, objections=(Reason.MOVING, Reason.NOT_TARED))
+    assert list(steps.now.reasons) == [Reason.NOT_TARED, Reason.NO_CONTACT], "not that it moves"
     for _ in range(50):
         assert steps.step(objections=(reason,)) is GateState.CLOSING
         assert steps.now.reasons == (reason,)
