@@ -7,23 +7,19 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
-import logging
 import os
 import re
-import resource
 import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from subprocess import CompletedProcess
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from daemon import cli
-from daemon.process.logs import LOGGERS
 from drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
+from tests.kit.inside import graspd
 from tests.process_replay.alike import lines_apart
 from tests.process_replay.judging import Case, run
 from tests.process_replay.streams import CHECKOUT, demo
@@ -132,60 +128,24 @@ _MASKS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Said:
-    """What a command has said."""
-
-    code: int
-    stdout: str
-    stderr: str
-
-
-def execute(arguments: Sequence[str], folder: Path) -> Said:
+def execute(arguments: Sequence[str], folder: Path) -> CompletedProcess[str]:
     """Run a command in this process and folder."""
-    stdout, stderr = io.StringIO(), io.StringIO()
-    with (
-        contextlib.chdir(folder),
-        _environment(folder),
-        _own_log(),
-        contextlib.redirect_stdout(stdout),
-        contextlib.redirect_stderr(stderr),
-    ):
-        try:
-            code = cli.main(arguments)
-        except SystemExit as left:
-            code = left.code if isinstance(left.code, int) else 1
-    return Said(code, stdout.getvalue(), stderr.getvalue())
+    with contextlib.chdir(folder), _environment(folder):
+        return graspd(*arguments)
 
 
 @contextlib.contextmanager
 def _environment(folder: Path) -> Iterator[None]:
-    """Set the width of help texts and an empty home; undo what a command changes."""
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    """Set the width of help texts and an empty home; undo that."""
     former = {name: os.environ.get(name) for name in ("COLUMNS", "HOME")}
     os.environ.update(COLUMNS="80", HOME=str(folder))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
         for name, value in former.items():
             os.environ.pop(name)
             if value is not None:
                 os.environ[name] = value
-
-
-@contextlib.contextmanager
-def _own_log() -> Iterator[None]:
-    """Let the command set up its log as in a new process, also under a test runner."""
-    root = logging.getLogger()
-    handlers, levels = root.handlers, [logging.getLogger(name).level for name in LOGGERS]
-    root.handlers = []
-    try:
-        yield
-    finally:
-        root.handlers = handlers
-        for name, level in zip(LOGGERS, levels, strict=True):
-            logging.getLogger(name).setLevel(level)
 
 
 def path_of(name: str) -> Path:
@@ -231,9 +191,9 @@ def _prepare(folder: Path) -> None:
         path.rename(folder / "recorded.mcap")
 
 
-def _text(line: str, said: Said, folder: Path) -> str:
-    parts = [f"$ graspd {line}\nexit code {said.code}\n"]
-    for name, output in (("stdout", said.stdout), ("stderr", said.stderr)):
+def _text(line: str, done: CompletedProcess[str], folder: Path) -> str:
+    parts = [f"$ graspd {line}\nexit code {done.returncode}\n"]
+    for name, output in (("stdout", done.stdout), ("stderr", done.stderr)):
         text = output.replace(str(folder), "FOLDER").replace(str(CHECKOUT), "CHECKOUT")
         for pattern, instead in _MASKS:
             text = re.sub(pattern, instead, text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import selectors
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -25,7 +24,9 @@ from daemon.scene import Scene
 from daemon.scene.scene import Record
 from daemon.trust.lift_book import GraspId, Report
 from drivers.base import DriverCounters, Fact, Reading, TactileReading
-from tests.process_replay.streams import FINGERS, PERIOD_NS, Clock
+from tests.kit.clock import Clock
+from tests.kit.loops import ClockSelector
+from tests.process_replay.streams import FINGERS, PERIOD_NS, START_NS
 
 BOOT_ID: Final = "0123456789abcdef" * 2
 ASKED_EVERY: Final = 40
@@ -62,7 +63,7 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
 
     This is the only place that builds a loop and its parts.
     """
-    clock, wanted = Clock(), _scene(case)
+    clock, wanted = Clock(START_NS), _scene(case)
     model = assembly.load_model(wanted)
     pipeline = assembly.build_pipeline(wanted, model, clock)
     pipeline.boot_id = BOOT_ID
@@ -85,7 +86,7 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
         wanted.max_age_ns,
         clock,
         rest=lambda _seconds: None,
-        selector=lambda: _Selector(clock),
+        selector=lambda: ClockSelector(clock),
     )
     loop = Loop([driver], pipeline, outbox, _Never(), outputs, timing)
     with closing(loop):
@@ -222,15 +223,3 @@ class _Never:
 
     def take_reload(self) -> bool:
         return False
-
-
-class _Selector(selectors.SelectSelector):
-    """Moves the clock instead of waiting."""
-
-    def __init__(self, clock: Clock) -> None:
-        super().__init__()
-        self._clock = clock
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        self._clock.now_ns += round((timeout or 0.0) * 1e9)
-        return []

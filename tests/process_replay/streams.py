@@ -29,6 +29,7 @@ from drivers.twins.faults import LinkFaultInjector, LinkFaults
 from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.palm import PalmTwin
 from models.contract import Finger
+from tests.kit.clock import Clock
 
 CHECKOUT: Final = Path(__file__).parents[2]
 FINGERS: Final[tuple[Finger, ...]] = ("ff", "mf", "th")
@@ -53,19 +54,9 @@ PAUSES: Final = (range(700, 730),)
 """Sweeps during which the SPI bridge is silent: the link is lost and found again."""
 
 
-class Clock:
-    """A clock that moves only when told to."""
-
-    def __init__(self) -> None:
-        self.now_ns = START_NS
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-
 def recording(path: Path, fingers: Sequence[str] = FINGERS) -> Iterator[Reading]:
     """Play a CSV recording in its own time, with joints if it has them."""
-    clock = Clock()
+    clock = Clock(START_NS)
     with ReplayDriver([path], fingers, clock=clock) as driver:
         while not driver.exhausted:
             clock.now_ns = max(clock.now_ns, driver.due_ns() or 0)
@@ -83,7 +74,7 @@ def can(
     log: BinaryIO | None = None,
 ) -> Iterator[Reading]:
     """Play the demo's grasps from a CAN twin; write its frames to `log`, as candump text."""
-    clock = Clock()
+    clock = Clock(START_NS)
     twin = CanTwin(
         "virtual", "none", _counts(), FINGERS, format=frame_format, faults=faults, clock=clock
     )

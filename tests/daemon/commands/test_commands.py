@@ -17,8 +17,8 @@ import zmq
 from daemon.publish.messages import Verdict, decode_verdict
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon import processes
-from tests.daemon.commands.inside import graspd
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
+from tests.kit.inside import graspd
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 

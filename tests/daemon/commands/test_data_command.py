@@ -19,7 +19,7 @@ import pytest
 
 from daemon.commands.data import DataError, fetch
 from models.bts3 import TABLES
-from tests.daemon.commands.inside import graspd
+from tests.kit.inside import graspd
 
 
 class QuietHandler(http.server.SimpleHTTPRequestHandler):

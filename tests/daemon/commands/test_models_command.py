@@ -16,7 +16,7 @@ from daemon.scene import Scene, parse
 from models import own, zoo
 from models.contract import ModelError
 from models.runtime import read
-from tests.daemon.commands.inside import graspd
+from tests.kit.inside import graspd
 
 
 @pytest.fixture

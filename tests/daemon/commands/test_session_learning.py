@@ -17,8 +17,8 @@ from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.recordings.csv_rows import SLIPPED, read_rows
-from tests.daemon.commands.inside import graspd
 from tests.daemon.record.test_export import Writer
+from tests.kit.inside import graspd
 
 FINGERS = ("ff", "mf", "th")
 ROWS = list(read_rows(DEMO_TABLE, FINGERS))

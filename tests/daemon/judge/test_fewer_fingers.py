@@ -14,7 +14,7 @@ from daemon.publish.messages import Verdict, decode_verdict
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from models import zoo
 from models.contract import FEATURES_PER_FINGER, OUTPUT_NAME
-from tests.daemon.commands.inside import graspd
+from tests.kit.inside import graspd
 
 HANDS = {
     "small-session-ff": ("ff",),

@@ -21,9 +21,9 @@ from daemon.publish.keys import KeysError, load_clients, load_own, load_pair, ma
 from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets
 from drivers.recordings.csv_player import DEMO_TABLE
-from tests.daemon.commands.inside import graspd
 from tests.daemon.publish.doors import Asked
 from tests.daemon.publish.test_sockets import STATUS
+from tests.kit.inside import graspd
 from tests.kit.waiting import PATIENCE_S, wait_until
 from tests.ports import free_port
 

@@ -24,7 +24,7 @@ from daemon.record.topics import Judged
 from drivers.base import ElectrodeFault, RecordingError, TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from models.training.data.datasets import read_table
-from tests.daemon.commands.inside import graspd
+from tests.kit.inside import graspd
 
 BOOT = "0123456789abcdef" * 2
 PERIOD_NS = 10_000_000

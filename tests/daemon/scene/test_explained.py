@@ -12,7 +12,7 @@ import pytest
 
 from daemon import scene
 from daemon.scene import explained
-from tests.daemon.commands.inside import graspd
+from tests.kit.inside import graspd
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCHEMA = explained.schema()
