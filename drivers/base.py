@@ -298,7 +298,7 @@ class LinkError(DriverError):
             if cause is not None:
                 return cls(cause, text, endpoint)
             reason = reason.__cause__ or reason.__context__
-        return cls(LinkCause.UNKNOWN, text)
+        return cls(LinkCause.UNKNOWN, text, endpoint)
 
 
 class RecordingError(DriverError):
