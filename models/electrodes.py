@@ -29,13 +29,13 @@ CONTRADICTING_MAX = 2
 held-out grasps 99 % are judged with it; of readings with each electrode from another grasp none is,
 and with a limit of four a tenth would be."""
 LEARNED_DISTANCES = 2.0
-"""A session takes in what is up to so many times farther than `distance_max`: if it took in only
-what it would judge, its mean would move towards what is left, and the rest look ever stranger."""
+"""A session learns from readings up to this many times `distance_max` away. Learning only from
+those it would judge would move its mean towards them, and make the others look ever stranger."""
 
 CONTRADICTED_DISTANCES = 0.75
-"""Of a session's reading, some of whose electrodes contradict the others, the rest must be as near
-as so many times `distance_max`: of readings with each electrode from another grasp a tenth have two
-or fewer that contradict, and all but a twentieth of these are farther; of real ones a tenth is."""
+"""Where some electrodes of a session's reading contradict the others, the others must be within
+this many times `distance_max`. Of readings with each electrode from another grasp a tenth have two
+or fewer that contradict, and 19 of 20 of these are farther; of real ones a tenth is."""
 
 
 class Electrodes:

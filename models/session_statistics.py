@@ -29,9 +29,8 @@ LEAST_WEIGHT = 0.02
 """Of a slip where nearly all are slips: so a session that began wrongly finds back."""
 
 SPREAD_RATIOS = (0.2, 3.0)
-"""Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
-by 0.4 to 1.5 times from twenty grasps of the published tables on; those of a dead finger by 0.06
-times."""
+"""Least and largest spread of a finger's electrodes (median) over the training's in a session of
+grasps. From twenty grasps of the published tables on it is 0.4 to 1.5, of a dead finger 0.06."""
 AWAY_MAX = 8.0
 """Electrodes of a session read, in the mean, at most so many of the training's spreads away from
 the training's mean (root mean square): 1.3 to 4.1 on the published days."""

@@ -43,7 +43,7 @@ class RecordedRun:
         self._paths = tuple(paths)
         self._companion = Companion()
         self._same_grasps = True
-        """False if grasps are told apart in another way: outcomes are of none of them."""
+        """False under another gate mode: recorded outcomes are not of its grasps."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
