@@ -31,9 +31,9 @@ STEPS: Final[tuple[Step, ...]] = (
     steps_install.start,
     steps_install.realtime,
     steps_install.access,
+    steps_verdicts.serial_verdicts,
     steps_faults.unplugged,
     steps_faults.disk_full,
-    steps_verdicts.serial_verdicts,
     steps_verdicts.can_verdicts,
     steps_verdicts.can_overload,
     steps_faults.killed,
@@ -46,7 +46,8 @@ STEPS: Final[tuple[Step, ...]] = (
     steps_install.enabled,
     steps_install.uninstall,
 )
-"""Grasps come over both links from `start` on, while the other steps are done."""
+"""Grasps come over both links from `start` on, while the other steps are done. The recording that a
+full disk ends must hold some: `serial_verdicts` waits for them."""
 NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_install.start))
 """Without these there is no use in going on."""
 
