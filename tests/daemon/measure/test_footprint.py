@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon import cli
 from daemon.measure.cost import CostError, Footprint, measure
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
+from tests.kit.inside import graspd
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
@@ -286,27 +286,27 @@ def test_a_scene_that_cannot_be_measured_says_why(tmp_path: Path) -> None:
         measure(scene)
 
 
-def test_check_prints_what_each_part_costs_only_when_asked(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = str(written(tmp_path, replay_of_table()))
-    assert cli.main(["check", scene]) == 0
-    assert "MiB" not in capsys.readouterr().out
-    assert cli.main(["check", scene, "--cost"]) == 0
-    text = capsys.readouterr().out
+def test_check_prints_what_each_part_costs_only_when_asked(tmp_path: Path) -> None:
+    scene = written(tmp_path, replay_of_table())
+    plain = graspd("check", scene)
+    assert plain.returncode == 0
+    assert "MiB" not in plain.stdout
+    costs = graspd("check", scene, "--cost")
+    assert costs.returncode == 0
+    text = costs.stdout
     for part in ("interpreter", "onnxruntime", "model", "driver replay", "judge", "all"):
         assert f"\n  {part} " in text
-    assert cli.main(["check", scene, "--cost", "--json"]) == 0
-    content = json.loads(capsys.readouterr().out)
+    as_json = graspd("check", scene, "--cost", "--json")
+    assert as_json.returncode == 0
+    content = json.loads(as_json.stdout)
     assert {"numpy", "onnxruntime"} <= set(content["cost"]["modules"])
     assert content["cost"]["start"]["cpu_ms"] > 0.0
 
 
-def test_check_of_several_scenes_makes_one_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scenes = [str(DEPLOY / "scenes" / "demo.toml"), str(written(tmp_path, replay_of_table()))]
-    assert cli.main(["check", "--cost", *scenes]) == 0
-    head, rule, *rows = capsys.readouterr().out.splitlines()
+def test_check_of_several_scenes_makes_one_table(tmp_path: Path) -> None:
+    demo, table = DEPLOY / "scenes" / "demo.toml", written(tmp_path, replay_of_table())
+    costs = graspd("check", "--cost", demo, table)
+    assert costs.returncode == 0
+    head, rule, *rows = costs.stdout.splitlines()
     assert [row.split("|")[1].strip() for row in rows] == ["demo", "scene"]
     assert {line.count("|") for line in (head, rule, *rows)} == {9}
