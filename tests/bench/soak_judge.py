@@ -243,7 +243,9 @@ def _losses(found: Found) -> list[Row]:
     torn = driver["restarts"] if "lost_frames" in driver else 0
     left = found.twin["sweeps"] + 2 * torn - driver["readings"] - counted - outage
     at_breaks = LOST_PER_BREAK * (driver["link_losses"] + 1)  # the last is the end
-    inside = abs(driver["readings"] - heard.readings)
+    # After a stall readings that came together are left out, which the daemon counts.
+    left_out = 0 if heard.status is None else heard.status.skipped_readings
+    inside = abs(driver["readings"] - heard.readings - left_out)
     return [
         Row("sweeps made", found.twin["sweeps"]),
         Row("lost on the link, counted", counted),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from daemon.judge.reasons import Decision
-from daemon.publish.messages import Verdict, encode
+from daemon.publish.messages import State, Status, Verdict, encode
 from drivers.twins.faults import LinkFaults
 from tests.bench.live import TALLIED, Kind, Usage
 from tests.bench.soak import Plan, link_faults, soak
@@ -161,6 +161,28 @@ def test_sweeps_are_explained_that_were_made_while_the_link_was_lost(losses: int
 def test_a_can_sweep_that_was_torn_makes_two_readings_and_one_missed() -> None:
     torn = {"readings": MADE - COUNTED + 3, "missed_readings": COUNTED + 3, "restarts": 3}
     assert broken(judge(with_driver(**torn, lost_frames=9, link_losses=0))) == set()
+
+
+@pytest.mark.parametrize("left_out", [3, 2])
+def test_readings_that_the_daemon_left_out_and_counted_are_explained(left_out: int) -> None:
+    status = Status(
+        boot_id="one",
+        seq=0,
+        t=0.0,
+        t_mono_ns=0,
+        state=State.RUNNING,
+        readings_hz=100.0,
+        verdicts={},
+        reasons={},
+        drivers={},
+        latency_us={},
+        skipped_readings=left_out,
+        model="any",
+        model_sha="",
+        versions={},
+    )
+    found = with_heard(readings=MADE - COUNTED - 3, status=status)
+    assert ("unexplained losses" in broken(judge(found))) == (left_out != 3)
 
 
 def test_the_slope_is_that_of_the_line_whatever_a_few_samples_say() -> None:
