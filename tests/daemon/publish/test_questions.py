@@ -12,11 +12,12 @@ import zmq
 
 from daemon.judge.reasons import Decision, Reason
 from daemon.publish.door import Frames
-from daemon.publish.messages import Verdict, decode_verdict
+from daemon.publish.messages import Verdict
 from daemon.publish.questions import WAITING_MAX, Questions
 from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.publish.doors import Asked
+from tests.kit.messages import decode_verdict
 
 PATIENCE_NS = 1_000_000_000
 

@@ -23,11 +23,11 @@ from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Moment
 from daemon.publish.companion import PublishedVerdict
 from daemon.publish.listener import PublishError
-from daemon.publish.messages import decode_status, decode_verdict
 from daemon.publish.sockets import Sockets, plan
 from daemon.trust.lift_book import GraspId, LiftBook
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
+from tests.kit.messages import decode_status, decode_verdict
 from tests.kit.scenes import demo_scene
 from tests.kit.waiting import wait_until
 

@@ -20,7 +20,6 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Parts
 from daemon.judge.reasons import GateState
-from daemon.publish.messages import decode_status
 from daemon.run.realtime import RealtimeMode
 from daemon.run.rehearsal import rehearse
 from daemon.run.runner import rehearse_grasp
@@ -28,6 +27,7 @@ from daemon.scene.scene import Realtime
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.twins.grasps.grasps import Counts, recorded_counts
+from tests.kit.messages import decode_status
 from tests.threads import at_work
 
 WORLD = """

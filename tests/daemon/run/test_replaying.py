@@ -10,12 +10,12 @@ import pytest
 from daemon.judge.health import SWEEPS
 from daemon.judge.reasons import Decision, Reason
 from daemon.publish.companion import Answer, PublishedVerdict
-from daemon.publish.messages import decode_verdict
 from daemon.run.replaying import Comparison, Controller
 from daemon.run.summary import WITHOUT_SESSION, RunSummary
 from daemon.trust.lift_book import Report
 from drivers.base import Annotation
 from tests.daemon.fakes import NO_LIFT, Clock, FakeModel, pipeline, reading
+from tests.kit.messages import decode_verdict
 
 GOLDEN = Path(__file__).parents[1] / "publish" / "golden" / "verdict_stable.json"
 

@@ -16,11 +16,12 @@ import zmq
 
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
-from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
+from daemon.publish.messages import State, Status, Verdict
 from daemon.run import runner
 from daemon.scene import Scene
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, put_first
+from tests.kit.messages import decode_status, decode_verdict
 from tests.kit.waiting import PATIENCE_S
 
 DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"

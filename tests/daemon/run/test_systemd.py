@@ -12,9 +12,10 @@ import msgspec
 import pytest
 
 from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.publish.messages import State, decode_status
+from daemon.publish.messages import State
 from daemon.run.systemd import Systemd, in_a_line
 from tests.daemon.fakes import MS, Clock
+from tests.kit.messages import decode_status
 
 GOLDEN = Path(__file__).parents[1] / "publish" / "golden"
 

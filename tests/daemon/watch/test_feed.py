@@ -11,13 +11,13 @@ import pytest
 from daemon import scene
 from daemon.judge.reasons import Decision
 from daemon.publish.keys import KeysError, make
-from daemon.publish.messages import decode_verdict
 from daemon.publish.sockets import Sockets
 from daemon.watch.feed import Feed, load_keys
 from daemon.watch.view import View
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Publisher
 from tests.daemon.watch.watch_fakes import MS, verdict
+from tests.kit.messages import decode_verdict
 from tests.kit.waiting import PATIENCE_S
 from tests.ports import free_port
 
