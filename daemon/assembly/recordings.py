@@ -72,10 +72,7 @@ class RecordedRun:
         return parse(changed(sections, publish, model, mode), self._paths[0])
 
     def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Return what plays the files and judges them, in the recorded state.
-
-        `speed` None is as fast as possible.
-        """
+        """Return what plays and judges the files from their state; `speed` None: no pauses."""
         header = self.header
         same_model = model.sha256 == header.model_sha256
         if not same_model:

@@ -22,7 +22,8 @@ KINDS_MAX = 200
 def set_up(environment: Mapping[str, str]) -> None:
     """Log to stderr, with priorities if `environment` says that it is the journal."""
     handler = logging.StreamHandler()
-    handler.setFormatter(JournalFormatter() if is_journal(environment) else _PLAIN)
+    plain = logging.Formatter("graspd: %(levelname)s: %(message)s")
+    handler.setFormatter(JournalFormatter() if is_journal(environment) else plain)
     handler.addFilter(RateLimit())
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     for ours in LOGGERS:
@@ -72,6 +73,3 @@ class RateLimit(logging.Filter):
                 record.args = None
         self._kinds[kind] = (start_s, seen + 1)
         return seen < BURST
-
-
-_PLAIN = logging.Formatter("graspd: %(levelname)s: %(message)s")

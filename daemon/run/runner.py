@@ -177,7 +177,9 @@ class Runner:
             stack.callback(loop.close)
             self._running, self._former = True, None
             self._trust = parts.pipeline.trust
-            _announce(wanted)
+            log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
+            if wanted.ask_endpoint is not None:
+                log.info("questions on %s", wanted.ask_endpoint)
             if self._manager is not None:
                 self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
             following: Parts | None = None
@@ -211,9 +213,3 @@ class Runner:
 def _is_told(error: Exception) -> bool:
     """Return True if the error is not a bug of graspd: its text says what to mend."""
     return isinstance(error, scene.SceneError | ModelError | PublishError | DriverError)
-
-
-def _announce(wanted: scene.Scene) -> None:
-    log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-    if wanted.ask_endpoint is not None:
-        log.info("questions on %s", wanted.ask_endpoint)

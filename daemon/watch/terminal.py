@@ -37,10 +37,7 @@ Row = tuple[str, str]
 
 
 def draw(hands: Sequence[Snapshot], width: int, chosen: int = 0) -> RenderableType:
-    """Return tables of the hands for a terminal of `width` columns.
-
-    Without room beside each other, only the `chosen` hand has a table.
-    """
+    """Return tables for `width` columns; if they have no room, only that of the `chosen` hand."""
     if len(hands) == 1:
         return _hand(hands[0], "q ends")
     if width // len(hands) >= HAND_COLUMNS:
