@@ -384,7 +384,7 @@ def test_malformed_messages_stop_neither_the_view_nor_the_terminal() -> None:
     rng = random.Random(seed)
     goldens = [(path.stem.split("_")[0], json.loads(path.read_text())) for path in GOLDEN]
     view = a_view()
-    for number in range(4000):
+    for number in range(1000):
         kind, golden = rng.choice(goldens)
         payload = mutated(rng, golden)
         try:
@@ -397,4 +397,4 @@ def test_malformed_messages_stop_neither_the_view_nor_the_terminal() -> None:
             error.add_note(f"seed {seed}, message {number}: {payload[:500]!r}")
             raise
     unreadable = int(figures(seen.timing)["not understood"].split()[0])
-    assert 400 < unreadable < 3600
+    assert 100 < unreadable < 900

@@ -220,7 +220,7 @@ def test_the_timeline_is_there_again_on_a_page_that_is_reloaded(
     browser.look(1280, 800)
     browser.go(page.address)
     see(browser, "slip")
-    time.sleep(2.0)  # of which three seconds of the clock are seen, or two
+    time.sleep(1.0)  # of which two seconds of the clock are seen, or one
     talker.decision = Decision.STABLE
     see(browser, "stable")
     browser.go("about:blank")
@@ -230,7 +230,7 @@ def test_the_timeline_is_there_again_on_a_page_that_is_reloaded(
         r"slip (\d+) s", browser.value("document.querySelector('.timeline').ariaLabel")
     )
     assert slips
-    assert int(slips[1]) >= 2
+    assert int(slips[1]) >= 1
     # It is drawn: below the first lane's name and the minutes there is something of its colour.
     assert browser.value(
         "(c => { const all = c.getContext('2d').getImageData(0, 0, c.width, 12).data; let n = 0;"
@@ -270,8 +270,7 @@ def seen_of_a_whole_hand(view: View, hand: str, seq: int, decision: Decision) ->
     ("names", "width", "fits", "theme"),
     [
         (["right"], 1280, True, "light"),
-        (["left", "right"], 1280, False, "dark"),
-        (["left", "right"], 400, False, "light"),
+        (["left", "right"], 400, False, "dark"),
     ],
 )
 def test_a_whole_hand_fits_one_window_and_several_one_page(
