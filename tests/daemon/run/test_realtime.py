@@ -157,28 +157,19 @@ def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None)
         assert collected == [True]
 
 
-@pytest.mark.parametrize("model", ["small-session", "cnn1"])
-def test_the_rehearsal_goes_through_a_whole_grasp(model: str) -> None:
-    wanted = scene.parse(
-        {
-            "model": {"name": model},
-            "gate": {"mode": "settled"},
-            "tactile": {"driver": "replay", "recordings": ["any.csv"]},
-        },
-        Path("any.toml"),
-    ).model_copy(update={"tactile": None})
-    loaded = assembly.load_model(wanted)
-    seen: list[GateState | None] = []
-
+def test_the_rehearsal_goes_through_a_whole_grasp() -> None:
+    tactile = {"driver": "spi", "port": "/nowhere"}
+    wanted = scene.parse({"tactile": tactile}, Path("any.toml"))
+    model = assembly.load_model(wanted)
     pipeline = rehearse(
-        lambda clock: assembly.build_pipeline(wanted, loaded, clock), loaded.contract.seen
+        lambda clock: assembly.build_pipeline(wanted, model, clock), model.contract.seen
     )
     assert pipeline.hand is not None
-    seen.append(pipeline.hand.gate.memory.state)
-    assert pipeline.hand.gate.memory.grasp == 1
-    assert seen[-1] in (GateState.RELEASED, GateState.IDLE)
-    if pipeline.session is not None:
-        assert pipeline.session.grasps == 1
+    memory = pipeline.hand.gate.memory
+    assert memory.grasp == 1
+    assert memory.state in (GateState.RELEASED, GateState.IDLE)
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 1
 
 
 def test_the_rehearsal_leaves_the_judge_as_it_was(as_before: None, tmp_path: Path) -> None:
@@ -209,8 +200,8 @@ def p_slips(parts: Parts, rows: list[Counts]) -> list[float | None]:
     ]
 
 
-RTTIME_US = 1_000_000
-"""As `LimitRTTIME` of the unit, but a fifth: so long may it compute without sleeping."""
+RTTIME_US = 500_000
+"""As `LimitRTTIME` of the unit, but a tenth: longest computing without a sleep."""
 
 
 def test_the_kernel_takes_the_rests_of_an_overloaded_loop_for_sleep(tmp_path: Path) -> None:
@@ -225,7 +216,7 @@ RLIMIT_RTTIME = 15  # linux/asm-generic/resource.h
 resource.setrlimit(RLIMIT_RTTIME, ({RTTIME_US // 2}, {RTTIME_US}))
 with RealtimeMode(Realtime(priority=1, cpus=(max(os.sched_getaffinity(0)),), lock_memory=False)):
     shedder = LoadShedder(time.monotonic_ns(), live=True)
-    end_s = time.monotonic() + 2.5
+    end_s = time.monotonic() + 1.2
     while time.monotonic() < end_s:
         judged_s = time.monotonic() + 0.03
         while time.monotonic() < judged_s:
