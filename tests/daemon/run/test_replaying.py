@@ -9,29 +9,15 @@ import pytest
 
 from daemon.judge.health import SWEEPS
 from daemon.judge.reasons import Decision, Reason
-from daemon.publish.companion import Answer, PublishedVerdict
+from daemon.publish.companion import PublishedVerdict
 from daemon.run.replaying import Comparison, Controller
 from daemon.run.summary import WITHOUT_SESSION, RunSummary
-from daemon.trust.lift_book import Report
 from drivers.base import Annotation
 from tests.daemon.fakes import NO_LIFT, Clock, FakeModel, pipeline, reading
+from tests.daemon.publish.doors import Asked
 from tests.kit.messages import decode_verdict
 
 GOLDEN = Path(__file__).parents[1] / "publish" / "golden" / "verdict_stable.json"
-
-
-class Requests:
-    """Keeps what is told."""
-
-    def __init__(self) -> None:
-        self.told: list[tuple[str, str | None]] = []
-
-    def ask(self) -> None:
-        raise AssertionError
-
-    def outcome(self, report: Report, answer: Answer) -> None:
-        self.told.append((report.outcome, report.object_name))
-        answer(None)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +27,7 @@ class Requests:
 def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     in_the_table: str | None, told: str | None
 ) -> None:
-    controller, requests = Controller(only_lifted=False), Requests()
+    controller, requests = Controller(only_lifted=False), Asked()
     controller.before_wait(requests)
     note = Annotation(Path("any.csv"), 1, in_the_table, slipped=True)
     verdict = decode_verdict(GOLDEN.read_bytes())
@@ -49,7 +35,7 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     judgement = pipeline(FakeModel(), Clock()).judge(lifted)
     controller.on_verdict(PublishedVerdict(judgement, verdict, b"", lifted, True, *NO_LIFT))
     controller.tell()
-    assert requests.told == [("slip", told)]
+    assert [(lift.outcome, lift.object_name) for lift in requests.outcomes] == [("slip", told)]
 
 
 @pytest.mark.parametrize(("between", "fresh"), [(SWEEPS, True), (SWEEPS - 2, False)])
