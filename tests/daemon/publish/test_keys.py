@@ -18,8 +18,8 @@ from daemon.publish.keys import KeysError, load_clients, load_own, load_pair, ma
 from daemon.publish.listener import PublishError
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.publish.doors import QUIET_S, Asked, KeyedDoor
-from tests.daemon.publish.test_sockets import STATUS
 from tests.kit.inside import graspd
+from tests.kit.messages import GOLDEN_STATUS
 from tests.kit.waiting import PATIENCE_S, wait_until
 from tests.ports import free_port
 
@@ -283,5 +283,5 @@ def test_an_authenticator_that_has_ended_ends_the_daemon(
     with monkeypatch.context() as patched:
         patched.setattr(ThreadAuthenticator, "is_alive", lambda _self: False)
         with pytest.raises(PublishError, match="authenticator has ended"):
-            door.sockets.on_status(STATUS)
-    door.sockets.on_status(STATUS)
+            door.sockets.on_status(GOLDEN_STATUS)
+    door.sockets.on_status(GOLDEN_STATUS)

@@ -25,7 +25,7 @@ from daemon.trust.lift_book import GraspId, LiftBook
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
 from tests.kit.inside import graspd
-from tests.kit.messages import decode_status, decode_verdict
+from tests.kit.messages import GOLDEN_VERDICT
 from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S, wait_until
 
@@ -48,10 +48,6 @@ def wanted(
         "ask": {"endpoint": f"ipc://{folder}/ask", **(ask or {})},
     }
     return scene.parse(text, folder / "scene.toml")
-
-
-GOLDEN = Path(__file__).parent / "golden"
-STATUS = decode_status((GOLDEN / "status.json").read_bytes())
 
 
 @pytest.mark.parametrize(
@@ -113,9 +109,10 @@ def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
     with Sockets(wanted(tmp_path)) as sockets:
         assert sockets.questions is not None
         sockets.questions.take([[b"dashboard", b"judge"], [b"controller", b"lift"]], 0, Asked())
-        verdict = decode_verdict((GOLDEN / "verdict_stable.json").read_bytes())
         judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(number), Opinion(0.1, ()))
-        sockets.on_verdict(PublishedVerdict(judgement, verdict, b"{}", None, True, grasp, lifts))
+        sockets.on_verdict(
+            PublishedVerdict(judgement, GOLDEN_VERDICT, b"{}", None, True, grasp, lifts)
+        )
         assert len(sockets.questions.waiting) == 0
     assert lifts.may_report(grasp, b"controller")
     assert lifts.may_report(grasp, b"dashboard") == (number == 0)

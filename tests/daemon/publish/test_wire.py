@@ -13,19 +13,12 @@ import pytest
 
 from daemon.commands.texts import schema_text
 from daemon.judge.reasons import ADVICE, GateCause, GateState, Reason
-from daemon.publish.messages import MESSAGES, Message, decode_outcome, encode, schema
-from tests.kit.messages import decode_verdict
+from daemon.publish.messages import MESSAGES, decode_outcome, encode, schema
+from tests.kit.messages import GOLDEN, decode_verdict, golden
 
-GOLDEN = Path(__file__).parent / "golden"
 SCHEMA_FILE = Path(__file__).parents[3] / "deploy" / "wire" / "messages.schema.json"
 NAMES = sorted(path.stem for path in GOLDEN.glob("*.json"))
 """Each begins with the kind of the message."""
-
-
-def golden(name: str) -> Message:
-    """Return a golden message as it is read."""
-    kind = name.partition("_")[0]
-    return msgspec.json.decode((GOLDEN / f"{name}.json").read_bytes(), type=MESSAGES[kind])
 
 
 @pytest.mark.parametrize(

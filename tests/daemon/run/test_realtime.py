@@ -27,7 +27,7 @@ from daemon.scene.scene import Realtime
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.twins.grasps.grasps import Counts, recorded_counts
-from tests.kit.messages import decode_status
+from tests.kit.messages import GOLDEN_STATUS
 from tests.threads import at_work
 
 WORLD = """
@@ -36,7 +36,6 @@ from daemon.run.realtime import RealtimeMode
 from daemon.scene.scene import Realtime
 """
 NOBODY = 65534
-STATUS = Path(__file__).parents[1] / "publish" / "golden" / "status.json"
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root to have and to lose rights")
 
@@ -153,7 +152,7 @@ def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None)
     with RealtimeMode(Realtime(priority=None, lock_memory=False)) as mode:
         Loop()
         assert collected == []
-        mode.on_status(decode_status(STATUS.read_bytes()))
+        mode.on_status(GOLDEN_STATUS)
         assert collected == [True]
 
 

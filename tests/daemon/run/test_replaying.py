@@ -15,9 +15,7 @@ from daemon.run.summary import WITHOUT_SESSION, RunSummary
 from drivers.base import Annotation
 from tests.daemon.fakes import NO_LIFT, Clock, FakeModel, pipeline, reading
 from tests.daemon.publish.doors import Asked
-from tests.kit.messages import decode_verdict
-
-GOLDEN = Path(__file__).parents[1] / "publish" / "golden" / "verdict_stable.json"
+from tests.kit.messages import GOLDEN_VERDICT
 
 
 @pytest.mark.parametrize(
@@ -30,10 +28,9 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     controller, requests = Controller(only_lifted=False), Asked()
     controller.before_wait(requests)
     note = Annotation(Path("any.csv"), 1, in_the_table, slipped=True)
-    verdict = decode_verdict(GOLDEN.read_bytes())
     lifted = msgspec.structs.replace(reading(0), annotation=note)
     judgement = pipeline(FakeModel(), Clock()).judge(lifted)
-    controller.on_verdict(PublishedVerdict(judgement, verdict, b"", lifted, True, *NO_LIFT))
+    controller.on_verdict(PublishedVerdict(judgement, GOLDEN_VERDICT, b"", lifted, True, *NO_LIFT))
     controller.tell()
     assert [(lift.outcome, lift.object_name) for lift in requests.outcomes] == [("slip", told)]
 
@@ -45,13 +42,12 @@ def test_a_comparison_finds_a_grasp_that_comes_again_as_fresh_as_the_run_does(
     clock, result = Clock(), RunSummary()
     run, compared = pipeline(FakeModel(), clock), pipeline(FakeModel(), clock)
     comparison = Comparison(WITHOUT_SESSION, compared, result)
-    verdict = decode_verdict(GOLDEN.read_bytes())
     seeds = [1, *range(2, 2 + between), 1]
     for seq, seed in enumerate(seeds):
         new = reading(clock.now_ns, seed=seed, seq=seq)
         last = run.judge(new)
         judged = seq in (0, len(seeds) - 1)
-        told = msgspec.structs.replace(verdict, judged=judged, grasp=1 + seq)
+        told = msgspec.structs.replace(GOLDEN_VERDICT, judged=judged, grasp=1 + seq)
         comparison.on_verdict(PublishedVerdict(last, told, b"", new, True, *NO_LIFT))
     tally = result.compared[WITHOUT_SESSION]
     assert tally.decisions.total() == 2

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-GOLDEN = Path(__file__).parents[1] / "publish" / "golden"
+from tests.kit.messages import GOLDEN
+
 EXACT_MAX = 2**53
 """Whole numbers up to here are doubles without loss; as ns, 104 days of a monotonic clock."""
 
