@@ -61,10 +61,7 @@ def build_pipeline(
     *,
     learns: bool = True,
 ) -> Pipeline:
-    """Build the judge of this scene, whose session `learns` from its grasps or does not change.
-
-    Raises `ModelError`, `SceneError` or `RecordingError` where the parts do not fit.
-    """
+    """Build the scene's judge. Raises `ModelError`, `SceneError` or `RecordingError`."""
     _refuse_other_fingers(scene, model)
     limits = Limits(
         max_age_ns=scene.max_age_ns,

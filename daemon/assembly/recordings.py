@@ -49,10 +49,7 @@ class RecordedRun:
                 log.warning("%s: does not go on where the file before it ends", path)
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the scene that was recorded, playing the files. Raises `SceneError`.
-
-        An empty `model` and `mode` None leave model and gate mode as recorded.
-        """
+        """Return the recorded scene, with `model` and `mode` if given. Raises `SceneError`."""
         recorded = self.header.scene
         sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
         if sections.get("model", {}).pop("min_accuracy", None) is not None:
@@ -93,10 +90,7 @@ class RecordedRun:
         return Parts(wanted, model, pipeline, [driver], header.boot_id)
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Restore the recorded session and what outcomes had taught. Raises `SceneError`.
-
-        Another model than the recorded one begins with nothing learned.
-        """
+        """Restore session and learning of the recorded model. Raises `SceneError`."""
         header = self.header
         try:
             if pipeline.session is not None and header.session is not None:

@@ -134,10 +134,7 @@ class Outbox:
         *,
         boot_id: str | None = None,
     ) -> None:
-        """Each output gets every message of `hand`; readings only if it wants them.
-
-        `clock` gives monotonic ns, `wall_clock` seconds since 1970.
-        """
+        """`clock` gives monotonic ns, `wall_clock` seconds since 1970."""
         self._latency = LatencyHistogram()
         self._decisions: Counter[Decision] = Counter()
         self._reasons: Counter[Reason] = Counter()

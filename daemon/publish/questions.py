@@ -107,10 +107,7 @@ class Questions:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
     def answer(self, payload: bytes, now_ns: int | None = None) -> list[Peer]:
-        """Answer all questions, or with `now_ns` those that can wait no longer.
-
-        Return the names of the peers that asked whether they may lift, in the order of asking.
-        """
+        """Answer all, or those due by `now_ns`; return the names of peers that ask for a lift."""
         lifters = []
         for peer, question in list(self.waiting.items()):
             if now_ns is not None and question.due_ns > now_ns:

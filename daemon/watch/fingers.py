@@ -60,10 +60,8 @@ class Fingers:
         self._tactile, self._tactile_ns = tactile, now_ns
         for index, finger in enumerate(tactile.fingers):
             if finger in resting:
-                counts, sound = (
-                    np.array(tactile.counts[index]),
-                    np.array(tactile.faults[index]) == 0,
-                )
+                counts = np.array(tactile.counts[index])
+                sound = np.array(tactile.faults[index]) == 0
                 self._rest.learn(finger, counts, sound)
         return True
 
