@@ -85,11 +85,6 @@ def test_a_plain_subscriber_gets_two_frames_in_order(
     assert received == [[b"verdict.right", b"%d" % number] for number in range(100)]
 
 
-def test_waiting_for_a_subscriber_must_be_announced(tmp_path: Path) -> None:
-    with Publisher(f"ipc://{tmp_path}/v") as publisher, pytest.raises(RuntimeError):
-        publisher.door.wait_for_subscriber(0.01)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_wait_for_a_subscriber(tmp_path: Path, number: signal.Signals) -> None:
     with StopSignal() as stop, Publisher(f"ipc://{tmp_path}/v", awaits=True) as publisher:

@@ -139,8 +139,3 @@ def test_the_loop_is_woken_for_the_next_preparation_only_where_one_is_requested(
         assert due_ns - began_ns >= 60_000_000_000
         assert not found.take_reload()
         assert len(preparing.began) == 1
-
-
-def test_nothing_is_there_before_it_is_said_to_be() -> None:
-    with reloading() as (found, _), pytest.raises(RuntimeError):
-        found.take()

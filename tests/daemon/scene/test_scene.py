@@ -11,7 +11,7 @@ import pytest
 from pydantic import BaseModel
 
 from daemon.scene import Scene, SceneError, load
-from daemon.scene.drivers import ReplayFaultsSection, ReplayTactile
+from daemon.scene.drivers import ReplayTactile
 from daemon.scene.endpoints import check_endpoint
 from daemon.scene.scene import SCENE_MAX_BYTES
 
@@ -203,11 +203,6 @@ def test_replay_faults_out_of_range_are_mistakes_of_the_scene(tmp_path: Path, ke
         path = write(tmp_path, GOOD + f"[tactile.faults]\n{key} = {value}")
         with pytest.raises(SceneError, match=rf"tactile\.faults\.{key}"):
             load(path)
-
-
-def test_replay_faults_at_the_limit_are_taken() -> None:
-    limits = {"wrong_counts": -4095, "electrodes": (1, 24), "fingers": ("ff",), "delayed_s": 3600.0}
-    ReplayFaultsSection.model_validate(limits)
 
 
 @pytest.mark.parametrize(
