@@ -49,7 +49,7 @@ class RecordedRun:
                 log.warning("%s: does not go on where the file before it ends", path)
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the recorded scene, with `model` and `mode` if given. Raises `SceneError`."""
+        """Return the recorded scene, changed as asked. Raises `SceneError`."""
         recorded = self.header.scene
         sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
         if sections.get("model", {}).pop("min_accuracy", None) is not None:
@@ -69,7 +69,7 @@ class RecordedRun:
         return parse(changed(sections, publish, model, mode), self._paths[0])
 
     def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Return what plays and judges the files from their state; `speed` None: no pauses."""
+        """Return what judges the files from their state; `speed` None: no pauses."""
         header = self.header
         same_model = model.sha256 == header.model_sha256
         if not same_model:
@@ -107,7 +107,6 @@ class RecordedRun:
         self._companion = companion
 
     def _repeat(self, pipeline: Pipeline, event: RecordedEvent) -> None:
-        """Repeat a recorded event to the judge."""
         match event:
             case Topic.ASKED:
                 pipeline.ask()

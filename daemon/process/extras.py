@@ -11,7 +11,7 @@ OURS = frozenset({"daemon", "drivers", "models"})
 
 
 def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
-    """Say how to install the package that `what` lacks. Raises `error` for a module of ours."""
+    """Say how to install what is missing. Raises `error` for a module of ours."""
     package = (error.name or "").partition(".")[0]
     if package in OURS:
         raise error

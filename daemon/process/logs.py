@@ -49,7 +49,7 @@ class JournalFormatter(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Lets a burst of each kind of message pass, then one a window; a kind is a text unfilled."""
+    """Lets a burst of each kind of message pass, then one a window."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()

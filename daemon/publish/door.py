@@ -147,7 +147,7 @@ class Door:
         *,
         awaits_subscriber: bool = False,
     ) -> None:
-        """Queue `high_water_mark` messages for each subscriber, at most. Raises `PublishError`."""
+        """Queue up to `high_water_mark` messages a subscriber. Raises `PublishError`."""
         self._admission = admission
         self._context: zmq.Context[Socket] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None

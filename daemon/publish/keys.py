@@ -122,7 +122,7 @@ def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
 
 
 def _refuse_open(path: Path) -> None:
-    """Raise `KeysError` if another user may replace what is at a path, or a folder on the way."""
+    """Raise `KeysError` if another user may replace a path or a folder on the way."""
     at, ahead, links = Path("/"), [*reversed((Path.cwd() / path).parts[1:])], 0
     while True:
         try:

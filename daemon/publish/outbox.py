@@ -325,6 +325,5 @@ def _learner(trust: Trust) -> LearnerHealth:
 
 
 def _angles(joints: JointReading) -> dict[str, float]:
-    """Return the joints that have an angle, rad."""
     pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
     return {name: angle for name, angle in pairs if math.isfinite(angle)}

@@ -187,7 +187,6 @@ class Loop:
             self._shedder.yield_processor(now_ns)
 
     def _register(self, selector: selectors.BaseSelector) -> None:
-        """Register the descriptors that drivers and companions have now."""
         watched = [fd for driver in self._drivers if (fd := driver.fileno()) is not None]
         for filenos in self._filenos:
             watched += filenos()
@@ -237,7 +236,7 @@ class Loop:
         return taken
 
     def _read(self) -> tuple[list[Reading], int]:
-        """Return what the drivers have (all of it under overload) and how much is tactile."""
+        """Return what the drivers have, and how many readings of it are tactile."""
         readings: list[Reading] = []
         for driver in self._drivers:
             readings += driver.read_ready()
@@ -360,7 +359,6 @@ class Loop:
         self._keep(partial(self._kept, grasp, answer))
 
     def _kept(self, grasp: GraspId, answer: Answer, problem: str | None) -> None:
-        """The outcome of a grasp is on the disk, or is not because of a problem."""
         if problem is None:
             self._pipeline.lifts.keep(grasp)
         answer(problem)

@@ -33,7 +33,7 @@ AWAKE_RETRY_S, AWAKE_LOOK_S = 1.0, 0.1
 
 
 def prepare(path: Path) -> Parts:
-    """Read a scene and load its model; in realtime, rehearse a grasp too. Raises as `Parts.of`."""
+    """Read a scene and load its model; rehearse in realtime. Raises as `Parts.of`."""
     wanted = scene.load(path)
     parts = Parts.of(wanted, assembly.load_model(wanted))
     if wanted.realtime is not None:

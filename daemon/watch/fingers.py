@@ -52,7 +52,7 @@ class Fingers:
         self._rest = RestCounts()
 
     def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
-        """Take a reading with its `resting`, tared fingers; False if its parts do not fit."""
+        """Take a reading and the fingers at rest; False if its parts do not fit."""
         lengths = {len(tactile.fingers), len(tactile.counts), len(tactile.faults)}
         rows = [*tactile.counts, *tactile.faults]
         if len(lengths) != 1 or any(len(row) != ELECTRODES for row in rows):
