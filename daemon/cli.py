@@ -8,11 +8,10 @@ stopped by SIGINT and SIGTERM before the work was done.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from daemon import __version__
@@ -72,10 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
-    """Load the command that is named and bind its arguments.
-
-    Raises `SystemExit` where there is nothing to run: 0 after --help, 2 for what is wrong.
-    """
+    """Load the named command and bind its arguments. Raises `SystemExit` if there is none."""
     arguments = sys.argv[1:] if arguments is None else arguments
     named = next((word for word in arguments if not word.startswith("-")), None)
     parser = _parser(lambda name: name == named)
@@ -88,8 +84,13 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         parser.error(f"'{args.command}' must come first")
 
     def run() -> int:
-        with _saying_which_extra(args.command):
+        try:
             code: int = importlib.import_module(COMMANDS[args.command][0]).run(args)
+        except ModuleNotFoundError as error:
+            if args.command not in EXTRAS:
+                raise
+            complain(needs(args.command, EXTRAS[args.command], error))
+            return WRONG
         return code
 
     return run
@@ -132,14 +133,3 @@ class _Version(argparse.Action):
         libraries.append(f"libzmq {zmq.zmq_version()}")
         sys.stdout.write(f"graspd {__version__}\n{', '.join(libraries)}\n")
         parser.exit()
-
-
-@contextlib.contextmanager
-def _saying_which_extra(command: str | None) -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if command not in EXTRAS:
-            raise
-        complain(needs(command, EXTRAS[command], error))
-        raise SystemExit(WRONG) from None

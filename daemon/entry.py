@@ -31,26 +31,17 @@ def main() -> int:
 
 
 def clash() -> str | None:
-    """Name the package that is in place of one of ours, and say what to do; None if there is none.
-
-    A package is found first on PYTHONPATH, or was installed over ours in the same environment.
-    """
+    """Say what is in place of one of our packages and what to do; None: nothing is."""
     for name, beginning in OURS.items():
         spec = find_spec(name)
         if spec is None or spec.origin is None:
             return f"the package {name} of graspd is missing: install graspd again"
         init = Path(spec.origin)
-        if init.read_text(errors="replace").startswith(beginning):
-            continue
-        from importlib.metadata import packages_distributions  # takes 20 ms
-
-        others = set(packages_distributions().get(name, ())) - {"graspd"}
-        if not others:
-            return f"{init.parent} is not graspd's: leave {init.parent.parent} off PYTHONPATH"
-        return (
-            f"{init.parent} is not graspd's but of the package {', '.join(sorted(others))}: "
-            "install graspd in an environment of its own (pipx, uv tool, python3 -m venv)"
-        )
+        if not init.read_text(errors="replace").startswith(beginning):
+            return (
+                f"{init.parent} is not graspd's: leave {init.parent.parent} off PYTHONPATH, or "
+                "install graspd in an environment of its own (pipx, uv tool, python3 -m venv)"
+            )
     return None
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publish.messages import decode_verdict
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.clients.building import skip_unless_it_can_be_compiled
+from tests.kit.messages import decode_verdict
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -18,13 +18,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import Final, cast
 
 import zmq
 
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
+from daemon.process.signals import StopSignal
 from daemon.publish.sockets import Sockets
 from daemon.run.loop import Loop, LoopTiming
 from tests.conftest import ROOT
@@ -118,7 +119,8 @@ def walk() -> Walk:
         stack.callback(os.close, recorded.event)
         timing = LoopTiming(wanted.max_age_ns)
         outbox = around.build_outbox()
-        loop = Loop(parts.drivers, parts.pipeline, outbox, recorded, around.companions, timing)
+        stop = cast(StopSignal, recorded)  # whose calls are none of the reading's
+        loop = Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
         context = stack.enter_context(zmq.Context())
         subscriber = stack.enter_context(context.socket(zmq.SUB))
         subscriber.connect(wanted.endpoint)

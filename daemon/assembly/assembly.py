@@ -42,10 +42,7 @@ Clock = Callable[[], int]
 
 
 def model_path(scene: Scene) -> Path:
-    """Return the file of the scene's model, in its form for the hand's fingers if there is one.
-
-    Raises `ModelError`.
-    """
+    """Return the file of the model for the hand's fingers. Raises `ModelError`."""
     if scene.model.path is not None:
         return scene.model.path
     name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
@@ -64,10 +61,7 @@ def build_pipeline(
     *,
     learns: bool = True,
 ) -> Pipeline:
-    """Build the judge of this scene, whose session `learns` from its grasps or does not change.
-
-    Raises `ModelError`, `SceneError` or `RecordingError` where the parts do not fit.
-    """
+    """Build the scene's judge. Raises `ModelError`, `SceneError` or `RecordingError`."""
     _refuse_other_fingers(scene, model)
     limits = Limits(
         max_age_ns=scene.max_age_ns,
@@ -122,10 +116,7 @@ def _and_sensors(scene: Scene) -> str:
 
 
 def gate_mode(scene: Scene) -> GateMode:
-    """Return the gate's mode, by the recordings unless given.
-
-    Raises `SceneError` or `RecordingError`.
-    """
+    """Return the gate's mode, by the recordings unless given. Raises as `build_pipeline`."""
     if scene.gate.mode is not None:
         return scene.gate.mode
     if not isinstance(scene.tactile, ReplayTactile) or is_mcap(scene.tactile):

@@ -25,10 +25,7 @@ class LinkLogs:
     """Link logs of one kind, in the order of time."""
 
     def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
-        """`path` is of the scene; None: a link with the usual options.
-
-        Raises `SceneError` if the files are of several kinds.
-        """
+        """`path` is of the scene. Raises `SceneError` for files of two kinds."""
         endings = {path.suffix for path in paths}
         if len(endings) > 1:
             raise SceneError(f"files of {' and '.join(sorted(endings))} are not one recording")

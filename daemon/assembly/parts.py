@@ -46,10 +46,7 @@ class Parts:
 
 
 class Assembly:
-    """Opens the parts of one run, and what the scene wants around them, one call a part.
-
-    `graspd run` makes the calls in this order. What is not wanted is not imported.
-    """
+    """Opens the parts of one run, and what the scene wants around them, one call a part."""
 
     def __init__(self, parts: Parts, stack: ExitStack) -> None:
         self.companions: list[Companion] = []

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 def build_recorder(
     wanted: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
 ) -> Recorder | None:
-    """Start the recorder of a scene; return None if the scene does not record.
-
-    `pipeline` has its session by now. Raises `SceneError` without the package `mcap`.
-    """
+    """Start the recorder, if wanted. Raises `SceneError` without the package `mcap`."""
     directory = wanted.record_directory
     if wanted.record is None or directory is None:
         return None
@@ -83,10 +80,7 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
 
 
 def header_now(pipeline: Pipeline, header: RecordingHeader) -> Callable[[], RecordingHeader]:
-    """Copy the state of judge and session, in 0.1 ms; return what makes the header with it.
-
-    Another thread may call that: encoding takes longer.
-    """
+    """Copy the judge's state; return what encodes it in any thread."""
     judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
     state = None if session is None else session.state()
     trust = None if pipeline.trust is None else pipeline.trust.state()

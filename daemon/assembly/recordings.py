@@ -49,10 +49,7 @@ class RecordedRun:
                 log.warning("%s: does not go on where the file before it ends", path)
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the scene that was recorded, playing the files. Raises `SceneError`.
-
-        An empty `model` and `mode` None leave model and gate mode as recorded.
-        """
+        """Return the recorded scene, changed as asked. Raises `SceneError`."""
         recorded = self.header.scene
         sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
         if sections.get("model", {}).pop("min_accuracy", None) is not None:
@@ -72,10 +69,7 @@ class RecordedRun:
         return parse(changed(sections, publish, model, mode), self._paths[0])
 
     def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Return what plays the files and judges them, in the recorded state.
-
-        `speed` None is as fast as possible.
-        """
+        """Return what judges the files from their state; `speed` None: no pauses."""
         header = self.header
         same_model = model.sha256 == header.model_sha256
         if not same_model:
@@ -96,10 +90,7 @@ class RecordedRun:
         return Parts(wanted, model, pipeline, [driver], header.boot_id)
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Restore the recorded session and what outcomes had taught. Raises `SceneError`.
-
-        Another model than the recorded one begins with nothing learned.
-        """
+        """Restore session and learning of the recorded model. Raises `SceneError`."""
         header = self.header
         try:
             if pipeline.session is not None and header.session is not None:
@@ -116,7 +107,6 @@ class RecordedRun:
         self._companion = companion
 
     def _repeat(self, pipeline: Pipeline, event: RecordedEvent) -> None:
-        """Repeat a recorded event to the judge."""
         match event:
             case Topic.ASKED:
                 pipeline.ask()

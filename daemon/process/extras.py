@@ -11,10 +11,7 @@ OURS = frozenset({"daemon", "drivers", "models"})
 
 
 def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
-    """Return one line: `what` needs the package that `error` misses, and how to install it.
-
-    Raises `error` itself if it misses a module of graspd's own.
-    """
+    """Say how to install what is missing. Raises `error` for a module of ours."""
     package = (error.name or "").partition(".")[0]
     if package in OURS:
         raise error

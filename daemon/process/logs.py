@@ -22,7 +22,8 @@ KINDS_MAX = 200
 def set_up(environment: Mapping[str, str]) -> None:
     """Log to stderr, with priorities if `environment` says that it is the journal."""
     handler = logging.StreamHandler()
-    handler.setFormatter(JournalFormatter() if is_journal(environment) else _PLAIN)
+    plain = logging.Formatter("graspd: %(levelname)s: %(message)s")
+    handler.setFormatter(JournalFormatter() if is_journal(environment) else plain)
     handler.addFilter(RateLimit())
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     for ours in LOGGERS:
@@ -48,10 +49,7 @@ class JournalFormatter(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Lets a burst of each kind of message pass, then one a window.
-
-    A kind is a message before its arguments are filled in.
-    """
+    """Lets a burst of each kind of message pass, then one a window."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -72,6 +70,3 @@ class RateLimit(logging.Filter):
                 record.args = None
         self._kinds[kind] = (start_s, seen + 1)
         return seen < BURST
-
-
-_PLAIN = logging.Formatter("graspd: %(levelname)s: %(message)s")

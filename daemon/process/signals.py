@@ -6,25 +6,11 @@ import contextlib
 import os
 import signal
 from types import FrameType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKEUPS_MAX = 4096
 """Bytes taken out of the pipe at once: one a signal."""
-
-
-class StopRequest(Protocol):
-    """Tells the loop when to end."""
-
-    @property
-    def received(self) -> signal.Signals | None:
-        """Signal that stops the process."""
-
-    def fileno(self) -> int:
-        """Return a descriptor that becomes readable when a signal arrives."""
-
-    def take_reload(self) -> bool:
-        """Return True if a reload became due since the last call."""
 
 
 class StopSignal:
@@ -40,6 +26,7 @@ class StopSignal:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def fileno(self) -> int:
+        """Return a descriptor that becomes readable when a signal arrives."""
         return self._read
 
     def take_reload(self) -> bool:

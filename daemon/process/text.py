@@ -25,10 +25,7 @@ class Colour(IntEnum):
 
 
 def coloured(text: str, colour: Colour, stream: TextIO | None = None) -> str:
-    """Return the text in this colour if `stream`, stdout unless given, shows colours.
-
-    `NO_COLOR` (https://no-color.org) and `TERM=dumb` say no.
-    """
+    """Return coloured text where the stream shows it (https://no-color.org)."""
     stream = sys.stdout if stream is None else stream
     if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text

@@ -64,10 +64,7 @@ class Worker(Generic[R]):
         return self._results.get()
 
     def close(self, wait_s: float) -> bool:
-        """End the thread; False if its job has not ended within `wait_s`.
-
-        That thread ends with its job, or with the process.
-        """
+        """End the thread; False if its job goes on after `wait_s`."""
         thread, self._thread = self._thread, None
         if thread is None:
             return True

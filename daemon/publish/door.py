@@ -24,7 +24,7 @@ from daemon.publish.listener import Listener, PublishError
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
-    from daemon.process.signals import StopRequest
+    from daemon.process.signals import StopSignal
 
 log = logging.getLogger("graspd")
 
@@ -147,10 +147,7 @@ class Door:
         *,
         awaits_subscriber: bool = False,
     ) -> None:
-        """Queue at most `high_water_mark` messages for each subscriber. Raises `PublishError`.
-
-        With an `admission`, only peers with its keys may connect over TCP.
-        """
+        """Queue up to `high_water_mark` messages a subscriber. Raises `PublishError`."""
         self._admission = admission
         self._context: zmq.Context[Socket] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
@@ -272,7 +269,7 @@ class Door:
         if self._echo.recv_multipart()[1] == self._unheard:
             self._unheard = b""
 
-    def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
+    def wait_for_subscriber(self, timeout_s: float, stop: StopSignal | None = None) -> bool:
         """Wait for a subscriber; False after `timeout_s`, or when `stop` becomes readable."""
         if self._monitor is None:
             raise RuntimeError("the door was not opened to wait")

@@ -122,10 +122,7 @@ def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
 
 
 def _refuse_open(path: Path) -> None:
-    """Raise `KeysError` if another user may write or replace what is at a path.
-
-    Folders on the way to it are checked, also those to which symbolic links lead.
-    """
+    """Raise `KeysError` if another user may replace a path or a folder on the way."""
     at, ahead, links = Path("/"), [*reversed((Path.cwd() / path).parts[1:])], 0
     while True:
         try:

@@ -135,14 +135,7 @@ def _locked(path: Path) -> int:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise PublishError("another graspd publishes there") from None
-            if _is_at(path, status):
+            if os.fstat(descriptor).st_nlink:
                 stack.pop_all()
                 return descriptor
             # Its former holder removed it after we had opened it.
-
-
-def _is_at(path: Path, status: os.stat_result) -> bool:
-    try:
-        return _identity(path) == (status.st_dev, status.st_ino)
-    except FileNotFoundError:
-        return False

@@ -247,12 +247,8 @@ MESSAGES: Final[dict[str, type[Message]]] = {
 
 encode = msgspec.json.Encoder().encode
 """JSON payload of a message."""
-decode_verdict = msgspec.json.Decoder(Verdict).decode
-decode_gate = msgspec.json.Decoder(GateMessage).decode
-decode_tactile = msgspec.json.Decoder(Tactile).decode
 decode_outcome = msgspec.json.Decoder(OutcomeMessage).decode
-decode_status = msgspec.json.Decoder(Status).decode
-"""Each decodes one kind of payload. Raises `msgspec.DecodeError`."""
+"""Decode the payload of an outcome. Raises `msgspec.DecodeError`."""
 
 
 def schema() -> dict[str, Any]:

@@ -71,6 +71,9 @@ class LatencyHistogram:
                 return min(FLOOR_US * BUCKET_RATIO ** (index + 1), self.max_us)
         return 0.0
 
+    def spread_us(self) -> dict[Literal["p50", "p99", "max"], float]:
+        return {"p50": self.quantile_us(0.5), "p99": self.quantile_us(0.99), "max": self.max_us}
+
 
 class Deadlines:
     """Counts late readings and jitter since the start."""
@@ -131,10 +134,7 @@ class Outbox:
         *,
         boot_id: str | None = None,
     ) -> None:
-        """Each output gets every message of `hand`; readings only if it wants them.
-
-        `clock` gives monotonic ns, `wall_clock` seconds since 1970.
-        """
+        """`clock` gives monotonic ns, `wall_clock` seconds since 1970."""
         self._latency = LatencyHistogram()
         self._decisions: Counter[Decision] = Counter()
         self._reasons: Counter[Reason] = Counter()
@@ -292,8 +292,8 @@ class Outbox:
             gate=None if hand is None else hand.gate.memory.state,
             tared=None if hand is None else list(hand.tared),
             health=health,
-            latency_us=_spread_us(self._latency),
-            jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},
+            latency_us=self._latency.spread_us(),
+            jitter_us=deadlines.jitter.spread_us() if deadlines.jitter.count else {},
             late_readings=deadlines.late,
             worst_age_ms=deadlines.worst_age_ms,
             skipped_readings=skipped_readings,
@@ -325,14 +325,5 @@ def _learner(trust: Trust) -> LearnerHealth:
 
 
 def _angles(joints: JointReading) -> dict[str, float]:
-    """Return the joints that have an angle, rad."""
     pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
     return {name: angle for name, angle in pairs if math.isfinite(angle)}
-
-
-def _spread_us(durations: LatencyHistogram) -> dict[Literal["p50", "p99", "max"], float]:
-    return {
-        "p50": durations.quantile_us(0.5),
-        "p99": durations.quantile_us(0.99),
-        "max": durations.max_us,
-    }

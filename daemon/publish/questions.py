@@ -79,7 +79,6 @@ class Questions:
         self.waiting[peer] = question
 
     def _take_outcome(self, envelope: Frames, text: bytes, requests: Requests) -> None:
-        """Pass on how a lift has ended, or refuse the text."""
         told = _REPORT.fullmatch(text)
         if told is None:
             self._answer_outcome(envelope, MALFORMED)
@@ -93,7 +92,6 @@ class Questions:
         requests.outcome(report, partial(self._answer_outcome, envelope))
 
     def _answer_outcome(self, envelope: Frames, refusal: str | None) -> None:
-        """Tell the peer whether its outcome was taken."""
         answer: dict[str, object] = {"v": 1, "ok": refusal in (None, REPEATED)}
         if refusal == REPEATED:
             answer["repeated"] = True
@@ -107,10 +105,7 @@ class Questions:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
     def answer(self, payload: bytes, now_ns: int | None = None) -> list[Peer]:
-        """Answer all questions, or with `now_ns` those that can wait no longer.
-
-        Return the names of the peers that asked whether they may lift, in the order of asking.
-        """
+        """Answer all, or those due by `now_ns`; return the peers that ask for a lift."""
         lifters = []
         for peer, question in list(self.waiting.items()):
             if now_ns is not None and question.due_ns > now_ns:

@@ -18,7 +18,7 @@ from daemon.scene import Scene, SceneError
 from daemon.scene.scene import Curve
 
 if TYPE_CHECKING:
-    from daemon.process.signals import StopRequest
+    from daemon.process.signals import StopSignal
     from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
@@ -149,7 +149,7 @@ class Sockets(Companion):
             counters["ask"] = dict(self.questions.counters)
         return counters
 
-    def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
+    def wait_for_subscriber(self, timeout_s: float, stop: StopSignal | None = None) -> bool:
         return self._door is not None and self._door.wait_for_subscriber(timeout_s, stop)
 
     def check_keys(self) -> None:

@@ -78,7 +78,6 @@ class Demo(Companion):
         self._write(f"{grasps:10}{''.join(self._cells(tally, allowed) for tally in tallies)}")
 
     def _cells(self, tally: Tally, allowed: float | None) -> str:
-        """Return the number of `stable`, the slips and the good lifts among them."""
         stable, slips = tally.stable
         worth = tally.worth() or {}
         share, kept = worth.get("slips_among_stable"), worth.get("coverage")

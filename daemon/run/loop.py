@@ -12,7 +12,7 @@ from functools import partial
 from typing import Final
 
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.process.signals import StopRequest
+from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import (
     REPEATED,
@@ -26,6 +26,7 @@ from daemon.publish.companion import (
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Deadlines, Outbox
 from daemon.run.overload import LoadShedder, mark_repeats
+from daemon.run.reload import Reload
 from daemon.trust.lift_book import (
     NOT_YOURS,
     REFUSALS,
@@ -85,7 +86,7 @@ class Loop:
         drivers: Sequence[Driver],
         pipeline: Pipeline,
         outbox: Outbox,
-        stop: StopRequest,
+        stop: StopSignal | Reload,
         companions: Sequence[Companion],
         timing: LoopTiming,
         keep: Callable[[Answer], None] = at_once,
@@ -186,7 +187,6 @@ class Loop:
             self._shedder.yield_processor(now_ns)
 
     def _register(self, selector: selectors.BaseSelector) -> None:
-        """Register the descriptors that drivers and companions have now."""
         watched = [fd for driver in self._drivers if (fd := driver.fileno()) is not None]
         for filenos in self._filenos:
             watched += filenos()
@@ -236,10 +236,7 @@ class Loop:
         return taken
 
     def _read(self) -> tuple[list[Reading], int]:
-        """Return what the drivers have, and the number of tactile readings in it.
-
-        Under overload, empty the tactile driver, to get its newest reading.
-        """
+        """Return what the drivers have, and how many readings of it are tactile."""
         readings: list[Reading] = []
         for driver in self._drivers:
             readings += driver.read_ready()
@@ -362,7 +359,6 @@ class Loop:
         self._keep(partial(self._kept, grasp, answer))
 
     def _kept(self, grasp: GraspId, answer: Answer, problem: str | None) -> None:
-        """The outcome of a grasp is on the disk, or is not because of a problem."""
         if problem is None:
             self._pipeline.lifts.keep(grasp)
         answer(problem)

@@ -44,10 +44,7 @@ def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
 
 
 def rehearse(make: Callable[[Callable[[], int]], Pipeline], seen: SeenCounts) -> Pipeline:
-    """Judge one synthetic grasp, so that the first real one needs no import or allocation.
-
-    `make` makes the pipeline that is returned, from a clock, monotonic ns.
-    """
+    """Judge a synthetic grasp; return the pipeline that `make` makes from a clock."""
     now_ns = 0
     pipeline = make(lambda: now_ns)
     for seq, counts in enumerate(grasps(seen, GRASP_EVERY)):

@@ -19,10 +19,7 @@ END_S: Final = 0.5
 
 
 class Reload(Companion):
-    """Stands before a `StopSignal`: the loop hears of a reload once there is a scene to run.
-
-    Requests that come during a preparation lead to one more preparation.
-    """
+    """Stands before a `StopSignal`: the loop hears of a reload once there is a scene to run."""
 
     def __init__(
         self, stop: StopSignal, prepare: Callable[[], Parts], began: Callable[[], None]

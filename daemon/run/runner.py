@@ -33,10 +33,7 @@ AWAKE_RETRY_S, AWAKE_LOOK_S = 1.0, 0.1
 
 
 def prepare(path: Path) -> Parts:
-    """Read a scene and load its model; in realtime, rehearse a grasp too.
-
-    Raises `SceneError`, `ModelError` or `RecordingError`.
-    """
+    """Read a scene and load its model; rehearse in realtime. Raises as `Parts.of`."""
     wanted = scene.load(path)
     parts = Parts.of(wanted, assembly.load_model(wanted))
     if wanted.realtime is not None:
@@ -177,7 +174,9 @@ class Runner:
             stack.callback(loop.close)
             self._running, self._former = True, None
             self._trust = parts.pipeline.trust
-            _announce(wanted)
+            log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
+            if wanted.ask_endpoint is not None:
+                log.info("questions on %s", wanted.ask_endpoint)
             if self._manager is not None:
                 self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
             following: Parts | None = None
@@ -211,9 +210,3 @@ class Runner:
 def _is_told(error: Exception) -> bool:
     """Return True if the error is not a bug of graspd: its text says what to mend."""
     return isinstance(error, scene.SceneError | ModelError | PublishError | DriverError)
-
-
-def _announce(wanted: scene.Scene) -> None:
-    log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-    if wanted.ask_endpoint is not None:
-        log.info("questions on %s", wanted.ask_endpoint)

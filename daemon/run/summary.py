@@ -73,10 +73,7 @@ class Tally:
                 self.worst = max(sum(self._latest), self.worst or 0)
 
     def scores(self) -> dict[str, float] | None:
-        """Return accuracy, precision, recall and F1, slip positive, of judged and labelled grasps.
-
-        A score whose denominator is zero is left out.
-        """
+        """Return the defined scores of judged and labelled grasps; slip is positive."""
         hit, miss = self.confusion[True, True], self.confusion[True, False]
         false_alarm, rest = self.confusion[False, True], self.confusion[False, False]
         total = hit + miss + false_alarm + rest
@@ -213,11 +210,7 @@ class RunSummary:
             "outcomes": 0 if trust is None else trust.learner.outcomes,
             "risk": None if trust is None else msgspec.to_builtins(trust.report()),
             "trained_on": list(self.trained_on),
-            "latency_us": {
-                "p50": self.latency.quantile_us(0.5),
-                "p99": self.latency.quantile_us(0.99),
-                "max": self.latency.max_us,
-            },
+            "latency_us": self.latency.spread_us(),
             "wall_s": wall_s,
         }
 

@@ -55,7 +55,12 @@ class Section(BaseModel):
     """Base of all sections: no unknown keys, no silent conversion, nothing changes later."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        validate_default=True,
+        use_attribute_docstrings=True,
     )
 
 

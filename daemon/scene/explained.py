@@ -3,19 +3,15 @@ and the example scenes."""
 
 from __future__ import annotations
 
-import ast
-import inspect
 import json
 import re
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import drivers.recordings
 from daemon.process.text import markdown_table
-from daemon.scene import drivers as driver_sections
-from daemon.scene import scene
+from daemon.scene import Scene
 
 EXAMPLES = Path(__file__).parent / "examples"
 """In the repository a link to deploy/scenes, in an installed package a copy of it."""
@@ -54,13 +50,12 @@ def example(name: str) -> str:
 
 def schema() -> dict[str, Any]:
     """The JSON Schema of a scene: each number with its `unit`, and no null, which TOML has not."""
-    found = scene.Scene.model_json_schema()
-    sections = found.pop("$defs")
-    meanings = _meanings()
-    for name, section in {"Scene": found, **sections}.items():
-        for key, about in section["properties"].items():
-            _describe(about, meanings.get((name, key)))
-    return {"$schema": DIALECT, **_plain(found, sections)}
+    whole = Scene.model_json_schema()
+    sections = whole.pop("$defs")
+    for section in (whole, *sections.values()):
+        for about in section["properties"].values():
+            _describe(about)
+    return {"$schema": DIALECT, **_plain(whole, sections)}
 
 
 def schema_text() -> str:
@@ -79,31 +74,12 @@ def page() -> str:
     return "\n".join(tables)
 
 
-def _meanings() -> dict[tuple[str, str], str]:
-    """By class and key: the string that stands below the key in the source.
-
-    It is read there when somebody asks: a daemon that starts pays nothing for it.
-    """
-    found = {}
-    for module in (driver_sections, scene):
-        for section in ast.parse(inspect.getsource(module)).body:
-            if not isinstance(section, ast.ClassDef):
-                continue
-            for key, below in pairwise(section.body):
-                match key, below:
-                    case (
-                        ast.AnnAssign(target=ast.Name(id=name)),
-                        ast.Expr(value=ast.Constant(value=str(text))),
-                    ):
-                        found[section.name, name] = " ".join(text.split())
-    return found
-
-
-def _describe(about: dict[str, Any], meaning: str | None) -> None:
-    """Put a key's meaning and unit into its schema; sections have theirs from their class."""
+def _describe(about: dict[str, Any]) -> None:
+    """Put the unit of a key into its meaning; a section has its meaning from its class."""
+    meaning = " ".join(about.pop("description", "").split())
     if "$ref" in about:
         about.pop("default", None)
-    elif meaning is not None:
+    elif meaning:
         unit = _unit(about)
         about["description"] = meaning if unit in ("", "-") else f"{meaning} Unit: {unit}."
 

@@ -54,10 +54,7 @@ class Feed:
         keys: tuple[bytes, bytes, bytes] | None = None,
         clock: Callable[[], int] = boottime_ns,
     ) -> None:
-        """`keys`: own public and secret key and the daemon's public one, Z85.
-
-        `clock` gives ns, also while the computer sleeps. Raises `zmq.ZMQError`.
-        """
+        """`keys` as by `load_keys`; `clock` gives ns, with sleep. Raises `zmq.ZMQError`."""
         self.link = "connecting"
         self._endpoint = endpoint
         self._keys = keys

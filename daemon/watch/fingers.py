@@ -52,10 +52,7 @@ class Fingers:
         self._rest = RestCounts()
 
     def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
-        """Take a reading; return False if its parts do not fit.
-
-        `resting` names the fingers that touch nothing and are tared.
-        """
+        """Take a reading and the fingers at rest; False if its parts do not fit."""
         lengths = {len(tactile.fingers), len(tactile.counts), len(tactile.faults)}
         rows = [*tactile.counts, *tactile.faults]
         if len(lengths) != 1 or any(len(row) != ELECTRODES for row in rows):
@@ -63,10 +60,8 @@ class Fingers:
         self._tactile, self._tactile_ns = tactile, now_ns
         for index, finger in enumerate(tactile.fingers):
             if finger in resting:
-                counts, sound = (
-                    np.array(tactile.counts[index]),
-                    np.array(tactile.faults[index]) == 0,
-                )
+                counts = np.array(tactile.counts[index])
+                sound = np.array(tactile.faults[index]) == 0
                 self._rest.learn(finger, counts, sound)
         return True
 

@@ -37,10 +37,7 @@ Row = tuple[str, str]
 
 
 def draw(hands: Sequence[Snapshot], width: int, chosen: int = 0) -> RenderableType:
-    """Return tables of the hands for a terminal of `width` columns.
-
-    Without room beside each other, only the `chosen` hand has a table.
-    """
+    """Return tables of all hands, or of the `chosen` one where `width` is small."""
     if len(hands) == 1:
         return _hand(hands[0], "q ends")
     if width // len(hands) >= HAND_COLUMNS:
@@ -68,7 +65,6 @@ def _hand(seen: Snapshot, keys: str) -> RenderableType:
 
 
 def _verdict(seen: Snapshot) -> Text:
-    """Return the verdict in its colour, with the first reason."""
     name = printable(seen.hand or "-", NAME_MAX)
     why = seen.why[0].what if seen.why else ""
     word = f" {seen.headline.upper()} "

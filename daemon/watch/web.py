@@ -5,13 +5,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
-import math
 import re
 import select
 import socket
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -30,13 +28,10 @@ HOSTS: Final = {"127.0.0.1", "localhost", "[::1]"}
 """A foreign page may bring another name to reach loopback (DNS rebinding)."""
 SITES: Final = {None, "none", "same-origin"}
 """`Sec-Fetch-Site` of requests that no other site has made."""
-PAGES_MAX: Final = 8
 CONNECTIONS_MAX: Final = 16
-"""Connections, each with a thread; a browser may need two."""
+"""Connections, each with a thread; an open page keeps one."""
 PATIENCE_S: Final = 5.0
-"""Longest time for a request, or for one snapshot, s."""
-GIVES_WAY_S: Final = 0.25
-"""Age, s, from which an unanswered request gives way to a new connection."""
+"""Longest silence of a browser within a request, and longest wait until it reads on, s."""
 SEND_BUFFER_BYTES: Final = 32 * 1024
 """Some snapshots. A slow browser misses the later ones."""
 RETRY_MS: Final = 1000
@@ -74,7 +69,7 @@ class Newest:
 class Server(ThreadingHTTPServer):
     """Serves the page and the snapshots."""
 
-    daemon_threads = False
+    daemon_threads = True
     allow_reuse_address = True
     request_queue_size = CONNECTIONS_MAX
 
@@ -82,52 +77,21 @@ class Server(ThreadingHTTPServer):
         """Listen on loopback. Raises `OSError`."""
         self.newest = newest
         self.page, self.policy = load_page()
-        self.pages = threading.BoundedSemaphore(PAGES_MAX)
         self._places = threading.BoundedSemaphore(CONNECTIONS_MAX)
-        self._ends: dict[socket.socket, float] = {}
-        """When each connection is cut off, monotonic s; the oldest first."""
-        self._lock = threading.Lock()
         super().__init__((ADDRESS, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Serve a connection in a thread, if one is free or another gives way."""
-        if not self._places.acquire(blocking=False):
-            self._cut_off(time.monotonic() + PATIENCE_S - GIVES_WAY_S, at_most=1)
-            if not self._places.acquire(timeout=GIVES_WAY_S):
-                self.shutdown_request(request)
-                return
-        with self._lock:
-            self._ends[request] = time.monotonic() + PATIENCE_S
-        super().process_request(request, client_address)
+        """Serve a connection in a thread, if one is free."""
+        if self._places.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         try:
             super().process_request_thread(request, client_address)
         finally:
-            with self._lock:
-                self._ends.pop(request, None)
             self._places.release()
-
-    def service_actions(self) -> None:
-        """Cut off slow connections; called several times a second."""
-        self._cut_off(time.monotonic())
-
-    def keep(self, request: socket.socket) -> None:
-        """Let a connection stay while it takes its snapshots."""
-        with self._lock:
-            self._ends[request] = math.inf
-
-    def _cut_off(self, due_s: float, at_most: int = CONNECTIONS_MAX) -> None:
-        """Cut off connections that end by `due_s`, the oldest first."""
-        with self._lock:
-            late = [request for request, end_s in self._ends.items() if end_s <= due_s][:at_most]
-            for request in late:
-                self._ends[request] = math.inf
-        for request in late:
-            try:
-                request.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                log.debug("a browser had gone already")
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         failure = sys.exception()
@@ -135,9 +99,8 @@ class Server(ThreadingHTTPServer):
         log.log(logging.DEBUG if gone else logging.ERROR, "%s: %r", client_address, failure)
 
     def server_close(self) -> None:
-        """Cut off all browsers and wait for their threads."""
+        """End all pages."""
         self.newest.close()
-        self._cut_off(math.inf)
         super().server_close()
 
 
@@ -193,20 +156,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _stream(self) -> None:
         newest = self.server.newest
-        if not self.server.pages.acquire(blocking=False):
-            self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f"{PAGES_MAX} pages are open")
-            return
-        try:
-            self.server.keep(self.request)
-            number = newest.number  # the next one is sent first: this may be old
-            self._begin("text/event-stream")
-            self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
-            while not newest.closed:
-                number, payload = newest.after(number)
-                if payload:
-                    self.wfile.write(b"data: " + payload + b"\n\n")
-        finally:
-            self.server.pages.release()
+        number = newest.number  # the next one is sent first: this may be old
+        self._begin("text/event-stream")
+        self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
+        while not newest.closed:
+            number, payload = newest.after(number)
+            if payload:
+                self.wfile.write(b"data: " + payload + b"\n\n")
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
         log.debug(format, *args)

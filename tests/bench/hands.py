@@ -20,7 +20,6 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from daemon.publish.messages import decode_verdict
 from tests.bench.live import (
     PATIENCE_S,
     Child,
@@ -33,6 +32,7 @@ from tests.bench.live import (
     usage,
     where_of,
 )
+from tests.kit.messages import decode_verdict
 
 PERIOD_S = 0.01
 PRIORITY = 50

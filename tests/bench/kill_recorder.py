@@ -20,10 +20,10 @@ from typing import Final
 
 import zmq
 
-from daemon.publish.messages import decode_verdict
 from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.record.recorded import messages
+from tests.kit.messages import decode_verdict
 
 FLUSH_MS: Final = 1000.0
 """The default of `[record] flush_ms`."""

@@ -21,7 +21,7 @@ from typing import Self
 import numpy as np
 
 from daemon.judge.reasons import Decision
-from daemon.publish.messages import Verdict, decode_verdict
+from daemon.publish.messages import Verdict
 from drivers.joints.message import JointMessage
 from drivers.twins.spi import SpiTwin
 from tests.bench.live import (
@@ -32,6 +32,7 @@ from tests.bench.live import (
     start_daemon,
     tactile_section,
 )
+from tests.kit.messages import decode_verdict
 from tests.ports import free_port
 
 JOINTS = ("FFJ3", "MFJ3", "THJ5")

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.publish.messages import decode_tactile, decode_verdict
 from daemon.session.file import SessionFile, kept_now, load
 from daemon.trust.lift_book import GraspId, OutcomeStatus
 from daemon.trust.trust import Trust, TrustState, decode
@@ -37,6 +36,7 @@ from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.recordings.csv_rows import read_rows
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.kit.messages import decode_tactile, decode_verdict
 
 RATE_HZ: Final = 50.0
 """256 grasps are remembered: an outcome that is told again must come within five seconds."""

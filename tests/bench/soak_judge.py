@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.reasons import Reason
-from daemon.publish.messages import Status, Verdict, decode_status, decode_verdict
+from daemon.publish.messages import Status, Verdict
 from tests.bench.live import TALLIED, Usage
+from tests.kit.messages import decode_status, decode_verdict
 
 SLOPE_MAX_KIB_PER_H = 1024.0
 """3 bytes per reading at 100 Hz, less than any object that could be kept of each."""

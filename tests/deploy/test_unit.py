@@ -96,7 +96,11 @@ def test_the_unit_keeps_what_the_daemon_needs() -> None:
 
 def test_a_reload_needs_nothing_but_the_shell(tmp_path: Path) -> None:
     (command,) = settings(UNIT)["ExecReload"]
-    with subprocess.Popen(["/bin/sleep", "60"]) as process:
+    # Under nohup a child ignores SIGHUP. Its line says that it no longer does.
+    heeding = ["env", "--default-signal=HUP", "sh", "-c", "echo; exec sleep 60"]
+    with subprocess.Popen(heeding, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"\n"
         words = shlex.split(command.replace("$MAINPID", str(process.pid)))
         assert words[0] == "/bin/sh"
         subprocess.run(words, check=True, env={"PATH": str(tmp_path)}, timeout=60)

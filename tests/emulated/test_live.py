@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.publish.messages import Tactile, decode_status, decode_tactile
+from daemon.publish.messages import Tactile
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.twins.grasps.grasps import recorded_counts
 from tests.bench.live import Subscriber
@@ -22,6 +22,7 @@ from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.emulated.board import BOARD_ID
 from tests.emulated.conftest import Image
 from tests.emulated.test_driver import grasps, write_counts
+from tests.kit.messages import decode_status, decode_tactile
 
 READINGS = 500
 READY_S = 200.0

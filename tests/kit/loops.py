@@ -10,12 +10,13 @@ from daemon.judge.decision import HandLimits
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import Answer, Companion, PublishedVerdict, at_once
-from daemon.publish.messages import Status, Verdict, decode_status
+from daemon.publish.messages import Status, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, LoopTiming
 from daemon.trust.trust import Trust
 from drivers.base import TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline
+from tests.kit.messages import decode_status
 
 
 class SentMessages:

@@ -14,6 +14,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.recorder import header_now, header_of
 from daemon.judge.pipeline import Pipeline
+from daemon.process.signals import StopSignal
 from daemon.publish.companion import Companion, PublishedVerdict, Requests
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
@@ -88,8 +89,10 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
         rest=lambda _seconds: None,
         selector=lambda: ClockSelector(clock),
     )
-    loop = Loop([driver], pipeline, outbox, _Never(), outputs, timing)
-    with closing(loop):
+    with (
+        StopSignal() as stop,
+        closing(Loop([driver], pipeline, outbox, stop, outputs, timing)) as loop,
+    ):
         loop.run()
     for recorder in outputs[1:]:
         recorder.close()
@@ -211,15 +214,3 @@ class _World(Companion):
         object_name = "cup" if grasp % 2 else None
         report = Report(GraspId(boot_id, grasp), "slip" if slipped else "stable", object_name)
         requests.outcome(report, lambda why: self.messages.append(("answer", f"{grasp}: {why}")))
-
-
-class _Never:
-    """Nothing stops the loop before its readings end."""
-
-    received = None
-
-    def fileno(self) -> int:
-        return 0
-
-    def take_reload(self) -> bool:
-        return False

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from daemon.assembly import assembly
-from daemon.publish.messages import Verdict, decode_verdict
+from daemon.publish.messages import Verdict
 from daemon.scene import load as load_scene
 from daemon.session.file import SessionFile, kept_now, load
 from drivers.spi.messages import Hello
@@ -31,6 +31,7 @@ from tests.bench.live import (
     start_daemon,
     tactile_section,
 )
+from tests.kit.messages import decode_verdict
 from tests.ports import free_port
 from tests.threads import at_work
 

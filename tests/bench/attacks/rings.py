@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from daemon.judge.reasons import Decision
-from daemon.publish.messages import Verdict, decode_verdict
+from daemon.publish.messages import Verdict
 from drivers.joints.message import JointMessage
 from drivers.twins.grasps.grasp_script import JOINT_NAMES
 from drivers.twins.grasps.grasps import Counts
@@ -36,6 +36,7 @@ from tests.bench.live import (
     start_daemon,
     tactile_section,
 )
+from tests.kit.messages import decode_verdict
 from tests.ports import free_port
 from tests.threads import at_work
 

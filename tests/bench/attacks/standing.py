@@ -15,7 +15,7 @@ import zmq
 from numpy.typing import NDArray
 
 from daemon.judge.hand import FreshMedian
-from daemon.publish.messages import Tactile, Verdict, decode_tactile, decode_verdict
+from daemon.publish.messages import Tactile, Verdict
 from drivers.twins.grasps.grasp_script import Phase
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -24,6 +24,7 @@ from models import zoo
 from models.runtime import TactileModel
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import HELD, PATIENCE_S, Subscriber, start_daemon, tactile_section
+from tests.kit.messages import decode_tactile, decode_verdict
 from tests.threads import at_work
 
 MODEL = "cnn1"

@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.publish.messages import Verdict, decode_verdict
+from daemon.publish.messages import Verdict
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon import processes
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
 from tests.kit.inside import graspd
+from tests.kit.messages import decode_verdict
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 

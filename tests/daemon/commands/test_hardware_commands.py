@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.publish.messages import Tactile, Verdict, decode_tactile, decode_verdict
+from daemon.publish.messages import Tactile, Verdict
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from tests.bench.live import Subscriber
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
+from tests.kit.messages import decode_tactile, decode_verdict
 from tests.ports import free_port
 
 WANTED = 150

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Self
 
 import zmq
 
+from daemon import scene
 from daemon.publish.companion import Answer
 from daemon.publish.door import Door
+from daemon.publish.keys import load_pair, make
 from daemon.publish.listener import Listener
+from daemon.publish.sockets import Sockets
 from daemon.trust.lift_book import Report
+from tests.ports import free_port
 
 WAIT_MS = 100_000
+QUIET_S = 0.3
+
+Keys = tuple[bytes, bytes]
 
 
 class Publisher:
@@ -97,6 +105,75 @@ class Peers:
         for each in self._sockets:
             each.close(linger=0)
         self.context.term()
+
+
+class KeyedDoor:
+    """A daemon's sockets with keys, and clients at it."""
+
+    def __init__(self, folder: Path) -> None:
+        make(folder, "daemon")
+        self.clients = folder / "clients"
+        self.known = self.client("controller", folder / "theirs")
+        (folder / "theirs" / "controller.key").rename(self.clients / "controller.key")
+        self.port = free_port()
+        self.endpoint = f"tcp://127.0.0.1:{self.port}"
+        self._ask = f"tcp://127.0.0.1:{free_port()}"
+        text = {
+            "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+            "publish": {"endpoint": self.endpoint},
+            "ask": {"endpoint": self._ask},
+            "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
+        }
+        self.sockets = Sockets(scene.parse(text, folder / "scene.toml"))
+        self.public = load_pair(folder / "daemon.key_secret")[0]
+        self.context = zmq.Context()
+        self.connected: list[zmq.Socket[bytes]] = []
+
+    def close(self) -> None:
+        for each in self.connected:
+            each.close(linger=0)
+        self.context.term()
+        self.sockets.close()
+
+    def client(self, name: str, folder: Path) -> Keys:
+        self.clients.mkdir(exist_ok=True)
+        return load_pair(make(folder, name)[1])
+
+    def admitted(self, name: str, folder: Path) -> Keys:
+        """Keys that the daemon has on its list from now on."""
+        keys = self.client(name, folder)
+        (folder / f"{name}.key").rename(self.clients / f"{name}.key")
+        self.sockets.check_keys()
+        return keys
+
+    def is_deaf(self, subscriber: zmq.Socket[bytes]) -> None:
+        """Nothing more comes there than what waits."""
+        while subscriber.poll(100):
+            subscriber.recv_multipart()
+        assert not self.hears(subscriber, QUIET_S)
+
+    def connect(
+        self, keys: Keys | None, kind: int = zmq.SUB, server: bytes | None = None
+    ) -> zmq.Socket[bytes]:
+        made = self.context.socket(kind)
+        self.connected.append(made)
+        made.linger = 0
+        if keys is not None:
+            made.curve_publickey, made.curve_secretkey = keys
+            made.curve_serverkey = server or self.public
+        made.connect(self.endpoint if kind == zmq.SUB else self._ask)
+        if kind == zmq.SUB:
+            made.subscribe("")
+        return made
+
+    def hears(self, subscriber: zmq.Socket[bytes], patience_s: float) -> bool:
+        deadline_s = time.monotonic() + patience_s
+        while time.monotonic() < deadline_s:
+            self.sockets.send(b"verdict.right", b"{}")
+            if subscriber.poll(5):
+                subscriber.recv_multipart()
+                return True
+        return False
 
 
 def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[bytes]:

@@ -8,7 +8,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -83,11 +83,6 @@ def test_a_plain_subscriber_gets_two_frames_in_order(
             assert publisher.send(b"verdict.right", b"%d" % number)
         received = [subscriber.recv_multipart() for _ in range(100)]
     assert received == [[b"verdict.right", b"%d" % number] for number in range(100)]
-
-
-def test_waiting_for_a_subscriber_must_be_announced(tmp_path: Path) -> None:
-    with Publisher(f"ipc://{tmp_path}/v") as publisher, pytest.raises(RuntimeError):
-        publisher.door.wait_for_subscriber(0.01)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -228,26 +223,15 @@ def test_a_peer_that_sends_too_much_is_disconnected_and_others_are_not(
     assert receive(door, 1) == [[b"polite", b"judge"]]
 
 
-FLOODS: dict[str, Callable[[int], bytes]] = {
-    "no subscription": lambda _number: b"\x05" + b"x" * 100,
-    "one topic": lambda _number: b"\x01verdict.right",
-    "on and off": lambda number: b"\x01v" if number % 2 else b"\x00v",
-}
-
-
-@pytest.mark.parametrize("kind", FLOODS)
-def test_a_flood_of_subscriptions_does_not_hold_up_the_loop(
-    tmp_path: Path, peers: Peers, kind: str
-) -> None:
+def test_a_flood_of_subscriptions_does_not_hold_up_the_loop(tmp_path: Path, peers: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
 
     def flood(stop: threading.Event) -> None:
         hostile = peers.connect(zmq.XSUB, endpoint)
-        number = 0
         while not stop.is_set():
-            number += 1
             try:
-                hostile.send(FLOODS[kind](number), zmq.NOBLOCK)
+                hostile.send(b"\x01v", zmq.NOBLOCK)
+                hostile.send(b"\x00v", zmq.NOBLOCK)
             except zmq.Again:
                 time.sleep(0.001)
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from daemon.judge.reasons import Decision, Reason
-from daemon.publish.messages import DECISION_CODE, Verdict
+from daemon.publish.messages import Verdict
 from daemon.publish.outbox import BUCKETS, LatencyHistogram
 from daemon.run.summary import WITHOUT_LEARNING, RunSummary, Tally
 from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust
+from tests.kit.messages import GOLDEN_VERDICT
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -29,34 +30,17 @@ def test_quantiles_are_right_to_two_percent(seed: int) -> None:
 
 def test_extreme_durations_stay_in_the_histogram() -> None:
     histogram = LatencyHistogram()
+    assert histogram.quantile_us(0.5) == 0.0
     for duration_us in (0.0, 1e-9, 1e20):
         histogram.add(duration_us)
     assert histogram.quantile_us(1.0) > 9.9e7
     assert len(histogram.buckets) == BUCKETS
 
 
-def test_an_empty_histogram_is_zero() -> None:
-    assert LatencyHistogram().quantile_us(0.5) == 0.0
-
-
 def verdict(outcome: Decision) -> Verdict:
-    unknown = outcome is Decision.UNKNOWN
-    return Verdict(
-        boot_id="0",
-        seq=0,
-        t=0.0,
-        t_mono_ns=0,
-        grasp=1,
-        verdict=outcome,
-        verdict_code=DECISION_CODE[outcome],
-        p_slip=None if unknown else 0.5,
-        valid=not unknown,
-        reasons=[Reason.STALE] if unknown else [],
-        age_ms=0.0,
-        latency_us=100.0,
-        silence_ms=100.0,
-        model="fake",
-        model_sha="0",
+    reasons = [Reason.STALE] if outcome is Decision.UNKNOWN else []
+    return msgspec.structs.replace(
+        GOLDEN_VERDICT, verdict=outcome, reasons=reasons, grasp=1, gate=None
     )
 
 

@@ -10,28 +10,23 @@ from tests.daemon.fakes import MS, reading
 PERIOD_NS = 10 * MS
 
 
-def test_jitter_is_the_distance_from_the_period() -> None:
+@pytest.mark.parametrize(
+    ("times_ms", "counted", "longest_us"),
+    [
+        ({0: 100, 1: 110, 2: 121, 3: 130}, 3, 1000.0),
+        ({0: 100, 2: 120, 3: 130}, 1, 0.0),
+        ({0: 100, 1: 110, 2: 3110, 3: 3120}, 2, 0.0),
+    ],
+    ids=["distance from the period", "lost reading", "outage"],
+)
+def test_jitter_is_of_readings_in_a_row(
+    times_ms: dict[int, int], counted: int, longest_us: float
+) -> None:
     deadlines = Deadlines()
-    for seq, t_ms in enumerate((100, 110, 121, 130)):
+    for seq, t_ms in times_ms.items():
         deadlines.add(reading(t_ms * MS, seq=seq), 0.5, PERIOD_NS)
-    assert deadlines.jitter.count == 3
-    assert deadlines.jitter.max_us == pytest.approx(1000.0)
-
-
-def test_a_lost_reading_is_not_jitter() -> None:
-    deadlines = Deadlines()
-    for seq, t_ms in ((0, 100), (2, 120), (3, 130)):
-        deadlines.add(reading(t_ms * MS, seq=seq), 0.5, PERIOD_NS)
-    assert deadlines.jitter.count == 1
-    assert deadlines.jitter.max_us == 0.0
-
-
-def test_an_outage_is_not_jitter() -> None:
-    deadlines = Deadlines()
-    for seq, t_ms in ((0, 100), (1, 110), (2, 3110), (3, 3120)):
-        deadlines.add(reading(t_ms * MS, seq=seq), 0.5, PERIOD_NS)
-    assert deadlines.jitter.count == 2
-    assert deadlines.jitter.max_us == 0.0
+    assert deadlines.jitter.count == counted
+    assert deadlines.jitter.max_us == pytest.approx(longest_us)
 
 
 def test_a_verdict_more_than_a_period_after_its_reading_is_late() -> None:

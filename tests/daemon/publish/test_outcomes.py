@@ -18,33 +18,21 @@ from daemon.publish.questions import Questions
 from daemon.trust.lift_book import GraspId, Report
 from tests.daemon.fakes import FINGERS, Clock
 from tests.daemon.publish.doors import Asked as Requests
+from tests.kit.loops import SentMessages
 
 BOOT = "0123456789abcdef" * 2
 NOW_NS = 10**12
 BOTH: tuple[Literal["stable", "slip"], ...] = ("stable", "slip")
 
 
-class Output:
-    """Keeps what is sent."""
-
-    def __init__(self) -> None:
-        self.sent: list[tuple[bytes, bytes]] = []
-
-    def send(self, topic: bytes, payload: bytes) -> None:
-        self.sent.append((topic, payload))
-
-    def wanted(self, _topic: bytes) -> bool:
-        return True
-
-
-def outbox(output: Output) -> Outbox:
+def outbox(output: SentMessages) -> Outbox:
     return Outbox(
         "right", FINGERS, "fake", "0" * 64, [output], Clock(NOW_NS), lambda: 5.0, boot_id=BOOT
     )
 
 
 def test_outcomes_are_published_as_the_schema_says() -> None:
-    output = Output()
+    output = SentMessages()
     sender = outbox(output)
     for outcome in BOTH:
         sender.outcome(Report(GraspId(BOOT, 3), outcome, "mug"))
@@ -67,7 +55,7 @@ def test_outcomes_are_published_as_the_schema_says() -> None:
 
 
 def test_an_outcome_of_a_grasp_that_an_earlier_start_judged_says_which() -> None:
-    output = Output()
+    output = SentMessages()
     sender = outbox(output)
     for boot_id, judged_by in ((BOOT, None), ("f" * 32, "f" * 32)):
         sender.outcome(Report(GraspId(boot_id, 3), "slip"))
@@ -187,26 +175,17 @@ def test_the_object_arrives_as_it_was_told(asked: Asked, name: str | None) -> No
     "text",
     [
         "outcome",
-        "outcome ",
         f"outcome {BOOT} 7",
         f"outcome {BOOT} 7 Slip",
         f"outcome {BOOT} 7 slip ",
         f"outcome {BOOT} -7 slip",
-        f"outcome {BOOT} 7.0 slip",
         f"outcome {BOOT[:-1]} 7 slip",
-        f"outcome {BOOT}  7 slip",
         f"outcome {BOOT.upper()} 7 slip",
         "outcome \xff",
-        f"outcome {BOOT} 7 slip  mug",
-        f"outcome {BOOT} 7 slip mug ",
         f"outcome {BOOT} 7 slip a mug",
         f"outcome {BOOT} 7 slip mug,cup",
-        f'outcome {BOOT} 7 slip "mug"',
-        f"outcome {BOOT} 7 slip mug's",
         f"outcome {BOOT} 7 slip mug\n",
         f"outcome {BOOT} 7 slip m\xfcg",
-        f"outcome {BOOT} 7 slip mug\x7f",
-        f"outcome {BOOT} 7 slip mug\0",
         f"outcome {BOOT} 7 slip " + "x" * 65,
         *(f"outcome {BOOT} 7 slip {name}" for name in NO_NAMES),
     ],

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 import zmq
 
-from daemon.judge.reasons import Decision, Reason
+from daemon.judge.reasons import Decision
 from daemon.publish.door import Frames
-from daemon.publish.messages import Verdict, decode_verdict
+from daemon.publish.messages import Verdict
 from daemon.publish.questions import WAITING_MAX, Questions
 from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
-from tests.daemon.publish.doors import Asked
+from tests.daemon.publish.doors import Asked, Peers
+from tests.kit.messages import decode_verdict
+from tests.kit.waiting import PATIENCE_S
 
 PATIENCE_NS = 1_000_000_000
 
@@ -36,24 +38,11 @@ def questions(sent: list[Frames]) -> Questions:
     return Questions(send, PATIENCE_NS)
 
 
-Connect = Callable[..., "zmq.Socket[bytes]"]
-
-
 @pytest.fixture
-def connect() -> Iterator[Connect]:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    sockets: list[zmq.Socket[bytes]] = []
-
-    def connected(endpoint: str, kind: int = zmq.DEALER) -> zmq.Socket[bytes]:
-        socket = context.socket(kind)
-        sockets.append(socket)
-        socket.connect(endpoint)
-        return socket
-
-    yield connected
-    for socket in sockets:
-        socket.close(linger=0)
-    context.term()
+def peers() -> Iterator[Peers]:
+    made = Peers()
+    yield made
+    made.close()
 
 
 @pytest.mark.parametrize("text", [b"judge", b"lift"])
@@ -137,10 +126,11 @@ def test_an_answer_that_is_dropped_is_counted() -> None:
     assert questions.counters["dropped"] == 1
 
 
-def scene(folder: Path, mode: str, request_ms: float = 800.0) -> Path:
+def scene(folder: Path, mode: str, request_ms: float) -> Path:
     path = folder / "scene.toml"
     path.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
+        '[tactile]\ndriver = "replay"\nloop = true\nspeed = 4.0\n'
+        f'recordings = ["{DEMO_RECORDING}"]\n'
         f'[gate]\nmode = "{mode}"\nrequest_ms = {request_ms}\n[model]\nname = "cnn1"\n'
         f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
     )
@@ -151,19 +141,18 @@ def ask(asker: zmq.Socket[bytes]) -> tuple[Verdict, float]:
     """One answer, and how long it took, s."""
     asked_s = time.monotonic()
     asker.send(b"judge")
-    assert asker.poll(100_000)
     return decode_verdict(asker.recv()), time.monotonic() - asked_s
 
 
 def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown_in_time(
-    tmp_path: Path, connect: Connect
+    tmp_path: Path, peers: Peers
 ) -> None:
-    with start("run", scene(tmp_path, "request")) as daemon:
+    with start("run", scene(tmp_path, "request", 200.0)) as daemon:
         wait_for(tmp_path / "ask")
-        asker = connect(f"ipc://{tmp_path}/ask", zmq.REQ)
+        asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")
         answers: list[Verdict] = []
         waited_s: list[float] = []
-        deadline_s = time.monotonic() + 100.0
+        deadline_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline_s and len([a for a in answers if a.valid]) < 2:
             answer, took_s = ask(asker)
             answers.append(answer)
@@ -172,36 +161,19 @@ def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown_in_time(
         daemon.terminate()
         daemon.communicate(timeout=TIMEOUT_S)
     assert len([answer for answer in answers if answer.valid]) >= 2
-    assert statistics.median(waited_s) < 0.8 + 0.5  # the deadline, and a machine that is busy
+    assert statistics.median(waited_s) < 0.2 + 0.5  # the deadline, and a machine that is busy
     for answer in answers:
         assert answer.valid or answer.reasons
         if not answer.judged:
             assert answer.verdict is Decision.UNKNOWN
 
 
-def test_nothing_is_judged_in_request_mode_unless_somebody_asks(
-    tmp_path: Path, connect: Connect
-) -> None:
-    with start("run", scene(tmp_path, "request")) as daemon:
-        wait_for(tmp_path / "graspd")
-        listener = connect(f"ipc://{tmp_path}/graspd", zmq.SUB)
-        listener.subscribe("verdict.")
-        verdicts = []
-        for _ in range(450):  # two grasps
-            assert listener.poll(100_000)
-            verdicts.append(decode_verdict(listener.recv_multipart()[1]))
-        daemon.terminate()
-        daemon.communicate(timeout=TIMEOUT_S)
-    assert not any(verdict.judged or verdict.valid for verdict in verdicts)
-    assert Reason.NOT_ASKED in {reason for verdict in verdicts for reason in verdict.reasons}
-
-
 def test_in_other_modes_the_answer_is_the_verdict_of_the_next_reading(
-    tmp_path: Path, connect: Connect
+    tmp_path: Path, peers: Peers
 ) -> None:
-    with start("run", scene(tmp_path, "settled", request_ms=10_000.0)) as daemon:
+    with start("run", scene(tmp_path, "settled", 10_000.0)) as daemon:
         wait_for(tmp_path / "ask")
-        asker = connect(f"ipc://{tmp_path}/ask", zmq.REQ)
+        asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")
         answers = [ask(asker) for _ in range(5)]
         daemon.terminate()
         daemon.communicate(timeout=TIMEOUT_S)

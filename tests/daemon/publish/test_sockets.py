@@ -7,9 +7,6 @@ import os
 import random
 import select
 import stat
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,16 +20,16 @@ from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Moment
 from daemon.publish.companion import PublishedVerdict
 from daemon.publish.listener import PublishError
-from daemon.publish.messages import decode_status, decode_verdict
 from daemon.publish.sockets import Sockets, plan
 from daemon.trust.lift_book import GraspId, LiftBook
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
+from tests.kit.inside import graspd
+from tests.kit.messages import GOLDEN_VERDICT
 from tests.kit.scenes import demo_scene
-from tests.kit.waiting import wait_until
+from tests.kit.waiting import PATIENCE_S, wait_until
 
-PATIENCE_MS = 100_000
-HOSTILE_MESSAGES = 10_000
+HOSTILE_MESSAGES = 2_000
 
 
 @pytest.fixture
@@ -51,10 +48,6 @@ def wanted(
         "ask": {"endpoint": f"ipc://{folder}/ask", **(ask or {})},
     }
     return scene.parse(text, folder / "scene.toml")
-
-
-GOLDEN = Path(__file__).parent / "golden"
-STATUS = decode_status((GOLDEN / "status.json").read_bytes())
 
 
 @pytest.mark.parametrize(
@@ -116,9 +109,10 @@ def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
     with Sockets(wanted(tmp_path)) as sockets:
         assert sockets.questions is not None
         sockets.questions.take([[b"dashboard", b"judge"], [b"controller", b"lift"]], 0, Asked())
-        verdict = decode_verdict((GOLDEN / "verdict_stable.json").read_bytes())
         judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(number), Opinion(0.1, ()))
-        sockets.on_verdict(PublishedVerdict(judgement, verdict, b"{}", None, True, grasp, lifts))
+        sockets.on_verdict(
+            PublishedVerdict(judgement, GOLDEN_VERDICT, b"{}", None, True, grasp, lifts)
+        )
         assert len(sockets.questions.waiting) == 0
     assert lifts.may_report(grasp, b"controller")
     assert lifts.may_report(grasp, b"dashboard") == (number == 0)
@@ -129,33 +123,17 @@ def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers:
     with Sockets(wanted(tmp_path)) as sockets:
         sockets.before_wait(requests)
         peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask").send(b"judge")
-        deadline_s = time.monotonic() + PATIENCE_MS / 1e3
         while not requests.times:  # it may be ready for less
-            assert select.select(sockets.filenos(), [], [], PATIENCE_MS / 1e3)[0]
-            assert time.monotonic() < deadline_s
+            assert select.select(sockets.filenos(), [], [], PATIENCE_S)[0]
             sockets.before_wait(requests)
 
 
-def test_a_proxy_that_has_ended_ends_the_loop(
+def test_a_daemon_whose_proxy_ends_ends_with_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(zmq, "proxy", lambda _front, _back: None)
-    with Sockets(wanted(tmp_path)) as sockets:
-        time.sleep(0.1)
-        with pytest.raises(PublishError, match="no longer serves"):
-            sockets.on_status(STATUS)
-
-
-def test_a_daemon_whose_proxy_ends_ends_with_an_error(tmp_path: Path) -> None:
     """So systemd starts it again: only the code 2 of a wrong scene forbids that."""
-    scene = demo_scene(tmp_path, "loop = true")
-    code = (
-        "import sys, time, zmq; zmq.proxy = lambda *_sockets: time.sleep(1.0); "
-        f"from daemon.cli import main; sys.exit(main(['run', {str(scene)!r}]))"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100
-    )
+    monkeypatch.setattr(zmq, "proxy", lambda _front, _back: None)
+    ended = graspd("run", demo_scene(tmp_path, "loop = true"))
     assert ended.returncode == 1
     assert "libzmq no longer serves it" in ended.stderr
 
@@ -240,9 +218,7 @@ def junk(rng: random.Random) -> list[bytes]:
 
 
 @pytest.mark.parametrize(("door", "kind"), [("v", zmq.XSUB), ("ask", zmq.DEALER)])
-def test_ten_thousand_hostile_messages_do_no_harm(
-    tmp_path: Path, peers: Peers, door: str, kind: int
-) -> None:
+def test_hostile_messages_do_no_harm(tmp_path: Path, peers: Peers, door: str, kind: int) -> None:
     rng, requests = random.Random(1), Asked()
     with Sockets(wanted(tmp_path)) as sockets:
         questions = sockets.questions

@@ -10,12 +10,13 @@ from typing import Any, cast
 
 import zmq
 
-from daemon.publish.messages import Status, Verdict, decode_verdict
+from daemon.publish.messages import Status, Verdict
 from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.kit.messages import decode_verdict
 
 BOOT = "0123456789abcdef" * 2
 HEADER = RecordingHeader(

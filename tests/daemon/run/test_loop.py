@@ -21,7 +21,7 @@ from daemon.publish.companion import (
     Requests,
     hooks,
 )
-from daemon.publish.messages import Lifts, State, decode_tactile
+from daemon.publish.messages import Lifts, State
 from daemon.run.loop import Ended
 from daemon.session.sensors import SensorWatch
 from daemon.trust.lift_book import UNKNOWN_START, GraspId, OutcomeStatus, Report
@@ -29,6 +29,7 @@ from daemon.trust.trust import Trust
 from drivers.base import DriverError, JointReading, LinkCause, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, reading
 from tests.kit.loops import LoopBench
+from tests.kit.messages import decode_tactile
 
 
 def test_every_reading_gets_one_verdict_in_order() -> None:

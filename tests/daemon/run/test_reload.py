@@ -120,19 +120,6 @@ def test_a_storm_prepares_one_scene_and_one_more() -> None:
         assert len(preparing.began) == preparing.told == 2
 
 
-def test_the_end_does_not_wait_for_what_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reload, "END_S", 0.05)
-    with reloading() as (found, preparing):
-        hang_up()
-        found.take_reload()
-        wait_until(lambda: bool(preparing.began))
-        began_s = time.monotonic()
-        found.close()
-        assert time.monotonic() - began_s < 5.0
-        preparing.go.release()
-        wait_until(lambda: "reload" not in [thread.name for thread in threading.enumerate()])
-
-
 def test_the_loop_is_woken_for_the_next_preparation_only_where_one_is_requested(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -152,8 +139,3 @@ def test_the_loop_is_woken_for_the_next_preparation_only_where_one_is_requested(
         assert due_ns - began_ns >= 60_000_000_000
         assert not found.take_reload()
         assert len(preparing.began) == 1
-
-
-def test_nothing_is_there_before_it_is_said_to_be() -> None:
-    with reloading() as (found, _), pytest.raises(RuntimeError):
-        found.take()

@@ -9,29 +9,13 @@ import pytest
 
 from daemon.judge.health import SWEEPS
 from daemon.judge.reasons import Decision, Reason
-from daemon.publish.companion import Answer, PublishedVerdict
-from daemon.publish.messages import decode_verdict
+from daemon.publish.companion import PublishedVerdict
 from daemon.run.replaying import Comparison, Controller
 from daemon.run.summary import WITHOUT_SESSION, RunSummary
-from daemon.trust.lift_book import Report
 from drivers.base import Annotation
 from tests.daemon.fakes import NO_LIFT, Clock, FakeModel, pipeline, reading
-
-GOLDEN = Path(__file__).parents[1] / "publish" / "golden" / "verdict_stable.json"
-
-
-class Requests:
-    """Keeps what is told."""
-
-    def __init__(self) -> None:
-        self.told: list[tuple[str, str | None]] = []
-
-    def ask(self) -> None:
-        raise AssertionError
-
-    def outcome(self, report: Report, answer: Answer) -> None:
-        self.told.append((report.outcome, report.object_name))
-        answer(None)
+from tests.daemon.publish.doors import Asked
+from tests.kit.messages import GOLDEN_VERDICT
 
 
 @pytest.mark.parametrize(
@@ -41,15 +25,14 @@ class Requests:
 def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     in_the_table: str | None, told: str | None
 ) -> None:
-    controller, requests = Controller(only_lifted=False), Requests()
+    controller, requests = Controller(only_lifted=False), Asked()
     controller.before_wait(requests)
     note = Annotation(Path("any.csv"), 1, in_the_table, slipped=True)
-    verdict = decode_verdict(GOLDEN.read_bytes())
     lifted = msgspec.structs.replace(reading(0), annotation=note)
     judgement = pipeline(FakeModel(), Clock()).judge(lifted)
-    controller.on_verdict(PublishedVerdict(judgement, verdict, b"", lifted, True, *NO_LIFT))
+    controller.on_verdict(PublishedVerdict(judgement, GOLDEN_VERDICT, b"", lifted, True, *NO_LIFT))
     controller.tell()
-    assert requests.told == [("slip", told)]
+    assert [(lift.outcome, lift.object_name) for lift in requests.outcomes] == [("slip", told)]
 
 
 @pytest.mark.parametrize(("between", "fresh"), [(SWEEPS, True), (SWEEPS - 2, False)])
@@ -59,13 +42,12 @@ def test_a_comparison_finds_a_grasp_that_comes_again_as_fresh_as_the_run_does(
     clock, result = Clock(), RunSummary()
     run, compared = pipeline(FakeModel(), clock), pipeline(FakeModel(), clock)
     comparison = Comparison(WITHOUT_SESSION, compared, result)
-    verdict = decode_verdict(GOLDEN.read_bytes())
     seeds = [1, *range(2, 2 + between), 1]
     for seq, seed in enumerate(seeds):
         new = reading(clock.now_ns, seed=seed, seq=seq)
         last = run.judge(new)
         judged = seq in (0, len(seeds) - 1)
-        told = msgspec.structs.replace(verdict, judged=judged, grasp=1 + seq)
+        told = msgspec.structs.replace(GOLDEN_VERDICT, judged=judged, grasp=1 + seq)
         comparison.on_verdict(PublishedVerdict(last, told, b"", new, True, *NO_LIFT))
     tally = result.compared[WITHOUT_SESSION]
     assert tally.decisions.total() == 2

@@ -12,11 +12,10 @@ import msgspec
 import pytest
 
 from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.publish.messages import State, decode_status
+from daemon.publish.messages import State
 from daemon.run.systemd import Systemd, in_a_line
 from tests.daemon.fakes import MS, Clock
-
-GOLDEN = Path(__file__).parents[1] / "publish" / "golden"
+from tests.kit.messages import GOLDEN_STATUS
 
 
 @pytest.fixture
@@ -144,7 +143,7 @@ def test_a_manager_that_is_gone_costs_one_warning(
 
 
 def test_the_status_line_says_state_rate_verdicts_and_what_is_not_well() -> None:
-    status = decode_status((GOLDEN / "status.json").read_bytes())
+    status = GOLDEN_STATUS
     assert status.state is State.RUNNING
     assert status.verdicts[Decision.SLIP] == 1
     assert status.gate is GateState.IDLE

@@ -11,7 +11,7 @@ import pytest
 from pydantic import BaseModel
 
 from daemon.scene import Scene, SceneError, load
-from daemon.scene.drivers import ReplayFaultsSection, ReplayTactile
+from daemon.scene.drivers import ReplayTactile
 from daemon.scene.endpoints import check_endpoint
 from daemon.scene.scene import SCENE_MAX_BYTES
 
@@ -59,10 +59,8 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (GOOD + "[hnad]\nname = 'left'", "hnad", "did you mean hand?"),
         (GOOD + "sped = 2.0", "tactile.sped", "did you mean speed?"),
         (GOOD + "[gate]\nmax_age_s = 0.1", "gate.max_age_s", "did you mean max_age_ms?"),
-        (GOOD + "[gate]\nmax_age_ms = '100 ms'", "gate.max_age_ms", "valid number"),
         (GOOD + "[gate]\nmax_age_ms = -1.0", "gate.max_age_ms", "greater than 0"),
         (GOOD + "[gate]\nmax_age_ms = inf", "gate.max_age_ms", "finite"),
-        (GOOD + "speed = true", "tactile.speed", "valid number"),
         (GOOD + "loop = 'yes'", "tactile.loop", "valid boolean"),
         (GOOD + "[hand]\nname = 'a b'", "hand.name", "pattern"),
         (GOOD + "[hand]\nfingers = ['ff', 'ff']", "hand.fingers", "twice"),
@@ -75,14 +73,10 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
             "publish.endpoint tcp://0.0",
         ),
         (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1'", "publish.endpoint", "port"),
-        (GOOD + "[publish]\nendpoint = 'tcp://robot:5'", "publish.endpoint", "IP address"),
         (GOOD + "[publish]\nendpoint = 'udp://127.0.0.1:5'", "publish.endpoint", "ipc://"),
         (GOOD + f"[publish]\nendpoint = 'ipc://{'x' * 108}'", "publish.endpoint", "107 bytes"),
         (GOOD + "[publish]\nendpoint = 'tcp://[::2]:5'", "scene", "not a loopback address"),
-        (GOOD + "[publish]\nendpoint = 'tcp://::1:5'", "publish.endpoint", "IP address"),
         (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1]:5'", "publish.endpoint", "IP address"),
-        (GOOD + "[publish]\nendpoint = 'tcp://*:5'", "publish.endpoint", "IP address"),
-        (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1:*'", "publish.endpoint", "port"),
         (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1:0'", "publish.endpoint", "port"),
         (
             GOOD + f"[publish]\nendpoint = 'tcp://127.0.0.1:{'9' * 5000}'",
@@ -90,31 +84,18 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
             "port",
         ),
         (GOOD + "[publish]\nendpoint = 'ipc://*'", "publish.endpoint", "not '*'"),
-        (GOOD + "[publish]\nendpoint = 'ipc://@'", "publish.endpoint", "needs a path"),
-        (GOOD + "[publish]\nendpoint = 'ipc://@graspd'", "publish.endpoint", "no file mode"),
         (GOOD + "[ask]\nendpoint = 'ipc://@graspd'", "ask.endpoint", "no file mode"),
         (GOOD + "[ask]\nfile_mode = '0888'", "ask.file_mode", "should match pattern"),
         (GOOD + '[publish]\nendpoint = "ipc:///tmp/\\u0000"', "publish.endpoint", "NUL"),
         (GOOD + '[model]\npath = "\\u0000.onnx"', "model.path", "NUL"),
-        (GOOD + '[model]\nname = "cnn1\\u0000"', "model.name", "NUL"),
         (GOOD + "[model]\nname = ''", "model.name", "at least 1"),
-        (
-            "[tactile]\ndriver = 'replay'\nrecordings = [\"a\\u0000\"]",
-            "tactile.recordings.0",
-            "NUL",
-        ),
         (GOOD + "[tactile.faults]\nslow_every = 0", "tactile.faults.slow_every", "greater"),
         (GOOD + "[tactile.faults]\nfingers = ['lf']", "scene", "names lf, not in hand.fingers"),
         (GOOD + "rate_hz = 1e6", "tactile.rate_hz", "less than or equal to 100000"),
-        *(
-            (f"[tactile]\n{live}\n[gate]\nmode = 'every'", "scene", says)
-            for live in (
-                "driver = 'can'",
-                "driver = 'spi'\nport = 'p'",
-                "driver = 'palm'\nsource = 'udp://127.0.0.1:9870'",
-                "driver = 'palm'\nsource = 'packets.bin'",
-            )
-            for says in ("gate.mode every is for grasp tables", 'use "settled" or "request"')
+        (
+            "[tactile]\ndriver = 'palm'\nsource = 'packets.bin'\n[gate]\nmode = 'every'",
+            "scene",
+            "gate.mode every is for grasp tables",
         ),
     ],
 )
@@ -222,11 +203,6 @@ def test_replay_faults_out_of_range_are_mistakes_of_the_scene(tmp_path: Path, ke
         path = write(tmp_path, GOOD + f"[tactile.faults]\n{key} = {value}")
         with pytest.raises(SceneError, match=rf"tactile\.faults\.{key}"):
             load(path)
-
-
-def test_replay_faults_at_the_limit_are_taken() -> None:
-    limits = {"wrong_counts": -4095, "electrodes": (1, 24), "fingers": ("ff",), "delayed_s": 3600.0}
-    ReplayFaultsSection.model_validate(limits)
 
 
 @pytest.mark.parametrize(

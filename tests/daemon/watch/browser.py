@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import os
@@ -103,11 +102,6 @@ class Browser:
             text = self.value("document.body.innerText")
             assert time.monotonic() < deadline_s, f"not true: {expression}\n{text}"
             time.sleep(0.05)
-
-    def picture(self, path: Path) -> None:
-        """Save what is seen."""
-        data = self.ask("Page.captureScreenshot", format="png")["data"]
-        path.write_bytes(base64.b64decode(data))
 
     def _ask(self, method: str, session: str | None = None, **parameters: object) -> Answer:
         number = self._send(method, parameters, session)

@@ -12,13 +12,14 @@ from daemon.watch.feed import Feed
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.view import TICK_S, HandFeed, View, snapshots
 from daemon.watch.web import Newest, Server
+from tests.kit.waiting import wait_until
 
 
 @contextlib.contextmanager
-def serving(publish: Callable[[Newest], None], port: int = 0) -> Iterator[Server]:
+def serving(publish: Callable[[Newest], object], port: int = 0) -> Iterator[Server]:
     """Serve the page while `publish` puts snapshots."""
     server = Server(port, Newest())
-    jobs = (lambda: server.serve_forever(0.02)), (lambda: publish(server.newest))
+    jobs = (lambda: server.serve_forever(0.01)), (lambda: publish(server.newest))
     threads = [threading.Thread(target=job) for job in jobs]
     for thread in threads:
         thread.start()
@@ -29,6 +30,9 @@ def serving(publish: Callable[[Newest], None], port: int = 0) -> Iterator[Server
         for thread in threads:
             thread.join()
         server.server_close()
+        wait_until(
+            lambda: not any("process_request" in each.name for each in threading.enumerate())
+        )
 
 
 class Page:

@@ -8,18 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from daemon import scene
 from daemon.judge.reasons import Decision
 from daemon.publish.keys import KeysError, make
-from daemon.publish.messages import decode_verdict
-from daemon.publish.sockets import Sockets
 from daemon.watch.feed import Feed, load_keys
 from daemon.watch.view import View
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import Publisher
+from tests.daemon.publish.doors import KeyedDoor, Publisher
 from tests.daemon.watch.watch_fakes import MS, verdict
+from tests.kit.messages import decode_verdict
 from tests.kit.waiting import PATIENCE_S
-from tests.ports import free_port
+
+Keys = tuple[bytes, bytes, bytes]
 
 
 @pytest.fixture
@@ -72,41 +71,31 @@ def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoi
 
 
 @pytest.fixture
-def address() -> str:
-    return f"tcp://127.0.0.1:{free_port()}"
+def door(tmp_path: Path) -> Iterator[KeyedDoor]:
+    """A door that knows `controller` and not `stranger`."""
+    made = KeyedDoor(tmp_path)
+    made.client("stranger", tmp_path / "theirs")
+    yield made
+    made.close()
 
 
-@pytest.fixture
-def door(tmp_path: Path, address: str) -> Iterator[Sockets]:
-    """A daemon's sockets that admit the key `known`."""
-    make(tmp_path, "daemon")
-    make(tmp_path / "clients", "known")
-    for name in ("known.key", "known.key_secret"):
-        (tmp_path / name).write_bytes((tmp_path / "clients" / name).read_bytes())
-        (tmp_path / name).chmod(0o600)
-    make(tmp_path, "stranger")
-    content = {
-        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
-        "publish": {"endpoint": address},
-        "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
-    }
-    with Sockets(scene.parse(content, tmp_path / "scene.toml")) as made:
-        yield made
+def keys_of(folder: Path, own: str = "controller", daemon: str = "daemon.key") -> Keys:
+    return load_keys(folder / "theirs" / f"{own}.key_secret", folder / daemon)
 
 
-def hears(door: Sockets, feed: Feed, until: Callable[[bool], bool]) -> None:
+def hears(door: KeyedDoor, feed: Feed, until: Callable[[bool], bool]) -> bool:
     deadline_s = time.monotonic() + PATIENCE_S
     heard = False
     while not until(heard):
         assert time.monotonic() < deadline_s, feed.link
-        door.send(b"verdict.right", verdict(0))
+        door.sockets.send(b"verdict.right", verdict(0))
         time.sleep(0.01)
         heard = heard or any(topic == b"verdict.right" for topic, _ in feed.take())
+    return heard
 
 
-def test_a_known_key_is_let_in(tmp_path: Path, address: str, door: Sockets) -> None:
-    keys = load_keys(tmp_path / "known.key_secret", tmp_path / "daemon.key")
-    with Feed(address, keys) as feed:
+def test_a_known_key_is_let_in(tmp_path: Path, door: KeyedDoor) -> None:
+    with Feed(door.endpoint, keys_of(tmp_path)) as feed:
         hears(door, feed, lambda heard: heard)
         assert feed.link == "connected"
 
@@ -114,37 +103,31 @@ def test_a_known_key_is_let_in(tmp_path: Path, address: str, door: Sockets) -> N
 @pytest.mark.parametrize(
     ("own", "server", "said"),
     [
-        ("stranger", "daemon", "the daemon does not know this key"),
-        ("known", "stranger", "is the daemon's key right?"),
-        (None, None, "the daemon wants a key"),
+        ("stranger", "daemon.key", "the daemon does not know this key"),
+        ("controller", "theirs/stranger.key", "is the daemon's key right?"),
+        (None, "", "the daemon wants a key"),
     ],
 )
 def test_whoever_is_turned_away_is_told_why(
-    tmp_path: Path,
-    address: str,
-    door: Sockets,
-    own: str | None,
-    server: str | None,
-    said: str,
+    tmp_path: Path, door: KeyedDoor, own: str | None, server: str, said: str
 ) -> None:
-    keys = own and load_keys(tmp_path / f"{own}.key_secret", tmp_path / f"{server}.key")
-    with Feed(address, keys or None) as feed:
-        hears(door, feed, lambda heard: heard or feed.link.startswith("turned away"))
+    keys = None if own is None else keys_of(tmp_path, own, server)
+    with Feed(door.endpoint, keys) as feed:
+        assert not hears(door, feed, lambda heard: heard or feed.is_turned_away)
         assert said in feed.link
         later_s = time.monotonic() + 0.5  # whatever is tried again says the same
-        hears(door, feed, lambda heard: heard or time.monotonic() > later_s)
+        assert not hears(door, feed, lambda heard: heard or time.monotonic() > later_s)
         assert said in feed.link
 
 
 def test_who_was_turned_away_is_let_in_when_its_key_is_known(
-    tmp_path: Path, address: str, door: Sockets
+    tmp_path: Path, door: KeyedDoor
 ) -> None:
     clock = Clock()
-    keys = load_keys(tmp_path / "stranger.key_secret", tmp_path / "daemon.key")
-    with Feed(address, keys, clock) as feed:
+    with Feed(door.endpoint, keys_of(tmp_path, "stranger"), clock) as feed:
         hears(door, feed, lambda _: feed.is_turned_away)
-        (tmp_path / "stranger.key").rename(tmp_path / "clients" / "stranger.key")
-        door.check_keys()
+        (tmp_path / "theirs" / "stranger.key").rename(door.clients / "stranger.key")
+        door.sockets.check_keys()
         for _ in range(6):  # looks, and is not paused
             clock.now_ns += 900 * MS
             list(feed.take())

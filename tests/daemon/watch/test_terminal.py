@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 import time
-from typing import Any
 
 import pytest
 from msgspec import structs
@@ -19,32 +17,17 @@ from daemon.watch.terminal import STYLES, draw
 from tests.daemon.watch.watch_fakes import (
     ENDPOINT,
     MS,
-    RESTING,
     a_view,
     after,
     status,
-    tactile,
     text_of,
     verdict,
+    whole_hand,
 )
-
-FIVE = ["ff", "mf", "rf", "lf", "th"]
 
 
 def a_full_hand(decision: Decision = Decision.SLIP, hand: str = "right") -> Snapshot:
-    """Five fingers that all move and touch, and a reason longer than a line."""
-    view = a_view(hand)
-    message = json.loads(tactile(0, RESTING, RESTING))
-    message |= {"fingers": FIVE, "counts": [RESTING] * 5, "faults": [[0] * 24] * 5}
-    motion = dict.fromkeys(FIVE, 1.2)
-    limits = dict.fromkeys(FIVE, 1.5)
-    more: dict[str, Any] = {"contact": FIVE, "motion": motion, "motion_limits": limits}
-    reasons = [] if decision is not Decision.UNKNOWN else [Reason.STALE]
-    view.take(f"status.{hand}".encode(), status(0), 0)
-    view.take(f"tactile.{hand}".encode(), json.dumps(message).encode(), 0)
-    said = verdict(0, decision, still_ms=131.0, reasons=reasons, **more)
-    view.take(f"verdict.{hand}".encode(), said, 0)
-    return view.snapshot(0)
+    return whole_hand(a_view(hand), hand, decision)
 
 
 @pytest.mark.parametrize("width", [60, 80, 200])

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import io
+import json
 import threading
 from typing import Any, Self
 
 from rich.console import Console
 
 from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
+from daemon.publish.messages import (
+    DECISION_CODE,
+    LearnerHealth,
+    Lifts,
+    State,
+    Status,
+    Tactile,
+    Verdict,
+    encode,
+)
+from daemon.trust.lift_book import OutcomeStatus
 from daemon.trust.trust import RiskReport
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.terminal import draw
@@ -105,6 +116,32 @@ def after(*messages: tuple[bytes, bytes], at_ns: int = 0) -> View:
     for topic, payload in messages:
         seen.take(topic, payload, at_ns)
     return seen
+
+
+FIVE = ["ff", "mf", "rf", "lf", "th"]
+LIFTS = Lifts(reported=41, outstanding=1, unreported=3)
+LEARNER = LearnerHealth(enabled=True, outcomes=5, told={OutcomeStatus.TAKEN: 5}, uncertainty=0.4)
+
+
+def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snapshot:
+    """Five fingers that all move and touch, with many joints, lifts and a learner."""
+    joints = {f"{name}J{joint}": 0.5 for name in ("FF", "MF", "RF", "TH") for joint in range(6)}
+    reading = {"fingers": FIVE, "counts": [RESTING] * 5, "faults": [[0] * 24] * 5, "joints": joints}
+    said = verdict(
+        seq,
+        decision,
+        grasp=7 + seq // 9,
+        reasons=[Reason.STALE] if decision is Decision.UNKNOWN else [],
+        contact=FIVE,
+        still_ms=131.0,
+        motion=dict.fromkeys(FIVE, 1.2),
+        motion_limits=dict.fromkeys(FIVE, 1.5),
+    )
+    view.take(f"status.{hand}".encode(), status(seq, lifts=LIFTS, learner=LEARNER), 0)
+    message = json.dumps(json.loads(tactile(0)) | reading).encode()
+    view.take(f"tactile.{hand}".encode(), message, 0)
+    view.take(f"verdict.{hand}".encode(), said, 0)
+    return view.snapshot(0)
 
 
 def text_of(seen: Snapshot | list[Snapshot], width: int = 80, chosen: int = 0) -> list[str]:
