@@ -107,10 +107,14 @@ def build(config: NetworkConfig, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Seque
     (stable, slip). Weights are Glorot-uniform and biases zero, as Keras starts them. Raises
     `ValueError` if the network does not fit the shape.
     """
-    look, width = _look(config, tuple(shape))
+    look = _look(config, tuple(shape))
+    try:
+        width = nn.Sequential(*look).eval()(torch.zeros(1, *shape)).shape[1]
+    except RuntimeError as error:
+        raise ValueError(f"inputs {tuple(shape)} are too small for the network") from error
     dense = _dense(width, config.hidden, config.batch_norm)
     last = nn.Linear(config.hidden, 2)
-    network = nn.Sequential(*look, *_drop(config), *dense, *_drop(config), last)
+    network = nn.Sequential(*look, *_drop(config), *dense, *_drop(config), last).train()
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
@@ -149,41 +153,29 @@ def for_margin(network: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*layers[:-1], margin).eval()
 
 
-def _look(config: NetworkConfig, shape: tuple[int, ...]) -> tuple[list[nn.Module], int]:
-    """Layers that turn an input into the values before the hidden layer, and their number."""
+def _look(config: NetworkConfig, shape: tuple[int, ...]) -> list[nn.Module]:
+    """Return the layers that turn an input into the values before the hidden layer."""
     if len(shape) == 3:
-        layers, width = _convolutions(config, (shape[0], shape[1]), shape[2])
-        return [ChannelsFirst(), *layers], width
+        return [ChannelsFirst(), *_convolutions(config, shape[2])]
     (features,) = shape
     fingers, extra = divmod(features, FEATURES_PER_FINGER)
     if extra:
         fingers, extra = divmod(features, ELECTRODES)
     if extra:
         raise ValueError(f"{features} features are not those of whole fingers")
-    layers, width = _convolutions(config, D1.shape, fingers)
-    layers = [FeatureImages(fingers), *layers]
+    layers = [FeatureImages(fingers), *_convolutions(config, fingers)]
     first = fingers * ELECTRODES
-    if first == features:
-        return layers, width
-    return [Beside(nn.Sequential(*layers), first)], width + features - first
+    return layers if first == features else [Beside(nn.Sequential(*layers), first)]
 
 
-def _convolutions(
-    config: NetworkConfig, size: tuple[int, int], channels: int
-) -> tuple[list[nn.Module], int]:
-    height, width = (side - KERNEL + 1 for side in size)
+def _convolutions(config: NetworkConfig, channels: int) -> list[nn.Module]:
     layers = _convolution(channels, config.filters, KERNEL, config.batch_norm)
-    channels = config.filters
     if config.pool:
         layers.append(nn.MaxPool2d(POOL))
-        height, width = height // POOL, width // POOL
     if config.second is not None:
-        kernel = config.second.kernel
-        layers += _convolution(channels, config.second.filters, kernel, config.batch_norm)
-        height, width, channels = height - kernel + 1, width - kernel + 1, config.second.filters
-    if height < 1 or width < 1:
-        raise ValueError(f"an image of {size[0]} x {size[1]} is too small for the network")
-    return [*layers, nn.Flatten()], channels * height * width
+        second = config.second
+        layers += _convolution(config.filters, second.filters, second.kernel, config.batch_norm)
+    return [*layers, nn.Flatten()]
 
 
 def _convolution(inputs: int, filters: int, kernel: int, batch_norm: bool) -> list[nn.Module]:

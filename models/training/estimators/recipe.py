@@ -143,10 +143,10 @@ def train_network(
         return network.eval()
 
 
-def logits(network: nn.Module, inputs: Floats32, threads: int = THREADS) -> Floats:
+def logits(network: nn.Module, inputs: Floats32) -> Floats:
     """Logits (N, 2), order (stable, slip), of inputs (N, *shape)."""
     batches = torch.split(torch.from_numpy(inputs), INFERENCE_BATCH)
-    with reproducible(0, threads), torch.no_grad():
+    with reproducible(0), torch.no_grad():
         return torch.cat([network(batch) for batch in batches]).double().numpy()
 
 

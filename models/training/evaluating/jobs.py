@@ -26,7 +26,7 @@ from models.training.evaluating.days import judged_days
 from models.training.evaluating.files import write_whole
 from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
 from models.training.fitting.trained import Trained, train
-from models.training.systems.system import SessionFeatures, System, digest, with_recipes
+from models.training.systems.system import SessionFeatures, System, digest
 
 FORMAT = 1
 """Goes up when a job gives another result for the same configuration, or is written otherwise."""
@@ -57,7 +57,7 @@ class Job:
 
     def key(self, data: str) -> str:
         """SHA-256 of all that the result depends on; `data` is the digest of the grasps."""
-        parts = [FORMAT, digest(_alone(self.system)), self.protocol, self.seed, self.fold]
+        parts = [FORMAT, digest(self.system), self.protocol, self.seed, self.fold]
         text = json.dumps([*parts, self.folds, data])
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -139,7 +139,7 @@ def run(job: Job, grasps: Grasps) -> JobResult:
     do not have that split, `ValueError` if the system cannot learn from it.
     """
     split = splits(job.protocol, grasps, job.seed, job.folds)[job.fold]
-    system, seed = _alone(job.system), fold_seed(job.seed, job.fold)
+    system, seed = job.system, fold_seed(job.seed, job.fold)
     grasps = grasps.of_fingers(system.fingers)
     counts, table_of = grasps.counts[split.test], grasps.table_of[split.test]
     ages: dict[str, Ints] = {}
@@ -196,10 +196,6 @@ def _later_margins(
         for variant, by in session.standards.items()
     }
     return margins, session.ages
-
-
-def _alone(system: System) -> System:
-    return with_recipes(system, threads=1)
 
 
 def _result(arrays: dict[str, Numbers]) -> JobResult:

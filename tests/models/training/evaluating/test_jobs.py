@@ -58,14 +58,6 @@ def test_a_job_gives_the_same_margins_again(system: System) -> None:
     assert all(np.array_equal(first.margins[name], again.margins[name]) for name in first.margins)
 
 
-def test_threads_of_a_recipe_change_neither_key_nor_result() -> None:
-    two = dataclasses.replace(NETWORK, recipe=Recipe(epochs=2, threads=2))
-    one_job, two_job = (Job(system, "cv", 0, 0, 4) for system in (NETWORK, two))
-    assert one_job.key("data") == two_job.key("data")
-    ours, theirs = jobs.run(one_job, GRASPS), jobs.run(two_job, GRASPS)
-    assert np.array_equal(ours.margins["training"], theirs.margins["training"])
-
-
 def test_everything_that_changes_the_result_changes_the_key() -> None:
     job = Job(SVM, "cv", 0, 0)
     others = [

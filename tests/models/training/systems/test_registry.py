@@ -136,12 +136,12 @@ def test_a_digest_tells_apart_what_gives_other_results_and_nothing_else() -> Non
 
 def test_all_recipes_of_a_system_can_be_changed_at_once() -> None:
     small, blend = SYSTEMS["small-session"], SYSTEMS["blend-electrodes"]
-    changed = with_recipes(small, epochs=2, threads=3)
+    changed = with_recipes(small, epochs=2)
     assert isinstance(changed.recipe, Recipe)
-    assert (changed.recipe.epochs, changed.recipe.threads) == (2, 3)
-    estimator = with_recipes(blend, epochs=2, threads=3).estimator
+    assert changed.recipe.epochs == 2
+    estimator = with_recipes(blend, epochs=2).estimator
     assert isinstance(estimator, BlendConfig)
     recipes = [member.recipe for member in estimator.members if member.recipe]
     assert recipes
-    assert all((recipe.epochs, recipe.threads) == (2, 3) for recipe in recipes)
+    assert all(recipe.epochs == 2 for recipe in recipes)
     assert with_recipes(SYSTEMS["svm"], epochs=2) == SYSTEMS["svm"]
