@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,13 +109,7 @@ GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
 of the first two; it gives none for perceptrons, and has no boosting."""
 
 
-class ClassicalModel(Protocol):
-    """A classifier of scikit-learn: one of those that `fit_classical` makes."""
-
-    n_features_in_: int
-
-    def fit(self, inputs: Floats32, slipped: Bools) -> object:
-        """Fit to inputs (N, M) and labels (N,)."""
+ClassicalModel: TypeAlias = SVC | RandomForestClassifier | MLPClassifier | Boosting
 
 
 def fit_classical(
@@ -145,12 +139,10 @@ def classical_margins(model: ClassicalModel, inputs: Floats32) -> Floats:
                 margins: Floats = model.decision_function(inputs)
             case MLPClassifier():
                 margins = _mlp_margins(model, inputs)
-            case RandomForestClassifier():
+            case _:
                 slip = model.predict_proba(inputs)[:, 1]
                 slip = slip.clip(PROBABILITY_FLOOR, 1.0 - PROBABILITY_FLOOR)
                 margins = np.log(slip / (1.0 - slip))
-            case _:
-                raise TypeError(f"no classifier of this module: {type(model).__name__}")
     return margins
 
 
@@ -161,25 +153,22 @@ def classical_size(model: ClassicalModel) -> int:
             return int(model.support_vectors_.size + model.dual_coef_.size + 1)
         case MLPClassifier():
             return sum(int(part.size) for part in (*model.coefs_, *model.intercepts_))
-        case RandomForestClassifier():
-            return sum(int(tree.tree_.node_count) for tree in model.estimators_)
         case Boosting():
             return sum(map(len, model.trees))
         case _:
-            raise TypeError(f"no classifier of this module: {type(model).__name__}")
+            return sum(int(tree.tree_.node_count) for tree in model.estimators_)
 
 
 def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
-    model: ClassicalModel
     match config:
         case SvmConfig():
-            model = SVC(C=config.c, gamma=config.gamma, class_weight="balanced")
+            return SVC(C=config.c, gamma=config.gamma, class_weight="balanced")
         case ForestConfig():
-            model = RandomForestClassifier(
+            return RandomForestClassifier(
                 n_estimators=config.trees, max_depth=config.depth, random_state=seed
             )
         case MlpConfig():
-            model = MLPClassifier(
+            return MLPClassifier(
                 hidden_layer_sizes=config.hidden,
                 alpha=config.alpha,
                 learning_rate_init=config.learning_rate,
@@ -188,7 +177,7 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
                 random_state=seed,
             )
         case BoostingConfig():
-            model = Boosting(
+            return Boosting(
                 max_iter=config.iterations,
                 learning_rate=config.learning_rate,
                 max_leaf_nodes=config.leaves,
@@ -198,7 +187,6 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
                 early_stopping=False,
                 random_state=seed,
             )
-    return model
 
 
 def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:

@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -107,19 +107,12 @@ class JobResult:
             "seconds": self.seconds,
             "parameters": self.parameters,
         }
-        arrays: dict[str, Numbers] = {
-            "test": self.test,
-            "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8),
-        }
-        parts: dict[str, Mapping[str, Numbers]] = {
-            "margins": self.margins,
-            "ages": self.ages,
-            "refused": self.refused,
-        }
-        for part, by_variant in parts.items():
-            arrays |= {f"{part}.{variant}": values for variant, values in by_variant.items()}
+        arrays = {f"margins.{variant}": values for variant, values in self.margins.items()}
+        ages = {f"ages.{variant}": values for variant, values in self.ages.items()}
+        refused = {f"refused.{variant}": values for variant, values in self.refused.items()}
+        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         file = io.BytesIO()
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(file, allow_pickle=False, test=self.test, meta=text, **arrays, **ages, **refused)
         return file.getvalue()
 
     @classmethod
@@ -199,7 +192,6 @@ def _later_margins(
 
 
 def _result(arrays: dict[str, Numbers]) -> JobResult:
-    """Raise `KeyError`, `TypeError` or `ValueError` for what is no result."""
     meta = json.loads(arrays["meta"].tobytes())
     if meta["format"] != FORMAT:
         raise ValueError(f"format {meta['format']}, not {FORMAT}")
@@ -207,13 +199,6 @@ def _result(arrays: dict[str, Numbers]) -> JobResult:
     margins = _by_variant(arrays, "margins.", np.float64)
     ages = _by_variant(arrays, "ages.", np.int64)
     refused = _by_variant(arrays, "refused.", np.bool_)
-    if test.ndim != 1 or not margins:
-        raise ValueError("has no margins")
-    columns = (*margins.values(), *ages.values(), *refused.values())
-    if any(values.shape != test.shape for values in columns):
-        raise ValueError("has margins or ages of another number of grasps")
-    if not all(np.isfinite(values).all() for values in margins.values()):
-        raise ValueError("has margins that are not finite")
     numbers = int(meta["train_grasps"]), float(meta["seconds"]), int(meta["parameters"])
     return JobResult(test, margins, *numbers, ages, refused)
 

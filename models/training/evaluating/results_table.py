@@ -223,8 +223,8 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
     yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best", "best"), rows)
 
 
-def difference(ours: SystemSummary, theirs: SystemSummary, figure: str = "f1") -> Difference | None:
-    """Return our mean figure less theirs on the splits that both have judged.
+def difference(ours: SystemSummary, theirs: SystemSummary) -> Difference | None:
+    """Return our mean F1 less theirs on the splits that both have judged.
 
     None: no split is the same, for other data or another number of folds, say.
     """
@@ -234,7 +234,7 @@ def difference(ours: SystemSummary, theirs: SystemSummary, figure: str = "f1") -
     pairs = [
         (one, other)
         for seed in seeds
-        for one, other in zip(_of(ours, figure, seed), _of(theirs, figure, seed), strict=True)
+        for one, other in zip(_f1_of(ours, seed), _f1_of(theirs, seed), strict=True)
         if one is not None and other is not None
     ]
     if not pairs:
@@ -243,8 +243,8 @@ def difference(ours: SystemSummary, theirs: SystemSummary, figure: str = "f1") -
     return paired_difference([one for one, _ in pairs], [other for _, other in pairs], overlap)
 
 
-def _of(summary: SystemSummary, figure: str, seed: int) -> list[float | None]:
-    return summary.main.figures[figure][summary.seeds.index(seed)]
+def _f1_of(summary: SystemSummary, seed: int) -> list[float | None]:
+    return summary.main.figures["f1"][summary.seeds.index(seed)]
 
 
 def _everything(summaries: Sequence[SystemSummary]) -> Iterator[str]:

@@ -66,10 +66,6 @@ class TrainingStandards:
             np.stack([one.mean for one in standards]), np.stack([one.spread for one in standards])
         )
 
-    def apply(self, features: Floats, table_of: Ints, clip: float) -> Floats32:
-        """Features (N, M), each standardised by its table. Raises `KeyError` for an unknown one."""
-        return self.each(table_of).apply(features, clip)
-
     def statistics(self) -> SessionStatistics:
         """Those of a new session."""
         return SessionStatistics(self.prior.mean, self.prior.spread, PRIOR_GRASPS)

@@ -97,7 +97,7 @@ def _inputs(
     if isinstance(system.input, SessionFeatures):
         if standards is None:
             raise ValueError("a session system needs standards")
-        return standards.apply(raw_features(counts), table_of, system.input.clip)
+        return standards.each(table_of).apply(raw_features(counts), system.input.clip)
     return builder(system.input, len(system.fingers)).build_batch(counts)[0]
 
 
