@@ -12,9 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("rich", reason="the train extra is not installed")
-
 from models.contract import Dataset, SessionInput
 from models.runtime import TactileModel
 from models.training.commands import train
@@ -84,15 +81,12 @@ def test_a_session_model_comes_with_all_that_the_daemon_and_its_user_need(
         "the figures are of this data only"
         for name in ("palm_down", "palm_side", "palm_45")
     ]
-
-
-def test_the_contract_holds_the_statistics_that_the_session_starts_from(
-    data: Path, tmp_path: Path
-) -> None:
-    options = ["--data", str(data), "--out", str(tmp_path), "--folds", "2", "--quiet"]
-    assert graspd_train(*options) == 0
-    session = TactileModel(tmp_path / f"{SYSTEM}.onnx").contract.input
+    session = model.contract.input
     assert isinstance(session, SessionInput)
+    assert_starts_from_statistics_of_tables(session, data)
+
+
+def assert_starts_from_statistics_of_tables(session: SessionInput, data: Path) -> None:
     tables = [
         np.loadtxt(data / f"{name}.csv", delimiter=",", skiprows=1, usecols=range(2, 74))
         for name in ("palm_down", "palm_side")
@@ -219,7 +213,6 @@ def test_a_session_model_needs_several_objects_of_each_session(
     last = capsys.readouterr().err.splitlines()[-1]
     assert "leaves out all objects of lab, by whose other grasps" in last
     assert "put the tables of a session together" in last
-    assert graspd_train(*options, "--out", str(tmp_path / "out"), system="svm") == 0
 
 
 def test_a_fold_that_leaves_one_kind_of_grasps_to_train_on_is_exit_code_2(

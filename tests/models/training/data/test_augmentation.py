@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("scipy", reason="the train extra is not installed")
-
 from scipy.ndimage import rotate
 
 from models.training.data.augmentation import Augmentation, augment

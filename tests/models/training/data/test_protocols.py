@@ -9,8 +9,6 @@ from typing import get_args
 import numpy as np
 import pytest
 
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from models.training.data.datasets import Grasps, concatenate, read_all
 from models.training.data.protocols import (
     ABOUT,

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from models.inputs import VectorBuilder
 from models.training.estimators.classical import (
     BoostingConfig,

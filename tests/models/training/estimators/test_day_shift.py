@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-
 import torch
 
 from models.training.estimators.recipe import DayShift, on_another_day

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from models.layout import D1

@@ -8,10 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("skl2onnx", reason="the train extra is not installed")
-
 from sklearn.neural_network import MLPClassifier
 
 from models.contract import VectorInput

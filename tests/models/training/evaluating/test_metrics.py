@@ -7,9 +7,6 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from sklearn.metrics import brier_score_loss, f1_score, log_loss
 
 from models.training.evaluating.metrics import (

@@ -10,9 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("skl2onnx", reason="the train extra is not installed")
-
 from models.training.data.protocols import EvalProtocol, splits
 from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.results_table import ONE_ROW, Made, difference, results_table
@@ -225,19 +222,11 @@ def test_every_row_has_as_many_cells_as_its_header() -> None:
 
 
 @pytest.fixture(scope="module")
-def fonts_are_open(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Matplotlib keeps the files of its fonts open for the life of the process."""
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Plots of two protocols. Matplotlib keeps fonts open for the life of the process."""
     pytest.importorskip("matplotlib", reason="no extra: report")
     from models.training.evaluating import plots
 
-    plots.draw([summary_of("cnn1", "cv", 0.1)], tmp_path_factory.mktemp("plots"))
-
-
-@pytest.mark.usefixtures("fonts_are_open")
-def test_plots_of_everything_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from models.training.evaluating import plots
-
-    monkeypatch.setattr(plots, "DPI", 20)
     session = summary_of("svm-session", "session", 0.2)
     every = dict.fromkeys(SESSION_VARIANTS, session.variants["n50"])
     made = [
@@ -245,11 +234,16 @@ def test_plots_of_everything_are_drawn(tmp_path: Path, monkeypatch: pytest.Monke
         summary_of("cnn2", "cv", 0.0),
         dataclasses.replace(session, variants=every),
     ]
-    written = plots.draw(made, tmp_path)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(plots, "DPI", 20)
+        return plots.draw(made, tmp_path_factory.mktemp("plots"))
+
+
+def test_plots_of_everything_are_drawn(drawn: list[Path]) -> None:
     stems = {"cnn1.cv", "cnn2.cv", "svm-session.session", "coverage.cv", "session-calibration"}
-    assert {path.name for path in written} == {
+    assert {path.name for path in drawn} == {
         f"{stem}.{suffix}" for stem in stems for suffix in ("png", "svg")
     }
-    for path in written:
+    for path in drawn:
         start = path.read_bytes()[:8]
         assert start.startswith(b"<?xml" if path.suffix == ".svg" else b"\x89PNG")

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from models.contract import VectorInput
 from models.inputs import SessionBuilder, builder, raw_features
 from models.tactile_image import TactileImager

@@ -6,9 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from models import zoo
 from models.contract import CountsInput, ImageInput, VectorInput
 from models.training.estimators.classical import ForestConfig, MlpConfig, SvmConfig
