@@ -152,28 +152,6 @@ def test_data_without_a_later_session_have_no_session_protocol(
     assert graspd_evaluate(*options, "--protocol", "objects-whole") == 0
 
 
-def test_an_output_folder_that_is_a_file_is_exit_code_2(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    out.write_text("")
-    assert graspd_evaluate("svm", "--quick", "--data", str(data), "--out", str(out)) == 2
-    assert f"graspd evaluate: {out}" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("--seeds", "0"), ("--jobs", "0"), ("--jobs", "two"), ("--protocol", "all")],
-)
-def test_a_value_out_of_range_is_exit_code_2(
-    option: str, value: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as caught:
-        graspd_evaluate("--data", "anywhere", option, value)
-    assert caught.value.code == 2
-    assert f"argument {option}:" in capsys.readouterr().err
-
-
 def test_no_cluster_is_exit_code_1_and_says_so(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.ndimage import rotate
 
 from models.training.data.augmentation import Augmentation, augment
@@ -55,8 +54,3 @@ def test_the_sides_are_chosen_by_the_seed() -> None:
     first, _ = augment(IMAGES, SLIPPED, Augmentation(), seed=5)
     assert np.array_equal(first, augment(IMAGES, SLIPPED, Augmentation(), seed=5)[0])
     assert not np.array_equal(first, augment(IMAGES, SLIPPED, Augmentation(), seed=6)[0])
-
-
-def test_vectors_cannot_be_flipped() -> None:
-    with pytest.raises(ValueError, match="only images"):
-        augment(np.zeros((4, 72), np.float32), np.zeros(4, np.bool_), Augmentation(), seed=0)
