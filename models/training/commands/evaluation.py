@@ -20,8 +20,7 @@ from models.training.commands.common import (
 )
 from models.training.data.datasets import Grasps, read_all, unpublished
 from models.training.data.protocols import FOLDS, STANDARD
-from models.training.estimators.classical import GRIDS
-from models.training.estimators.networks import NetworkConfig
+from models.training.estimators.configs import GRIDS, NetworkConfig
 from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import Job, JobResult, jobs_of
 from models.training.evaluating.results_table import Made, results_table

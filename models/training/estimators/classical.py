@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,13 @@ from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
 from models.training.arrays import Bools, Floats, Floats32
+from models.training.estimators.configs import (
+    BoostingConfig,
+    ClassicalConfig,
+    ForestConfig,
+    MlpConfig,
+    SvmConfig,
+)
 
 PROBABILITY_FLOOR = 1e-3
 """A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
@@ -38,75 +44,6 @@ class Boosting(HistGradientBoostingClassifier):  # type: ignore[misc]  # scikit-
     def base(self) -> float:
         """Margin before the first tree."""
         return float(self._baseline_prediction.item())
-
-
-@dataclass(frozen=True, slots=True)
-class SvmConfig:
-    """Support vector machine with a radial kernel, classes weighted to balance."""
-
-    c: float
-    gamma: float | Literal["auto"]
-    """Of the kernel exp(-gamma * distance**2); auto: one over the number of features."""
-
-
-@dataclass(frozen=True, slots=True)
-class ForestConfig:
-    """Random forest."""
-
-    trees: int
-    depth: int | None
-    """Largest depth of a tree; None: until its leaves are pure."""
-
-
-@dataclass(frozen=True, slots=True)
-class MlpConfig:
-    """Multi-layer perceptron: ReLU, Adam, a fixed number of epochs."""
-
-    hidden: tuple[int, ...]
-    """Units of each hidden layer."""
-    alpha: float = 1e-4
-    """L2 term."""
-    learning_rate: float = 1e-3
-    epochs: int = 100
-
-
-@dataclass(frozen=True, slots=True)
-class BoostingConfig:
-    """Gradient boosting on histograms."""
-
-    iterations: int = 300
-    learning_rate: float = 0.1
-    leaves: int = 31
-    """Largest number of leaves of a tree."""
-    leaf_grasps: int = 20
-    """Fewest grasps in a leaf."""
-    l2: float = 0.0
-    features: float = 1.0
-    """Fraction of the features that a split may choose from."""
-
-
-ClassicalConfig = SvmConfig | ForestConfig | MlpConfig | BoostingConfig
-
-_TREES: dict[str, Sequence[object]] = {"leaves": (8, 15, 31), "features": (0.3, 1.0)}
-GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
-    SvmConfig: [
-        {
-            "c": (0.01, 0.1, 1.0, 3.0, 10.0, 100.0, 1000.0, 5000.0),
-            "gamma": ("auto", 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1),
-        }
-    ],
-    # Odd numbers of trees cannot tie.
-    ForestConfig: [{"trees": (11, 25, 51, 101, 199), "depth": (None, 5, 10, 15, 20, 30)}],
-    MlpConfig: [
-        {"hidden": ((32,), (100,), (300,), (64, 32), (100, 100)), "alpha": (1e-4, 0.1, 1.0)}
-    ],
-    BoostingConfig: [
-        {"iterations": (150,), "learning_rate": (0.1,), **_TREES},
-        {"iterations": (400,), "learning_rate": (0.05,), **_TREES},
-    ],
-}
-"""What a grid search tries, as scikit-learn's `ParameterGrid` takes it. The paper gives the grids
-of the first two; it gives none for perceptrons, and has no boosting."""
 
 
 ClassicalModel: TypeAlias = SVC | RandomForestClassifier | MLPClassifier | Boosting

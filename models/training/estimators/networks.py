@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -13,6 +12,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 from models.contract import FEATURES_PER_FINGER
 from models.layout import D1, ELECTRODES
 from models.tactile_image import Fill, fill_matrix
+from models.training.estimators.configs import NetworkConfig
 
 IMAGE_SHAPE = (12, 11, 3)
 """Height, width, fingers of the D1 image."""
@@ -22,43 +22,6 @@ POOL = 2
 """Side and stride of a maximum pooling, pixels."""
 NORM_EPSILON = 1e-3
 """Keras' default: the published networks were trained with it."""
-
-
-@dataclass(frozen=True, slots=True)
-class SecondConvolution:
-    """A convolution after the first one and its pooling (valid)."""
-
-    filters: int = 64
-    kernel: int = 1
-    """Side, pixels: the authors' notebooks have 1, the table of the paper has 3."""
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkConfig:
-    """A convolutional network: convolution(s), one hidden dense layer, two classes.
-
-    It takes images, or features whose first 24 values per finger become a D1 image inside the
-    network while the rest joins the hidden layer's inputs.
-    """
-
-    filters: int
-    """Filters of the first convolution, 3 x 3, valid."""
-    hidden: int
-    """Units of the hidden dense layer."""
-    pool: bool = False
-    """2 x 2 maximum pooling after the first convolution; an odd row or column is left out."""
-    second: SecondConvolution | None = None
-    dropout: float = 0.0
-    """Fraction of values left out in training, before and after the hidden layer."""
-    batch_norm: bool = True
-    """After each convolution and after the hidden layer; a convolution then needs no bias."""
-
-
-CNN0 = NetworkConfig(filters=32, hidden=128)
-CNN1 = NetworkConfig(filters=32, hidden=1024)
-"""The best network of the paper: Conv32 - FC1024."""
-CNN2 = NetworkConfig(filters=32, hidden=1024, pool=True)
-CNN3 = NetworkConfig(filters=32, hidden=1024, pool=True, second=SecondConvolution())
 
 
 class ChannelsFirst(nn.Module):

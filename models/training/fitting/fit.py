@@ -14,14 +14,14 @@ from models.training.arrays import Bools, Floats, Floats32
 from models.training.data.augmentation import augment
 from models.training.estimators import graphs
 from models.training.estimators.classical import (
-    ClassicalConfig,
     ClassicalModel,
     classical_margins,
     classical_size,
     fit_classical,
 )
-from models.training.estimators.networks import NetworkConfig, parameter_count
-from models.training.estimators.recipe import AnyRecipe, logits, train_network
+from models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
+from models.training.estimators.networks import parameter_count
+from models.training.estimators.recipe import logits, train_network
 from models.training.systems.system import BlendConfig, System
 
 

@@ -11,17 +11,21 @@ from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.layout import D1, D2A, D2B, D3
 from models.tactile_image import Composition, Fill, Normalisation
 from models.training.data.augmentation import Augmentation
-from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig
-from models.training.estimators.classical import SvmConfig as Svm
-from models.training.estimators.networks import (
+from models.training.estimators.configs import (
     CNN0,
     CNN1,
     CNN2,
     CNN3,
+    BoostingConfig,
+    ForestConfig,
+    MlpConfig,
     NetworkConfig,
+    PublishedRecipe,
+    Recipe,
     SecondConvolution,
+    SessionRecipe,
 )
-from models.training.estimators.recipe import PublishedRecipe, Recipe, SessionRecipe
+from models.training.estimators.configs import SvmConfig as Svm
 from models.training.systems.system import (
     BlendConfig,
     Member,

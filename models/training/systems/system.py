@@ -14,9 +14,7 @@ from models.bts3 import FINGERS, WHOLE
 from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.training.data.augmentation import Augmentation
 from models.training.data.protocols import EvalProtocol
-from models.training.estimators.classical import ClassicalConfig
-from models.training.estimators.networks import NetworkConfig
-from models.training.estimators.recipe import AnyRecipe
+from models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
 
 CLIP = 3.0
 """Standardised session features are cut off here: what is farther out is a sensor that moved."""

@@ -17,7 +17,7 @@ import pytest
 from models.training.commands import evaluate, evaluation
 from models.training.commands.evaluation import grid_of
 from models.training.data.datasets import read_all
-from models.training.estimators.classical import GRIDS, ForestConfig, SvmConfig
+from models.training.estimators.configs import GRIDS, ForestConfig, SvmConfig
 from models.training.evaluating import jobs, run_jobs
 from models.training.evaluating.jobs import Job
 from models.training.systems.registry import SYSTEMS

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from models.inputs import VectorBuilder
-from models.training.estimators.classical import (
+from models.training.estimators.classical import classical_margins, classical_size, fit_classical
+from models.training.estimators.configs import (
     BoostingConfig,
     ClassicalConfig,
     ForestConfig,
     MlpConfig,
     SvmConfig,
-    classical_margins,
-    classical_size,
-    fit_classical,
 )
 from tests.models.training.training_samples import separable_counts
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.training.estimators.recipe import DayShift, on_another_day
+from models.training.estimators.configs import DayShift
+from models.training.estimators.recipe import on_another_day
 
 GRASPS = 4000
 

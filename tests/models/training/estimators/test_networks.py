@@ -10,14 +10,16 @@ from torch import nn
 
 from models.layout import D1
 from models.tactile_image import TactileImager
-from models.training.estimators.networks import (
+from models.training.estimators.configs import (
     CNN0,
     CNN1,
     CNN2,
     CNN3,
-    Beside,
     NetworkConfig,
     SecondConvolution,
+)
+from models.training.estimators.networks import (
+    Beside,
     build,
     for_inference,
     for_margin,

@@ -13,9 +13,7 @@ from sklearn.neural_network import MLPClassifier
 from models.contract import VectorInput
 from models.inputs import SessionBuilder, raw_features
 from models.training.data.protocols import splits
-from models.training.estimators.classical import MlpConfig, SvmConfig
-from models.training.estimators.networks import NetworkConfig
-from models.training.estimators.recipe import Recipe
+from models.training.estimators.configs import MlpConfig, NetworkConfig, Recipe, SvmConfig
 from models.training.evaluating import jobs
 from models.training.evaluating.jobs import BrokenResultError, Job, JobResult
 from models.training.fitting.standards import (

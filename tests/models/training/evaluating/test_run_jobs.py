@@ -17,7 +17,7 @@ import pytest
 
 from models.contract import VectorInput
 from models.training.data.datasets import Grasps
-from models.training.estimators.classical import ForestConfig
+from models.training.estimators.configs import ForestConfig
 from models.training.evaluating import jobs
 from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.run_jobs import ClusterError, run_jobs

@@ -29,9 +29,15 @@ from models.contract import (
 )
 from models.inputs import builder, raw_features
 from models.runtime import TactileModel
-from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig, SvmConfig
-from models.training.estimators.networks import NetworkConfig, SecondConvolution
-from models.training.estimators.recipe import Recipe
+from models.training.estimators.configs import (
+    BoostingConfig,
+    ForestConfig,
+    MlpConfig,
+    NetworkConfig,
+    Recipe,
+    SecondConvolution,
+    SvmConfig,
+)
 from models.training.fitting.fit import Fitted, fit
 from models.training.fitting.standards import Standards
 from models.training.making.export import ExportError, export
