@@ -63,6 +63,7 @@ def test_a_path_that_no_file_can_have_is_refused() -> None:
         ('"layout":"D1"', '"layout":"D3"', r"its contract says \(4, 7, 3\)"),
         ('"layout":"D1"', '"layout":"D9"', "asks for an image that is not known: 'D9'"),
         ("neighbour-mean", "zeros", "asks for an image that is not known: 'zeros'"),
+        ("filled-image", "min-max", "asks for an image that is not known: 'min-max'"),
         ('["ff","mf","th"]', '["ff","mf"]', r"not \(fingers, 24\)"),
     ],
 )

@@ -49,7 +49,7 @@ def evaluate(args: argparse.Namespace) -> None:
     grasps = read_all(args.data)
     warn_of_unpublished("evaluate", unpublished(grasps.files))
     if args.quick:
-        systems = [_quick(system) for system in systems]
+        systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
         chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]
         grasps = grasps.rows(np.sort(chosen).astype(np.int64))
     tried = [point for system in systems for point in grid_of(system)] if args.grid else systems
@@ -103,10 +103,6 @@ def _check_extras(args: argparse.Namespace) -> None:
             raise WrongInputError(f"needs the package '{package}': pip install '.[{extra}]'")
 
 
-def _quick(system: System) -> System:
-    return with_recipes(system, epochs=QUICK_EPOCHS)
-
-
 def _summaries(
     systems: Sequence[System], grasps: Grasps, args: argparse.Namespace
 ) -> list[SystemSummary]:
@@ -155,7 +151,8 @@ def _line(summary: SystemSummary) -> str:
 def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
     """Write table and plots of all summaries in the folder that are of this data (a digest)."""
     digests = {
-        name: digest(_quick(system) if args.quick else system) for name, system in SYSTEMS.items()
+        name: digest(with_recipes(system, epochs=QUICK_EPOCHS) if args.quick else system)
+        for name, system in SYSTEMS.items()
     }
     summaries = read_summaries(args.out, data, digests)
     if args.table:

@@ -183,12 +183,12 @@ def _later_margins(
     if not isinstance(trained.system.input, SessionFeatures) or split.calibration is None:
         raise ValueError(f"{trained.system.name} is not calibrated by a session")
     features, clip = raw_features(grasps.counts), trained.system.input.clip
-    session = later_session(features, split.test, split.calibration, standards, seed)
+    by_variant, ages = later_session(features, split.test, split.calibration, standards, seed)
     margins = {
         variant: trained.fitted.margins(by.apply(features[split.test], clip))
-        for variant, by in session.standards.items()
+        for variant, by in by_variant.items()
     }
-    return margins, session.ages
+    return margins, ages
 
 
 def _result(arrays: dict[str, Numbers]) -> JobResult:

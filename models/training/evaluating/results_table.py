@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from models.training.evaluating.day_figures import GROUPS, DayFigures
 from models.training.evaluating.metrics import Difference, Spread, paired_difference
-from models.training.evaluating.summaries import HEADLINE, SystemSummary, Variant
+from models.training.evaluating.summaries import HEADLINE, SystemSummary
 from models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import PaperFigure, SessionFeatures, System
@@ -137,13 +137,11 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
         for name in SYSTEMS
         if (name, "session") in by_group
     }
-    yield _table(
-        ("system", *columns),
-        (
-            (f"`{name}`", *(_value(_f1(variants.get(key))) for key in SESSION_VARIANTS))
-            for name, variants in here.items()
-        ),
-    )
+    shown = []
+    for name, variants in here.items():
+        f1 = {key: variant.spreads["f1"] for key, variant in variants.items()}
+        shown.append((f"`{name}`", *(_value(f1.get(key)) for key in SESSION_VARIANTS)))
+    yield _table(("system", *columns), shown)
     # How right the verdicts of a running session are while it is young.
     young = {name: variants[RUNNING].ages for name, variants in here.items() if RUNNING in variants}
     if young:
@@ -304,10 +302,6 @@ def _table(header: Row, rows: Iterable[Row]) -> str:
 
 def _trainings(summary: SystemSummary) -> int:
     return len(summary.seeds) * summary.folds
-
-
-def _f1(variant: Variant | None) -> Spread | None:
-    return None if variant is None else variant.spreads["f1"]
 
 
 def _percent(fraction: float | None) -> str:
