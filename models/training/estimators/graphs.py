@@ -140,6 +140,7 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
         _constant("vector_part", -gamma * np.square(vectors).sum(axis=1)),
         _constant("weights", model.dual_coef_.reshape(-1, 1).astype(np.float64)),
         _constant("bias", model.intercept_.astype(np.float64)),
+        _constant("axis", np.array([1])),
     ]
     steps: _Steps = (
         ("Cast", (input_name,), "x_64", {"to": onnx.TensorProto.DOUBLE}),
@@ -155,7 +156,6 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
         ("Add", ("weighted", "bias"), "decision", {}),
         ("Cast", ("decision",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
     )
-    constants.append(_constant("axis", np.array([1])))
     return _model(_nodes(steps), constants, _vectors(input_name, features), MARGIN_NAME, 1)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from models.training.evaluating.day_figures import GROUPS, DayFigures
-from models.training.evaluating.metrics import Difference, Spread, paired_difference
+from models.training.evaluating.metrics import Spread, paired_difference
 from models.training.evaluating.summaries import HEADLINE, SystemSummary
 from models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
 from models.training.systems.registry import SYSTEMS
@@ -221,8 +221,8 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
     yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best", "best"), rows)
 
 
-def difference(ours: SystemSummary, theirs: SystemSummary) -> Difference | None:
-    """Return our mean F1 less theirs on the splits that both have judged.
+def difference(ours: SystemSummary, theirs: SystemSummary) -> tuple[float, float | None] | None:
+    """Return our mean F1 less theirs on the splits that both have judged, and its standard error.
 
     None: no split is the same, for other data or another number of folds, say.
     """
@@ -333,8 +333,8 @@ def _difference(ours: SystemSummary, theirs: SystemSummary | None) -> str:
     gap = difference(ours, theirs)
     if gap is None:
         return NOT_RUN
-    error = "" if gap.error is None else f" +- {100 * gap.error:.1f}"
-    return f"{100 * gap.mean:+.1f}{error}"
+    mean, error = gap
+    return f"{100 * mean:+.1f}" + ("" if error is None else f" +- {100 * error:.1f}")
 
 
 def _duration(seconds: float) -> str:
