@@ -204,8 +204,10 @@ def test_ctrl_c_ends_processes_with_130_and_leaves_results_of_one_process(
     assert lines[-1] == "graspd evaluate: interrupted; the same command goes on from here"
     assert 2 <= len(list((tmp_path / "jobs").iterdir())) < 300
     grasps = read_all(data)
-    job = Job(SYSTEMS["mlp"], "cv", 0, 0)
-    stored = jobs.load(tmp_path / "jobs", job, grasps.digest())
+    folder, digest = tmp_path / "jobs", grasps.digest()
+    made = [Job(SYSTEMS["mlp"], "cv", 0, fold) for fold in range(10)]
+    job = next(job for job in made if (folder / job.file_name(digest)).exists())
+    stored = jobs.load(folder, job, digest)
     assert stored is not None
     expected = jobs.run(job, grasps)
     assert np.array_equal(stored.margins["none"], expected.margins["none"])
