@@ -118,7 +118,7 @@ class CountsBuilder(_FlatBuilder):
         self.shape = (fingers * ELECTRODES,)
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
-        return _flat(counts), _features(counts)[1]
+        return counts.reshape(*counts.shape[:-2], -1), _features(counts)[1]
 
 
 class SessionBuilder(_FlatBuilder):
@@ -157,23 +157,6 @@ def raw_features(counts: NDArray[np.generic]) -> Floats:
     return _features(counts.astype(np.float64))[0]
 
 
-def _features(counts: Floats) -> tuple[Floats, Floats]:
-    fingers = counts.shape[-2]
-    features = np.empty((*counts.shape[:-2], fingers * FEATURES_PER_FINGER))
-    z, mean, spread = (
-        features[..., : -2 * fingers],
-        features[..., -2 * fingers : -fingers],
-        features[..., -fingers:],
-    )
-    _z_scores(counts, z.reshape(counts.shape), mean, spread)
-    return features, spread
-
-
-def _flat(values: Floats) -> Floats:
-    """Shape (..., fingers * 24) of (..., fingers, 24)."""
-    return values.reshape(*values.shape[:-2], -1)
-
-
 def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
     """What deviations are multiplied by: one over the spread, 0 where that must not be judged.
 
@@ -186,12 +169,17 @@ def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
 
 
-def _z_scores(counts: Floats, z: Floats, mean: Floats, spread: Floats) -> None:
-    """Z-values, means and (population) spreads of each finger; z-values are zero where it is flat.
+def _features(counts: Floats) -> tuple[Floats, Floats]:
+    """Return z-values, means and (population) spreads of each finger; and the spreads alone.
 
-    In two passes, so that large counts that hardly differ cancel before they are squared: for
-    counts of 12 bits the error is below 1e-9 of the largest magnitude, 6e-8 once it is float32.
+    Z-values are zero where a finger is flat. In two passes, so that large counts that hardly differ
+    cancel before they are squared: for counts of 12 bits the error is below 1e-9 of the largest
+    magnitude, 6e-8 once it is float32.
     """
+    fingers = counts.shape[-2]
+    features = np.empty((*counts.shape[:-2], fingers * FEATURES_PER_FINGER))
+    z = features[..., : -2 * fingers].reshape(counts.shape)
+    mean, spread = features[..., -2 * fingers : -fingers], features[..., -fingers:]
     np.add.reduce(counts, axis=-1, out=mean)
     mean /= ELECTRODES
     np.subtract(counts, mean[..., np.newaxis], out=z)
@@ -199,3 +187,4 @@ def _z_scores(counts: Floats, z: Floats, mean: Floats, spread: Floats) -> None:
     spread /= ELECTRODES
     np.sqrt(spread, out=spread)
     z *= scale_of(spread)[..., np.newaxis]
+    return features, spread

@@ -24,7 +24,7 @@ from models.contract import Finger, ModelError
 from models.layout import D1
 from models.runtime import TactileModel
 from models.training.data.datasets import Grasps
-from models.training.estimators.networks import CNN1
+from models.training.estimators.configs import CNN1
 
 CONFIDENCE = 0.95
 Errors = dict[str, dict[str, float]]

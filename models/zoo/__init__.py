@@ -7,8 +7,6 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
 
-import msgspec
-
 from models.contract import Finger, ModelError
 
 ZOO = Path(__file__).parent
@@ -57,24 +55,14 @@ def read_card(path: Path) -> dict[str, Any]:
     return dict(content)
 
 
-class _File(msgspec.Struct):
-    sha256: str
-
-
-class _Card(msgspec.Struct):
-    file: _File
-
-
 def ships(path: Path, sha256: str) -> bool:
-    """Whether the file at `path`, of this digest (hexadecimal), is a model of the zoo as its card
-    has it."""
+    """Return True if the card of a zoo model at `path` states this digest (hexadecimal)."""
     if path.resolve().parent != ZOO.resolve():
         return False
     try:
-        said = msgspec.json.decode(path.with_suffix(".json").read_bytes(), type=_Card)
-    except (OSError, msgspec.DecodeError):
+        return bool(read_card(path.with_suffix(".json"))["file"].get("sha256") == sha256)
+    except ModelError:
         return False
-    return said.file.sha256 == sha256
 
 
 def find(name: str) -> Path:

@@ -10,7 +10,6 @@ from models.contract import (
     CountsInput,
     ImageInput,
     Input,
-    ModelError,
     SessionInput,
     Sharpness,
     VectorInput,
@@ -93,19 +92,6 @@ def test_a_flat_finger_has_no_spread_and_no_infinities(wanted: Input) -> None:
     out = np.empty(inputs.shape, dtype=np.float32)
     assert inputs.build(reading, out)[1] == 0.0
     assert np.isfinite(out).all()
-
-
-@pytest.mark.parametrize(
-    "wanted",
-    [
-        ImageInput("D9", "neighbour-mean", "filled-image", "channels"),
-        ImageInput("D1", "zeros", "filled-image", "channels"),
-        ImageInput("D1", "neighbour-mean", "min-max", "channels"),
-    ],
-)
-def test_an_image_that_nobody_knows_is_refused(wanted: ImageInput) -> None:
-    with pytest.raises(ModelError, match="not known"):
-        builder(wanted, 3)
 
 
 @pytest.mark.parametrize(

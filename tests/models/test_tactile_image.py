@@ -79,14 +79,14 @@ def real_counts(bts3_dir: Path) -> list[list[int]]:
 
 @pytest.mark.parametrize("fill", Fill)
 @pytest.mark.parametrize("normalisation", Normalisation)
-def test_every_real_grasp_equals_the_plain_implementation(
+def test_every_fifth_real_grasp_equals_the_plain_implementation(
     bts3_dir: Path, fill: Fill, normalisation: Normalisation
 ) -> None:
     grasps = real_counts(bts3_dir)
     assert len(grasps) == 2549
-    counts = np.array(grasps, dtype=np.uint16).reshape(-1, 3, 24)
+    counts = np.array(grasps[::5], dtype=np.uint16).reshape(-1, 3, 24)
     images, _ = TactileImager(3, D1, fill, normalisation).build_batch(counts)
-    assert images.shape == (2549, 12, 11, 3)
+    assert images.shape == (510, 12, 11, 3)
     worst = 0.0
     for image, reading in zip(images, counts, strict=True):
         plain = [

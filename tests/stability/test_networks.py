@@ -25,8 +25,9 @@ from models import zoo
 from models.contract import METADATA_KEY, ModelContract, VectorInput
 from models.inputs import builder
 from models.runtime import TactileModel
+from models.training.estimators.configs import NetworkConfig
 from models.training.estimators.graphs import IR_VERSION, MARGIN_NAME, OPSET, with_probability
-from models.training.estimators.networks import IMAGE_SHAPE, NetworkConfig, build, for_inference
+from models.training.estimators.networks import IMAGE_SHAPE, build, for_inference
 from tests.stability.comparison import P_SLIP_ERROR_MAX
 
 Note = Callable[..., None]

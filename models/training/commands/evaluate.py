@@ -7,7 +7,7 @@ from pathlib import Path
 
 from models.training.commands.common import exit_code, whole
 from models.training.data.protocols import ABOUT, PROTOCOLS
-from models.training.systems.names import SYSTEM_NAMES
+from models.training.systems.registry import SYSTEMS
 
 MAX_PROCESSES = 1024
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         nargs="*",
         metavar="NAME",
-        help=f"systems (default: all): {', '.join(SYSTEM_NAMES)}",
+        help=f"systems (default: all): {', '.join(SYSTEMS)}",
     )
     parser.add_argument(
         "--protocol",

@@ -20,8 +20,7 @@ from models.training.commands.common import (
 )
 from models.training.data.datasets import Grasps, read_all, unpublished
 from models.training.data.protocols import FOLDS, STANDARD
-from models.training.estimators.classical import GRIDS
-from models.training.estimators.networks import NetworkConfig
+from models.training.estimators.configs import GRIDS, NetworkConfig
 from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import Job, JobResult, jobs_of
 from models.training.evaluating.results_table import Made, results_table
@@ -50,7 +49,7 @@ def evaluate(args: argparse.Namespace) -> None:
     grasps = read_all(args.data)
     warn_of_unpublished("evaluate", unpublished(grasps.files))
     if args.quick:
-        systems = [_quick(system) for system in systems]
+        systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
         chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]
         grasps = grasps.rows(np.sort(chosen).astype(np.int64))
     tried = [point for system in systems for point in grid_of(system)] if args.grid else systems
@@ -104,10 +103,6 @@ def _check_extras(args: argparse.Namespace) -> None:
             raise WrongInputError(f"needs the package '{package}': pip install '.[{extra}]'")
 
 
-def _quick(system: System) -> System:
-    return with_recipes(system, epochs=QUICK_EPOCHS)
-
-
 def _summaries(
     systems: Sequence[System], grasps: Grasps, args: argparse.Namespace
 ) -> list[SystemSummary]:
@@ -156,7 +151,8 @@ def _line(summary: SystemSummary) -> str:
 def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
     """Write table and plots of all summaries in the folder that are of this data (a digest)."""
     digests = {
-        name: digest(_quick(system) if args.quick else system) for name, system in SYSTEMS.items()
+        name: digest(with_recipes(system, epochs=QUICK_EPOCHS) if args.quick else system)
+        for name, system in SYSTEMS.items()
     }
     summaries = read_summaries(args.out, data, digests)
     if args.table:

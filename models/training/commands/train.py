@@ -22,7 +22,7 @@ from models.training.commands.common import (
 from models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
 from models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
 from models.training.data.protocols import TooFewGraspsError
-from models.training.systems.names import SYSTEM_NAMES
+from models.training.systems.registry import SYSTEMS
 
 if TYPE_CHECKING:
     from models.training.making.card import Card
@@ -36,9 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
     parser.add_argument(
         "model",
-        choices=sorted(SYSTEM_NAMES),
+        choices=sorted(SYSTEMS),
         metavar="MODEL",
-        help=f"one of {', '.join(SYSTEM_NAMES)}",
+        help=f"one of {', '.join(SYSTEMS)}",
     )
     parser.add_argument(
         "--data",
@@ -154,7 +154,6 @@ def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
 
 def _plan(args: argparse.Namespace) -> TrainingPlan:
     from models.training.making.plan import TrainingPlan
-    from models.training.systems.registry import SYSTEMS
 
     system, lab = SYSTEMS[args.model], tuple(path.stem for path in args.own)
     if lab:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import rotate
 
 from models.training.arrays import Bools, Floats32
 
@@ -40,6 +39,8 @@ def augment(
 
 
 def _rotated(images: Floats32, angle_deg: float, seed: int) -> Floats32:
+    from scipy.ndimage import rotate  # help and completion know `Augmentation` without it
+
     left = np.random.default_rng(seed).integers(2, size=len(images)).astype(np.bool_)
     rotated = np.empty_like(images)
     for chosen, angle in ((left, angle_deg), (~left, -angle_deg)):

@@ -105,25 +105,26 @@ def read_table(path: Path) -> Grasps:
     except UnicodeDecodeError as error:
         raise DatasetError(path, "is not text") from error
     rows = csv.reader(io.StringIO(text, newline=""), strict=True)
-    counts: list[list[int]] = []
-    slipped: list[bool] = []
-    objects: list[str] = []
+    grasps: list[tuple[str, bool, list[int]]] = []
     try:
-        table = _Table(path, next(rows, []))
+        header = next(rows, [])
+        _check_header(path, header)
         for row in rows:
-            name, slip, values = table.parse(row, rows.line_num)
-            objects.append(name)
-            slipped.append(slip)
-            counts.append(values)
+            if len(row) != len(header):
+                problem = f"has {len(row)} values, not {len(header)}"
+                raise DatasetError(path, problem, line=rows.line_num)
+            cells = dict(zip(header, row, strict=True))
+            grasps.append(_grasp(path, rows.line_num, cells))
     except csv.Error as error:
         raise DatasetError(path, f"is not a table: {error}", line=rows.line_num) from error
-    if not counts:
+    if not grasps:
         raise DatasetError(path, "has no grasps")
+    objects, slipped, counts = zip(*grasps, strict=True)
     return Grasps(
         np.array(counts, dtype=np.uint16).reshape(-1, len(FINGERS), ELECTRODES),
         np.array(slipped, dtype=np.bool_),
-        tuple(objects),
-        (Dataset(path.stem, hashlib.sha256(data).hexdigest(), len(counts)),),
+        objects,
+        (Dataset(path.stem, hashlib.sha256(data).hexdigest(), len(grasps)),),
     )
 
 
@@ -162,43 +163,29 @@ def lab_table_names(files: Sequence[Dataset]) -> tuple[str, ...]:
     return tuple(file.name for file in files if file.name not in published)
 
 
-class _Table:
-    """Where the columns of one table stand, and how its rows are read."""
+def _check_header(path: Path, header: list[str]) -> None:
+    for name in ("object", "slipped", *COUNT_COLUMNS):
+        if header.count(name) != 1:
+            problem = "missing" if name not in header else "there more than once"
+            raise DatasetError(path, f"column is {problem}", line=1, column=name)
 
-    def __init__(self, path: Path, header: list[str]) -> None:
-        self._path = path
-        self._header = header
-        for name in ("object", "slipped", *COUNT_COLUMNS):
-            if header.count(name) != 1:
-                found = "missing" if name not in header else "there more than once"
-                raise DatasetError(path, f"column is {found}", line=1, column=name)
-        self._object = header.index("object")
-        self._slipped = header.index("slipped")
-        self._counts = [header.index(name) for name in COUNT_COLUMNS]
 
-    def parse(self, row: list[str], line: int) -> tuple[str, bool, list[int]]:
-        if len(row) != len(self._header):
-            problem = f"has {len(row)} values, not {len(self._header)}"
-            raise DatasetError(self._path, problem, line=line)
-        name, slipped = row[self._object], row[self._slipped]
-        if not name:
-            raise DatasetError(self._path, "object has no name", line=line, column="object")
-        if slipped not in ("0", "1"):
-            raise DatasetError(
-                self._path, f"{slipped!r} is not 0 or 1", line=line, column="slipped"
-            )
-        return (
-            name,
-            slipped == "1",
-            [self._count(row[column], line, column) for column in self._counts],
-        )
-
-    def _count(self, text: str, line: int, column: int) -> int:
+def _grasp(path: Path, line: int, cells: dict[str, str]) -> tuple[str, bool, list[int]]:
+    """Return object, slip and counts of one row; `cells` are its texts by column."""
+    name, slipped, counts = cells["object"], cells["slipped"], []
+    if not name:
+        raise DatasetError(path, "object has no name", line=line, column="object")
+    if slipped not in ("0", "1"):
+        raise DatasetError(path, f"{slipped!r} is not 0 or 1", line=line, column="slipped")
+    for column in COUNT_COLUMNS:
+        text = cells[column]
         # No count has more than four digits; int() alone would also take "1_0" or " 7".
-        if text.isascii() and text.isdigit() and len(text) <= 4 and int(text) <= COUNT_MAX:
-            return int(text)
-        problem = f"{text[:20]!r} is not a count (0..{COUNT_MAX})"
-        raise DatasetError(self._path, problem, line=line, column=self._header[column])
+        digits = text.isascii() and text.isdigit() and len(text) <= 4
+        if not digits or int(text) > COUNT_MAX:
+            problem = f"{text[:20]!r} is not a count (0..{COUNT_MAX})"
+            raise DatasetError(path, problem, line=line, column=column)
+        counts.append(int(text))
+    return name, slipped == "1", counts
 
 
 def _read(path: Path) -> bytes:

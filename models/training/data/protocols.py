@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -111,23 +112,16 @@ def object_folds(objects: Sequence[str], folds: int, seed: int) -> Ints:
     return np.array([fold_of_object[name] for name in objects], dtype=np.int64)
 
 
-_Maker = Callable[[Grasps, int, int], list[Split]]
+def _stratified(
+    tables: tuple[str, ...], with_lab: bool, grasps: Grasps, seed: int, folds: int
+) -> list[Split]:
+    rows = _rows(grasps, *tables, with_lab=with_lab)
+    return _leave_out(rows, folds_of(grasps.slipped[rows], folds, seed), folds)
 
 
-def _stratified(*tables: str, with_lab: bool = False) -> _Maker:
-    def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-        rows = _rows(grasps, *tables, with_lab=with_lab)
-        return _leave_out(rows, folds_of(grasps.slipped[rows], folds, seed), folds)
-
-    return make
-
-
-def _grouped(*tables: str) -> _Maker:
-    def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-        rows = _rows(grasps, *tables, with_lab=True)
-        return _leave_out(rows, _object_folds(grasps, rows, folds, seed), folds)
-
-    return make
+def _grouped(tables: tuple[str, ...], grasps: Grasps, seed: int, folds: int) -> list[Split]:
+    rows = _rows(grasps, *tables, with_lab=True)
+    return _leave_out(rows, _object_folds(grasps, rows, folds, seed), folds)
 
 
 def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
@@ -170,15 +164,15 @@ def _days(grasps: Grasps, seed: int, folds: int) -> list[Split]:
     return made
 
 
-_MAKERS: dict[EvalProtocol, _Maker] = {
-    "cv": _stratified(*WHOLE, with_lab=True),
+_MAKERS: dict[EvalProtocol, Callable[[Grasps, int, int], list[Split]]] = {
+    "cv": partial(_stratified, WHOLE, True),
     "unknown": _unknown,
-    "objects": _grouped(*WHOLE, NEW_SESSION),
-    "objects-whole": _grouped(*WHOLE),
+    "objects": partial(_grouped, (*WHOLE, NEW_SESSION)),
+    "objects-whole": partial(_grouped, WHOLE),
     "session": _session,
     "days": _days,
-    "cv-palm-down": _stratified(WHOLE[0]),
-    "cv-palm-side": _stratified(WHOLE[1]),
+    "cv-palm-down": partial(_stratified, WHOLE[:1], False),
+    "cv-palm-side": partial(_stratified, WHOLE[1:], False),
 }
 
 

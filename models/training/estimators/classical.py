@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,13 @@ from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
 from models.training.arrays import Bools, Floats, Floats32
+from models.training.estimators.configs import (
+    BoostingConfig,
+    ClassicalConfig,
+    ForestConfig,
+    MlpConfig,
+    SvmConfig,
+)
 
 PROBABILITY_FLOOR = 1e-3
 """A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
@@ -40,82 +46,7 @@ class Boosting(HistGradientBoostingClassifier):  # type: ignore[misc]  # scikit-
         return float(self._baseline_prediction.item())
 
 
-@dataclass(frozen=True, slots=True)
-class SvmConfig:
-    """Support vector machine with a radial kernel, classes weighted to balance."""
-
-    c: float
-    gamma: float | Literal["auto"]
-    """Of the kernel exp(-gamma * distance**2); auto: one over the number of features."""
-
-
-@dataclass(frozen=True, slots=True)
-class ForestConfig:
-    """Random forest."""
-
-    trees: int
-    depth: int | None
-    """Largest depth of a tree; None: until its leaves are pure."""
-
-
-@dataclass(frozen=True, slots=True)
-class MlpConfig:
-    """Multi-layer perceptron: ReLU, Adam, a fixed number of epochs."""
-
-    hidden: tuple[int, ...]
-    """Units of each hidden layer."""
-    alpha: float = 1e-4
-    """L2 term."""
-    learning_rate: float = 1e-3
-    epochs: int = 100
-
-
-@dataclass(frozen=True, slots=True)
-class BoostingConfig:
-    """Gradient boosting on histograms."""
-
-    iterations: int = 300
-    learning_rate: float = 0.1
-    leaves: int = 31
-    """Largest number of leaves of a tree."""
-    leaf_grasps: int = 20
-    """Fewest grasps in a leaf."""
-    l2: float = 0.0
-    features: float = 1.0
-    """Fraction of the features that a split may choose from."""
-
-
-ClassicalConfig = SvmConfig | ForestConfig | MlpConfig | BoostingConfig
-
-_TREES: dict[str, Sequence[object]] = {"leaves": (8, 15, 31), "features": (0.3, 1.0)}
-GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
-    SvmConfig: [
-        {
-            "c": (0.01, 0.1, 1.0, 3.0, 10.0, 100.0, 1000.0, 5000.0),
-            "gamma": ("auto", 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1),
-        }
-    ],
-    # Odd numbers of trees cannot tie.
-    ForestConfig: [{"trees": (11, 25, 51, 101, 199), "depth": (None, 5, 10, 15, 20, 30)}],
-    MlpConfig: [
-        {"hidden": ((32,), (100,), (300,), (64, 32), (100, 100)), "alpha": (1e-4, 0.1, 1.0)}
-    ],
-    BoostingConfig: [
-        {"iterations": (150,), "learning_rate": (0.1,), **_TREES},
-        {"iterations": (400,), "learning_rate": (0.05,), **_TREES},
-    ],
-}
-"""What a grid search tries, as scikit-learn's `ParameterGrid` takes it. The paper gives the grids
-of the first two; it gives none for perceptrons, and has no boosting."""
-
-
-class ClassicalModel(Protocol):
-    """A classifier of scikit-learn: one of those that `fit_classical` makes."""
-
-    n_features_in_: int
-
-    def fit(self, inputs: Floats32, slipped: Bools) -> object:
-        """Fit to inputs (N, M) and labels (N,)."""
+ClassicalModel: TypeAlias = SVC | RandomForestClassifier | MLPClassifier | Boosting
 
 
 def fit_classical(
@@ -145,12 +76,10 @@ def classical_margins(model: ClassicalModel, inputs: Floats32) -> Floats:
                 margins: Floats = model.decision_function(inputs)
             case MLPClassifier():
                 margins = _mlp_margins(model, inputs)
-            case RandomForestClassifier():
+            case _:
                 slip = model.predict_proba(inputs)[:, 1]
                 slip = slip.clip(PROBABILITY_FLOOR, 1.0 - PROBABILITY_FLOOR)
                 margins = np.log(slip / (1.0 - slip))
-            case _:
-                raise TypeError(f"no classifier of this module: {type(model).__name__}")
     return margins
 
 
@@ -161,25 +90,22 @@ def classical_size(model: ClassicalModel) -> int:
             return int(model.support_vectors_.size + model.dual_coef_.size + 1)
         case MLPClassifier():
             return sum(int(part.size) for part in (*model.coefs_, *model.intercepts_))
-        case RandomForestClassifier():
-            return sum(int(tree.tree_.node_count) for tree in model.estimators_)
         case Boosting():
             return sum(map(len, model.trees))
         case _:
-            raise TypeError(f"no classifier of this module: {type(model).__name__}")
+            return sum(int(tree.tree_.node_count) for tree in model.estimators_)
 
 
 def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
-    model: ClassicalModel
     match config:
         case SvmConfig():
-            model = SVC(C=config.c, gamma=config.gamma, class_weight="balanced")
+            return SVC(C=config.c, gamma=config.gamma, class_weight="balanced")
         case ForestConfig():
-            model = RandomForestClassifier(
+            return RandomForestClassifier(
                 n_estimators=config.trees, max_depth=config.depth, random_state=seed
             )
         case MlpConfig():
-            model = MLPClassifier(
+            return MLPClassifier(
                 hidden_layer_sizes=config.hidden,
                 alpha=config.alpha,
                 learning_rate_init=config.learning_rate,
@@ -188,7 +114,7 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
                 random_state=seed,
             )
         case BoostingConfig():
-            model = Boosting(
+            return Boosting(
                 max_iter=config.iterations,
                 learning_rate=config.learning_rate,
                 max_leaf_nodes=config.leaves,
@@ -198,7 +124,6 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
                 early_stopping=False,
                 random_state=seed,
             )
-    return model
 
 
 def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:

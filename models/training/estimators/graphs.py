@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 import onnx
 import torch
 from onnx import helper, numpy_helper
+from onnx.compose import add_prefix_graph
 from skl2onnx import to_onnx
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.neural_network import MLPClassifier
@@ -51,39 +52,36 @@ def network_margin(
 
 def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
     """Log-odds of slip (N, 1) of a classifier on vectors."""
-    match model:
-        case SVC():
-            return _svm(model, input_name)
-        case Boosting():
-            return _boosting(model, input_name)
-        case RandomForestClassifier():
-            return _forest(model, input_name)
-        case MLPClassifier():
-            return _perceptron(model, input_name)
-        case _:
-            raise TypeError(f"no graph for a {type(model).__name__}")
+    graph_of: dict[type[ClassicalModel], Callable[[Any, str], onnx.ModelProto]] = {
+        SVC: _svm,
+        Boosting: _boosting,
+        RandomForestClassifier: _forest,
+        MLPClassifier: _perceptron,
+    }
+    return graph_of[type(model)](model, input_name)
 
 
 def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> onnx.ModelProto:
     """One graph whose margin is the sum of the parts' margins times their factors.
 
-    The parts have the same input; their nodes are renamed in place.
+    The parts have the same input.
     """
-    width = parts[0].graph.input[0]
+    given = parts[0].graph.input[0]
     nodes: list[onnx.NodeProto] = []
     constants: list[onnx.TensorProto] = []
     terms = []
     for index, (part, factor) in enumerate(zip(parts, factors, strict=True)):
         prefix = f"member{index}_"
-        _prefix(part.graph, prefix, keep=width.name)
-        nodes += part.graph.node
-        constants += part.graph.initializer
+        graph = add_prefix_graph(part.graph, prefix)
+        _feed(graph, prefix + given.name, given.name)
+        nodes += graph.node
+        constants += graph.initializer
         constants.append(_constant(f"{prefix}factor", np.array(factor, np.float32)))
         term = f"{prefix}term"
         nodes.append(helper.make_node("Mul", [prefix + MARGIN_NAME, f"{prefix}factor"], [term]))
         terms.append(term)
     nodes.append(helper.make_node("Sum", terms, [MARGIN_NAME]))
-    return _model(nodes, constants, width, MARGIN_NAME, 1)
+    return _model(nodes, constants, given, MARGIN_NAME, 1)
 
 
 def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelProto:
@@ -142,6 +140,7 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
         _constant("vector_part", -gamma * np.square(vectors).sum(axis=1)),
         _constant("weights", model.dual_coef_.reshape(-1, 1).astype(np.float64)),
         _constant("bias", model.intercept_.astype(np.float64)),
+        _constant("axis", np.array([1])),
     ]
     steps: _Steps = (
         ("Cast", (input_name,), "x_64", {"to": onnx.TensorProto.DOUBLE}),
@@ -157,7 +156,6 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
         ("Add", ("weighted", "bias"), "decision", {}),
         ("Cast", ("decision",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
     )
-    constants.append(_constant("axis", np.array([1])))
     return _model(_nodes(steps), constants, _vectors(input_name, features), MARGIN_NAME, 1)
 
 
@@ -298,17 +296,6 @@ def _strip(model: onnx.ModelProto) -> None:
         del part.metadata_props[:]
         part.doc_string = ""
     del graph.value_info[:]
-
-
-def _prefix(graph: onnx.GraphProto, prefix: str, keep: str) -> None:
-    """Rename everything in a graph but its input, so that it can stand beside others."""
-    for node in graph.node:
-        node.name = prefix + node.name if node.name else ""
-        # An empty name is an input that is left out.
-        node.input[:] = [name if name in (keep, "") else prefix + name for name in node.input]
-        node.output[:] = [prefix + name if name else name for name in node.output]
-    for tensor in graph.initializer:
-        tensor.name = prefix + tensor.name
 
 
 def _model(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -13,6 +12,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 from models.contract import FEATURES_PER_FINGER
 from models.layout import D1, ELECTRODES
 from models.tactile_image import Fill, fill_matrix
+from models.training.estimators.configs import NetworkConfig
 
 IMAGE_SHAPE = (12, 11, 3)
 """Height, width, fingers of the D1 image."""
@@ -22,43 +22,6 @@ POOL = 2
 """Side and stride of a maximum pooling, pixels."""
 NORM_EPSILON = 1e-3
 """Keras' default: the published networks were trained with it."""
-
-
-@dataclass(frozen=True, slots=True)
-class SecondConvolution:
-    """A convolution after the first one and its pooling (valid)."""
-
-    filters: int = 64
-    kernel: int = 1
-    """Side, pixels: the authors' notebooks have 1, the table of the paper has 3."""
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkConfig:
-    """A convolutional network: convolution(s), one hidden dense layer, two classes.
-
-    It takes images, or features whose first 24 values per finger become a D1 image inside the
-    network while the rest joins the hidden layer's inputs.
-    """
-
-    filters: int
-    """Filters of the first convolution, 3 x 3, valid."""
-    hidden: int
-    """Units of the hidden dense layer."""
-    pool: bool = False
-    """2 x 2 maximum pooling after the first convolution; an odd row or column is left out."""
-    second: SecondConvolution | None = None
-    dropout: float = 0.0
-    """Fraction of values left out in training, before and after the hidden layer."""
-    batch_norm: bool = True
-    """After each convolution and after the hidden layer; a convolution then needs no bias."""
-
-
-CNN0 = NetworkConfig(filters=32, hidden=128)
-CNN1 = NetworkConfig(filters=32, hidden=1024)
-"""The best network of the paper: Conv32 - FC1024."""
-CNN2 = NetworkConfig(filters=32, hidden=1024, pool=True)
-CNN3 = NetworkConfig(filters=32, hidden=1024, pool=True, second=SecondConvolution())
 
 
 class ChannelsFirst(nn.Module):
@@ -107,10 +70,14 @@ def build(config: NetworkConfig, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Seque
     (stable, slip). Weights are Glorot-uniform and biases zero, as Keras starts them. Raises
     `ValueError` if the network does not fit the shape.
     """
-    look, width = _look(config, tuple(shape))
+    look = _look(config, tuple(shape))
+    try:
+        width = nn.Sequential(*look).eval()(torch.zeros(1, *shape)).shape[1]
+    except RuntimeError as error:
+        raise ValueError(f"inputs {tuple(shape)} are too small for the network") from error
     dense = _dense(width, config.hidden, config.batch_norm)
     last = nn.Linear(config.hidden, 2)
-    network = nn.Sequential(*look, *_drop(config), *dense, *_drop(config), last)
+    network = nn.Sequential(*look, *_drop(config), *dense, *_drop(config), last).train()
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
@@ -149,41 +116,29 @@ def for_margin(network: nn.Sequential) -> nn.Sequential:
     return nn.Sequential(*layers[:-1], margin).eval()
 
 
-def _look(config: NetworkConfig, shape: tuple[int, ...]) -> tuple[list[nn.Module], int]:
-    """Layers that turn an input into the values before the hidden layer, and their number."""
+def _look(config: NetworkConfig, shape: tuple[int, ...]) -> list[nn.Module]:
+    """Return the layers that turn an input into the values before the hidden layer."""
     if len(shape) == 3:
-        layers, width = _convolutions(config, (shape[0], shape[1]), shape[2])
-        return [ChannelsFirst(), *layers], width
+        return [ChannelsFirst(), *_convolutions(config, shape[2])]
     (features,) = shape
     fingers, extra = divmod(features, FEATURES_PER_FINGER)
     if extra:
         fingers, extra = divmod(features, ELECTRODES)
     if extra:
         raise ValueError(f"{features} features are not those of whole fingers")
-    layers, width = _convolutions(config, D1.shape, fingers)
-    layers = [FeatureImages(fingers), *layers]
+    layers = [FeatureImages(fingers), *_convolutions(config, fingers)]
     first = fingers * ELECTRODES
-    if first == features:
-        return layers, width
-    return [Beside(nn.Sequential(*layers), first)], width + features - first
+    return layers if first == features else [Beside(nn.Sequential(*layers), first)]
 
 
-def _convolutions(
-    config: NetworkConfig, size: tuple[int, int], channels: int
-) -> tuple[list[nn.Module], int]:
-    height, width = (side - KERNEL + 1 for side in size)
+def _convolutions(config: NetworkConfig, channels: int) -> list[nn.Module]:
     layers = _convolution(channels, config.filters, KERNEL, config.batch_norm)
-    channels = config.filters
     if config.pool:
         layers.append(nn.MaxPool2d(POOL))
-        height, width = height // POOL, width // POOL
     if config.second is not None:
-        kernel = config.second.kernel
-        layers += _convolution(channels, config.second.filters, kernel, config.batch_norm)
-        height, width, channels = height - kernel + 1, width - kernel + 1, config.second.filters
-    if height < 1 or width < 1:
-        raise ValueError(f"an image of {size[0]} x {size[1]} is too small for the network")
-    return [*layers, nn.Flatten()], channels * height * width
+        second = config.second
+        layers += _convolution(config.filters, second.filters, second.kernel, config.batch_norm)
+    return [*layers, nn.Flatten()]
 
 
 def _convolution(inputs: int, filters: int, kernel: int, batch_norm: bool) -> list[nn.Module]:

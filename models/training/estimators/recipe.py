@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,91 +13,21 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from models.contract import FEATURES_PER_FINGER
 from models.layout import ELECTRODES
 from models.training.arrays import Bools, Floats, Floats32
-from models.training.estimators.networks import NetworkConfig, build
+from models.training.estimators.configs import (
+    THREADS,
+    AnyRecipe,
+    DayShift,
+    NetworkConfig,
+    PublishedRecipe,
+    Recipe,
+    SessionRecipe,
+)
+from models.training.estimators.networks import build
 
-THREADS = 1
-"""Threads of a training. Fixed, because sums over more threads round differently; one, because two
-that share busy cores wait for each other, and many trainings at once use a machine better."""
 INFERENCE_BATCH = 512
 """Inputs per forward pass: bounds memory, changes nothing else."""
 KERAS_ADAM_EPSILON = 1e-8
 """Of Keras 2.0.8, with which the published networks were trained."""
-
-
-@dataclass(frozen=True, slots=True)
-class DayShift:
-    """How far the features of one day differ from those of another, beyond their standardising.
-
-    Measured by what helped networks on days that they were not trained on; twice as much helps
-    networks of a single training day more, and costs the others.
-    """
-
-    gain: float = 0.3
-    """Each feature is multiplied by `exp(gain * e)`, e standard normal."""
-    finger_gain: float = 0.3
-    """All 24 z-values of a finger are multiplied by the same `exp(finger_gain * e)`."""
-    offset: float = 0.7
-    """Standard deviation of what is added to each finger's mean and to its spread."""
-
-
-DAY_SHIFT = DayShift()
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """Settings of one training by a one-cycle AdamW schedule.
-
-    Twenty epochs of one cycle stand for the paper's 300 epochs of Adam at a falling rate; the
-    cross-validated F1 stays within the paper's spread. A remainder of the last batch is left out.
-    """
-
-    epochs: int = 20
-    batch: int = 32
-    peak_learning_rate: float = 1e-3
-    warm_up: float = 0.3
-    """Fraction of the training in which the learning rate rises."""
-    weight_decay: float = 0.5
-    """Decoupled (times the learning rate in each step), on convolution and dense weights only;
-    stands for the paper's L2 term."""
-    label_smoothing: float = 0.0
-    """This much of each target is shared out evenly among both classes."""
-    input_noise: float = 0.0
-    """Standard deviation of the noise added to each input, in the input's own (z-score) units."""
-    norm_momentum: float = 0.1
-    """Weight of a new batch in the running statistics of a batch norm."""
-    threads: int = THREADS
-
-
-@dataclass(frozen=True, slots=True)
-class SessionRecipe(Recipe):
-    """For session features: each batch is seen as it might have been on other days."""
-
-    epochs: int = 40
-    weight_decay: float = 1.0
-    input_noise: float = 0.4
-    day_shift: DayShift = DAY_SHIFT
-
-
-@dataclass(frozen=True, slots=True)
-class PublishedRecipe:
-    """Settings of one training as published: Adam at a rate that falls with every update."""
-
-    epochs: int = 300
-    batch: int = 32
-    learning_rate: float = 1e-4
-    decay: float = 0.005
-    """Keras' time decay: update t (from 0) has the rate `learning_rate / (1 + decay * t)`."""
-    l2: float = 0.01
-    """Keras' kernel regularizer: the loss has `l2 * sum(w**2)` over the weights of every layer
-    but the last."""
-    label_smoothing: float = 0.0
-    input_noise: float = 0.0
-    norm_momentum: float = 0.01
-    """Keras writes it 0.99: the weight of what was."""
-    threads: int = THREADS
-
-
-AnyRecipe = Recipe | PublishedRecipe
 
 
 @contextmanager
@@ -143,10 +72,10 @@ def train_network(
         return network.eval()
 
 
-def logits(network: nn.Module, inputs: Floats32, threads: int = THREADS) -> Floats:
+def logits(network: nn.Module, inputs: Floats32) -> Floats:
     """Logits (N, 2), order (stable, slip), of inputs (N, *shape)."""
     batches = torch.split(torch.from_numpy(inputs), INFERENCE_BATCH)
-    with reproducible(0, threads), torch.no_grad():
+    with reproducible(0), torch.no_grad():
         return torch.cat([network(batch) for batch in batches]).double().numpy()
 
 

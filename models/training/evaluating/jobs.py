@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -26,7 +26,7 @@ from models.training.evaluating.days import judged_days
 from models.training.evaluating.files import write_whole
 from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
 from models.training.fitting.trained import Trained, train
-from models.training.systems.system import SessionFeatures, System, digest, with_recipes
+from models.training.systems.system import SessionFeatures, System, digest
 
 FORMAT = 1
 """Goes up when a job gives another result for the same configuration, or is written otherwise."""
@@ -57,7 +57,7 @@ class Job:
 
     def key(self, data: str) -> str:
         """SHA-256 of all that the result depends on; `data` is the digest of the grasps."""
-        parts = [FORMAT, digest(_alone(self.system)), self.protocol, self.seed, self.fold]
+        parts = [FORMAT, digest(self.system), self.protocol, self.seed, self.fold]
         text = json.dumps([*parts, self.folds, data])
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -107,19 +107,12 @@ class JobResult:
             "seconds": self.seconds,
             "parameters": self.parameters,
         }
-        arrays: dict[str, Numbers] = {
-            "test": self.test,
-            "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8),
-        }
-        parts: dict[str, Mapping[str, Numbers]] = {
-            "margins": self.margins,
-            "ages": self.ages,
-            "refused": self.refused,
-        }
-        for part, by_variant in parts.items():
-            arrays |= {f"{part}.{variant}": values for variant, values in by_variant.items()}
+        arrays = {f"margins.{variant}": values for variant, values in self.margins.items()}
+        ages = {f"ages.{variant}": values for variant, values in self.ages.items()}
+        refused = {f"refused.{variant}": values for variant, values in self.refused.items()}
+        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         file = io.BytesIO()
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(file, allow_pickle=False, test=self.test, meta=text, **arrays, **ages, **refused)
         return file.getvalue()
 
     @classmethod
@@ -139,7 +132,7 @@ def run(job: Job, grasps: Grasps) -> JobResult:
     do not have that split, `ValueError` if the system cannot learn from it.
     """
     split = splits(job.protocol, grasps, job.seed, job.folds)[job.fold]
-    system, seed = _alone(job.system), fold_seed(job.seed, job.fold)
+    system, seed = job.system, fold_seed(job.seed, job.fold)
     grasps = grasps.of_fingers(system.fingers)
     counts, table_of = grasps.counts[split.test], grasps.table_of[split.test]
     ages: dict[str, Ints] = {}
@@ -190,20 +183,15 @@ def _later_margins(
     if not isinstance(trained.system.input, SessionFeatures) or split.calibration is None:
         raise ValueError(f"{trained.system.name} is not calibrated by a session")
     features, clip = raw_features(grasps.counts), trained.system.input.clip
-    session = later_session(features, split.test, split.calibration, standards, seed)
+    by_variant, ages = later_session(features, split.test, split.calibration, standards, seed)
     margins = {
         variant: trained.fitted.margins(by.apply(features[split.test], clip))
-        for variant, by in session.standards.items()
+        for variant, by in by_variant.items()
     }
-    return margins, session.ages
-
-
-def _alone(system: System) -> System:
-    return with_recipes(system, threads=1)
+    return margins, ages
 
 
 def _result(arrays: dict[str, Numbers]) -> JobResult:
-    """Raise `KeyError`, `TypeError` or `ValueError` for what is no result."""
     meta = json.loads(arrays["meta"].tobytes())
     if meta["format"] != FORMAT:
         raise ValueError(f"format {meta['format']}, not {FORMAT}")
@@ -211,13 +199,6 @@ def _result(arrays: dict[str, Numbers]) -> JobResult:
     margins = _by_variant(arrays, "margins.", np.float64)
     ages = _by_variant(arrays, "ages.", np.int64)
     refused = _by_variant(arrays, "refused.", np.bool_)
-    if test.ndim != 1 or not margins:
-        raise ValueError("has no margins")
-    columns = (*margins.values(), *ages.values(), *refused.values())
-    if any(values.shape != test.shape for values in columns):
-        raise ValueError("has margins or ages of another number of grasps")
-    if not all(np.isfinite(values).all() for values in margins.values()):
-        raise ValueError("has margins that are not finite")
     numbers = int(meta["train_grasps"]), float(meta["seconds"]), int(meta["parameters"])
     return JobResult(test, margins, *numbers, ages, refused)
 

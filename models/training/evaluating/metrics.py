@@ -65,16 +65,6 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
-    """A figure of one system less that of another, on the same splits."""
-
-    mean: float
-    error: float | None
-    """Standard error; None for a single split."""
-    splits: int
-
-
-@dataclass(frozen=True, slots=True)
 class Fraction:
     """Share of right verdicts, with its 95 % interval (Wilson 1927)."""
 
@@ -167,20 +157,20 @@ def over_seeds(figures: Sequence[Sequence[float]]) -> Spread:
 
 def paired_difference(
     ours: Sequence[float], theirs: Sequence[float], test_to_train: float
-) -> Difference:
-    """Mean of `ours - theirs` over all splits of all seeds, and its standard error.
+) -> tuple[float, float | None]:
+    """Return the mean of `ours - theirs` over all splits, and its standard error.
 
     Trainings share most of their grasps, so their errors are not independent: the variance of the
     mean is `(1 / J + test_to_train)` times that of the J differences (Nadeau & Bengio 2003,
     Inference for the Generalization Error). `test_to_train` is the ratio of their grasps; 0 where
-    the trainings differ by their seed alone.
+    the trainings differ by their seed alone. A single split has no error.
     """
     differences = np.array(ours) - np.array(theirs)
-    number = len(differences)
-    if number < 2:
-        return Difference(float(differences.mean()), None, number)
-    variance = float(differences.var(ddof=1)) * (1.0 / number + test_to_train)
-    return Difference(float(differences.mean()), math.sqrt(variance), number)
+    mean = float(differences.mean())
+    if len(differences) < 2:
+        return mean, None
+    variance = float(differences.var(ddof=1)) * (1.0 / len(differences) + test_to_train)
+    return mean, math.sqrt(variance)
 
 
 def wilson(accuracy: float, grasps: int) -> Fraction:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -59,13 +59,9 @@ def _report(summary: SystemSummary) -> Figure:
         fontsize=13,
     )
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.15))
-    panels: tuple[Callable[[Axes, SystemSummary], None], ...] = (
-        _reliability,
-        _coverage,
-        _confusion,
-    )
-    for row, panel in enumerate(panels):
-        panel(figure.add_subplot(grid[row, 0]), summary)
+    _reliability(figure.add_subplot(grid[0, 0]), summary)
+    _coverage(figure.add_subplot(grid[1, 0]), summary)
+    _confusion(figure.add_subplot(grid[2, 0]), summary)
     _objects(figure.add_subplot(grid[:, 1]), summary)
     return figure
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from models.training.evaluating.day_figures import GROUPS, DayFigures
-from models.training.evaluating.metrics import Difference, Spread, paired_difference
-from models.training.evaluating.summaries import HEADLINE, SystemSummary, Variant
+from models.training.evaluating.metrics import Spread, paired_difference
+from models.training.evaluating.summaries import HEADLINE, SystemSummary
 from models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import PaperFigure, SessionFeatures, System
@@ -137,13 +137,11 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
         for name in SYSTEMS
         if (name, "session") in by_group
     }
-    yield _table(
-        ("system", *columns),
-        (
-            (f"`{name}`", *(_value(_f1(variants.get(key))) for key in SESSION_VARIANTS))
-            for name, variants in here.items()
-        ),
-    )
+    shown = []
+    for name, variants in here.items():
+        f1 = {key: variant.spreads["f1"] for key, variant in variants.items()}
+        shown.append((f"`{name}`", *(_value(f1.get(key)) for key in SESSION_VARIANTS)))
+    yield _table(("system", *columns), shown)
     # How right the verdicts of a running session are while it is young.
     young = {name: variants[RUNNING].ages for name, variants in here.items() if RUNNING in variants}
     if young:
@@ -223,8 +221,8 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
     yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best", "best"), rows)
 
 
-def difference(ours: SystemSummary, theirs: SystemSummary, figure: str = "f1") -> Difference | None:
-    """Return our mean figure less theirs on the splits that both have judged.
+def difference(ours: SystemSummary, theirs: SystemSummary) -> tuple[float, float | None] | None:
+    """Return our mean F1 less theirs on the splits that both have judged, and its standard error.
 
     None: no split is the same, for other data or another number of folds, say.
     """
@@ -234,7 +232,7 @@ def difference(ours: SystemSummary, theirs: SystemSummary, figure: str = "f1") -
     pairs = [
         (one, other)
         for seed in seeds
-        for one, other in zip(_of(ours, figure, seed), _of(theirs, figure, seed), strict=True)
+        for one, other in zip(_f1_of(ours, seed), _f1_of(theirs, seed), strict=True)
         if one is not None and other is not None
     ]
     if not pairs:
@@ -243,8 +241,8 @@ def difference(ours: SystemSummary, theirs: SystemSummary, figure: str = "f1") -
     return paired_difference([one for one, _ in pairs], [other for _, other in pairs], overlap)
 
 
-def _of(summary: SystemSummary, figure: str, seed: int) -> list[float | None]:
-    return summary.main.figures[figure][summary.seeds.index(seed)]
+def _f1_of(summary: SystemSummary, seed: int) -> list[float | None]:
+    return summary.main.figures["f1"][summary.seeds.index(seed)]
 
 
 def _everything(summaries: Sequence[SystemSummary]) -> Iterator[str]:
@@ -306,10 +304,6 @@ def _trainings(summary: SystemSummary) -> int:
     return len(summary.seeds) * summary.folds
 
 
-def _f1(variant: Variant | None) -> Spread | None:
-    return None if variant is None else variant.spreads["f1"]
-
-
 def _percent(fraction: float | None) -> str:
     return NOT_RUN if fraction is None else f"{100 * fraction:.1f}"
 
@@ -339,8 +333,8 @@ def _difference(ours: SystemSummary, theirs: SystemSummary | None) -> str:
     gap = difference(ours, theirs)
     if gap is None:
         return NOT_RUN
-    error = "" if gap.error is None else f" +- {100 * gap.error:.1f}"
-    return f"{100 * gap.mean:+.1f}{error}"
+    mean, error = gap
+    return f"{100 * mean:+.1f}" + ("" if error is None else f" +- {100 * error:.1f}")
 
 
 def _duration(seconds: float) -> str:

@@ -54,9 +54,9 @@ def run_jobs(
             yield job, stored
     if not missing:
         return
-    run = _run if dask or processes == 1 else _run_in_process
     with _on_cluster(dask, grasps) if dask else _on_this_machine(processes) as parallel:
-        outcomes = parallel(joblib.delayed(run)(job, grasps) for job in missing)
+        in_process = dask is None and processes > 1
+        outcomes = parallel(joblib.delayed(_run)(job, grasps, in_process) for job in missing)
         with closing(outcomes):  # stops what still runs
             for outcome in outcomes:
                 if not isinstance(outcome, tuple):  # what joblib makes of a cancelled task
@@ -66,14 +66,11 @@ def run_jobs(
                 yield job, result
 
 
-def _run(job: Job, grasps: Grasps) -> tuple[Job, JobResult]:
+def _run(job: Job, grasps: Grasps, in_process: bool) -> tuple[Job, JobResult]:
+    if in_process:
+        # A terminal sends Ctrl-C to the workers, too; it is the first process that ends them.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     return job, jobs.run(job, grasps)
-
-
-def _run_in_process(job: Job, grasps: Grasps) -> tuple[Job, JobResult]:
-    # A terminal sends Ctrl-C to the workers, too; it is the first process that ends them.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return _run(job, grasps)
 
 
 @contextmanager

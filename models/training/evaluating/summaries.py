@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from sklearn.metrics import confusion_matrix
 
 from models.contract import Dataset
 from models.training.arrays import Bools, Ints
@@ -83,7 +84,7 @@ class Variant:
     """By name: of each fold (seeds, folds)."""
     temperature: float
     """Of all margins together; the figures' probabilities are cross-fitted."""
-    confusion: tuple[tuple[int, int], tuple[int, int]]
+    confusion: list[list[int]]
     """Grasps of all seeds: rows stable, slip as it was; columns as it was judged."""
     objects: dict[str, ObjectFigures]
     palms: dict[str, Fraction]
@@ -132,10 +133,6 @@ class SystemSummary:
     def main(self) -> Variant:
         """The variant whose figures are quoted."""
         return self.variants[self.headline]
-
-
-Results = Mapping[int, Sequence[JobResult]]
-"""By seed: the results of all folds."""
 
 
 def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> SystemSummary:
@@ -214,7 +211,8 @@ def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[
     return sorted(found, key=lambda one: (systems.index(one.system), PROTOCOLS.index(one.protocol)))
 
 
-def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
+def _variant(name: str, results: Mapping[int, Sequence[JobResult]], grasps: Grasps) -> Variant:
+    """Return the figures of one way of judging; `results` has, by seed, those of all folds."""
     pools = [_Pool(name, folds, grasps) for folds in results.values()]
     scores = [pool.scores() for pool in pools]
     figures = {
@@ -249,7 +247,7 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
             for metric, values in figures.items()
         },
         temperature=fit_temperature(margins, slipped),
-        confusion=(_counted(verdict[~slipped]), _counted(verdict[slipped])),
+        confusion=confusion_matrix(slipped, verdict, labels=(False, True)).tolist(),
         objects={name: by_object(objects == name) for name in np.unique(objects).tolist()},
         palms={grasps.files[table].name: share(tables == table) for table in np.unique(tables)},
         curve=coverage_curve(probability, slipped),
@@ -259,11 +257,6 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
         ages=[by_age(group, groups == group) for group in np.unique(groups)],
         days=day_figures(name, list(results.values()), grasps) if judged_days else {},
     )
-
-
-def _counted(verdict: Bools) -> tuple[int, int]:
-    """How many are judged stable and slip."""
-    return int((~verdict).sum()), int(verdict.sum())
 
 
 class _Pool:

@@ -14,14 +14,14 @@ from models.training.arrays import Bools, Floats, Floats32
 from models.training.data.augmentation import augment
 from models.training.estimators import graphs
 from models.training.estimators.classical import (
-    ClassicalConfig,
     ClassicalModel,
     classical_margins,
     classical_size,
     fit_classical,
 )
-from models.training.estimators.networks import NetworkConfig, parameter_count
-from models.training.estimators.recipe import AnyRecipe, logits, train_network
+from models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
+from models.training.estimators.networks import parameter_count
+from models.training.estimators.recipe import logits, train_network
 from models.training.systems.system import BlendConfig, System
 
 
@@ -64,7 +64,6 @@ class FittedNetwork(Fitted):
 
     network: nn.Sequential
     shape: tuple[int, ...]
-    threads: int
 
     @property
     def parameters(self) -> int:
@@ -73,7 +72,7 @@ class FittedNetwork(Fitted):
     def margins(self, inputs: Floats32) -> Floats:
         if not len(inputs):
             return np.empty(0)
-        values = logits(self.network, inputs, self.threads)
+        values = logits(self.network, inputs)
         margins: Floats = values[:, 1] - values[:, 0]
         return margins
 
@@ -174,7 +173,7 @@ def _fit_single(
     if recipe is None:
         raise ValueError("a network needs a recipe")
     network = train_network(estimator, inputs, slipped, recipe, seed=seed)
-    return FittedNetwork(network, inputs.shape[1:], recipe.threads)
+    return FittedNetwork(network, inputs.shape[1:])
 
 
 def _fit_blend(blend: BlendConfig, inputs: Floats32, slipped: Bools, seed: int) -> FittedBlend:

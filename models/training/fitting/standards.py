@@ -66,29 +66,17 @@ class TrainingStandards:
             np.stack([one.mean for one in standards]), np.stack([one.spread for one in standards])
         )
 
-    def apply(self, features: Floats, table_of: Ints, clip: float) -> Floats32:
-        """Features (N, M), each standardised by its table. Raises `KeyError` for an unknown one."""
-        return self.each(table_of).apply(features, clip)
-
     def statistics(self) -> SessionStatistics:
         """Those of a new session."""
         return SessionStatistics(self.prior.mean, self.prior.spread, PRIOR_GRASPS)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LaterSession:
-    """By what the test grasps of a later session are standardised, by variant."""
-
-    standards: dict[str, Standards]
-    ages: dict[str, Ints]
-    """Of the running variants, shape (N,): grasps seen before each test grasp."""
-
-
 def later_session(
     features: Floats, test: Ints, pool: Ints, training: TrainingStandards, seed: int
-) -> LaterSession:
-    """All variants of judging the rows `test` of features (all grasps, M).
+) -> tuple[dict[str, Standards], dict[str, Ints]]:
+    """Return standards of the rows `test` of features (all grasps, M), by variant.
 
+    And, of the running variants, the grasps (N,) that were seen before each test grasp.
     Only the rows `pool` calibrate `n5` ... and `all`; in a running session every grasp counts
     once it was judged. Labels are not used.
     """
@@ -99,11 +87,11 @@ def later_session(
         for row in random.permutation(pool)[:number]:
             statistics.observe(features[row])
         standards[f"n{number}"] = Standards(statistics.mean, statistics.spread)
-    ages = {}
+    ages: dict[str, Ints] = {}
     session = np.sort(np.concatenate((test, pool)))
     for variant, order in ((RUNNING, random.permutation(session)), (RUNNING_SORTED, session)):
         standards[variant], ages[variant] = _running(features, order, test, training)
-    return LaterSession(standards, ages)
+    return standards, ages
 
 
 def _running(

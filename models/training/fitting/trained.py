@@ -13,7 +13,7 @@ from models.training.data.datasets import Grasps
 from models.training.fitting.fit import Fitted, fit
 from models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS, seen_counts
 from models.training.fitting.standards import Standards, TrainingStandards
-from models.training.systems.system import SessionFeatures, System, with_recipes
+from models.training.systems.system import SessionFeatures, System
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,7 @@ def train(system: System, grasps: Grasps, seed: int) -> Trained:
     session = isinstance(system.input, SessionFeatures)
     standards = TrainingStandards.of(raw_features(counts), table_of) if session else None
     inputs = _inputs(system, standards, counts, table_of)
-    fitted = fit(with_recipes(system, threads=1), inputs, grasps.slipped, seed=seed)
+    fitted = fit(system, inputs, grasps.slipped, seed=seed)
     sensors = SensorMapping.of(counts, table_of, session=session)
     return Trained(system, fitted, grasps, sensors, standards)
 
@@ -97,7 +97,7 @@ def _inputs(
     if isinstance(system.input, SessionFeatures):
         if standards is None:
             raise ValueError("a session system needs standards")
-        return standards.apply(raw_features(counts), table_of, system.input.clip)
+        return standards.each(table_of).apply(raw_features(counts), system.input.clip)
     return builder(system.input, len(system.fingers)).build_batch(counts)[0]
 
 

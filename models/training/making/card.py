@@ -75,7 +75,7 @@ class Measured(msgspec.Struct, frozen=True):
     spreads: dict[str, Spread]
     temperature: float
     """Makes these margins probabilities; Brier score and the like are cross-fitted."""
-    confusion: tuple[tuple[int, int], tuple[int, int]]
+    confusion: list[list[int]]
     """Rows stable, slip as it was; columns as it was judged."""
     palms: dict[str, Fraction]
     objects: dict[str, ObjectFigures]

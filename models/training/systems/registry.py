@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 
@@ -11,17 +10,21 @@ from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.layout import D1, D2A, D2B, D3
 from models.tactile_image import Composition, Fill, Normalisation
 from models.training.data.augmentation import Augmentation
-from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig
-from models.training.estimators.classical import SvmConfig as Svm
-from models.training.estimators.networks import (
+from models.training.estimators.configs import (
     CNN0,
     CNN1,
     CNN2,
     CNN3,
+    BoostingConfig,
+    ForestConfig,
+    MlpConfig,
     NetworkConfig,
+    PublishedRecipe,
+    Recipe,
     SecondConvolution,
+    SessionRecipe,
 )
-from models.training.estimators.recipe import PublishedRecipe, Recipe, SessionRecipe
+from models.training.estimators.configs import SvmConfig as Svm
 from models.training.systems.system import (
     BlendConfig,
     Member,
@@ -40,7 +43,6 @@ def image(
     return ImageInput(layout, fill.value, Normalisation.FILLED_IMAGE.value, composition.value)
 
 
-EVERY_TABLE = (*WHOLE, NEW_SESSION)
 VECTOR = VectorInput()
 COUNTS = CountsInput()
 IMAGE = image()
@@ -48,10 +50,7 @@ SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
 SHARP_SVM = Svm(c=5.0, gamma=0.02)
-SMALL_SESSION = NetworkConfig(filters=16, hidden=64, dropout=0.3)
 SESSION_RECIPE = SessionRecipe()
-SESSION_SVM = Svm(c=3.0, gamma=0.003)
-SESSION_BOOSTING = BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3)
 
 
 def cnn(
@@ -211,13 +210,13 @@ _SESSION = (
         "svm-session",
         "Support vector machine on session-calibrated features.",
         SESSION,
-        SESSION_SVM,
+        Svm(c=3.0, gamma=0.003),
     ),
     System(
         "hgb-session",
         "Gradient boosting on session-calibrated features.",
         SESSION,
-        SESSION_BOOSTING,
+        BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3),
     ),
     System(
         "cnn1-session",
@@ -230,35 +229,28 @@ _SESSION = (
         "small-session",
         "Conv16 - FC64 on session-calibrated features: under 100,000 parameters.",
         SESSION,
-        SMALL_SESSION,
+        NetworkConfig(filters=16, hidden=64, dropout=0.3),
         SESSION_RECIPE,
-        tables=EVERY_TABLE,
+        tables=(*WHOLE, NEW_SESSION),
     ),
 )
 
 
-def _fewer_fingers() -> Iterator[System]:
-    """The default system for hands with fewer sensors: fewer channels, no padding."""
-    whole = next(system for system in _SESSION if system.name == "small-session")
-    hand: tuple[Finger, ...] = FINGERS
-    for fingers in (*combinations(hand, 1), *combinations(hand, 2)):
-        yield replace(
-            whole,
-            name=f"{whole.name}-{'-'.join(fingers)}",
-            description=f"Conv16 - FC64 on session-calibrated features of {' and '.join(fingers)}.",
-            fingers=fingers,
-        )
+_HAND: tuple[Finger, ...] = FINGERS
+_FEWER_FINGERS = tuple(
+    replace(
+        _SESSION[-1],
+        name=f"small-session-{'-'.join(fingers)}",
+        description=f"Conv16 - FC64 on session-calibrated features of {' and '.join(fingers)}.",
+        fingers=fingers,
+    )
+    for fingers in (*combinations(_HAND, 1), *combinations(_HAND, 2))
+)
+"""The default system for hands with fewer sensors: fewer channels, no padding."""
 
 
 SYSTEMS = {
     system.name: system
-    for system in (
-        *_PAPER,
-        *_LAYOUTS,
-        *_COMPOSITIONS,
-        *_ELECTRODES,
-        *_SESSION,
-        *_fewer_fingers(),
-    )
+    for system in _PAPER + _LAYOUTS + _COMPOSITIONS + _ELECTRODES + _SESSION + _FEWER_FINGERS
 }
 """By name, the paper's first. A new system is one more entry here."""

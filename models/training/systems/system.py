@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
@@ -14,9 +14,7 @@ from models.bts3 import FINGERS, WHOLE
 from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.training.data.augmentation import Augmentation
 from models.training.data.protocols import EvalProtocol
-from models.training.estimators.classical import ClassicalConfig
-from models.training.estimators.networks import NetworkConfig
-from models.training.estimators.recipe import AnyRecipe, PublishedRecipe, Recipe
+from models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
 
 CLIP = 3.0
 """Standardised session features are cut off here: what is farther out is a sensor that moved."""
@@ -97,9 +95,21 @@ def configuration(system: System, *fields: str) -> dict[str, Any]:
     return {name: _plain(getattr(system, name)) for name in names}
 
 
-def with_recipes(system: System, **changes: float) -> System:
-    """The system with these fields changed in each of its recipes: `epochs=2`, `threads=1`."""
-    return _changed(system, changes)
+def with_recipes(system: System, *, epochs: int) -> System:
+    """Return the system with this number of epochs in each of its recipes."""
+    estimator = system.estimator
+    if isinstance(estimator, BlendConfig):
+        members = [
+            dataclasses.replace(member, recipe=_with_epochs(member.recipe, epochs))
+            for member in estimator.members
+        ]
+        estimator = BlendConfig(tuple(members))
+    recipe = _with_epochs(system.recipe, epochs)
+    return dataclasses.replace(system, estimator=estimator, recipe=recipe)
+
+
+def _with_epochs(recipe: AnyRecipe | None, epochs: int) -> AnyRecipe | None:
+    return None if recipe is None else dataclasses.replace(recipe, epochs=epochs)
 
 
 def _plain(value: object) -> Any:  # noqa: ANN401 - JSON
@@ -113,20 +123,3 @@ def _plain(value: object) -> Any:  # noqa: ANN401 - JSON
     else:
         return value
     return {"kind": type(value).__name__, **{name: _plain(getattr(value, name)) for name in names}}
-
-
-T = TypeVar("T")
-
-
-def _changed(value: T, changes: dict[str, Any]) -> T:
-    if isinstance(value, Recipe | PublishedRecipe):
-        return dataclasses.replace(value, **changes)
-    if isinstance(value, tuple):
-        return type(value)(_changed(part, changes) for part in value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        parts = {
-            field.name: _changed(getattr(value, field.name), changes)
-            for field in dataclasses.fields(value)
-        }
-        return dataclasses.replace(value, **parts)
-    return value

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-
-pytest.importorskip("scipy", reason="the train extra is not installed")
-
 from scipy.ndimage import rotate
 
 from models.training.data.augmentation import Augmentation, augment
@@ -52,14 +48,3 @@ def test_rotations_go_ten_degrees_to_either_side() -> None:
         assert sum(matches) == 1
         turned.append(matches[0])
     assert 4 <= sum(turned) <= 16
-
-
-def test_the_sides_are_chosen_by_the_seed() -> None:
-    first, _ = augment(IMAGES, SLIPPED, Augmentation(), seed=5)
-    assert np.array_equal(first, augment(IMAGES, SLIPPED, Augmentation(), seed=5)[0])
-    assert not np.array_equal(first, augment(IMAGES, SLIPPED, Augmentation(), seed=6)[0])
-
-
-def test_vectors_cannot_be_flipped() -> None:
-    with pytest.raises(ValueError, match="only images"):
-        augment(np.zeros((4, 72), np.float32), np.zeros(4, np.bool_), Augmentation(), seed=0)

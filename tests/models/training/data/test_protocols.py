@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from models.training.data.datasets import Grasps, concatenate, read_all
 from models.training.data.protocols import (
-    ABOUT,
-    PROTOCOLS,
     UNKNOWN_OBJECTS,
     EvalProtocol,
     TooFewGraspsError,
@@ -111,12 +106,6 @@ def test_days_have_four_groups_of_objects_at_most(real: Grasps) -> None:
     assert [len(splits("days", real, 0, folds)) for folds in (2, 4, 10)] == [8, 16, 16]
 
 
-def test_only_a_session_has_grasps_to_calibrate_with(real: Grasps) -> None:
-    for protocol in PROTOCOLS:
-        made = splits(protocol, real, seed=0)
-        assert all((split.calibration is not None) == (protocol == "session") for split in made)
-
-
 @pytest.mark.parametrize("protocol", ["cv", *GROUPED])
 def test_the_seed_alone_decides_the_split(protocol: EvalProtocol) -> None:
     grasps = sessions(200)
@@ -188,20 +177,6 @@ def test_data_without_the_papers_unknown_objects_are_refused() -> None:
 
 def test_each_fold_of_each_seed_trains_from_another_start() -> None:
     assert len({fold_seed(seed, fold) for seed in range(10) for fold in range(10)}) == 100
-
-
-def test_every_protocol_is_explained() -> None:
-    assert set(ABOUT) == set(get_args(EvalProtocol)) == set(PROTOCOLS)
-
-
-def test_folds_are_stratified_and_leave_each_grasp_out_once() -> None:
-    slipped = np.arange(200) % 4 == 0
-    fold_of = folds_of(slipped, 10, seed=0)
-    for fold in range(10):
-        inside = fold_of == fold
-        assert (int(inside.sum()), int(slipped[inside].sum())) == (20, 5)
-    assert np.array_equal(fold_of, folds_of(slipped, 10, seed=0))
-    assert not np.array_equal(fold_of, folds_of(slipped, 10, seed=1))
 
 
 def test_too_few_grasps_of_one_class_are_refused() -> None:

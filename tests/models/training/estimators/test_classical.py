@@ -5,18 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from models.inputs import VectorBuilder
-from models.training.estimators.classical import (
+from models.training.estimators.classical import classical_margins, classical_size, fit_classical
+from models.training.estimators.configs import (
     BoostingConfig,
     ClassicalConfig,
     ForestConfig,
     MlpConfig,
     SvmConfig,
-    classical_margins,
-    classical_size,
-    fit_classical,
 )
 from tests.models.training.training_samples import separable_counts
 
@@ -45,8 +41,8 @@ def test_a_positive_margin_says_slip(config: ClassicalConfig) -> None:
 
 def test_an_svm_decides_by_the_radial_kernel() -> None:
     model = fit_classical(SvmConfig(3.0, "auto"), VECTORS, SLIPPED, seed=0)
-    vectors = model.support_vectors_  # type: ignore[attr-defined]
-    weights, bias = model.dual_coef_[0], model.intercept_[0]  # type: ignore[attr-defined]
+    vectors = model.support_vectors_
+    weights, bias = model.dual_coef_[0], model.intercept_[0]
     for reading, margin in zip(VECTORS[:10], classical_margins(model, VECTORS[:10]), strict=True):
         distance = ((vectors - reading) ** 2).sum(axis=1)
         expected = (weights * np.exp(-distance / 72.0)).sum() + bias
@@ -66,7 +62,7 @@ def test_a_perceptron_counts_its_weights_and_keeps_large_margins() -> None:
     margins = classical_margins(model, 20.0 * VECTORS)
     assert np.isfinite(margins).all()
     assert np.abs(margins).max() > 40.0  # where a probability in double precision is 1
-    slip = model.predict_proba(VECTORS)[:, 1]  # type: ignore[attr-defined]
+    slip = model.predict_proba(VECTORS)[:, 1]
     expected = np.log(slip / (1.0 - slip))
     assert classical_margins(model, VECTORS) == pytest.approx(expected, rel=1e-2)
 
@@ -77,7 +73,7 @@ def test_classes_weigh_the_same_however_many_grasps_each_has() -> None:
     inputs = random.normal(size=(400, 72)).astype(np.float32)
     slipped = np.arange(400) % 10 > 0
     model = fit_classical(SvmConfig(0.01, 0.0001), inputs, slipped, seed=0)
-    weights = np.abs(model.dual_coef_[0])  # type: ignore[attr-defined]
+    weights = np.abs(model.dual_coef_[0])
     assert weights.max() / weights.min() == pytest.approx(9.0, rel=0.01)
 
 

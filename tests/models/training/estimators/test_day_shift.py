@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import pytest
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-
 import torch
 
-from models.training.estimators.recipe import DayShift, on_another_day
+from models.training.estimators.configs import DayShift
+from models.training.estimators.recipe import on_another_day
 
 GRASPS = 4000
 

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from models.layout import D1
 from models.tactile_image import TactileImager
-from models.training.estimators.networks import (
+from models.training.estimators.configs import (
     CNN0,
     CNN1,
     CNN2,
     CNN3,
-    Beside,
     NetworkConfig,
     SecondConvolution,
+)
+from models.training.estimators.networks import (
+    Beside,
     build,
     for_inference,
     for_margin,
@@ -121,35 +120,6 @@ def test_weights_start_as_in_keras() -> None:
             assert layer.bias is None or not layer.bias.any()
         if isinstance(layer, nn.BatchNorm2d | nn.BatchNorm1d):
             assert layer.eps == 1e-3
-
-
-@pytest.mark.parametrize("finger", [0, 1, 2])
-def test_each_finger_is_one_input_channel(finger: int, images: NDArray[np.float32]) -> None:
-    with reproducible(seed=2):
-        network = build(TINY).eval()
-    convolution = network[1]
-    assert isinstance(convolution, nn.Conv2d)
-    with torch.no_grad():
-        convolution.weight[:, [other for other in range(3) if other != finger]] = 0.0
-    before = logits(network, images)
-    for changed in range(3):
-        other = images.copy()
-        other[..., changed] = images[::-1, ..., changed]
-        assert np.array_equal(logits(network, other), before) == (changed != finger)
-
-
-def test_rows_and_columns_are_not_swapped(images: NDArray[np.float32]) -> None:
-    """One filter that passes one pixel on shows where the convolution finds it."""
-    with reproducible(seed=2):
-        network = build(TINY).eval()
-    convolution = network[1]
-    assert isinstance(convolution, nn.Conv2d)
-    with torch.no_grad():
-        convolution.weight.zero_()
-        convolution.weight[0, 2, 0, 1] = 1.0  # thumb, the row above the centre
-        seen = network[:2](torch.from_numpy(images))[:, 0].numpy()
-    assert seen.shape == (160, 10, 9)
-    assert np.array_equal(seen, images[:, 0:10, 1:10, 2])
 
 
 def _convolve(planes: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:

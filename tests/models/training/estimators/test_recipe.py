@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from models.inputs import VectorBuilder
 from models.tactile_image import TactileImager
 from models.training.estimators import recipe as recipes
-from models.training.estimators.networks import NetworkConfig, build
-from models.training.estimators.recipe import (
+from models.training.estimators.configs import (
     DayShift,
+    NetworkConfig,
     PublishedRecipe,
     Recipe,
     SessionRecipe,
-    logits,
-    optimization,
-    reproducible,
-    train_network,
 )
+from models.training.estimators.networks import build
+from models.training.estimators.recipe import logits, optimization, reproducible, train_network
 from tests.models.training.training_samples import separable_counts
 
 TINY = NetworkConfig(filters=4, hidden=16)

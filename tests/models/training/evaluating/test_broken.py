@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-
 from models.training.evaluating.broken import KINDS, NUMBERS, broken_study
 from models.training.systems.registry import SYSTEMS
 from tests.models.training.evaluation_samples import sessions

@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("skl2onnx", reason="the train extra is not installed")
-
 from daemon.judge.calibration import SessionCalibration
 from daemon.judge.network import Plausibility
 from models.contract import SessionInput, Sharpness

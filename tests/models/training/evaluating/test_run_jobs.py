@@ -1,4 +1,4 @@
-"""Sweeps: here, in processes, on a cluster that loses a worker, and after an interruption."""
+"""Sweeps: here, on a cluster that loses a worker, and after an interruption."""
 
 from __future__ import annotations
 
@@ -15,34 +15,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("skl2onnx", reason="the train extra is not installed")
-
-import joblib
-from joblib.externals.loky import get_reusable_executor
-
 from models.contract import VectorInput
 from models.training.data.datasets import Grasps
-from models.training.estimators.classical import ForestConfig
-from models.training.estimators.networks import NetworkConfig
-from models.training.estimators.recipe import Recipe
+from models.training.estimators.configs import ForestConfig
 from models.training.evaluating import jobs
 from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.run_jobs import ClusterError, run_jobs
-from models.training.systems.system import SessionFeatures, System
+from models.training.systems.system import System
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(120)
 ROOT = Path(__file__).parents[4]
 START_S = 100.0
 """How long a scheduler or a worker may take to start on a busy machine."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def helpers_of_joblib_run() -> None:
-    """Joblib's resource tracker stays for the life of the process, with its pipes."""
-    joblib.Parallel(n_jobs=2, backend="loky")(joblib.delayed(abs)(value) for value in (1, 2))
-    get_reusable_executor().shutdown(wait=True)
 
 
 def forest(trees: int) -> System:
@@ -63,19 +48,6 @@ def assert_same(ours: dict[Job, JobResult], theirs: dict[Job, JobResult]) -> Non
         assert one.margins.keys() == other.margins.keys()
         for variant, margins in one.margins.items():
             assert np.array_equal(margins, other.margins[variant])
-
-
-def test_two_processes_give_what_one_gives_bit_for_bit(tmp_path: Path) -> None:
-    network = NetworkConfig(filters=4, hidden=8)
-    small = System("small", "A network.", SessionFeatures(), network, Recipe(epochs=2))
-    wanted = [*some_jobs(3), *(Job(small, "objects", 2, fold, 4) for fold in range(3))]
-    alone = dict(run_jobs(wanted, GRASPS, tmp_path / "one"))
-    both = dict(run_jobs(wanted, GRASPS, tmp_path / "two", processes=2))
-    assert_same(both, alone)
-    assert list(alone) == wanted
-    names = {path.name for path in (tmp_path / "one").iterdir()}
-    assert names == {path.name for path in (tmp_path / "two").iterdir()}
-    assert len(names) == 6
 
 
 def test_an_interrupted_sweep_goes_on_and_runs_nothing_twice(
@@ -140,14 +112,7 @@ def cluster(folder: Path) -> Iterator[tuple[str, Process, list[Process]]]:
             )
         )
         address = _address(place)
-        options = (
-            "--nthreads",
-            "1",
-            "--no-nanny",
-            "--no-dashboard",
-            "--local-directory",
-            str(folder),
-        )
+        options = ("--nthreads", "1", "--no-nanny", "--no-dashboard")
         running = [
             stack.enter_context(started("dask_worker", address, *options, folder=folder))
             for _ in range(3)
@@ -161,10 +126,7 @@ def cluster(folder: Path) -> Iterator[tuple[str, Process, list[Process]]]:
 
 @contextlib.contextmanager
 def started(module: str, *arguments: str, folder: Path) -> Iterator[Process]:
-    environment = os.environ | {
-        "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": str(Path(__file__).parents[4]),
-    }
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     with (folder / "cluster.log").open("ab") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.{module}", *arguments],

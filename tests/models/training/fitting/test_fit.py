@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("sklearn", reason="the train extra is not installed")
-
 from models.contract import VectorInput
 from models.inputs import SessionBuilder, builder, raw_features
 from models.tactile_image import TactileImager
 from models.training.data.augmentation import Augmentation
-from models.training.estimators.classical import BoostingConfig, ForestConfig, SvmConfig
-from models.training.estimators.networks import NetworkConfig
-from models.training.estimators.recipe import Recipe
+from models.training.estimators.configs import (
+    BoostingConfig,
+    ForestConfig,
+    NetworkConfig,
+    Recipe,
+    SvmConfig,
+)
 from models.training.fitting.fit import Fitted, FittedBlend, FittedNetwork, fit
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import (

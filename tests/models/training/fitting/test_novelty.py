@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from models.electrodes import NoveltyCheck
 from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen, seen_counts

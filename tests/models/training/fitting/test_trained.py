@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
 from models.training.fitting.trained import SensorMapping

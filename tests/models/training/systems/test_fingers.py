@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("onnx", reason="the train extra is not installed")
-
 from daemon.assembly.assembly import build_pipeline, load_model
 from daemon.scene import parse
 from drivers.base import TactileReading

@@ -1,0 +1,196 @@
+"""What estimators are made from: settings of classifiers, networks and their training.
+
+No library of the training is imported here, so that help and completion know every system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+THREADS = 1
+"""Threads of a training. Fixed, because sums over more threads round differently; one, because two
+that share busy cores wait for each other, and many trainings at once use a machine better."""
+
+
+@dataclass(frozen=True, slots=True)
+class SvmConfig:
+    """Support vector machine with a radial kernel, classes weighted to balance."""
+
+    c: float
+    gamma: float | Literal["auto"]
+    """Of the kernel exp(-gamma * distance**2); auto: one over the number of features."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForestConfig:
+    """Random forest."""
+
+    trees: int
+    depth: int | None
+    """Largest depth of a tree; None: until its leaves are pure."""
+
+
+@dataclass(frozen=True, slots=True)
+class MlpConfig:
+    """Multi-layer perceptron: ReLU, Adam, a fixed number of epochs."""
+
+    hidden: tuple[int, ...]
+    """Units of each hidden layer."""
+    alpha: float = 1e-4
+    """L2 term."""
+    learning_rate: float = 1e-3
+    epochs: int = 100
+
+
+@dataclass(frozen=True, slots=True)
+class BoostingConfig:
+    """Gradient boosting on histograms."""
+
+    iterations: int = 300
+    learning_rate: float = 0.1
+    leaves: int = 31
+    """Largest number of leaves of a tree."""
+    leaf_grasps: int = 20
+    """Fewest grasps in a leaf."""
+    l2: float = 0.0
+    features: float = 1.0
+    """Fraction of the features that a split may choose from."""
+
+
+ClassicalConfig = SvmConfig | ForestConfig | MlpConfig | BoostingConfig
+
+_TREES: dict[str, Sequence[object]] = {"leaves": (8, 15, 31), "features": (0.3, 1.0)}
+GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
+    SvmConfig: [
+        {
+            "c": (0.01, 0.1, 1.0, 3.0, 10.0, 100.0, 1000.0, 5000.0),
+            "gamma": ("auto", 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1),
+        }
+    ],
+    # Odd numbers of trees cannot tie.
+    ForestConfig: [{"trees": (11, 25, 51, 101, 199), "depth": (None, 5, 10, 15, 20, 30)}],
+    MlpConfig: [
+        {"hidden": ((32,), (100,), (300,), (64, 32), (100, 100)), "alpha": (1e-4, 0.1, 1.0)}
+    ],
+    BoostingConfig: [
+        {"iterations": (150,), "learning_rate": (0.1,), **_TREES},
+        {"iterations": (400,), "learning_rate": (0.05,), **_TREES},
+    ],
+}
+"""What a grid search tries, as scikit-learn's `ParameterGrid` takes it. The paper gives the grids
+of the first two; it gives none for perceptrons, and has no boosting."""
+
+
+@dataclass(frozen=True, slots=True)
+class SecondConvolution:
+    """A convolution after the first one and its pooling (valid)."""
+
+    filters: int = 64
+    kernel: int = 1
+    """Side, pixels: the authors' notebooks have 1, the table of the paper has 3."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """A convolutional network: convolution(s), one hidden dense layer, two classes.
+
+    It takes images, or features whose first 24 values per finger become a D1 image inside the
+    network while the rest joins the hidden layer's inputs.
+    """
+
+    filters: int
+    """Filters of the first convolution, 3 x 3, valid."""
+    hidden: int
+    """Units of the hidden dense layer."""
+    pool: bool = False
+    """2 x 2 maximum pooling after the first convolution; an odd row or column is left out."""
+    second: SecondConvolution | None = None
+    dropout: float = 0.0
+    """Fraction of values left out in training, before and after the hidden layer."""
+    batch_norm: bool = True
+    """After each convolution and after the hidden layer; a convolution then needs no bias."""
+
+
+CNN0 = NetworkConfig(filters=32, hidden=128)
+CNN1 = NetworkConfig(filters=32, hidden=1024)
+"""The best network of the paper: Conv32 - FC1024."""
+CNN2 = NetworkConfig(filters=32, hidden=1024, pool=True)
+CNN3 = NetworkConfig(filters=32, hidden=1024, pool=True, second=SecondConvolution())
+
+
+@dataclass(frozen=True, slots=True)
+class DayShift:
+    """How far the features of one day differ from those of another, beyond their standardising.
+
+    Measured by what helped networks on days that they were not trained on; twice as much helps
+    networks of a single training day more, and costs the others.
+    """
+
+    gain: float = 0.3
+    """Each feature is multiplied by `exp(gain * e)`, e standard normal."""
+    finger_gain: float = 0.3
+    """All 24 z-values of a finger are multiplied by the same `exp(finger_gain * e)`."""
+    offset: float = 0.7
+    """Standard deviation of what is added to each finger's mean and to its spread."""
+
+
+DAY_SHIFT = DayShift()
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Settings of one training by a one-cycle AdamW schedule.
+
+    Twenty epochs of one cycle stand for the paper's 300 epochs of Adam at a falling rate; the
+    cross-validated F1 stays within the paper's spread. A remainder of the last batch is left out.
+    """
+
+    epochs: int = 20
+    batch: int = 32
+    peak_learning_rate: float = 1e-3
+    warm_up: float = 0.3
+    """Fraction of the training in which the learning rate rises."""
+    weight_decay: float = 0.5
+    """Decoupled (times the learning rate in each step), on convolution and dense weights only;
+    stands for the paper's L2 term."""
+    label_smoothing: float = 0.0
+    """This much of each target is shared out evenly among both classes."""
+    input_noise: float = 0.0
+    """Standard deviation of the noise added to each input, in the input's own (z-score) units."""
+    norm_momentum: float = 0.1
+    """Weight of a new batch in the running statistics of a batch norm."""
+    threads: int = THREADS
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRecipe(Recipe):
+    """For session features: each batch is seen as it might have been on other days."""
+
+    epochs: int = 40
+    weight_decay: float = 1.0
+    input_noise: float = 0.4
+    day_shift: DayShift = DAY_SHIFT
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedRecipe:
+    """Settings of one training as published: Adam at a rate that falls with every update."""
+
+    epochs: int = 300
+    batch: int = 32
+    learning_rate: float = 1e-4
+    decay: float = 0.005
+    """Keras' time decay: update t (from 0) has the rate `learning_rate / (1 + decay * t)`."""
+    l2: float = 0.01
+    """Keras' kernel regularizer: the loss has `l2 * sum(w**2)` over the weights of every layer
+    but the last."""
+    label_smoothing: float = 0.0
+    input_noise: float = 0.0
+    norm_momentum: float = 0.01
+    """Keras writes it 0.99: the weight of what was."""
+    threads: int = THREADS
+
+
+AnyRecipe = Recipe | PublishedRecipe
