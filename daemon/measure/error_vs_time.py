@@ -66,18 +66,9 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> R
         grasps = grasps.rows(np.arange(0, len(grasps), QUICK_EVERY))
     several = candidates(folders, grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
-    times = measure({each.name: each.step for each in several}, readings, paced)
+    times = measure({row["name"]: step for row, step in several}, readings, paced)
     progress("")
-    rows = [
-        {
-            "name": each.name,
-            "kind": each.kind,
-            "fingers": each.fingers,
-            "error": each.error,
-            "time": times[each.name],
-        }
-        for each in several
-    ]
+    rows = [{**row, "time": times[row["name"]]} for row, _ in several]
     return {
         "machine": {"processor": _processor(), "python": platform.python_version()}
         | {package: version(package) for package in ("numpy", "onnxruntime")},

@@ -51,16 +51,6 @@ class Point:
     """From the error down and up to the ends of its 95 % interval, in %."""
     hollow: bool
 
-    @property
-    def label(self) -> str:
-        """Text beside the point."""
-        return f"{self.name} (default)" if self.name == DEFAULT else self.name
-
-    @property
-    def weight(self) -> str:
-        """Weight of the label's font."""
-        return "bold" if self.name == DEFAULT else "normal"
-
 
 def error_of(row: Row, protocols: Sequence[str]) -> dict[str, float]:
     """Return the figures of the first of these protocols that a row has; empty: none."""
@@ -153,9 +143,11 @@ def name_points(axes: Axes, several: Sequence[Point]) -> None:
     ordered = sorted(several, key=lambda point: point.error)
     heights = np.linspace(0.02, 0.98, len(ordered))
     for point, height in zip(ordered, heights, strict=True):
+        is_default = point.name == DEFAULT
         axes.annotate(
-            point.label, (point.us, point.error), fontsize=FONT_PT, color=COLOURS[point.kind],
-            fontweight=point.weight, va="center",
+            f"{point.name} (default)" if is_default else point.name, (point.us, point.error),
+            fontsize=FONT_PT, color=COLOURS[point.kind],
+            fontweight="bold" if is_default else "normal", va="center",
             xytext=(1.02, height), textcoords="axes fraction",
             arrowprops={"arrowstyle": "-", "lw": 0.6, "color": "#999", "relpos": (0.0, 0.5)},
         )  # fmt: skip

@@ -19,7 +19,7 @@ from daemon.commands.report import add_arguments
 from daemon.measure import streams as module
 from daemon.measure import worth
 from daemon.measure.streams import DRAWS, Stream, stable_of, streams
-from daemon.measure.worth import ALLOWED, ALONE, LEARNING, PUBLISHED, RISK, draw, measured
+from daemon.measure.worth import ALLOWED, ALONE, LEARNING, PUBLISHED, RISK, measured
 from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import Grasps, read_all
 from models.training.systems.system import System
@@ -92,23 +92,6 @@ def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
 
 
 @pytest.fixture(scope="module")
-def pictures() -> tuple[str, str]:
-    """Drawn twice, and before a test counts descriptors: matplotlib keeps its fonts open."""
-    curves = measured([stream(seed) for seed in range(30)])
-    return draw(curves), draw(curves)
-
-
-def test_the_picture_has_every_method_and_is_drawn_the_same_again(
-    pictures: tuple[str, str],
-) -> None:
-    first, second = pictures
-    assert first == second
-    assert first.startswith("<?xml")
-    for colour in ("#c65d21", "#9a8f2f", "#1f6f8b", "#123f50"):
-        assert colour in first
-
-
-@pytest.fixture(scope="module")
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the report, made in this process: it starts slowly."""
     out = tmp_path_factory.mktemp("worth")
@@ -127,10 +110,3 @@ def test_from_tables_to_picture(folder: Path) -> None:
     for name in (PUBLISHED, ALONE, LEARNING, RISK):
         assert re.search(rf"\| {re.escape(name)} +\| (\d+|nan) / \d+ ", text)
     assert (folder / "worth.svg").read_text().count("<svg") == 1
-
-
-def test_a_folder_without_tables_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert worth.run(options("--data", str(tmp_path))) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
