@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from daemon.measure.candidates import candidates
 from daemon.measure.picture import DEFAULT, PANELS, Report, Row, draw, error_of
 from daemon.measure.timing import measure
-from daemon.process.text import complain, markdown_table, progress
+from daemon.process.text import complain, markdown_table, progress, write_lines
 from models import zoo
 from models.contract import ModelError
 from models.training.data.datasets import DatasetError, Grasps, read_all
@@ -56,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2
-    sys.stdout.write(f"{figures if args.json else text}\n")
+    write_lines(figures if args.json else text)
     return 0
 
 

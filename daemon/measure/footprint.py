@@ -78,11 +78,10 @@ def main(arguments: list[str]) -> int:
             importlib.import_module(module)
         meter.take(name)
     gc.freeze()
-    import json
     from contextlib import ExitStack
     from pathlib import Path
 
-    from daemon.process.text import complain
+    from daemon.process.text import complain, write_json
     from daemon.publish.listener import PublishError
     from daemon.scene import SceneError
     from drivers.base import DriverError
@@ -94,7 +93,7 @@ def main(arguments: list[str]) -> int:
     except (SceneError, ModelError, DriverError, PublishError) as error:
         complain(error)
         return WRONG
-    sys.stdout.write(json.dumps(cost) + "\n")
+    write_json(cost)
     return 0
 
 

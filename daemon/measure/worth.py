@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import io
 import itertools
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -20,7 +19,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from daemon.measure.streams import Stream, stable_of, streams
-from daemon.process.text import complain, markdown_table, progress
+from daemon.process.text import complain, markdown_table, progress, write_lines
 from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import DatasetError, read_all
 
@@ -65,13 +64,13 @@ def run(args: argparse.Namespace) -> int:
             several = list(streams(grasps, args.seeds))
         progress("")
         curves = measured(several)
-        text = "\n".join(table(curves)) + "\n"
-        (args.out / "worth.md").write_text(text)
+        text = "\n".join(table(curves))
+        (args.out / "worth.md").write_text(text + "\n")
         (args.out / "worth.svg").write_text(draw(curves))
     except (DatasetError, OSError) as error:
         complain(error)
         return 2
-    sys.stdout.write(text)
+    write_lines(text)
     return 0
 
 
