@@ -142,10 +142,7 @@ def _warnings(wanted: scene.Scene) -> list[str]:
 
 
 def _try_drivers(wanted: scene.Scene) -> int | None:
-    """Construct all drivers, and open those that only read files.
-
-    Return the time between readings, ns; None where only the device knows.
-    """
+    """Construct the drivers, open those of files; return the period, ns, None if unknown."""
     tactile, joints = wanted.tactile, wanted.joints
     driver, *_ = assembly.build_drivers(wanted)
     is_file = isinstance(tactile, scene_drivers.PalmTactile) and "://" not in tactile.source

@@ -136,9 +136,15 @@ def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
         if columns is None:
             yield f"{mark}{what}  -> {advice}" if advice else f"{mark}{what}"
             continue
-        width = max(columns, NARROWEST)
-        yield from _wrapped(what, mark, "   ", width)
-        yield from _wrapped(advice, "   -> ", "      ", width)
+        for text, first in ((what, mark), (advice, "   -> ")):
+            yield from textwrap.wrap(
+                text,
+                max(columns, NARROWEST),
+                initial_indent=first,
+                subsequent_indent=" " * len(first),
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
     levels = [finding.level for finding in findings]
     yield ""
     yield f"{levels.count(Level.ERROR)} wrong, {levels.count(Level.WARNING)} to look at"
@@ -252,17 +258,6 @@ def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> li
         for finding in told
     ]
     return raised + [finding for finding in electrodes if finding not in absent]
-
-
-def _wrapped(text: str, first: str, further: str, width: int) -> list[str]:
-    return textwrap.wrap(
-        text,
-        width,
-        initial_indent=first,
-        subsequent_indent=further,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
 
 
 def _table(electrodes: dict[str, dict[str, list[float]]], columns: int) -> Iterator[str]:

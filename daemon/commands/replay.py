@@ -156,13 +156,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 0 when the recordings were played to their end."""
-    if args.wait is not None and args.publish is None:
-        complain("--wait is for subscribers: it needs --publish")
-        return 2
-    if args.only_lifted and args.recordings and not args.outcomes:
-        complain("--only-lifted says which outcomes are told: it needs --outcomes")
-        return 2
     try:
+        if args.wait is not None and args.publish is None:
+            raise SceneError("--wait is for subscribers: it needs --publish")
+        if args.only_lifted and args.recordings and not args.outcomes:
+            raise SceneError("--only-lifted says which outcomes are told: it needs --outcomes")
         with StopSignal() as stop:
             return _replay(args, stop)
     except (SceneError, ModelError, DriverError, SessionFileError) as error:
@@ -185,7 +183,8 @@ def _where_from(error: Exception) -> str:
 def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     is_demo = not args.recordings
     if is_demo:
-        _choose_demo(args)
+        args.recordings, args.outcomes = [DEMO_DAY], True
+        args.max_slip_when_stable = args.max_slip_when_stable or DEMO_RISK
     source = _source(args)
     parts = _parts(args, source)
     model, pipeline = parts.model, parts.pipeline
@@ -215,7 +214,10 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
             around.add_sockets(sockets)
         around.open_drivers()
         if sockets is not None and args.wait is not None:
-            _wait(sockets, args.wait, stop)
+            came = sockets.wait_for_subscriber(args.wait, stop)
+            if not came and stop.received is None:
+                where = f"{sockets.endpoint} within {args.wait:g} s"
+                raise PublishError(f"nobody subscribed to {where}")
         companions = [*around.companions, *told]
         loop = Loop(parts.drivers, pipeline, around.build_outbox(), stop, companions, timing)
         stack.callback(lambda: shown.summary(pipeline.trust))
@@ -223,13 +225,6 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         stack.callback(controller.tell)
         loop.run()
     return 0 if stop.received is None else 128 + stop.received
-
-
-def _choose_demo(args: argparse.Namespace) -> None:
-    args.recordings = [DEMO_DAY]
-    args.outcomes = True
-    if args.max_slip_when_stable is None:
-        args.max_slip_when_stable = DEMO_RISK
 
 
 class _Tables:
@@ -308,10 +303,7 @@ def _source(args: argparse.Namespace) -> Source:
 
 
 def _parts(args: argparse.Namespace, source: Source) -> Parts:
-    """Make what plays and judges.
-
-    Raises `SessionFileError` if the file of `--session` is no session of this hand.
-    """
+    """Make what plays and judges. Raises `SessionFileError` for a session of another hand."""
     chosen = {}
     if args.model is not None:
         chosen["path" if args.model.endswith(".onnx") else "name"] = args.model
@@ -365,12 +357,6 @@ def _comparisons(
         judge = assembly.build_pipeline(alone, other, pipeline.clock, learns=learns)
         _restore_session(args, source, judge, wanted.hand.fingers)
         yield Comparison(WITHOUT_LEARNING, judge, result)
-
-
-def _wait(sockets: Sockets, timeout_s: float, stop: StopSignal) -> None:
-    """Wait for a subscriber. Raises `PublishError` if there is none in time."""
-    if not sockets.wait_for_subscriber(timeout_s, stop) and stop.received is None:
-        raise PublishError(f"nobody subscribed to {sockets.endpoint} within {timeout_s:g} s")
 
 
 def _endpoint(text: str) -> str:

@@ -75,7 +75,9 @@ def run(args: argparse.Namespace) -> int:
         if args.action == "show":
             _show(wanted, model, as_json=args.json)
         elif args.action == "reset":
-            _reset(wanted)
+            with SessionFile(wanted.session_path) as file:
+                result = "forgotten" if file.remove() else "no session was kept"
+            write_lines(f"{printable(str(wanted.session_path))}: {result}")
         else:
             _seed(wanted, model, args.recordings)
     except (scene.SceneError, ModelError, DriverError, SessionFileError) as error:
@@ -173,13 +175,6 @@ def _learned(kept: KeptSession) -> dict[str, Any] | None:
         "unreported": state.lifts.unreported,
         "proven": state.risk.proven,
     }
-
-
-def _reset(wanted: scene.Scene) -> None:
-    with SessionFile(wanted.session_path) as file:
-        was_kept = file.remove()
-    result = "forgotten" if was_kept else "no session was kept"
-    write_lines(f"{printable(str(wanted.session_path))}: {result}")
 
 
 def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:

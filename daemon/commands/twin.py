@@ -164,7 +164,7 @@ def run(args: argparse.Namespace) -> int:
 
     former = {number: signal.signal(number, ask_to_stop) for number in STOPPING}
     try:
-        injected = SERVE[args.kind](args, _faults(args), stop)
+        injected = SERVE.get(args.kind, _serve_datagrams)(args, _faults(args), stop)
     except (DriverError, ValueError, OSError) as error:
         complain(error)
         return 2
@@ -251,9 +251,5 @@ def _serve_datagrams(
     return twin.injected
 
 
-SERVE = {
-    "spi": _serve_spi,
-    "can": _serve_can,
-    "palm": _serve_datagrams,
-    "joints": _serve_datagrams,
-}
+SERVE = {"spi": _serve_spi, "can": _serve_can}
+"""What serves these kinds; the others send datagrams."""

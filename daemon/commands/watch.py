@@ -8,7 +8,6 @@ import os
 import select
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import zmq
 
@@ -32,17 +31,12 @@ HANDS_MAX = 8
 """Most hands in one page or terminal."""
 FAILED, WRONG = 1, 2
 
+Target = tuple[str, str | None, Path | None]
+"""Endpoint, hand and the daemon's key of what is watched."""
+
 
 class UsageError(Exception):
     """The command line is wrong; the message says how."""
-
-
-class Target(NamedTuple):
-    """What to subscribe to."""
-
-    endpoint: str
-    hand: str | None
-    server_key: Path | None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,9 +84,9 @@ def run(args: argparse.Namespace) -> int:
     try:
         with contextlib.ExitStack() as stack:
             hands = []
-            for target in _targets(args):
-                feed = stack.enter_context(_feed(target, _keys(args, target)))
-                hands.append(HandFeed(feed, View(target.endpoint, target.hand)))
+            for endpoint, hand, server_key in _targets(args):
+                feed = stack.enter_context(_feed(endpoint, _keys(args, server_key)))
+                hands.append(HandFeed(feed, View(endpoint, hand)))
             if args.foxglove:
                 return _foxglove(hands, args.port or FOXGLOVE_PORT)
             return _page(hands, args.port or PORT) if args.web else _terminal(hands)
@@ -101,11 +95,11 @@ def run(args: argparse.Namespace) -> int:
     return WRONG
 
 
-def _feed(target: Target, keys: tuple[bytes, bytes, bytes] | None) -> Feed:
+def _feed(endpoint: str, keys: tuple[bytes, bytes, bytes] | None) -> Feed:
     try:
-        return Feed(target.endpoint, keys)
+        return Feed(endpoint, keys)
     except zmq.ZMQError as error:
-        problem = f"{target.endpoint}: cannot connect there: {error.strerror}"
+        problem = f"{endpoint}: cannot connect there: {error.strerror}"
         raise UsageError(problem) from error
 
 
@@ -117,24 +111,24 @@ def _port(text: str) -> int:
 
 def _targets(args: argparse.Namespace) -> list[Target]:
     endpoints = args.connect or ([] if args.scenes else [ENDPOINT])
-    targets = [Target(endpoint, None, args.server_key) for endpoint in endpoints]
+    targets: list[Target] = [(endpoint, None, args.server_key) for endpoint in endpoints]
     for path in args.scenes:
         wanted = scene.load(path)
         server = args.server_key
         if server is None and wanted.curve is not None:
             server = wanted.curve.secret_key.with_suffix(".key")
-        targets.append(Target(wanted.endpoint, wanted.hand.name, server))
+        targets.append((wanted.endpoint, wanted.hand.name, server))
     if len(targets) > HANDS_MAX:
         raise UsageError(f"{len(targets)} hands are more than the {HANDS_MAX} that can be watched")
     return targets
 
 
-def _keys(args: argparse.Namespace, target: Target) -> tuple[bytes, bytes, bytes] | None:
+def _keys(args: argparse.Namespace, server_key: Path | None) -> tuple[bytes, bytes, bytes] | None:
     if args.keys is None:
         return None
-    if target.server_key is None:
+    if server_key is None:
         raise UsageError("--keys needs --server-key: the daemon's .key file")
-    return load_keys(args.keys, target.server_key)
+    return load_keys(args.keys, server_key)
 
 
 def _terminal(hands: list[HandFeed]) -> int:

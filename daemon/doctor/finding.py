@@ -102,12 +102,6 @@ class Finding:
     cause: Cause | None = None
     advice: str | None = None
 
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for a fault without cause and advice, or said to be fine."""
-        is_fine = self.level is Level.OK
-        if is_fine != (self.cause is None) or is_fine != (not self.advice):
-            raise ValueError(f"{self.what!r} is {self.level}, {self.cause}, {self.advice!r}")
-
 
 class Trouble(NamedTuple):
     """A cause, and what to do about it."""

@@ -9,7 +9,6 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,48 +17,33 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from daemon.measure.picture import Row
 from daemon.measure.timing import Step
 from models.bts3 import FINGERS
-from models.contract import Finger, ModelError
+from models.contract import ModelError
 from models.layout import D1
 from models.runtime import TactileModel
 from models.training.data.datasets import Grasps
 from models.training.estimators.configs import CNN1
 
 CONFIDENCE = 0.95
-Errors = dict[str, dict[str, float]]
-"""By protocol: `f1` with `low` and `high` (95 %), accuracy, brier, ece; all in 0..1."""
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A model or a peer that can be timed."""
-
-    name: str
-    kind: str
-    """`model` or `peer`."""
-    fingers: tuple[Finger, ...]
-    error: Errors
-    step: Step
+Candidate = tuple[Row, Step]
+"""Name, kind, fingers and error of a model or a peer, and what is timed."""
 
 
 def candidates(folders: Sequence[Path], grasps: Grasps) -> list[Candidate]:
-    """Return the models of these folders, and the published code if Keras is installed.
-
-    Raises `ModelError` for a file that is no model or has no card.
-    """
+    """Return the models, and the published code if Keras is installed. Raises `ModelError`."""
     paths = [path for folder in folders for path in sorted(folder.glob("*.onnx"))]
     models = [_model(path, grasps) for path in paths]
     if find_spec("keras") is None:
         return models
-    published = Candidate(
-        "published: loops, Keras predict",
-        "peer",
-        FINGERS,
-        next((model.error for model in models if model.name == "cnn1"), {}),
-        _published(grasps.counts),
-    )
-    return [*models, published]
+    published: Row = {
+        "name": "published: loops, Keras predict",
+        "kind": "peer",
+        "fingers": FINGERS,
+        "error": next((row["error"] for row, _ in models if row["name"] == "cnn1"), {}),
+    }
+    return [*models, (published, _published(grasps.counts))]
 
 
 def _model(path: Path, grasps: Grasps) -> Candidate:
@@ -70,7 +54,8 @@ def _model(path: Path, grasps: Grasps) -> Candidate:
         error = {name: errors(figures) for name, figures in card["protocols"].items()}
     except (OSError, ValueError, KeyError) as problem:
         raise ModelError(f"{card_path}: cannot read the card: {problem}") from problem
-    return Candidate(contract.name, "model", contract.fingers, error, model_step(model, grasps))
+    row = {"name": contract.name, "kind": "model", "fingers": contract.fingers, "error": error}
+    return row, model_step(model, grasps)
 
 
 def model_step(model: TactileModel, grasps: Grasps) -> Step:
@@ -88,7 +73,7 @@ def model_step(model: TactileModel, grasps: Grasps) -> Step:
 
 
 def errors(figures: dict[str, Any]) -> dict[str, float]:
-    """Return the figures of a protocol; F1's interval is Nadeau and Bengio's corrected t-test."""
+    """Return the figures of a protocol, in 0..1; 95 % of F1 by Nadeau and Bengio's t-test."""
     spreads, folds = figures["spreads"], figures["folds"]
     f1 = spreads["f1"]
     share = figures["test_grasps"] / figures["train_grasps"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -19,13 +18,15 @@ import numpy as np
 from daemon.measure.candidates import candidates
 from daemon.measure.picture import DEFAULT, PANELS, Report, Row, draw, error_of
 from daemon.measure.timing import measure
-from daemon.process.text import complain, markdown_table, progress
+from daemon.process.text import complain, markdown_table, progress, write_lines
 from models import zoo
 from models.contract import ModelError
 from models.training.data.datasets import DatasetError, Grasps, read_all
 
 READINGS, PACED = 2000, 300
-QUICK_READINGS, QUICK_PACED, QUICK_GRASPS = 100, 5, 300
+QUICK_READINGS, QUICK_PACED = 100, 5
+QUICK_EVERY = 20
+"""With `--quick`, one of this many grasps is used."""
 COLUMNS = (
     "model",
     "fingers",
@@ -54,29 +55,19 @@ def run(args: argparse.Namespace) -> int:
     except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2
-    sys.stdout.write(f"{figures if args.json else text}\n")
+    write_lines(figures if args.json else text)
     return 0
 
 
 def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> Report:
     """Return the figures of all models in these folders. Raises `ModelError`."""
     if quick:
-        chosen = np.linspace(0, len(grasps) - 1, min(QUICK_GRASPS, len(grasps)))
-        grasps = grasps.rows(chosen.astype(np.int64))
+        grasps = grasps.rows(np.arange(0, len(grasps), QUICK_EVERY))
     several = candidates(folders, grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
-    times = measure({each.name: each.step for each in several}, readings, paced)
+    times = measure({row["name"]: step for row, step in several}, readings, paced)
     progress("")
-    rows = [
-        {
-            "name": each.name,
-            "kind": each.kind,
-            "fingers": each.fingers,
-            "error": each.error,
-            "time": times[each.name],
-        }
-        for each in several
-    ]
+    rows = [{**row, "time": times[row["name"]]} for row, _ in several]
     return {
         "machine": {"processor": _processor(), "python": platform.python_version()}
         | {package: version(package) for package in ("numpy", "onnxruntime")},

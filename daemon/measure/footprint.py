@@ -55,9 +55,9 @@ class Meter:
         self.parts.append(_added(name, self._last, now))
         self._last = now
 
-    def whole(self, name: str) -> dict[str, float | str]:
+    def whole(self) -> dict[str, float | str]:
         """Return what was added until the last call of `take`."""
-        return _added(name, self._first, self._last)
+        return _added("all", self._first, self._last)
 
 
 def main(arguments: list[str]) -> int:
@@ -78,11 +78,10 @@ def main(arguments: list[str]) -> int:
             importlib.import_module(module)
         meter.take(name)
     gc.freeze()
-    import json
     from contextlib import ExitStack
     from pathlib import Path
 
-    from daemon.process.text import complain
+    from daemon.process.text import complain, write_json
     from daemon.publish.listener import PublishError
     from daemon.scene import SceneError
     from drivers.base import DriverError
@@ -94,7 +93,7 @@ def main(arguments: list[str]) -> int:
     except (SceneError, ModelError, DriverError, PublishError) as error:
         complain(error)
         return WRONG
-    sys.stdout.write(json.dumps(cost) + "\n")
+    write_json(cost)
     return 0
 
 
@@ -115,14 +114,12 @@ def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[s
     readings = _readings(wanted, drivers[0], model.contract.seen)
     _judge(next(readings), pipeline, outbox)
     meter.take("first reading")
-    start = meter.whole("all")
-    timed = _timed(readings, pipeline, outbox)
     return {
         "parts": meter.parts,
-        "start": start,
+        "start": meter.whole(),
+        "timed": _timed(readings, pipeline, outbox),
         "peak_kib": _status("VmHWM"),
         "modules": sorted(sys.modules),
-        "timed": timed,
     }
 
 
@@ -200,53 +197,46 @@ def _readings(wanted: Scene, driver: Driver, seen: SeenCounts) -> Iterator[Readi
         if wanted.joints is not None:
             angles = np.array([0.2, 0.2 + hall_rad * (number % 2)])
             yield JointReading(now_ns, number, ("FFJ3", "MFJ3"), angles, made_ns)
-        sound = np.zeros(counts.shape, dtype=np.uint8)
-        yield TactileReading(now_ns, number, counts, sound, recorded_ns=made_ns)
+        yield TactileReading(
+            now_ns, number, counts, np.zeros_like(counts, np.uint8), recorded_ns=made_ns
+        )
 
 
-def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, int, bool] | None:
-    """Return ns of CPU for judging and for reporting, and if the network ran; None for joints."""
+def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> dict[str, int]:
+    """Return ns of CPU by what was done: `reading`, `judged` if the network ran, `report`."""
     from drivers.base import JointReading
 
     if isinstance(reading, JointReading):
         pipeline.observe_joints(reading)
-        return None
+        return {}
     begun_ns = time.thread_time_ns()
     judgement = pipeline.judge(reading)
     judged_ns = time.thread_time_ns()
     outbox.verdict(judgement, judgement.t_ns, SILENCE_NS)
-    ran = judgement.moment.judged or judgement.judged_counts is not None
-    return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, ran
+    took = {"reading": judged_ns - begun_ns, "report": time.thread_time_ns() - judged_ns}
+    if judgement.moment.judged or judgement.judged_counts is not None:
+        took["judged"] = took["reading"]
+    return took
 
 
 def _timed(
     readings: Iterator[Reading], pipeline: Pipeline, outbox: Outbox
 ) -> dict[str, dict[str, float]]:
-    """Return quantiles of CPU time: of all readings, those judged, and reporting."""
-    times_ns: dict[str, list[int]] = {"reading": [], "judged": [], "report": []}
+    """Return quantiles of CPU time by what was done."""
+    times_ns: dict[str, list[int]] = {"reading": []}
     for reading in readings:
         if pipeline.on_request and len(times_ns["reading"]) % ASK_EVERY == 0:
             pipeline.ask()
-        took = _judge(reading, pipeline, outbox)
-        if took is None:
-            continue
-        judge_ns, report_ns, ran = took
-        times_ns["reading"].append(judge_ns)
-        times_ns["report"].append(report_ns)
-        if ran:
-            times_ns["judged"].append(judge_ns)
+        for name, took_ns in _judge(reading, pipeline, outbox).items():
+            times_ns.setdefault(name, []).append(took_ns)
         if len(times_ns["reading"]) == READINGS:
             break
-    return {name: _quantiles(values) for name, values in times_ns.items() if values}
-
-
-def _quantiles(times_ns: list[int]) -> dict[str, float]:
-    ordered, count = sorted(times_ns), len(times_ns)
-    return {
-        "number": count,
-        "p50_us": ordered[count // 2] / 1e3,
-        "p99_us": ordered[(99 * count) // 100] / 1e3,
-    }
+    quantiles = {}
+    for name, values in times_ns.items():
+        ordered, count = sorted(values), len(values)
+        p50_ns, p99_ns = ordered[count // 2], ordered[(99 * count) // 100]
+        quantiles[name] = {"number": count, "p50_us": p50_ns / 1e3, "p99_us": p99_ns / 1e3}
+    return quantiles
 
 
 def _now() -> dict[str, float]:

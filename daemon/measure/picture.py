@@ -12,9 +12,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties
-from matplotlib.textpath import TextPath
-from matplotlib.transforms import Bbox
 
 Report = dict[str, Any]
 """Figures in `error-vs-time.json`."""
@@ -53,16 +50,6 @@ class Point:
     reach: tuple[float, float]
     """From the error down and up to the ends of its 95 % interval, in %."""
     hollow: bool
-
-    @property
-    def label(self) -> str:
-        """Text beside the point."""
-        return f"{self.name} (default)" if self.name == DEFAULT else self.name
-
-    @property
-    def weight(self) -> str:
-        """Weight of the label's font."""
-        return "bold" if self.name == DEFAULT else "normal"
 
 
 def error_of(row: Row, protocols: Sequence[str]) -> dict[str, float]:
@@ -108,9 +95,6 @@ def draw(report: Report) -> str:
         _draw_panel(axes, several, asked)
     panels[-1].set_xlabel("time of a reading, input and network, paced at 100 Hz, p50, us")
     figure.suptitle(_title(report), fontsize=11)
-    figure.draw_without_rendering()  # so that all have a place
-    for axes, several in zip(panels, drawn, strict=True):
-        name_points(axes, several)
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     return text.getvalue()
@@ -151,45 +135,19 @@ def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
         axes.set_ylim(max(low - margin, 0.0), min(high + margin, ERROR_MAX))
     axes.set_ylabel(f"{asked}\n1 - F1, %")
     axes.grid(alpha=0.25)
+    name_points(axes, several)
 
 
 def name_points(axes: Axes, several: Sequence[Point]) -> None:
-    """Put each name where it covers nothing, as near to its point as can be."""
-    where = axes.get_window_extent()
-    at = {point: axes.transData.transform((point.us, point.error)) for point in several}
-    reach = 0.5 * MARKER_PT + 1.0
-    taken = [Bbox.from_extents(x - reach, y - reach, x + reach, y + reach) for x, y in at.values()]
-    for point in sorted(several, key=lambda point: -at[point][1]):
-        x, y = (float(each) for each in at[point])
-        near, *others = _places(x, y, _width(point))
-        free = (box for box in (near, *others) if _is_free(box, taken, where))
-        box = next(free, near)
-        taken.append(box)
+    """Put the names in a column beside the panel, in the order of the errors."""
+    ordered = sorted(several, key=lambda point: point.error)
+    heights = np.linspace(0.02, 0.98, len(ordered))
+    for point, height in zip(ordered, heights, strict=True):
+        is_default = point.name == DEFAULT
         axes.annotate(
-            point.label, (point.us, point.error), fontsize=FONT_PT, color=COLOURS[point.kind],
-            fontweight=point.weight, va="center", zorder=6,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.4},
-            xytext=(box.x0 - x, 0.5 * (box.y0 + box.y1) - y), textcoords="offset points",
-            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": "#999", "shrinkB": 4},
+            f"{point.name} (default)" if is_default else point.name, (point.us, point.error),
+            fontsize=FONT_PT, color=COLOURS[point.kind],
+            fontweight="bold" if is_default else "normal", va="center",
+            xytext=(1.02, height), textcoords="axes fraction",
+            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": "#999", "relpos": (0.0, 0.5)},
         )  # fmt: skip
-
-
-def _width(point: Point) -> float:
-    """Return the width of its name with a margin, in points."""
-    font = FontProperties(size=FONT_PT, weight=point.weight)
-    return float(TextPath((0.0, 0.0), point.label, prop=font).get_extents().width) + 3.0
-
-
-def _places(x: float, y: float, width: float) -> Iterator[Bbox]:
-    """Yield places for a name of this width, the nearest first, in points."""
-    height = 1.2 * FONT_PT
-    for distance in np.arange(MARKER_PT, 400.0, 4.0):
-        for angle in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
-            across, up = distance * np.cos(angle), distance * np.sin(angle)
-            left = x + across - (0.0 if across >= 0.0 else width)
-            yield Bbox.from_bounds(left, y + up - 0.5 * height, width, height)
-
-
-def _is_free(box: Bbox, taken: Sequence[Bbox], within: Bbox) -> bool:
-    is_inside = within.contains(*box.min) and within.contains(*box.max)
-    return is_inside and not any(box.overlaps(other) for other in taken)

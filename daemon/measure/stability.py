@@ -18,7 +18,14 @@ from typing import Any
 from xml.etree import ElementTree
 
 from daemon.process.extras import needs
-from daemon.process.text import complain, markdown_table, printable, progress
+from daemon.process.text import (
+    complain,
+    markdown_table,
+    printable,
+    progress,
+    write_json,
+    write_lines,
+)
 from models import zoo
 from models.bts3 import TABLES
 from models.contract import ModelError
@@ -71,10 +78,10 @@ def run(args: argparse.Namespace) -> int:
         return WRONG
     broken = sum(row["bounds"] != "kept" for row in rows)
     if args.json:
-        sys.stdout.write(json.dumps({"rows": rows, "broken": broken, "machine": _machine()}) + "\n")
+        write_json({"rows": rows, "broken": broken, "machine": _machine()})
     else:
-        sys.stdout.writelines(f"{printable(line)}\n" for line in _markdown(rows))
-        sys.stdout.write(f"\n{broken} of {len(rows)} rows break a bound. {_machine()}.\n")
+        write_lines(*map(printable, _markdown(rows)))
+        write_lines("", f"{broken} of {len(rows)} rows break a bound. {_machine()}.")
     return BROKEN if broken else 0
 
 

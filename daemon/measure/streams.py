@@ -35,8 +35,6 @@ DRAWS: Final = 2
 class Stream:
     """The grasps of one table and fold in random order."""
 
-    protocol: str
-    table: str
     margins: NDArray[np.float64]
     """Log-odds of slip (N,) of graspd's network."""
     features: NDArray[np.float32]
@@ -45,64 +43,35 @@ class Stream:
     """Log-odds of slip (N,) of the published network."""
     slipped: NDArray[np.bool_]
 
-    def rows(self) -> Iterator[tuple[float, NDArray[np.float32], bool]]:
-        """Margin, features and outcome of each grasp."""
-        yield from zip(self.margins.tolist(), self.features, self.slipped.tolist(), strict=True)
 
+def streams(
+    grasps: Grasps, seeds: int, folds: int = DAYS_FOLDS, epochs: int | None = None
+) -> Iterator[Stream]:
+    """Train the networks of each day and fold; yield the streams of the three tables.
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """How much is trained."""
-
-    seeds: int
-    """Splits of the objects, and trainings of each fold."""
-    folds: int = DAYS_FOLDS
-    """Folds of each split that are judged."""
-    epochs: int | None = None
-    """None: as many as the systems have themselves."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Life:
-    """What was said of a stream's grasps (N,), each after the outcomes of those before it."""
-
-    p_slip: NDArray[np.float64]
-    stable: NDArray[np.bool_]
-    within: bool
-    """True if slips among stable lifts never exceeded the bound."""
-
-
-def streams(grasps: Grasps, plan: Plan) -> Iterator[Stream]:
-    """Train the networks of each day and fold; yield the streams of the three tables."""
+    Objects are split `seeds` times, and `folds` of each split are judged. `epochs` None are as many
+    as the systems have themselves.
+    """
+    systems = [SYSTEMS[name] for name in (OWN, PUBLISHED)]
+    if epochs is not None:
+        systems = [with_recipes(system, epochs=epochs) for system in systems]
     names = np.array([file.name for file in grasps.files])[grasps.table_of]
-    for seed, fold in itertools.product(range(plan.seeds), range(plan.folds)):
+    for seed, fold in itertools.product(range(seeds), range(folds)):
         fold_of = object_folds(grasps.objects, DAYS_FOLDS, seed)
         for protocol, training, tables in DAYS:
-            progress(
-                f"seed {seed + 1} of {plan.seeds}, fold {fold + 1} of {plan.folds}, {protocol}"
-            )
+            progress(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {protocol}")
             others = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
             random = np.random.default_rng([seed, fold])
-            kinds, rows = [], []
+            rows = []
             for table, _ in itertools.product(tables, range(DRAWS)):
                 inside = np.flatnonzero((names == table) & (fold_of == fold))
-                kinds.append(table)
                 rows.append(random.permutation(inside))
             counts = [grasps.counts[chosen] for chosen in rows]
             own, published = (
-                judged(_system(name, plan), others, counts, fold_seed(seed, fold))
-                for name in (OWN, PUBLISHED)
+                judged(system, others, counts, fold_seed(seed, fold)) for system in systems
             )
-            for table, chosen, (margins, features), (theirs, _) in zip(
-                kinds, rows, own, published, strict=True
-            ):
-                slipped = grasps.slipped[chosen]
-                yield Stream(protocol, table, margins, features, theirs, slipped)
-
-
-def _system(name: str, plan: Plan) -> System:
-    system = SYSTEMS[name]
-    return system if plan.epochs is None else with_recipes(system, epochs=plan.epochs)
+            for chosen, (margins, features), (theirs, _) in zip(rows, own, published, strict=True):
+                yield Stream(margins, features, theirs, grasps.slipped[chosen])
 
 
 def judged(
@@ -130,20 +99,16 @@ def judged(
     return answers
 
 
-def live(stream: Stream, limits: RiskLimits, *, every: bool) -> Life:
-    """Judge, lift and tell one grasp after the other.
-
-    Without `every`, only stable and supervised grasps are lifted and their outcomes told.
-    """
-    trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
-    p_slip, stable, within = np.empty(count), np.zeros(count, np.bool_), True
-    for index, (margin, row, slipped) in enumerate(stream.rows()):
-        grasp = GraspId(stream.table, index)
-        assessed = trust.judge(grasp, sigmoid(margin), margin, row)
-        p_slip[index] = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
-        stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5
-        trust.note(grasp, assessed, stable=bool(stable[index]))
-        if every or stable[index] or assessed.supervised:
-            trust.outcome(grasp, slipped=slipped)
-        within &= trust.risk.bound is None or trust.risk.slips <= trust.risk.bound + 1e-9
-    return Life(p_slip, stable, within)
+def stable_of(stream: Stream, limits: RiskLimits) -> NDArray[np.bool_]:
+    """Judge, lift and tell one grasp after the other; return which were said to be stable (N,)."""
+    trust = Trust("worth", stream.features.shape[1], limits)
+    verdicts = []
+    for index, margin in enumerate(stream.margins.tolist()):
+        grasp = GraspId("worth", index)
+        assessed = trust.judge(grasp, sigmoid(margin), margin, stream.features[index])
+        p_slip = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
+        stable = assessed.permission is Permission.ALLOWED and p_slip < 0.5
+        trust.note(grasp, assessed, stable=stable)
+        trust.outcome(grasp, slipped=bool(stream.slipped[index]))
+        verdicts.append(stable)
+    return np.array(verdicts, np.bool_)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import io
 import itertools
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -19,8 +18,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from daemon.measure.streams import Plan, Stream, live, streams
-from daemon.process.text import complain, markdown_table, progress
+from daemon.measure.streams import Stream, stable_of, streams
+from daemon.process.text import complain, markdown_table, progress, write_lines
 from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import DatasetError, read_all
 
@@ -29,7 +28,8 @@ TOLD: Final = (0, 10, 25, 50, 75, 100, 150, 200, 250, 300)
 """Ends of the parts that the figures are means of, outcomes."""
 LEAST: Final = 100
 """Parts with fewer grasps in all streams are left out."""
-QUICK_GRASPS: Final = 240
+QUICK_EVERY: Final = 20
+"""With `--quick`, one of this many grasps is used."""
 PUBLISHED, ALONE, LEARNING, RISK = (
     "the published method (cnn1)",
     "graspd, nothing told",
@@ -56,22 +56,21 @@ def run(args: argparse.Namespace) -> int:
     """Measure, draw and print; 2 if data or folder are wrong."""
     try:
         grasps = read_all(args.data)
-        plan = Plan(args.seeds)
-        if args.quick:
-            plan = Plan(seeds=1, folds=1, epochs=1)
-            chosen = np.linspace(0, len(grasps) - 1, min(QUICK_GRASPS, len(grasps)))
-            grasps = grasps.rows(chosen.astype(np.int64))
         args.out.mkdir(parents=True, exist_ok=True)
-        several = list(streams(grasps, plan))
+        if args.quick:
+            grasps = grasps.rows(np.arange(0, len(grasps), QUICK_EVERY))
+            several = list(streams(grasps, seeds=1, folds=1, epochs=1))
+        else:
+            several = list(streams(grasps, args.seeds))
         progress("")
         curves = measured(several)
-        text = "\n".join(table(curves)) + "\n"
-        (args.out / "worth.md").write_text(text)
+        text = "\n".join(table(curves))
+        (args.out / "worth.md").write_text(text + "\n")
         (args.out / "worth.svg").write_text(draw(curves))
     except (DatasetError, OSError) as error:
         complain(error)
         return 2
-    sys.stdout.write(text)
+    write_lines(text)
     return 0
 
 
@@ -81,13 +80,11 @@ Curves = dict[str, list[WorthPoint]]
 
 def measured(several: Sequence[Stream]) -> Curves:
     """Return how often `stable` was said and slipped, over all streams together."""
-    learning = [live(one, RiskLimits(), every=True) for one in several]
-    risk = [live(one, RiskLimits(ALLOWED), every=True) for one in several]
     said = {
         PUBLISHED: [one.published < 0.0 for one in several],
         ALONE: [one.margins < 0.0 for one in several],
-        LEARNING: [life.stable for life in learning],
-        RISK: [life.stable for life in risk],
+        LEARNING: [stable_of(one, RiskLimits()) for one in several],
+        RISK: [stable_of(one, RiskLimits(ALLOWED)) for one in several],
     }
     slipped = [one.slipped for one in several]
     return {name: _curve(stable, slipped) for name, stable in said.items()}

@@ -11,14 +11,12 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.publish.messages import OutcomeMessage, decode_outcome
+from daemon.publish.messages import decode_outcome
 from daemon.record.mcap import McapReader, RecordedMessage
 from daemon.record.topics import Judged, Topic, decode_judged
+from daemon.trust.lift_book import GraspId
 from drivers.base import ELECTRODES, RecordingError
 from drivers.recordings.csv_rows import OBJECT, SLIPPED, electrode_columns, open_recording
-
-GraspId = tuple[str, int]
-"""Boot id and number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,21 +51,14 @@ class Export:
     """Last judged counts of each grasp."""
 
     def take(self, message: RecordedMessage) -> GraspId | None:
-        """Take the next message; return the grasp of an outcome.
-
-        Raises `ValueError` or `OverflowError` for a malformed message.
-        """
+        """Take a message; return the grasp of an outcome. Raises `ValueError`, `OverflowError`."""
         if message.kind == Topic.JUDGED:
             judgement = decode_judged(message.payload)
-            self.judged[judgement.boot_id, judgement.grasp] = judgement
+            self.judged[GraspId(judgement.boot_id, judgement.grasp)] = judgement
         if message.kind != Topic.OUTCOME:
             return None
         outcome = decode_outcome(message.payload)
-        grasp = outcome.grasp_boot_id or outcome.boot_id, outcome.grasp
-        self._join(grasp, outcome)
-        return grasp
-
-    def _join(self, grasp: GraspId, outcome: OutcomeMessage) -> None:
+        grasp = GraspId(outcome.grasp_boot_id or outcome.boot_id, outcome.grasp)
         judged = self.judged.get(grasp)
         if judged is None:
             self.unjoined += 1
@@ -77,6 +68,7 @@ class Export:
             shape = len(self.fingers), ELECTRODES
             counts = np.array(judged.counts, dtype=np.uint16).reshape(shape)
             self.grasps[grasp] = Grasp(counts, outcome.outcome == "slip", outcome.object)
+        return grasp
 
     def leave_out_repeats(self) -> None:
         """Keep the first of the grasps that have the same counts, and count the others."""

@@ -35,19 +35,13 @@ class Retention:
         return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{number:04}{ending}"
 
     def make_room(self, expected_bytes: int) -> int:
-        """Delete the oldest recordings until one of `expected_bytes` fits; count them.
-
-        Raises `OSError`.
-        """
+        """Delete the oldest recordings until `expected_bytes` fit; count them. Raises `OSError`."""
         self.directory.mkdir(parents=True, exist_ok=True)
         recordings = self._recordings()
-        total = sum(size for _, size in recordings.values())
+        total = expected_bytes + sum(size for _, size in recordings.values())
         removed = 0
-        for stamp in sorted(recordings):
-            few = len(recordings) - removed < self.keep_files
-            if few and total + expected_bytes <= self.keep_bytes:
-                break
-            paths, size = recordings[stamp]
+        while recordings and (len(recordings) >= self.keep_files or total > self.keep_bytes):
+            paths, size = recordings.pop(min(recordings))
             for path in paths:
                 path.unlink(missing_ok=True)
             total -= size

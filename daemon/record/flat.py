@@ -34,10 +34,7 @@ def table(values: object) -> object:
 
 
 def schema_of(message: type[msgspec.Struct]) -> JsonSchema:
-    """Return the JSON Schema of what `flat` makes of messages of a type.
-
-    Raises `TypeError` for a field that no viewer could read.
-    """
+    """Return the schema of flat messages. Raises `TypeError` for a field no viewer can read."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **_schema(inspect.type_info(message)),

@@ -26,11 +26,7 @@ class Tap:
         encode: Callable[..., bytes],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`ending` is that of the file.
-
-        `encode` makes the bytes of an entry from its monotonic time, ns, the offset of the wall
-        clock, ns, and the parts of the entry.
-        """
+        """`encode` takes an entry's monotonic time and the wall clock's offset, ns; its parts."""
         self.ending = ending
         self.encode = encode
         self._clock = clock

@@ -127,10 +127,7 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """Return name and JSON Schema of each topic's messages.
-
-    Viewers know `foxglove.RawImage` and `foxglove.Log` by name.
-    """
+    """Return name and JSON Schema by topic. Viewers know those of `foxglove` by name."""
     described = {}
     for topic, message in MESSAGES.items():
         family = "foxglove" if message in (RawImage, Log) else "graspd"

@@ -8,14 +8,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import version
-from pathlib import Path
 
 import pytest
 import zmq
 
 from daemon.cli import COMMANDS, LIBRARIES, whole_parser
 from daemon.commands.arguments import Parser
-from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.conftest import ROOT
 from tests.daemon.processes import GRASPD, graspd
 
@@ -114,12 +112,6 @@ def test_what_is_mistyped_is_answered_with_the_nearest(arguments: list[str], mea
     assert done.stderr.endswith(f"; did you mean {meant}?\n")
 
 
-def test_without_a_command_it_names_all_that_there_are() -> None:
-    bare = graspd()
-    assert (bare.returncode, bare.stdout) == (2, "")
-    assert bare.stderr == graspd("--help").stdout
-
-
 def test_a_value_may_look_like_an_option_behind_two_dashes() -> None:
     done = graspd("run", "--", "--scene.toml")
     assert "graspd: --scene.toml: cannot read the scene" in done.stderr
@@ -151,27 +143,12 @@ def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:
     return text
 
 
-SETTINGS = pytest.mark.parametrize(
+@pytest.mark.parametrize(
     ("setting", "is_coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
 )
-
-
-@SETTINGS
 def test_verdicts_are_coloured_on_a_terminal_that_wants_it(
     setting: dict[str, str], is_coloured: bool
 ) -> None:
     text = on_a_terminal(setting, "replay", "--verbose")
     assert (b"\x1b[32mstable" in text) == is_coloured
-    assert (b"\x1b" in text) == is_coloured
-
-
-@SETTINGS
-def test_so_is_what_the_doctor_finds(
-    setting: dict[str, str], is_coloured: bool, tmp_path: Path
-) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_RECORDING}"]\n')
-    text = on_a_terminal(setting, "doctor", "--listen", "0.3", str(scene))
-    assert b"ok " in text
-    assert (b"\x1b[32mok \x1b[0m" in text) == is_coloured
     assert (b"\x1b" in text) == is_coloured

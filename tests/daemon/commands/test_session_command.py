@@ -172,21 +172,6 @@ def test_a_young_session_is_hardly_ever_sure_and_then_right(bts3_dir: Path) -> N
     assert all(sure)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("replay", "--model", "cnn1", "--session", "x.json"), "cnn1 keeps no session"),
-        (("replay", "--session", "nowhere.json"), "nowhere.json: cannot read the session"),
-        (("session", "show", "nowhere.toml"), "nowhere.toml: cannot read the scene"),
-    ],
-)
-def test_a_session_that_cannot_be_had_is_one_line(arguments: tuple[str, ...], says: str) -> None:
-    result = graspd(*arguments)
-    assert result.returncode == 2
-    assert says in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-
-
 def test_a_model_that_learns_nothing_says_so(tmp_path: Path, bts3_dir: Path) -> None:
     path = tmp_path / "scene.toml"
     scene = SCENE.format(recording=bts3_dir / "palm_45.csv", model="cnn1")
@@ -194,20 +179,3 @@ def test_a_model_that_learns_nothing_says_so(tmp_path: Path, bts3_dir: Path) -> 
     result = graspd("session", "show", path)
     assert result.returncode == 2
     assert result.stderr == "graspd: the model cnn1 keeps no session\n"
-
-
-@pytest.mark.parametrize("confidence", [0.5, 0.8])
-def test_the_confidence_of_the_scene_is_the_one_that_is_checked(
-    tmp_path: Path, confidence: float
-) -> None:
-    path = tmp_path / "scene.toml"
-    scene = SCENE.format(recording=DEMO_TABLE, model="small-session")
-    path.write_text(
-        scene.replace('"small-session"', f'"small-session"\nmin_confidence = {confidence}')
-        + '\n[publish]\nendpoint = "ipc://'
-        + str(tmp_path / "s")
-        + '"\n'
-    )
-    checked = graspd("check", path)
-    assert checked.returncode == 0, checked.stderr
-    assert ("unknown below a confidence of 0.80" in checked.stdout) is (confidence > 0.5)

@@ -93,7 +93,6 @@ def test_a_recording_teaches_as_the_table_of_its_grasps_does(tmp_path: Path) -> 
     recording = tmp_path / "monday.mcap"
     writer = Writer(recording)
     for number, row in enumerate(ROWS, 1):
-        writer.tactile(row.counts)
         writer.judged(number, row.counts)
         writer.outcome(number, "slip" if row.annotation.slipped else "stable")
     writer.close()

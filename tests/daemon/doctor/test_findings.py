@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause, Finding, Level
+from daemon.doctor.finding import Cause, Level
 from daemon.doctor.link import COUNTERS, counter_findings, device_findings, rate_finding
 from daemon.record.player import McapCounters
 from drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
@@ -256,14 +256,3 @@ def test_counters_that_are_told_exist_and_have_a_cause_and_advice() -> None:
             assert finding.cause
             assert finding.advice
             assert finding.what == f"x: 1000 {name.replace('_', ' ')}"
-
-
-def test_no_fault_can_be_said_to_be_fine_and_none_goes_without_advice() -> None:
-    for level, cause, advice in (
-        (Level.OK, Cause.SLOW, "wait"),
-        (Level.ERROR, None, "wait"),
-        (Level.ERROR, Cause.SLOW, ""),
-        (Level.WARNING, Cause.SLOW, None),
-    ):
-        with pytest.raises(ValueError, match="something"):
-            Finding(level, "something", cause, advice)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.judge.reasons import Decision, GateState
-from daemon.publish.messages import OutcomeMessage, Tactile, Verdict, encode
+from daemon.publish.messages import OutcomeMessage, encode
 from daemon.record.export import collect
 from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapWriter
@@ -27,7 +26,6 @@ from models.training.data.datasets import read_table
 from tests.kit.inside import graspd
 
 BOOT = "0123456789abcdef" * 2
-PERIOD_NS = 10_000_000
 Ending = Literal["stable", "slip"]
 HEADER = RecordingHeader(
     fingers=("ff", "mf", "th"),
@@ -47,50 +45,11 @@ class Writer:
         self._file = McapWriter(path, replace(HEADER, boot_id=boot_id))
         self._boot_id = boot_id
         self._now_ns = 10**12
-        self._seq = 0
-
-    def tactile(self, counts: NDArray[np.uint16]) -> None:
-        self._seq += 1
-        self._now_ns += PERIOD_NS
-        message = Tactile(
-            boot_id=self._boot_id,
-            seq=self._seq,
-            t=0.0,
-            t_mono_ns=self._now_ns,
-            fingers=["ff", "mf", "th"],
-            counts=counts.tolist(),
-            faults=np.zeros((3, 24), dtype=int).tolist(),
-        )
-        self._file.write(b"tactile.right", encode(message), self._now_ns)
-
-    def verdict(self, grasp: int, *, judged: bool = True, repaired: Sequence[str] = ()) -> None:
-        message = Verdict(
-            boot_id=self._boot_id,
-            seq=self._seq,
-            t=0.0,
-            t_mono_ns=self._now_ns,
-            grasp=grasp,
-            verdict=Decision.SLIP,
-            verdict_code=2,
-            p_slip=0.9,
-            valid=True,
-            reasons=[],
-            age_ms=0.0,
-            latency_us=0.0,
-            judged=judged,
-            repaired=list(repaired),
-            gate=GateState.JUDGED,
-            silence_ms=100.0,
-            model="fake",
-            model_sha="0" * 12,
-        )
-        self._file.write(b"verdict.right", encode(message), self._now_ns)
 
     def judged(
         self, grasp: int, counts: NDArray[np.integer[Any]], *, repaired: Sequence[str] = ()
     ) -> None:
-        """A verdict, and what it was made of."""
-        self.verdict(grasp, repaired=repaired)
+        """What a grasp was judged by."""
         message = Judged(
             boot_id=self._boot_id,
             t_mono_ns=self._now_ns,
@@ -131,30 +90,19 @@ def sweeps(number: int, seed: int = 0) -> list[NDArray[np.uint16]]:
     return [(base + 7 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
 
 
-def recorded(path: Path, *, seed: int = 0) -> NDArray[np.float64]:
-    """One grasp of six sweeps, judged with the fifth by the median of three; it slips. The median.
-
-    The sweep before the fifth is not in the recording.
-    """
-    rows = sweeps(6, seed)
-    median: NDArray[np.float64] = np.median(rows[2:5], axis=0)
+def recorded(path: Path, counts: NDArray[np.uint16]) -> None:
+    """A recording of one grasp with these counts; it slips."""
     writer = Writer(path)
-    for step, counts in enumerate(rows):
-        if step != 3:
-            writer.tactile(counts)
-        if step == 4:
-            writer.judged(1, median.astype(np.uint16))
-        else:
-            writer.verdict(1, judged=False)
+    writer.judged(1, counts)
     writer.outcome(1, "slip")
     writer.close()
-    return median
 
 
-def test_a_row_is_what_was_judged_whichever_sweeps_are_in_the_recording(tmp_path: Path) -> None:
-    median = recorded(tmp_path / "a.mcap")
+def test_a_row_is_what_was_judged(tmp_path: Path) -> None:
+    (counts,) = sweeps(1)
+    recorded(tmp_path / "a.mcap", counts)
     (grasp,) = collect([tmp_path / "a.mcap"]).grasps.values()
-    assert np.array_equal(grasp.counts, median)
+    assert np.array_equal(grasp.counts, counts)
     assert grasp.slipped
 
 
@@ -185,7 +133,6 @@ def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_a
 def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.mcap")
     for grasp, counts in enumerate(sweeps(8)):
-        writer.tactile(counts)
         if grasp >= 4:
             writer.judged(grasp, counts, repaired=["ff_7"] if grasp == 5 else ())
     writer.outcome(4, "stable")
@@ -246,7 +193,7 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
 
 
 def test_a_table_that_is_there_is_replaced_only_when_that_is_said(tmp_path: Path) -> None:
-    recorded(tmp_path / "a.mcap")
+    recorded(tmp_path / "a.mcap", sweeps(1)[0])
     out = tmp_path / "t.csv"
     out.write_text("of another day")
     words = ("export-grasps", tmp_path / "a.mcap", "--out", out)

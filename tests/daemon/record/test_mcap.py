@@ -205,12 +205,6 @@ def test_no_damage_makes_the_reader_raise_anything_else(changes: list[tuple[int,
         read(bytes(data))
 
 
-@given(st.binary(max_size=200))
-def test_no_bytes_after_the_magic_make_it_raise_anything_else(data: bytes) -> None:
-    with pytest.raises(RecordingError):
-        read(b"\x89MCAP0\r\n" + data)
-
-
 def test_messages_that_are_no_readings_are_counted(tmp_path: Path) -> None:
     file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
     good = {

@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import cast
 
 import msgspec
-import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -200,38 +198,6 @@ def again(*paths: Path) -> list[Judgement]:
                 found.append(msgspec.structs.replace(judgement, t_ns=reading.made_ns))
                 pipeline.learn()
     return found
-
-
-def fresh_median(values: Sequence[int]) -> float:
-    """Median of an electrode's last three values, but for those that only repeat the one before."""
-    fresh, held = [values[0]], False
-    for former, value in pairwise(values):
-        held = value == former and not held
-        if not held:
-            fresh.append(value)
-    return float(np.median(fresh[-3:]))
-
-
-def test_what_a_settled_grasp_was_judged_by_is_recorded_with_its_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    daemon, readings = Daemon(tmp_path, monkeypatch), sweeps()[:1000]
-    judged = {
-        judgement.t_ns: (judgement.moment.grasp, place + 1)
-        for place, judgement in enumerate(map(daemon.judge, readings))
-        if judgement.moment.judged
-    }
-    daemon.recorder.close()
-    found = [
-        content for path in files(tmp_path) for kind, content in messages(path) if kind == "judged"
-    ]
-    assert len(found) == len(judged) > 1
-    for content in found:
-        grasp, upto = judged[content["t_mono_ns"]]
-        history = np.array([reading.counts for reading in readings[:upto]]).reshape(upto, -1)
-        expected = [fresh_median(values) for values in history.T.tolist()]
-        assert (content["grasp"], content["boot_id"]) == (grasp, BOOT)
-        assert np.ravel(content["counts"]).tolist() == expected
 
 
 def assert_played_alike(folder: Path, expected: list[Judgement]) -> None:
