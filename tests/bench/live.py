@@ -328,8 +328,7 @@ class Usage:
     cpu_s: float
     """Processor time of all its threads since its start."""
     rss_kib: int
-    pss_kib: int
-    """Memory that it has to itself, and its share of what it has together with others."""
+    """Its memory, and what it has together with others."""
     descriptors: int
     threads: int
 
@@ -343,7 +342,6 @@ def usage(pid: int) -> Usage:
         t_s=time.monotonic(),
         cpu_s=(int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"),
         rss_kib=int(memory["Rss"]),
-        pss_kib=int(memory["Pss"]),
         descriptors=len(os.listdir(about / "fd")),
         threads=int(fields[17]),
     )

@@ -18,7 +18,7 @@ from daemon.publish.messages import Status, Tactile, decode_status, decode_tacti
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.twins.grasps.grasps import recorded_counts
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, graspd, put_first, start, wait_for
 from tests.emulated.board import BOARD_ID
 from tests.emulated.conftest import Image
 from tests.emulated.test_driver import grasps, write_counts
@@ -57,6 +57,7 @@ def live(image: Image, tmp_path: Path) -> Iterator[Live]:
     with subprocess.Popen(
         [*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
+        put_first(process.pid)
         end_s = time.monotonic() + READY_S
         while not link.is_symlink():
             assert process.poll() is None
