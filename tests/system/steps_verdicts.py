@@ -83,6 +83,8 @@ def serial_verdicts(lab: Lab) -> Outcome:
     for _ in range(GRASPS):
         judged = lab.await_message("serial", after_s, "a judged grasp", judgement)
         after_s = judged.t_s
+    # What `disk_full` replays must hold one.
+    lab.await_message("serial", began_s, "a valid verdict", _valid)
     judgements = lab.machine.messages.between("serial", "gate", began_s, after_s)
     grasps = Counter(m.body["grasp"] for m in judgements if m.body["state"] == "judged")
     counters = lab.last("serial", "status")["drivers"]["spi"]
@@ -102,6 +104,10 @@ def _tared(message: Message) -> bool:
 def judgement(message: Message) -> bool:
     """Whether it is the verdict of a grasp that has just been judged."""
     return message.told and bool(message.body["judged"])
+
+
+def _valid(message: Message) -> bool:
+    return judgement(message) and bool(message.body["valid"])
 
 
 @dataclass(frozen=True, slots=True)
