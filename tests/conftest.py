@@ -15,8 +15,9 @@ from hypothesis import HealthCheck, settings
 
 from tests.daemon.processes import before_others
 
-# A shell's background jobs ignore it, and so would all that the tests start.
+# A shell's background jobs ignore SIGINT, those of nohup SIGHUP, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # Before anybody imports onnxruntime: its telemetry opens descriptors whenever it likes.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 # Tests run side by side; threads of OpenMP that wait for each other would take the cores.

@@ -35,7 +35,7 @@ TARGETS = {
 }
 """Name of each parser and where its `Target` is: module and attribute."""
 
-FRAMES = 100_000
+FRAMES = 25_000
 """Rounds per parser in a test run."""
 GARBAGE_MAX_BYTES = 3_000
 DAMAGES_MAX = 3

@@ -54,8 +54,6 @@ DRAIN_S = 0.5
 """How long a twin that was told to stop stays there, s, so that all it sent is read."""
 
 Kind = Literal["spi", "can"]
-Stamp = tuple[int, int, int]
-"""When a sweep ended, and before and after the system call that wrote its last bytes, ns."""
 Tally = NDArray[np.int64]
 """What a twin's processes did so far, in the order of `TALLIED`, in shared memory."""
 TALLIED = ("sweeps", "disconnect", "drop", "bit_flip", "duplicate", "reorder", "unsent")
@@ -71,15 +69,10 @@ class TwinPlan(msgspec.Struct, frozen=True, kw_only=True):
     tally: str
     """File of a `Tally`; each process goes on where the one before it ended."""
     rate_hz: float = 100.0
-    held: bool = False
-    """Whether one grasp is held for ever, each sweep but the first few hundred fit to be judged."""
     faults: LinkFaults = LinkFaults()
     ends: str | None = None
     """File for the time of each sweep's end, monotonic ns, 64-bit integers, in its place by the
     tally (`spi` only)."""
-    stamps: str | None = None
-    """File for the times of each sweep (`spi` only): shape (sweeps, 3), monotonic ns of its end,
-    and of before and after the system call that wrote its last bytes."""
 
 
 def new_tally(path: Path) -> Tally:
@@ -107,31 +100,21 @@ def judged_counts() -> Iterator[Counts]:
 
 
 def _counts(plan: TwinPlan) -> Iterator[Counts]:
-    if plan.held:
-        return judged_counts()
     return (moment.counts for moment in synthetic_grasps(rate_hz=plan.rate_hz, loop=True))
 
 
-class StampedSpiTwin(SpiTwin):
-    """Notes when each sweep ends, and when its last byte is written."""
-
-    _before_ns = _after_ns = 0
+class TimedSpiTwin(SpiTwin):
+    """Notes when each sweep ends."""
 
     def __init__(self, plan: TwinPlan) -> None:
         super().__init__(Path(plan.where), _counts(plan), rate_hz=plan.rate_hz, faults=plan.faults)
-        self.stamps_ns: list[Stamp] = []
-
-    def _drain(self) -> None:
-        self._before_ns = time.monotonic_ns()
-        super()._drain()
-        self._after_ns = time.monotonic_ns()
+        self.ends_ns: list[int] = []
 
     def _send(self, message: Message, *, waits: bool = True) -> None:
         boot_ns = self._boot_ns
         super()._send(message, waits=waits)
         if isinstance(message, Sweep):
-            end_ns = boot_ns + message.tick_end * 1000  # ticks of 1 us
-            self.stamps_ns.append((end_ns, self._before_ns, self._after_ns))
+            self.ends_ns.append(boot_ns + message.tick_end * 1000)  # ticks of 1 us
 
 
 def serve_twin(plan: TwinPlan) -> None:
@@ -140,14 +123,12 @@ def serve_twin(plan: TwinPlan) -> None:
     signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
     tally: Tally = np.memmap(plan.tally, dtype=np.int64, mode="r+", shape=len(TALLIED))
     serve = _serve_spi if plan.kind == "spi" else _serve_can
-    stamps_ns = serve(plan, tally, stop)
-    if plan.stamps is not None:
-        np.save(plan.stamps, np.array(stamps_ns, dtype=np.int64).reshape(-1, 3))
+    serve(plan, tally, stop)
 
 
-def _serve_spi(plan: TwinPlan, tally: Tally, stop: threading.Event) -> list[Stamp]:
+def _serve_spi(plan: TwinPlan, tally: Tally, stop: threading.Event) -> None:
     before = tally.copy()
-    twin = StampedSpiTwin(plan)
+    twin = TimedSpiTwin(plan)
     ends_ns = None if plan.ends is None else np.memmap(plan.ends, dtype=np.int64, mode="r+")
 
     def is_over() -> bool:
@@ -155,18 +136,16 @@ def _serve_spi(plan: TwinPlan, tally: Tally, stop: threading.Event) -> list[Stam
         tally[:] = before + [known.get(name, 0) for name in TALLIED]
         if ends_ns is not None:
             made = int(tally[0])
-            ends_ns[made - len(twin.stamps_ns) : made] = [end_ns for end_ns, _, _ in twin.stamps_ns]
-        if plan.stamps is None:
-            twin.stamps_ns.clear()
+            ends_ns[made - len(twin.ends_ns) : made] = twin.ends_ns
+        twin.ends_ns.clear()
         return stop.is_set()
 
     with twin:
         twin.serve(is_over)
         time.sleep(DRAIN_S)
-    return twin.stamps_ns
 
 
-def _serve_can(plan: TwinPlan, tally: Tally, stop: threading.Event) -> list[Stamp]:
+def _serve_can(plan: TwinPlan, tally: Tally, stop: threading.Event) -> None:
     before = tally.copy()
 
     def counted() -> Iterator[Counts]:
@@ -188,7 +167,6 @@ def _serve_can(plan: TwinPlan, tally: Tally, stop: threading.Event) -> list[Stam
     with twin:
         twin.serve(stop)
         time.sleep(DRAIN_S)
-    return []
 
 
 def tactile_section(kind: Kind, where: str) -> str:
@@ -350,8 +328,7 @@ class Usage:
     cpu_s: float
     """Processor time of all its threads since its start."""
     rss_kib: int
-    pss_kib: int
-    """Memory that it has to itself, and its share of what it has together with others."""
+    """Its memory, and what it has together with others."""
     descriptors: int
     threads: int
 
@@ -365,7 +342,6 @@ def usage(pid: int) -> Usage:
         t_s=time.monotonic(),
         cpu_s=(int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"),
         rss_kib=int(memory["Rss"]),
-        pss_kib=int(memory["Pss"]),
         descriptors=len(os.listdir(about / "fd")),
         threads=int(fields[17]),
     )

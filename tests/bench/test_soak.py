@@ -21,7 +21,7 @@ from tests.daemon.processes import before_others
 
 SPEED = {"late verdicts", "worst, last byte to subscriber", "time to stop"}
 """Of the machine as much as of the daemon: no test is about them."""
-SECONDS = 10.0
+SECONDS = 7.0
 HOUR_S = 3600.0
 RATE_HZ = 100
 MADE = 12_000
@@ -48,7 +48,7 @@ def samples(kib: Callable[[float], float], seconds: float = HOUR_S) -> list[Usag
     """Of a daemon whose memory is a function of time, s, with the noise of an allocator."""
     noise = np.random.default_rng(0).integers(-20, 21, round(2 * seconds))
     return [
-        Usage(t_s, 0.03 * t_s, 80_000 + round(kib(t_s)) + 4 * int(n), 60_000, 14, 3)
+        Usage(t_s, 0.03 * t_s, 80_000 + round(kib(t_s)) + 4 * int(n), 14, 3)
         for t_s, n in zip(np.arange(0.0, seconds, 0.5), noise, strict=True)
     ]
 

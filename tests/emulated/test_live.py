@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.publish.messages import Tactile
+from daemon.publish.messages import Status, Tactile
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.twins.grasps.grasps import recorded_counts
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, graspd, put_first, start, wait_for
 from tests.emulated.board import BOARD_ID
 from tests.emulated.conftest import Image
 from tests.emulated.test_driver import grasps, write_counts
@@ -58,6 +58,7 @@ def live(image: Image, tmp_path: Path) -> Iterator[Live]:
     with subprocess.Popen(
         [*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
+        put_first(process.pid)
         end_s = time.monotonic() + READY_S
         while not link.is_symlink():
             assert process.poll() is None
@@ -67,16 +68,15 @@ def live(image: Image, tmp_path: Path) -> Iterator[Live]:
         process.terminate()
 
 
-def readings(endpoint: str) -> tuple[list[Tactile], int]:
-    """Readings in a row, and how often the board's clock was distrusted until after them."""
+def readings(endpoint: str) -> tuple[list[Tactile], Status]:
+    """Readings in a row, and a status after them."""
     found: list[Tactile] = []
     with Subscriber(endpoint, topics=("tactile.", "status.")) as subscriber:
         while (message := subscriber.take(20.0)) is not None:
             if message[0].startswith(b"tactile."):
                 found.append(decode_tactile(message[1]))
             elif len(found) >= READINGS:
-                counters = decode_status(message[1]).drivers["spi"]
-                return found[:READINGS], counters["clock_faults"]
+                return found[:READINGS], decode_status(message[1])
     raise TimeoutError("the daemon fell silent")
 
 
@@ -91,7 +91,7 @@ def test_the_doctor_and_the_daemon_take_it_for_a_board(live: Live, tmp_path: Pat
 
     with start("run", live.scene) as daemon:
         wait_for(tmp_path / "graspd")
-        found, clock_faults = readings(f"ipc://{tmp_path}/graspd")
+        found, status = readings(f"ipc://{tmp_path}/graspd")
         daemon.send_signal(signal.SIGTERM)
         assert daemon.wait(TIMEOUT_S) == 0
     behind_ms = live.behind_ms()
@@ -102,10 +102,12 @@ def test_the_doctor_and_the_daemon_take_it_for_a_board(live: Live, tmp_path: Pat
     steps = np.diff(at) % len(once)
     assert not any(any(map(any, reading.faults)) for reading in found)
     # The chip's clock is right however far its emulation is behind.
-    assert clock_faults == 0
+    assert status.drivers["spi"]["clock_faults"] == 0
     intervals_ns = np.diff([reading.t_mono_ns for reading in found])
     assert (intervals_ns > 0).all()
     if behind_ms < ON_TIME_MS:
-        assert (steps == 1).all()
+        assert (steps >= 1).all()
+        # A daemon that was held up says how many readings it left out.
+        assert (steps - 1).sum() <= status.skipped_readings
         assert report["readings"] > 250
         assert float(np.median(intervals_ns)) == pytest.approx(10e6, rel=0.01)

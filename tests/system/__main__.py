@@ -31,23 +31,26 @@ STEPS: Final[tuple[Step, ...]] = (
     steps_install.start,
     steps_install.realtime,
     steps_install.access,
+    steps_faults.wrong_start,
     steps_verdicts.serial_verdicts,
     steps_faults.unplugged,
     steps_faults.disk_full,
+    steps_faults.clock_stepped,
     steps_verdicts.can_verdicts,
     steps_verdicts.can_overload,
+    steps_faults.recording_again,
+    steps_faults.hangs,
     steps_faults.killed,
-    steps_faults.hung,
     steps_faults.bus_down,
-    steps_faults.clock_stepped,
     steps_faults.wrong_reload,
+    steps_faults.hung,
     steps_faults.stopped,
-    steps_faults.wrong_start,
     steps_install.enabled,
     steps_install.uninstall,
 )
 """Grasps come over both links from `start` on, while the other steps are done. The recording that a
-full disk ends must hold some: `serial_verdicts` waits for them."""
+full disk ends must hold some: `serial_verdicts` waits for them. What takes its time by itself is
+begun by one step and awaited by a later one: `recording_again`, `hung`."""
 NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_install.start))
 """Without these there is no use in going on."""
 

@@ -24,14 +24,11 @@ PYTHON: Final = "/opt/graspd/venv/bin/python"
 HANDS: Final = ("can", "serial")
 MEMBER, STRANGER = "member", "stranger"
 """Users inside: of the group graspd, and of none."""
-CAN_RATE_HZ: Final = 10.0
-SERIAL_RATE_HZ: Final = 20.0
-"""Sweeps/s: what two emulated processors judge without falling behind."""
+RATE_HZ: Final = 20.0
+"""Sweeps/s of each hand: what two emulated processors judge without falling behind."""
 GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(6.5, 6.5))
 """At a fifth of the usual rate it takes as much longer to learn where the fingers rest (a hundred
 sweeps) and to settle."""
-CAN_GRASPS: Final = Durations(first_rest_s=(13.0, 13.0), settle_s=(4.0, 4.0), rest_s=(13.0, 13.0))
-"""The same at half that rate."""
 PATIENCE_S: Final = 600.0
 """For what takes a second on a computer that is not emulated, nor busy."""
 LOOK_S: Final = 0.5
@@ -57,6 +54,8 @@ class Lab:
     def __init__(self, machine: Machine, bridge: Bridge) -> None:
         self.machine = machine
         self.bridge = bridge
+        self.deeds_s: dict[str, float] = {}
+        """When a step did what a later step awaits, by the machine's monotonic clock."""
 
     def sh(self, script: str, timeout_s: float = COMMAND_TIMEOUT_S) -> str:
         """What a script prints, without the last line's end. Raises `StepError` if it fails."""
@@ -69,6 +68,12 @@ class Lab:
     def deed(self, script: str) -> float:
         """Run a script; when it began, by the machine's monotonic clock, s."""
         return float(self.sh(f"read now _ < /proc/uptime; echo $now\n{script}").split()[0])
+
+    def done_s(self, what: str) -> float:
+        """When an earlier step did something. Raises `StepError` if it did not."""
+        if what not in self.deeds_s:
+            raise StepError(f"{what}: the step that does it did not come so far")
+        return self.deeds_s[what]
 
     def now_s(self) -> float:
         """The machine's monotonic clock, s."""
@@ -173,10 +178,10 @@ class Lab:
             f"--recording {PAYLOAD}/recording.csv --loop"
         )
 
-    def await_twin(self) -> None:
-        """Wait for a verdict on a reading that the twin made which was started last."""
+    def await_new_reading(self, hand: str) -> None:
+        """Wait for a verdict on a reading that is made from now on."""
         now_s = self.now_s()
-        self.await_message("can", now_s, "a verdict", lambda m: m.told and m.made_s > now_s)
+        self.await_message(hand, now_s, "a verdict", lambda m: m.told and m.made_s > now_s)
 
     def interface(self) -> dict[str, int]:
         """Frames that the kernel has carried on vcan0, by its own counters."""
@@ -189,9 +194,9 @@ class Bridge:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        grasps = synthetic_grasps(rate_hz=SERIAL_RATE_HZ, durations=GRASPS, loop=True)
+        grasps = synthetic_grasps(rate_hz=RATE_HZ, durations=GRASPS, loop=True)
         counts = (moment.counts for moment in grasps)
-        self._twin = SpiTwin(path, counts, rate_hz=SERIAL_RATE_HZ)
+        self._twin = SpiTwin(path, counts, rate_hz=RATE_HZ)
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:

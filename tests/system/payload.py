@@ -12,7 +12,7 @@ from typing import Final
 
 from drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
 from tests.system.image import ImageError, run
-from tests.system.lab import CAN_GRASPS, CAN_RATE_HZ
+from tests.system.lab import GRASPS, RATE_HZ
 
 PROJECT: Final = Path(__file__).parents[2]
 GUEST: Final = Path(__file__).parent / "guest"
@@ -47,9 +47,9 @@ def make_payload(cache: Path, disk: Path) -> None:
 
 def write_recording(path: Path) -> None:
     """Write what the CAN board plays: the same grasps each time."""
-    grasps = synthetic_grasps(RECORDED, rate_hz=CAN_RATE_HZ, durations=CAN_GRASPS)
+    grasps = synthetic_grasps(RECORDED, rate_hz=RATE_HZ, durations=GRASPS)
     with path.open("w") as file:
-        write_stream(grasps, file, t_decimals=1)
+        write_stream(grasps, file, t_decimals=2)
 
 
 def _dependencies(cache: Path) -> Path:

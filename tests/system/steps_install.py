@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 from tests.system.lab import (
-    CAN_RATE_HZ,
     HANDS,
     MEMBER,
     PAYLOAD,
     PYTHON,
+    RATE_HZ,
     STRANGER,
     Lab,
     Outcome,
@@ -21,7 +21,7 @@ INSTALL: Final = f"sh {PAYLOAD}/deploy/install.sh"
 OFFLINE: Final = f"{INSTALL} --wheelhouse {PAYLOAD}/wheels --extras {EXTRA}"
 INSTALL_TIMEOUT_S: Final = 900.0
 DOCTOR_TIMEOUT_S: Final = 600.0
-LISTEN_S: Final = 10.0
+LISTEN_S: Final = 5.0
 """Long enough for the doctor to hear the bridge on an emulated processor that is busy."""
 EACCES: Final = 13
 
@@ -71,7 +71,7 @@ def start(lab: Lab) -> Outcome:
     lab.observe()
     for hand in HANDS:
         lab.await_message(hand, began_s, "a message", lambda _: True)
-    lab.twin(CAN_RATE_HZ)
+    lab.twin(RATE_HZ)
     what = " and ".join(f"{hand} after {s:.1f} s" for hand, s in zip(HANDS, ready_s, strict=True))
     return Outcome(f"READY {what}", max(ready_s))
 

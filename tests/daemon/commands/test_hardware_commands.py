@@ -16,7 +16,7 @@ import pytest
 from daemon.publish.messages import Tactile, Verdict
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
-from tests.bench.live import Subscriber
+from tests.bench.live import Subscriber, can_id, where_of
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict
 from tests.ports import free_port
@@ -24,24 +24,30 @@ from tests.ports import free_port
 WANTED = 150
 """Readings to wait for, of the 200 rows of the recording."""
 
+GROUP = where_of("can", Path())
 SCENES = {
     "spi": 'driver = "spi"\nport = "{folder}/bridge"',
-    "can": 'driver = "can"\ninterface = "udp_multicast"\nchannel = "239.74.163.2"\n'
-    'sequence = "electrodes"',
+    "can": 'driver = "can"\ninterface = "udp_multicast"\nchannel = "{group}"\n'
+    'sequence = "electrodes"\narbitration_id = {id}',
     "palm": 'driver = "palm"\nsource = "udp://127.0.0.1:{port}"',
 }
 TWINS: dict[str, list[str]] = {
     "spi": ["--path", "{folder}/bridge"],
-    "can": [],
+    "can": ["--channel", "{group}", "--arbitration-id", "{id}"],
     "palm": ["--to", "udp://127.0.0.1:{port}"],
 }
 PORT = free_port(socket.SOCK_DGRAM)
 
 
+def filled(text: str, folder: Path) -> str:
+    """Of `SCENES` or `TWINS`, with the places that are this test's own."""
+    return text.format(folder=folder, port=PORT, group=GROUP, id=can_id(GROUP))
+
+
 def scene_for(kind: str, folder: Path) -> Path:
     scene = folder / "scene.toml"
     scene.write_text(
-        f"[tactile]\n{SCENES[kind].format(folder=folder, port=PORT)}\n"
+        f"[tactile]\n{filled(SCENES[kind], folder)}\n"
         f'[model]\nname = "cnn1"\n[publish]\nendpoint = "ipc://{folder}/graspd"\n'
         "tactile_hz = 10000\n"
     )
@@ -49,7 +55,7 @@ def scene_for(kind: str, folder: Path) -> Path:
 
 
 def twin(kind: str, folder: Path, *more: str) -> subprocess.Popen[str]:
-    options = [option.format(folder=folder, port=PORT) for option in TWINS[kind]]
+    options = [filled(option, folder) for option in TWINS[kind]]
     return start("twin", kind, *options, *more)
 
 
