@@ -93,7 +93,7 @@ def test_electrodes_that_are_not_in_the_sequence_are_missing(rig: Rig) -> None:
     missing = np.delete(reading.faults, there, axis=1)
     assert (missing == ElectrodeFault.MISSING).all()
     counters = rig.driver.counters
-    assert (counters.faulty_readings, counters.missing_words) == (1, 0)
+    assert (counters.faulty_readings, counters.unplugged_words) == (1, 0)
 
 
 def test_an_absent_sensor_is_missing_whatever_its_words_say(rig: Rig) -> None:
@@ -104,7 +104,7 @@ def test_an_absent_sensor_is_missing_whatever_its_words_say(rig: Rig) -> None:
     assert not reading.faults[[0, 2]].any()
     assert not reading.counts[1].any()
     counters = rig.driver.counters
-    assert (counters.absent_sensors, counters.missing_words) == (1, 0)
+    assert (counters.absent_sensors, counters.unplugged_words) == (1, 0)
 
 
 def test_bad_words_are_flagged_and_counted_and_never_a_count(rig: Rig) -> None:
@@ -122,7 +122,7 @@ def test_bad_words_are_flagged_and_counted_and_never_a_count(rig: Rig) -> None:
     assert np.count_nonzero(reading.faults) == 4
     assert not reading.counts[reading.faults != 0].any()
     counters = rig.driver.counters
-    assert (counters.error_words, counters.parity_words, counters.missing_words) == (1, 1, 2)
+    assert (counters.error_words, counters.parity_words, counters.unplugged_words) == (1, 1, 2)
 
 
 def test_a_board_may_have_more_sensors_than_fingers_are_named(rig: Rig) -> None:
