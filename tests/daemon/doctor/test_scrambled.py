@@ -37,8 +37,7 @@ from tests.daemon.doctor.emulated import (
 )
 from tests.drivers.can.can_standin import ScriptedBus, SocketBus, stand_in
 from tests.drivers.can.test_can_socket import DownSocket, over_socket
-from tests.drivers.spi.bridge_bench import MS, hello, sweep
-from tests.drivers.spi.test_conversation import T0, greeted, hear, opened, said, told
+from tests.drivers.spi.bridge_bench import MS, T0, greeted, hear, hello, opened, said, sweep, told
 
 XXX = "xxx"
 LOOK_S = 3
@@ -169,7 +168,7 @@ def another_version() -> Conversation:
 
 
 def rarely_sweeping() -> Conversation:
-    return greeted(1001)
+    return greeted(hello(0, period_ms=1001))
 
 
 def misread() -> Conversation:
