@@ -55,8 +55,9 @@ def dbc() -> Database:
 def test_the_real_formats_sample_is_read() -> None:
     sample = parse_sample(E1_SAMPLE, 3, 7)
     assert not isinstance(sample, Reject)
-    counts, faults = decode_words(np.frombuffer(sample.words, dtype=">u2").astype(np.uint16))
-    assert sample.channel == 17
+    channel, words = sample
+    counts, faults = decode_words(np.frombuffer(words, dtype=">u2").astype(np.uint16))
+    assert channel == 17
     assert counts.tolist() == [2602, 2713, 2391]
     assert not faults.any()
 
