@@ -19,16 +19,13 @@ def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     return np.array([row[2:] for row in rows], dtype=float), np.array([int(row[1]) for row in rows])
 
 
-def test_the_demo_is_made_again_byte_for_byte(tmp_path: Path) -> None:
-    out = tmp_path / "demo.csv"
-    synthetic.main(["--out", str(out)])
-    assert out.read_bytes() == DEMO_TABLE.read_bytes()
+def test_the_demos_are_made_again_byte_for_byte(tmp_path: Path) -> None:
+    synthetic.main(tmp_path)
+    for demo in (DEMO_TABLE, DEMO_DAY):
+        assert (tmp_path / demo.name).read_bytes() == demo.read_bytes()
 
 
-def test_the_demo_day_is_made_again_byte_for_byte_and_called_synthetic(tmp_path: Path) -> None:
-    out = tmp_path / "day.csv"
-    synthetic.main(["--day", "--out", str(out)])
-    assert out.read_bytes() == DEMO_DAY.read_bytes()
+def test_the_demo_day_is_labelled_within_the_range_and_called_synthetic() -> None:
     counts, slipped = load(DEMO_DAY)
     assert counts.shape == (300, 72)
     assert slipped.sum() == 150

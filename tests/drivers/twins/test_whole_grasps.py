@@ -118,7 +118,7 @@ def test_real_end_points_are_reached_with_real_noise(bts3_dir: Path, sampling: S
 
 def test_the_demo_is_made_again_byte_for_byte(tmp_path: Path) -> None:
     out = tmp_path / "demo.csv"
-    whole_grasps.main(["--out", str(out)])
+    whole_grasps.main(out)
     assert out.read_bytes() == DEMO_RECORDING.read_bytes()
 
 
