@@ -55,17 +55,6 @@ PACKETS = [
 """More rounds than the longest plan has, and some for other starts."""
 
 
-@pytest.mark.parametrize("before", range(ROUND, 2 * ROUND))
-def test_a_relay_that_was_silent_for_25_ms_may_go_on_anywhere(before: int) -> None:
-    for after in range(3 * ROUND, 6 * ROUND):
-        stream, seen = PalmStream(FINGERS), 0
-        came = [*range(before), *range(before + after, before + after + 3 * ROUND)]
-        for number, at in enumerate(came):
-            silent = 25 * MS if number >= before else 0
-            seen += expect_one_sweep(stream.receive(PACKETS[at], number * MS + silent) or ())
-        assert seen >= 3
-
-
 def sweep_frame(unit: Unit, first: int) -> CanFrame:
     """Frames of three fingers follow each other; number and tick begin anew with the board."""
     sweep, row = divmod(unit.index, len(FINGERS))

@@ -181,10 +181,3 @@ def test_the_driver_flags_what_is_wrong_with_a_sensor(start_bridge: StartBridge)
         sound = expected == 0
         sound[0, 7] = False
         np.testing.assert_array_equal(reading.counts[sound], pattern(row)[sound])
-
-
-def test_the_driver_reads_no_finger_that_is_read_too_early(start_bridge: StartBridge) -> None:
-    host = start_bridge("--settle-us", "2:80", "--period-us", 4000)
-    for reading in read(host.path, 5):
-        assert (reading.faults[:2] == 0).all()
-        assert (reading.faults[2] != 0).all()
