@@ -67,23 +67,6 @@ def test_the_real_formats_sample_is_written() -> None:
     assert encode_sample(17, words) == E1_SAMPLE
 
 
-@pytest.mark.parametrize(
-    ("data", "reject"),
-    [
-        ("", Reject.LENGTH),
-        ("A2 A251 A8C8", Reject.LENGTH),
-        ("A2 A251 A8C8 94B9 00", Reject.LENGTH),
-        ("A3 A251 A8C8 94B9", Reject.COMMAND),
-        ("A1 A251 A8C8 94B9", Reject.COMMAND),  # the old protocol's streaming command
-        ("61 A251 A8C8 94B9", Reject.COMMAND),  # reads a parameter, samples nothing
-        ("00 0000 0000 0000", Reject.COMMAND),
-        ("88 A251 A8C8 94B9", Reject.COMMAND),  # even parity
-    ],
-)
-def test_what_is_no_sample_is_refused(data: str, reject: Reject) -> None:
-    assert parse_sample(bytes.fromhex(data), 3, 7) == reject
-
-
 def test_the_protocols_example_of_a_sweep_frame_is_read_and_written() -> None:
     sweep = SweepFrame(4, 0x1234, 1_000_000, bytes.fromhex("A251") * 24)
     assert len(SWEEP_EXAMPLE) == 64
