@@ -189,7 +189,7 @@ class Assembler:
 ASSEMBLERS = {
     "bridge": Assembler(bridge, 1, silent=11),
     "log of a bridge": Assembler(bridge_log, 1, silent=11),
-    "palm": Assembler(palm, ROUND, silent=25),
+    "palm": Assembler(palm, ROUND, silent=25, steady_sweeps=2),  # it may begin within a round
     "sweep frames": Assembler(sweep_frames, 3, silent=SILENT_NS // FRAME_NS + 1, late_max=4),
     "log of sweep frames": Assembler(
         bus_log("sweep_fd", lambda unit: sweep_frame(unit, 0), FRAME_NS),

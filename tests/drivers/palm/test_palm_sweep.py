@@ -217,6 +217,7 @@ def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
 ) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(2)
+    sweeps.interrupt()
     for at in range(ROUND):
         sweeps.push(stream[at], at * MS)
     sweeps.interrupt()
