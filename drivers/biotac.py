@@ -6,7 +6,6 @@ SynTouch where the manual is silent.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -80,17 +79,7 @@ def decode_words(
     words: NDArray[np.integer[Any]],
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Return counts, 0 where faulty, and `ElectrodeFault` bits of words, best `np.intp`."""
-    return COUNT_OF_WORD[words], FAULT_OF_WORD[words]
-
-
-def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
-    """Return which samples are electrodes: rows of (sample, electrode 0..23)."""
-    pairs = [
-        (at, channel - E1)
-        for at, channel in enumerate(channels)
-        if channel is not None and E1 <= channel <= E24
-    ]
-    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    return _COUNT_OF_WORD[words], _FAULT_OF_WORD[words]
 
 
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
@@ -109,5 +98,4 @@ def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
 
 
 _CHANNEL_OF_COMMAND: Final = {sample_command(channel): channel for channel in CHANNELS}
-COUNT_OF_WORD, FAULT_OF_WORD = _tables()
-"""Count, and `ElectrodeFault` bits, of each of the 65536 response words; see `decode_words`."""
+_COUNT_OF_WORD, _FAULT_OF_WORD = _tables()

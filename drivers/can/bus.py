@@ -31,6 +31,7 @@ from drivers.can.frames import (
     Stamped,
     unpack_frame,
 )
+from drivers.can.readings import CanCounters
 from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
 
 FRAMES_PER_DRAIN: Final = 512
@@ -98,10 +99,8 @@ class CanBus:
         """True if the last drain left frames behind."""
         self.tap: Callable[[list[Stamped]], None] | None = None
         """Called with the frames of each drain that has some."""
-        self.malformed = 0
-        """Records from the socket that are no CAN frames. The owner resets it."""
-        self.kernel_drops = 0
-        """Frames that the kernel dropped as its buffer was full. The owner resets it."""
+        self.counters = CanCounters()
+        """Where malformed records and the kernel's drops are counted."""
         self._interface = interface
         self._channel = channel
         self._options = {**_OPTIONS.get(interface, {}), **options}
@@ -178,7 +177,7 @@ class CanBus:
                 self._count_drops(drops, frames)
             frame = unpack_frame(record)
             if frame is None:
-                self.malformed += 1
+                self.counters.malformed_frames += 1
             else:
                 frames.append((frame, t_ns, t_ns))
 
@@ -188,7 +187,7 @@ class CanBus:
         if dropped:
             now_ns = self._clock()
             frames.append((CanFrame(0, b"", LOST), now_ns, now_ns))
-        self.kernel_drops += dropped
+        self.counters.kernel_drops += dropped
         self._drops_seen = total
 
     def _drain_bus(self, bus: can.BusABC, frames: list[Stamped]) -> None:

@@ -66,20 +66,20 @@ class SynTouchDecoder:
         ):
             self._counters.foreign_frames += 1
             return ()
-        if frame.flags & FD:
-            _count_reject(self._counters, Reject.CONTENT, identifier)
-            return ()
         sample = parse_sample(frame.data, self._sensors, self._length)
+        if frame.flags & FD:
+            sample = Reject.CONTENT
         if isinstance(sample, Reject):
             _count_reject(self._counters, sample, identifier)
             return ()
+        channel, words = sample
         if identifier is None:
-            if not _is_sound(sample.words):
+            if not _is_sound(words):
                 self._counters.foreign_frames += 1
                 return ()
             self.arbitration_id, self._flags = frame.arbitration_id, frame.flags & EXTENDED
         self._counters.accepted_frames += 1
-        return self.sweeps.push(sample.channel, sample.words, t_ns, until_ns)
+        return self.sweeps.push(channel, words, t_ns, until_ns)
 
     def interrupt(self) -> None:
         """Drop the current sweep; another board may come next."""

@@ -106,6 +106,7 @@ class CanBridgeDriver(Opened):
         """Try once to take the bus. Raises `DriverError` if no try can ever succeed."""
         self.close()
         self.stream = self._make_stream()
+        self._bus.counters = self.counters
         self._resting_until_ns = None
         self._window_start_ns = now_ns = self._clock()
         self._window_frames = 0
@@ -170,17 +171,11 @@ class CanBridgeDriver(Opened):
         self.stream.lost(error, self._clock())
 
     def _count(self, stamped: Sequence[Stamped]) -> None:
-        frames = len(stamped)
-        if self._bus.kernel_drops:
-            frames -= sum(frame.flags == LOST for frame, _, _ in stamped)
+        frames = sum(frame.flags != LOST for frame, _, _ in stamped)
         now_ns = self._clock()
         self._poll_due_ns = now_ns + (0 if self._bus.more else POLL_NS)
         self._resting_until_ns = self._rest(now_ns)
-        counters = self.counters
-        counters.frames += frames
-        counters.malformed_frames += self._bus.malformed
-        counters.kernel_drops += self._bus.kernel_drops
-        self._bus.malformed = self._bus.kernel_drops = 0
+        self.counters.frames += frames
         self._window_frames += frames
         elapsed_ns = now_ns - self._window_start_ns
         if elapsed_ns >= RATE_WINDOW_NS:

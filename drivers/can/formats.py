@@ -56,14 +56,6 @@ class Reject(StrEnum):
     CONTENT = "malformed_frames"
 
 
-class SynTouchSample(msgspec.Struct, frozen=True, gc=False):
-    """One channel sampled by all sensors at once."""
-
-    channel: int
-    words: bytes
-    """The sensors' response words in turn, two bytes each, first byte on the wire first."""
-
-
 class SweepStatus(IntFlag):
     """Status bits of a sweep frame. The others are reserved and zero."""
 
@@ -103,14 +95,14 @@ def encode_sample(channel: int, words: bytes) -> bytes:
     return bytes((sample_command(channel),)) + words
 
 
-def parse_sample(data: bytes, sensors: int, length: int) -> SynTouchSample | Reject:
-    """Return the sample in a frame of `length` bytes of which `1 + 2 * sensors` are used."""
+def parse_sample(data: bytes, sensors: int, length: int) -> tuple[int, bytes] | Reject:
+    """Return channel and response words in a frame of `length` bytes, `1 + 2 * sensors` used."""
     if len(data) != length:
         return Reject.LENGTH
     channel = channel_of(data[0])
     if channel is None:
         return Reject.COMMAND
-    return SynTouchSample(channel, data[1 : 1 + WORD_BYTES * sensors])
+    return channel, data[1 : 1 + WORD_BYTES * sensors]
 
 
 def parse_sweep(data: bytes) -> SweepFrame | Reject:

@@ -1,4 +1,4 @@
-"""What both CAN formats share: counters, sequence numbers, the measured period, decoded words."""
+"""What both CAN formats share: counters, and the measured period."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers.base import DriverCounters, ElectrodeFault, TactileReading
-from drivers.biotac import decode_words
+from drivers.base import DriverCounters
 
 PERIODS_KEPT: Final = 15
 PERIODS_NEEDED: Final = 5
@@ -85,14 +81,13 @@ class CanCounters(DriverCounters):
     """Times that the link was up and was lost."""
 
 
-class ReadingMaker:
-    """Numbers readings, counts their faults, learns their period."""
+class SweepPeriod:
+    """The time between sweeps, as measured."""
 
-    def __init__(self, counters: CanCounters) -> None:
-        self.counters = counters
-        self.seq = 0
+    def __init__(self) -> None:
         self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
         self.period_ns: int | None = None
+        """None until it is known."""
 
     def learn(self, gap_ns: int) -> None:
         """Take the time between two sweeps in a row, unless it is an outage."""
@@ -101,31 +96,7 @@ class ReadingMaker:
         if len(self._gaps_ns) >= PERIODS_NEEDED:
             self.period_ns = round(statistics.median(self._gaps_ns))
 
-    def forget_period(self) -> None:
+    def forget(self) -> None:
         """Drop a period that may be one of lost sweeps."""
         self._gaps_ns.clear()
         self.period_ns = None
-
-    def miss(self, sweeps: int) -> None:
-        self.seq += sweeps
-        self.counters.missed_readings += sweeps
-
-    def make(self, words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int) -> TactileReading:
-        """Return the reading of words, shape (fingers, 24), with the known faults `marks`."""
-        counts, faults = decode_words(words)
-        if np.count_nonzero(faults) or np.count_nonzero(marks):
-            absent = marks & np.uint8(ElectrodeFault.MISSING) != 0
-            faults[absent] = 0
-            self._count_words(faults)
-            faults |= marks
-            counts[absent] = 0
-            self.counters.faulty_readings += bool(faults.any())
-        self.counters.readings += 1
-        reading = TactileReading(t_ns, self.seq, counts, faults)
-        self.seq += 1
-        return reading
-
-    def _count_words(self, faults: NDArray[np.uint8]) -> None:
-        self.counters.parity_words += int((faults == ElectrodeFault.PARITY).sum())
-        self.counters.error_words += int((faults == ElectrodeFault.ERROR_WORD).sum())
-        self.counters.unplugged_words += int((faults == ElectrodeFault.MISSING).sum())

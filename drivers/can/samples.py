@@ -23,7 +23,8 @@ import numpy as np
 
 from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
 from drivers.biotac import E1, E24
-from drivers.can.readings import OUTAGE_NS, CanCounters, ReadingMaker
+from drivers.can.readings import OUTAGE_NS, CanCounters, SweepPeriod
+from drivers.words import make_reading
 
 REORDER_MAX: Final = 3
 """Most electrodes by which a sample may be late: adapters with few buffers swap neighbours."""
@@ -66,7 +67,7 @@ class SampleAssembler:
         self._sensors = sensors
         self._rows = np.arange(sensors) if rows is None else np.array(rows, dtype=np.intp)
         self._width = 2 * sensors
-        self._readings = ReadingMaker(counters)
+        self._period = SweepPeriod()
         self._counters = counters
         self._buffer = bytearray(ELECTRODES * self._width)
         self._previous_start_ns: int | None = None
@@ -89,12 +90,12 @@ class SampleAssembler:
     @property
     def period_ns(self) -> int | None:
         """Time between sweeps, ns, as measured; None until it is known."""
-        return self._readings.period_ns
+        return self._period.period_ns
 
     @property
     def expected_ns(self) -> int | None:
         """Time when the next reading should be complete, ns; None: not known yet."""
-        period_ns = self._readings.period_ns
+        period_ns = self._period.period_ns
         if period_ns is None or self._last < 0:
             return None
         left = 1.0 if self._finished else self._position[-1] - self._position[self._last]
@@ -188,20 +189,20 @@ class SampleAssembler:
     def _is_early(self, place: int, until_ns: int) -> bool:
         """Return True if a sample came too soon to be of this sweep: it is of the last one."""
         late_ns = self._late_ns(place, until_ns)
-        if self._readings.period_ns is None:
+        if self._period.period_ns is None:
             return late_ns < 0
         return -late_ns >= self._lateness_ns()
 
     def _late_ns(self, place: int, until_ns: int) -> float:
         """Return how much later than its place explains a sample came, ns; below 0 if earlier."""
-        period_ns = self._readings.period_ns
+        period_ns = self._period.period_ns
         if period_ns is None:
             return until_ns - self._t_ns - max(place - self._last, 0) * SLOT_MIN_NS
         return until_ns - (self._origin_ns + self._position[place] * period_ns)
 
     def _lateness_ns(self) -> float:
         """Return the delay, ns, from which on a sample is of another sweep."""
-        period_ns = self._readings.period_ns or self._samples * SLOT_MIN_NS
+        period_ns = self._period.period_ns or self._samples * SLOT_MIN_NS
         return NEXT_SWEEP_PERIODS * period_ns
 
     def _is_tail_of_previous(self, place: int) -> bool:
@@ -229,7 +230,7 @@ class SampleAssembler:
         return True
 
     def _store(self, place: int, words: bytes, t_ns: int) -> Sequence[TactileReading]:
-        begun_ns = t_ns - self._position[place] * (self._readings.period_ns or 0)
+        begun_ns = t_ns - self._position[place] * (self._period.period_ns or 0)
         self._origin_ns = begun_ns if self._last < 0 else min(self._origin_ns, begun_ns)
         self._last = place
         self._put(place, words, t_ns)
@@ -259,18 +260,18 @@ class SampleAssembler:
             places = [place for place in range(ELECTRODES) if not self._have >> place & 1]
             marks[:, self._electrodes[places]] = ElectrodeFault.MISSING
             self._counters.lost_frames += lost
-        return (self._readings.make(words, marks, self._t_ns),)
+        return (make_reading(words, marks, self._t_ns, self._counters),)
 
     def _check_time(self) -> None:
         """Find sweeps lost as a whole, and learn the period from two complete ends in a row."""
-        period_ns = self._readings.period_ns
+        period_ns = self._period.period_ns
         start_ns = self._t_ns - round(self._position[self._last] * (period_ns or 0))
         if self._previous_start_ns is not None:
             gap_ns = start_ns - self._previous_start_ns
             if gap_ns > OUTAGE_NS:
-                self._readings.miss(1)
+                self._counters.missed_readings += 1
             elif period_ns and gap_ns - period_ns >= max(self._lateness_ns(), ARRIVAL_JITTER_NS):
-                self._readings.miss(round(gap_ns / period_ns) - 1)
+                self._counters.missed_readings += round(gap_ns / period_ns) - 1
         self._previous_start_ns = start_ns
         if self._last == ELECTRODES - 1:
             self._learn(self._t_ns)
@@ -290,9 +291,9 @@ class SampleAssembler:
             is_even = self._widest_ns < EVEN_SHARE * gap_ns
             if is_even and not self._is_steady:
                 self._is_steady = True
-                self._readings.forget_period()
+                self._period.forget()
             if is_even or not (self._broken or self._is_steady):
-                self._readings.learn(gap_ns)
+                self._period.learn(gap_ns)
         self._broken = False
         self._widest_ns = 0
         self._previous_end_ns = end_ns

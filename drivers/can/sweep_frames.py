@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 
 from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.can.readings import CanCounters, ReadingMaker
+from drivers.can.readings import CanCounters, SweepPeriod
+from drivers.words import make_reading
 
 SEQUENCE_JUMP_MAX: Final = 1000
 """A jump by more is a restart of the counter; 1000 sweeps last ten seconds."""
@@ -39,7 +40,7 @@ class FrameAssembler:
         self._order = range(fingers) if order is None else order
         self._fingers = fingers
         self._all = (1 << fingers) - 1
-        self._readings = ReadingMaker(counters)
+        self._period = SweepPeriod()
         self._counters = counters
         self._words = np.zeros((fingers, ELECTRODES), dtype=np.intp)
         self._faults = np.zeros(fingers, dtype=np.uint8)
@@ -59,7 +60,7 @@ class FrameAssembler:
 
     @property
     def period_ns(self) -> int | None:
-        return self._readings.period_ns
+        return self._period.period_ns
 
     def push(
         self, row: int, sequence: int, tick_us: int, words: bytes, faults: int, t_ns: int
@@ -89,7 +90,7 @@ class FrameAssembler:
         elif t_ns - self._begun_ns > self._patience_ns():
             self._counters.restarts += 1
             done = self._finish()
-            self._readings.miss(1)
+            self._counters.missed_readings += 1
             self._follows = None
             self._begin(tick_us, t_ns)
         elif tick_us != self._tick_us:
@@ -111,12 +112,12 @@ class FrameAssembler:
         """Drop the current sweep. Call when the link broke."""
         if self._have and not self._finished:
             self._counters.interrupted_sweeps += 1
-            self._readings.miss(1)
+            self._counters.missed_readings += 1
             self._finished = True
         self._synchronised = False
 
     def _patience_ns(self) -> int:
-        period_ns = self._readings.period_ns
+        period_ns = self._period.period_ns
         return PATIENCE_NS if period_ns is None else PATIENCE_PERIODS * period_ns
 
     def _is_late(self, sequence: int, tick_us: int, t_ns: int) -> bool:
@@ -133,10 +134,10 @@ class FrameAssembler:
             backwards = (tick_us - self._tick_us) % _TICKS >= _HALF
             if jump > SEQUENCE_JUMP_MAX or backwards:
                 self._counters.restarts += 1
-                self._readings.miss(1)
+                self._counters.missed_readings += 1
                 self._follows = None
             else:
-                self._readings.miss(jump - 1)
+                self._counters.missed_readings += jump - 1
         self._current = sequence
         self._begin(tick_us, t_ns)
 
@@ -150,12 +151,12 @@ class FrameAssembler:
             self._synchronised = True
             self._counters.unsynchronised_frames += here
             if self._finished_ns is not None:
-                self._readings.miss(1)
+                self._counters.missed_readings += 1
             return ()
         self._synchronised = True
         self._counters.lost_frames += self._fingers - here
         if self._finished_ns is not None and self._current == self._follows:
-            self._readings.learn(self._t_ns - self._finished_ns)
+            self._period.learn(self._t_ns - self._finished_ns)
         self._finished_ns = self._t_ns
         self._follows = None if self._current is None else (self._current + 1) % (1 << 16)
         return (self._reading(),)
@@ -166,4 +167,4 @@ class FrameAssembler:
         self._counters.unplugged_words += ELECTRODES * int(reported.sum())
         fingers = np.where(came, self._faults, np.uint8(ElectrodeFault.MISSING))
         marks = np.repeat(fingers[:, np.newaxis], ELECTRODES, axis=1)
-        return self._readings.make(self._words, marks, self._t_ns)
+        return make_reading(self._words, marks, self._t_ns, self._counters)

@@ -60,11 +60,9 @@ class JointMessage:
 
     def to_bytes(self) -> bytes:
         """Return the datagram. Raises `ValueError` for NaN and more than 4096 bytes."""
-        message: dict[str, Any] = {"joints": dict(zip(self.names, self.position_rad, strict=True))}
-        if self.t_s is not None:
-            message = {"t": self.t_s, **message}
-        if self.seq is not None:
-            message = {"seq": self.seq, **message}
+        joints = dict(zip(self.names, self.position_rad, strict=True))
+        fields = {"seq": self.seq, "t": self.t_s, "joints": joints}
+        message = {name: value for name, value in fields.items() if value is not None}
         data = json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
         if len(data) > DATAGRAM_BYTES_MAX:
             raise ValueError(f"{len(data)} bytes are more than {DATAGRAM_BYTES_MAX}")

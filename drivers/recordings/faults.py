@@ -18,31 +18,22 @@ WORD_MAX = 0xFFFF
 class ReplayFaults:
     """Which faults to inject; by default none. Readings are numbered from 0 over the whole run.
 
+    Names, meaning and limits are those of `[tactile.faults]` in deploy/SCENE.md, which checks them.
     `stuck`, `wrong` and `garbage` change the counts of the chosen electrodes, in this order.
     `off`, `slow` and `intermittent` take whole tactile readings away; joint readings still come.
-    The scene's section `[tactile.faults]` checks the values.
+    Only `intermittent` leaves a gap in `seq`. `delayed` leaves `t_ns` at when it should have come.
     """
 
     off_from: int | None = None
-    """From this reading on the sensor is silent."""
     stuck_from: int | None = None
-    """From this reading on the counts are those of the reading before it, so at least 1."""
     garbage_probability: float = 0.0
-    """Chance that a reading has random 16-bit values for counts. Those over 4095 are no counts."""
     wrong_counts: int = 0
-    """Added to every count; the sum is clipped to 0..4095."""
     slow_every: int = 1
-    """The sensor makes only every n-th reading: readings 0, n, 2n... `seq` shows no gap."""
     delayed_s: float = 0.0
-    """Readings come this much late, s, and their `t_ns` says when they should have come."""
     intermittent_probability: float = 0.0
-    """Chance that a reading is lost on the way. `seq` shows a gap."""
     fingers: tuple[str, ...] | None = None
-    """Fingers whose counts change; None for all."""
     electrodes: tuple[int, ...] | None = None
-    """Electrodes, 1..24, whose counts change; None for all."""
     seed: int = 0
-    """The same seed injects the same faults into the same recording."""
 
 
 @dataclass(slots=True)

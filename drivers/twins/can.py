@@ -10,8 +10,8 @@ from typing import Any, Final
 
 import can
 
-from drivers.base import ELECTRODES, FINGERS, Opened
-from drivers.biotac import E1, E24, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
+from drivers.base import FINGERS, Opened
+from drivers.biotac import E1, PAC, PDC, SEQUENCE_ELECTRODES, SEQUENCES, TAC, TDC, encode_word
 from drivers.can.bus import open_bus
 from drivers.can.formats import (
     SWEEP_BASE_ID,
@@ -140,43 +140,33 @@ class CanTwin(Opened):
         counts = next(self._counts, None)
         if counts is None:
             return []
-        words = [self._words_of(row, counts) for row in range(len(self._fingers))]
-        frames = (
-            self._sweep_frames(words)
-            if self._format is CanFormat.SWEEP_FD
-            else self._sample_frames(words)
-        )
+        is_sweep = self._format is CanFormat.SWEEP_FD
+        frames = self._sweep_frames(counts) if is_sweep else self._sample_frames(counts)
         self._sweep += 1
         return frames
 
-    def _words_of(self, row: int, counts: Counts) -> list[bytes]:
-        """Return a finger's words of E1 to E24, with the sensor's faults."""
+    def _word(self, row: int, channel: int, counts: Counts) -> bytes:
+        """Return what a finger's sensor answers, with its faults."""
         if row in self._faults.unplugged_fingers:
-            return [_UNDRIVEN] * ELECTRODES
-        dead = {electrode for finger, electrode in self._faults.dead_electrodes if finger == row}
-        return [
-            _WORDS[0 if electrode in dead else count]
-            for electrode, count in enumerate(counts[row].tolist())
-        ]
+            return _UNDRIVEN
+        if channel in OTHER_COUNTS:
+            return _WORDS[OTHER_COUNTS[channel]]
+        is_dead = (row, channel - E1) in self._faults.dead_electrodes
+        return _WORDS[0 if is_dead else counts[row, channel - E1]]
 
-    def _sample_frames(self, words: list[list[bytes]]) -> list[Outgoing]:
-        return [
-            (self._id, encode_sample(channel, b"".join(self._sample(channel, words))))
-            for channel in self._channels
-        ]
+    def _sample_frames(self, counts: Counts) -> list[Outgoing]:
+        frames = []
+        for channel in self._channels:
+            words = [self._word(row, channel, counts) for row in range(len(self._fingers))]
+            frames.append((self._id, encode_sample(channel, b"".join(words))))
+        return frames
 
-    def _sample(self, channel: int, words: list[list[bytes]]) -> list[bytes]:
-        if E1 <= channel <= E24:
-            return [finger[channel - E1] for finger in words]
-        unplugged = self._faults.unplugged_fingers
-        other = _WORDS[OTHER_COUNTS[channel]]
-        return [_UNDRIVEN if row in unplugged else other for row in range(len(words))]
-
-    def _sweep_frames(self, words: list[list[bytes]]) -> list[Outgoing]:
+    def _sweep_frames(self, counts: Counts) -> list[Outgoing]:
         tick_us = self._stuck_tick_us if self._faults.stuck_clock else self._tick_us()
         frames = []
-        for finger, finger_words in zip(self._fingers, words, strict=True):
-            sweep = SweepFrame(finger, self._sweep % (1 << 16), tick_us, b"".join(finger_words))
+        for row, finger in enumerate(self._fingers):
+            words = [self._word(row, channel, counts) for channel in SEQUENCE_ELECTRODES]
+            sweep = SweepFrame(finger, self._sweep % (1 << 16), tick_us, b"".join(words))
             data = sweep.to_bytes()
             if self._faults.wrong_version:
                 data = bytes((SWEEP_VERSION + 1,)) + data[1:]

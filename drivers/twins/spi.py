@@ -75,15 +75,10 @@ class SpiTwin(Opened):
         rate_hz: float | None = NOMINAL_HZ,
         channels: Sequence[int] = SEQUENCE_ELECTRODES,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
-        digest: int = DIGEST,
-        drift_ppm: float = 0.0,
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
-        """`digest`: layout that it was built with. `drift_ppm`: how fast its clock is.
-
-        `tap` is called with all bytes that go to the host. Raises `ValueError`.
-        """
+        """`tap` is called with all bytes that go to the host. Raises `ValueError`."""
         if rate_hz is not None and not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         counts = iter(source)
@@ -111,8 +106,6 @@ class SpiTwin(Opened):
         self.injected = self._injector.injected
         self.injected_in_sweeps: Counter[str] = Counter()
         """Of the faults injected, those that hit sweeps."""
-        self._digest = digest
-        self._ticks_per_ns = TICK_HZ / 1e9 * (1.0 + drift_ppm * 1e-6)
         self._clock = clock
         self._tap = tap
         self._parser = FrameParser(DIGEST)
@@ -293,7 +286,7 @@ class SpiTwin(Opened):
     def _tick(self, host_ns: int) -> int:
         if self._faults.stuck_clock:
             return 0
-        return max(int((host_ns - self._boot_ns) * self._ticks_per_ns), 0)
+        return max((host_ns - self._boot_ns) * TICK_HZ // 1_000_000_000, 0)
 
     def _hello(self, nonce: int) -> Hello:
         return Hello(
@@ -309,7 +302,6 @@ class SpiTwin(Opened):
             firmware=FIRMWARE,
             board="twin",
             version=VERSION + self._faults.wrong_version,
-            digest=self._digest,
         )
 
     def _status(self) -> BridgeStatus:
@@ -324,7 +316,7 @@ class SpiTwin(Opened):
         )
 
     def _send(self, message: Message, *, waits: bool = True) -> None:
-        frame = encode(message, self._digest)
+        frame = encode(message)
         if isinstance(message, Sweep) and self._injector.breaks_here():
             self._write(frame[: len(frame) // 2])
             self._drain()

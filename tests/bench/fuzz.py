@@ -26,8 +26,6 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 TARGETS = {
-    "can-samples": "tests.drivers.can.fuzz_can:SAMPLES",
-    "can-sweeps": "tests.drivers.can.fuzz_can:SWEEPS",
     "framing": "tests.drivers.spi.fuzz_bridge:FRAMING",
     "messages": "tests.drivers.spi.fuzz_bridge:MESSAGES",
     "palm": "tests.drivers.palm.fuzz_palm:PALM",

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from drivers.base import ElectrodeFault
 from drivers.biotac import (
     CHANNELS,
-    E1,
     ERROR_WORDS,
     FORBIDDEN_COMMAND,
     PAC,
@@ -21,7 +20,6 @@ from drivers.biotac import (
     TDC,
     channel_of,
     decode_words,
-    electrode_columns,
     encode_word,
     sample_command,
 )
@@ -136,8 +134,3 @@ def test_sequences_are_those_of_the_manual() -> None:
     assert [len(sequence) for sequence in lengths] == [54, 28, 24]
     assert set(SEQUENCE_INTERLEAVED[1::2]) == {PAC}
     assert list(SEQUENCE_INTERLEAVED[::2]) == [*electrodes, PDC, TAC, TDC]
-
-
-def test_electrodes_are_found_in_a_sequence() -> None:
-    assert electrode_columns([PAC, E1 + 5, TDC, E1]).tolist() == [[1, 5], [3, 0]]
-    assert electrode_columns((PAC, PDC)).shape == (0, 2)

@@ -5,13 +5,12 @@ Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by 5763 parameters per cla
 92,000 counts of a class; it holds none of its grasps. A class is a mixture of three Gaussians over
 the raw counts of ff, mf, th, with the 24 largest principal axes of each.
 
-`python -m drivers.twins.grasps.synthetic` writes the demo table, with `--day` the demo day.
+`python -m drivers.twins.grasps.synthetic` writes the demo table and the demo day.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -135,21 +134,14 @@ def _to_array(_kind: type, numbers: list[float]) -> NDArray[np.float64]:
     return np.array(numbers, dtype=np.float64)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the demo table, or the demo day."""
-    parser = argparse.ArgumentParser(
-        prog="python -m drivers.twins.grasps.synthetic", description=__doc__
-    )
-    parser.add_argument("--day", action="store_true", help="a day in which the sensors drift")
-    parser.add_argument("--out", type=Path, help="CSV file to write (default: the demo's)")
-    options = parser.parse_args(arguments)
-    rng = np.random.default_rng(DEMO_SEED)
-    if options.day:
-        grasps, out = draw_day(read_model(), rng, DAY_GRASPS), DEMO_DAY
-    else:
-        grasps, out = draw(read_model(), rng, DEMO_GRASPS), DEMO_TABLE
-    with (options.out or out).open("w", encoding="utf-8", newline="") as file:
-        write_table(grasps, file)
+def main(folder: Path = DEMO_TABLE.parent) -> None:
+    """Write the demo table and the demo day."""
+    model = read_model()
+    table = draw(model, np.random.default_rng(DEMO_SEED), DEMO_GRASPS)
+    day = draw_day(model, np.random.default_rng(DEMO_SEED), DAY_GRASPS)
+    for grasps, demo in ((table, DEMO_TABLE), (day, DEMO_DAY)):
+        with (folder / demo.name).open("w", encoding="utf-8", newline="") as file:
+            write_table(grasps, file)
 
 
 def _draw_one(grasp_class: GraspClass, rng: np.random.Generator) -> tuple[int, NDArray[np.uint16]]:

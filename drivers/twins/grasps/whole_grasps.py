@@ -8,7 +8,6 @@ Contact lowers counts, so a believable end point lies at or below the rest; see 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -277,13 +276,10 @@ def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> Non
         file.write(",".join(cells) + "\n")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(path: Path = DEMO_RECORDING) -> None:
     """Write the demo recording."""
-    parser = argparse.ArgumentParser(prog="python -m drivers.twins.grasps.whole_grasps")
-    parser.add_argument("--out", type=Path, default=DEMO_RECORDING, help="CSV file to write")
-    options = parser.parse_args(arguments)
     stream = synthetic_grasps(DEMO_GRASPS, sampling=Sampling.HELD, durations=DEMO_DURATIONS)
-    with options.out.open("w", encoding="utf-8", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         write_stream(stream, file, t_decimals=2)
 
 

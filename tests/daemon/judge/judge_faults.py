@@ -197,7 +197,7 @@ FAULTS: dict[str, Fault] = {
     "replay wrong by -500": replayed(wrong_counts=-500),
     "replay slow, 20th": replayed(slow_every=20),
     "replay delayed, 0.2 s": replayed(delayed_s=0.2),
-    "replay lossy, half": replayed(intermittent_probability=0.5),
+    "replay intermittent": replayed(intermittent_probability=0.5),
     **{
         f"{fault.name}, {name}".lower().replace("_", "-"): flagged(fault, where)
         for fault in SINGLE

@@ -34,7 +34,7 @@ replay wrong by +500  not-tared       not-tared       moving          moving    
 replay wrong by -500  =               =               moving          ~moving         =
 replay slow, 20th     stale           stale           stale           stale           stale
 replay delayed, 0.2 s stale           stale           stale           stale           stale
-replay lossy, half    =               =               =               =               =
+replay intermittent   =               =               =               =               =
 missing, one          =               =               =               =               =
 missing, nine         sensor-missing  sensor-missing  sensor-missing  sensor-missing  sensor-missing
 missing, finger       sensor-missing  sensor-missing  sensor-missing  sensor-missing  sensor-missing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,10 @@ def assembler(sequence: str = "electrodes") -> tuple[SampleAssembler, CanCounter
 
 def concatenated(sweeps: Sequence[Sequence[Sample]]) -> list[Sample]:
     return [sample for sweep in sweeps for sample in sweep]
+
+
+def feed(sweeps: SampleAssembler, stream: Iterable[Sample]) -> list[TactileReading]:
+    return [reading for sample in stream for reading in sweeps.push(*sample)]
 
 
 def assert_true(reading: TactileReading, sweep: int) -> None:

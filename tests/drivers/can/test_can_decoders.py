@@ -21,6 +21,8 @@ from tests.drivers.can.test_can_formats import E1_SAMPLE, SWEEP_EXAMPLE
         (CanFrame(0x100, E1_SAMPLE + b"\0"), "wrong_length_frames"),
         (CanFrame(0x100, b""), "wrong_length_frames"),
         (CanFrame(0x100, b"\xa1" + E1_SAMPLE[1:]), "unknown_commands"),
+        (CanFrame(0x100, b"\x61" + E1_SAMPLE[1:]), "unknown_commands"),  # reads a parameter
+        (CanFrame(0x100, b"\x88" + E1_SAMPLE[1:]), "unknown_commands"),  # even parity
         (CanFrame(0x100, E1_SAMPLE, FD), "malformed_frames"),
         (CanFrame(0x100, E1_SAMPLE), "accepted_frames"),
     ],

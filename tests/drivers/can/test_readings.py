@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.can.readings import CanCounters, ReadingMaker
+from drivers.can.readings import SweepPeriod
 from tests.drivers.can.can_words import SLOT_NS, assembler, concatenated, samples
 
 MS = 1_000_000
@@ -12,7 +12,7 @@ PERIOD_NS = 24 * SLOT_NS
 
 
 def test_a_period_is_the_median_of_the_last_fifteen_and_known_after_five() -> None:
-    made, known = ReadingMaker(CanCounters()), []
+    made, known = SweepPeriod(), []
     for gap_ns in [10] * 15 + [20] * 9:
         made.learn(gap_ns)
         known.append(made.period_ns)
@@ -20,21 +20,13 @@ def test_a_period_is_the_median_of_the_last_fifteen_and_known_after_five() -> No
 
 
 def test_a_period_is_of_two_seconds_at_most_and_of_no_sweeps_at_one_time() -> None:
-    made = ReadingMaker(CanCounters())
+    made = SweepPeriod()
     for gap_ns in (0, -1, 2_000 * MS + 1) * 5:
         made.learn(gap_ns)
     assert made.period_ns is None
     for _ in range(5):
         made.learn(2_000 * MS)
     assert made.period_ns == 2_000 * MS
-
-
-def test_what_was_missed_leaves_a_gap_in_the_numbers() -> None:
-    counters = CanCounters()
-    made = ReadingMaker(counters)
-    made.miss(3)
-    made.miss(4)
-    assert (made.seq, counters.missed_readings) == (7, 7)
 
 
 def missed_when_late(number: int, late_ns: int) -> int:

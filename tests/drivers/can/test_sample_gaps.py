@@ -11,22 +11,18 @@ import pytest
 
 from drivers.base import TactileReading
 from drivers.biotac import SEQUENCES
-from drivers.can.samples import SampleAssembler
 from tests.drivers.can.can_words import (
     SLOT_NS,
     Sample,
     assembler,
     assert_true,
     concatenated,
+    feed,
     samples,
     truth,
 )
 
 MS = 1_000_000
-
-
-def feed(sweeps: SampleAssembler, stream: Sequence[Sample]) -> list[TactileReading]:
-    return [reading for sample in stream for reading in sweeps.push(*sample)]
 
 
 def assert_of_one_sweep(reading: TactileReading) -> int:
@@ -276,14 +272,3 @@ def test_a_late_sample_of_a_lost_sweep_is_none_of_the_next_one() -> None:
         assert_true(reading, reading.seq)
         assert not reading.faults.any()
     assert (len(readings), counters.late_frames) == (11, 1)
-
-
-def test_a_board_without_a_pause_teaches_no_period_by_the_sweeps_that_it_lost() -> None:
-    """Every second sweep is lost, then the rest of one, and the begin of the next but one."""
-    sweeps, _ = assembler()
-    steady = [samples(n) for n in range(3)]
-    in_turns = [samples(n) for n in range(4, 30, 2)]
-    feed(sweeps, concatenated([*steady, *in_turns]))
-    cut = [*samples(30)[:10], *samples(31)[10:], *samples(32)]
-    for reading in feed(sweeps, cut):
-        assert_of_one_sweep(reading)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 import pytest
 
@@ -14,10 +12,10 @@ from drivers.can.samples import SampleAssembler
 from tests.drivers.can.can_words import (
     FINGERS,
     SLOT_NS,
-    Sample,
     assembler,
     assert_true,
     concatenated,
+    feed,
     samples,
     truth,
     word,
@@ -27,13 +25,6 @@ OUTAGE_NS = 2_000_000_000
 PERIODS_NEEDED = 5
 
 MISSING = ElectrodeFault.MISSING
-
-
-def feed(sweeps: SampleAssembler, stream: Iterable[Sample]) -> list[TactileReading]:
-    readings: list[TactileReading] = []
-    for channel, words, t_ns in stream:
-        readings += sweeps.push(channel, words, t_ns)
-    return readings
 
 
 def missing_electrodes(reading: TactileReading) -> list[int]:

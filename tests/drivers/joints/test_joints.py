@@ -54,10 +54,6 @@ def message(seq: int | None = None, t_s: float | None = None, **angles: float) -
     return json.dumps(fields).encode()
 
 
-def state(driver: JointStreamDriver) -> LinkState:
-    return driver.link_state
-
-
 def test_the_example_of_the_documentation_is_read() -> None:
     found, counters = parse(
         '{"seq": 1041, "t": 12.31, "joints": {"FFJ3": 0.51, "FFJ4": -0.02, "THJ5": 0.3}}'
@@ -92,11 +88,9 @@ def test_a_hand_prefix_and_other_fields_do_no_harm() -> None:
         b'{"joints": {"FFJ3": 0.5}} x',
         b'{"joints": {"FFJ3": 0.5, "FFJ3": 0.6}}',
         b'{"joints": {}, "joints": {"FFJ3": 0.5}}',
-        b'{"joints": {"FFJ3": 0.5}, "seq": -1}',
         b'{"joints": {"FFJ3": 0.5}, "seq": 1.5}',
         b'{"joints": {"FFJ3": 0.5}, "seq": true}',
         b'{"joints": {"FFJ3": 0.5}, "seq": "7"}',
-        b'{"joints": {"FFJ3": 0.5}, "seq": 9223372036854775808}',
         b'{"joints": {"FFJ3": 0.5}, "seq": NaN}',
         b'{"joints": {"FFJ3": 0.5}, "t": "now"}',
         b'{"joints": {"FFJ3": 0.5}, "t": 1e999}',
@@ -205,6 +199,7 @@ def test_no_joint_turns_further_than_200_degrees(degrees: float, angle: bool) ->
 def test_the_joint_stream_is_a_driver() -> None:
     driver: Driver = JointStreamDriver(LOOPBACK)
     assert (driver.name, driver.period_ns, driver.exhausted) == ("joints", None, False)
+    assert JointStreamDriver.silence_ns == 500 * MS, "a sender of 10 Hz passes"
     assert driver.fileno() is driver.due_ns() is None
     assert driver.describe() == {
         "source": Fact(LOOPBACK),
@@ -256,35 +251,11 @@ def test_a_sender_that_repeats_itself_is_never_taken(driver: JointStreamDriver) 
     assert driver.counters.old_messages == 99
 
 
-def test_silence_loses_the_link_and_a_message_brings_it_back(
-    driver: JointStreamDriver, clock: DatagramClock
-) -> None:
-    assert state(driver) is LinkState.GREETING
-    with Sender(driver) as sender:
-        sender.send(message(100))
-        driver.read_ready()
-        assert state(driver) is LinkState.UP
-        clock.now_ns += 499 * MS
-        driver.read_ready()
-        assert state(driver) is LinkState.UP
-        due_ns = driver.due_ns()
-        assert due_ns is not None
-        clock.now_ns = due_ns
-        driver.read_ready()
-        assert state(driver) is LinkState.GREETING
-        assert driver.counters.link_losses == 1
-        assert driver.describe()["why"].text == "nothing good for 500 ms"
-    assert len(taken(driver, message(1))) == 1  # another sender, counting from the start
-    assert state(driver) is LinkState.UP
-
-
 def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:
     assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
-    assert state(driver) is LinkState.UP
+    assert driver.link_state is LinkState.UP
 
 
-def test_a_twin_with_nonsense_settings_is_refused() -> None:
-    with pytest.raises(ValueError, match="rate_hz"):
-        JointTwin(rate_hz=0.0)
+def test_a_twin_refuses_a_fault_that_it_cannot_show() -> None:
     with pytest.raises(ValueError, match="burst-frames"):
         JointTwin(faults=LinkFaults(burst_frames=2))

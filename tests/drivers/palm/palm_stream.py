@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import select
 import socket
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -126,30 +124,6 @@ class Sender:
 
     def __exit__(self, *_: object) -> None:
         self.socket.close()
-
-
-def wait_like_the_service(driver: PalmDriver | JointStreamDriver, most_s: float) -> list[Reading]:
-    """Wait for descriptor or due time once, then take what there is."""
-    descriptor, due_ns = driver.fileno(), driver.due_ns()
-    wait_s = most_s
-    if due_ns is not None:
-        wait_s = min(most_s, max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
-    select.select([] if descriptor is None else [descriptor], [], [], wait_s)
-    return list(driver.read_ready())
-
-
-def listen(
-    driver: PalmDriver | JointStreamDriver,
-    until: Callable[[list[Reading]], bool],
-    most_s: float = 100.0,
-) -> list[Reading]:
-    """Readings until a condition holds; fails after `most_s`."""
-    readings: list[Reading] = []
-    end = time.monotonic() + most_s
-    while not until(readings):
-        assert time.monotonic() < end, f"waited {most_s} s in vain"
-        readings += wait_like_the_service(driver, 0.05)
-    return readings
 
 
 def tactile(readings: Iterable[Reading]) -> list[TactileReading]:

@@ -217,6 +217,7 @@ def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
 ) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(2)
+    sweeps.interrupt()
     for at in range(ROUND):
         sweeps.push(stream[at], at * MS)
     sweeps.interrupt()
@@ -224,6 +225,8 @@ def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
     assert sweeps.push(stream[ROUND + 3], 15 * MS) == ()
     sweeps.push(stream[ROUND], 13 * MS + after_ns)
     assert (sweeps.counters.missed_readings, sweeps.counters.unsynchronised_packets) == (missed, 1)
+    sweeps.interrupt()
+    assert sweeps.counters.interrupted_rounds == 1
 
 
 @pytest.mark.parametrize(

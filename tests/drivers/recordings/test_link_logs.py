@@ -58,27 +58,6 @@ def test_python_can_reads_our_lines(frame: CanFrame) -> None:
     assert message.timestamp == pytest.approx(1e9)
 
 
-@given(frames())
-def test_we_read_the_lines_of_python_can(frame: CanFrame) -> None:
-    if frame.flags & ERROR:
-        return
-    out = io.StringIO()
-    writer = can.CanutilsLogWriter(out)
-    writer.on_message_received(
-        can.Message(
-            timestamp=1436509052.249713,
-            arbitration_id=frame.arbitration_id,
-            is_extended_id=bool(frame.flags & EXTENDED),
-            is_fd=bool(frame.flags & FD),
-            is_remote_frame=bool(frame.flags & REMOTE),
-            data=frame.data,
-            dlc=len(frame.data),
-            channel="can0",
-        )
-    )
-    assert frame_of(out.getvalue()) == (1436509052249713000, frame)
-
-
 @pytest.mark.parametrize(
     ("line", "frame"),
     [  # candump -L of can-utils

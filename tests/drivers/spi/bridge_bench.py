@@ -1,4 +1,4 @@
-"""The other end of a serial bridge for tests: by hand message by message, or the twin at work."""
+"""The other end of a serial bridge for tests: messages, a scripted port, or the twin at work."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import TactileReading
+from drivers.base import Reading, TactileReading
 from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
 from drivers.link import LinkState
+from drivers.spi.conversation import Conversation
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.messages import DIGEST, FrameParser, Hello, Message, Ping, Sweep, decode, encode
 from drivers.twins.spi import SpiTwin
 from tests.kit.clock import Clock
 
 MS = 1_000_000
+T0 = 5_000_000 * MS
+"""Host time when a conversation begins, ns."""
 FINGERS = ("ff", "mf", "th")
 PATIENCE_S = 100.0
 """Real time that a test waits for bytes that must come."""
@@ -79,10 +82,11 @@ def hello(
     *,
     channels: Sequence[int] = SEQUENCE_ELECTRODES,
     sensors: int = 3,
-    tick_hz: int = 1_000_000,
+    period_ms: int = 10,
 ) -> Hello:
     commands = tuple(sample_command(channel) for channel in channels)
-    return Hello(nonce, tick, tick_hz, tick_hz // 100, ("BTSP-1",) * sensors, commands, board="b")
+    serials = ("BTSP-1",) * sensors
+    return Hello(nonce, tick, 1_000_000, 1000 * period_ms, serials, commands, board="b")
 
 
 def words(first: int = 1000, slots: int = 24, sensors: int = 3) -> NDArray[np.uint16]:
@@ -100,6 +104,53 @@ def sweep(seq: int, tick: int, present: int = 7, read: NDArray[np.uint16] | None
     return Sweep(seq, tick, tick + 1900, present, words() if read is None else read)
 
 
+def said(conversation: Conversation, now_ns: int) -> list[Message]:
+    """What the host says, taken as sent."""
+    messages = []
+    parser = FrameParser(DIGEST)
+    for data in conversation.say(now_ns):
+        conversation.sent(data, now_ns)
+        messages += [decode(*frame) for frame in parser.feed(data)]
+    return [message for message in messages if message is not None]
+
+
+def hear(conversation: Conversation, message: Message, now_ns: int) -> list[TactileReading]:
+    """The readings that a message makes."""
+    return tactile(conversation.receive(encode(message), now_ns, now_ns))
+
+
+def opened(nonce: int = 41, sensors: Sequence[str] | None = None) -> Conversation:
+    conversation = Conversation("port", FINGERS, sensors, nonce=nonce)
+    conversation.opened(T0)
+    return conversation
+
+
+def answer(conversation: Conversation, about: Hello, now_ns: int = T0) -> None:
+    """Let a HELLO answer the PING that is due."""
+    (nonce,) = (each.nonce for each in said(conversation, now_ns) if isinstance(each, Ping))
+    assert hear(conversation, dataclasses.replace(about, nonce=nonce), now_ns) == []
+
+
+def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> None:
+    """Let a HELLO of these sensors answer; if the link is lost, it is opened again."""
+    answer(conversation, dataclasses.replace(hello(0), serials=serials), now_ns)
+    if conversation.link.state is LinkState.WAITING:
+        conversation.opened(now_ns)
+
+
+def greeted(about: Hello | None = None, sensors: Sequence[str] | None = None) -> Conversation:
+    """A conversation with a bridge that tells this of itself, before its START."""
+    conversation = opened(40, sensors)
+    for _ in range(2):  # the serial numbers are believed when they are told again
+        if conversation.hello is None and conversation.link.state is LinkState.GREETING:
+            answer(conversation, about or hello(0))
+    return conversation
+
+
+def tactile(readings: Sequence[Reading]) -> list[TactileReading]:
+    return [reading for reading in readings if isinstance(reading, TactileReading)]
+
+
 def take(driver: SpiBridgeDriver, bridge: ScriptedBridge) -> list[TactileReading]:
     """All readings of what the bridge has sent; returns early when the driver gives up."""
     readings: list[TactileReading] = []
@@ -109,24 +160,8 @@ def take(driver: SpiBridgeDriver, bridge: ScriptedBridge) -> list[TactileReading
         descriptor = driver.fileno()
         assert descriptor is not None
         select.select([descriptor], [], [], 0.1)
-        readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
+        readings += tactile(driver.read_ready())
     return readings
-
-
-def greeted(
-    driver: SpiBridgeDriver, bridge: ScriptedBridge, answer: Callable[[int], Message] = hello
-) -> list[Message]:
-    """Open the driver and answer its PINGs; what it had said until the first."""
-    driver.open()
-    said = heard = bridge.heard(Ping)
-    for _ in range(2):  # the serial numbers are believed when they are told again
-        (ping,) = (message for message in heard if isinstance(message, Ping))
-        bridge.send(answer(ping.nonce))
-        take(driver, bridge)
-        if driver.link_state is LinkState.WAITING or driver.conversation.hello is not None:
-            break
-        heard = bridge.heard(Ping)
-    return said
 
 
 @dataclass(frozen=True)
@@ -135,17 +170,20 @@ class Rig:
     driver: SpiBridgeDriver
     clock: Clock
 
-    def greet(self, answer: Hello | None = None) -> list[Message]:
-        """Bring the driver so far that it has sent START."""
+    def greet(self) -> list[Message]:
+        """Bring the driver so far that it has sent START; what it had said until its first PING."""
+        self.driver.open()
+        first = self._answered()
+        self._answered()
+        return first
 
-        def answered(nonce: int) -> Message:
-            return dataclasses.replace(answer or hello(0), nonce=nonce)
-
-        return greeted(self.driver, self.bridge, answered)
-
-    def wait(self, ms: float) -> None:
-        self.clock.now_ns += round(ms * MS)
-        assert self.driver.read_ready() == []
+    def _answered(self) -> list[Message]:
+        """Answer the next PING; what was said until then."""
+        heard = self.bridge.heard(Ping)
+        (ping,) = (message for message in heard if isinstance(message, Ping))
+        self.bridge.send(hello(ping.nonce))
+        take(self.driver, self.bridge)
+        return heard
 
 
 def run(
@@ -159,7 +197,7 @@ def run(
         twin.run_once()
         due_ns = driver.due_ns()
         if (due_ns is not None and time.monotonic_ns() >= due_ns) or is_readable(driver):
-            readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
+            readings += tactile(driver.read_ready())
         else:
             time.sleep(0.0002)
     return readings

@@ -1,21 +1,16 @@
-"""A device whose clock is known exactly: measures what `drivers.spi.sweeps` makes of it.
-
-`python -m tests.drivers.spi.clock_error` prints the errors that the docstring states.
-"""
+"""A device whose clock is known exactly: what `drivers.spi.sweeps` makes of it."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.spi.sweeps import BridgeCounters, DeviceClock
+from drivers.spi.sweeps import DeviceClock
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -91,24 +86,3 @@ def errors_ms(way: Way, duration_s: float, clock: DeviceClock) -> NDArray[np.flo
             errors.append((mapped_ns - event.made_ns) / MS)
         idle_ns = event.arrival_ns
     return np.array(errors)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--duration-s", type=float, default=600.0)
-    options = parser.parse_args()
-    for drift_ppm in (-100.0, 0.0, 100.0):
-        for jitter_ms, batch_ms in ((1.0, 16.0), (0.1, 0.0)):
-            way = Way(jitter_ms, batch_ms, drift_ppm)
-            clock = DeviceClock(TICK_HZ, BridgeCounters())
-            errors = errors_ms(way, options.duration_s, clock)
-            low, p1, median, high = np.percentile(errors, [0, 1, 50, 100])
-            sys.stdout.write(
-                f"drift {drift_ppm:+.0f} ppm (found {clock.drift_ppm or math.nan:+.1f}), jitter "
-                f"{jitter_ms} ms, batches of {batch_ms:.0f} ms: error min {low:.2f}, 1 % {p1:.2f}, "
-                f"median {median:.2f}, max {high:.2f} ms; {clock.counters.clock_faults} faults\n"
-            )
-
-
-if __name__ == "__main__":
-    main()

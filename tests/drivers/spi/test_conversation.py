@@ -7,60 +7,39 @@ import dataclasses
 import pytest
 
 from drivers.base import DeviceFault, Fact, LinkCause
+from drivers.biotac import SEQUENCE_ALL
 from drivers.link import LinkState
 from drivers.spi.conversation import Conversation
 from drivers.spi.messages import (
     DIGEST,
     FIRMWARE,
     BridgeStatus,
-    FrameParser,
-    Message,
     Ping,
     Start,
     Stop,
     Sweep,
-    decode,
     encode,
     encode_frame,
 )
-from tests.drivers.spi.bridge_bench import FINGERS, MS, hello, sweep, words
+from tests.drivers.spi.bridge_bench import (
+    MS,
+    T0,
+    answer,
+    greeted,
+    hear,
+    hello,
+    opened,
+    said,
+    sweep,
+    told,
+    words,
+)
 
-T0 = 5_000_000 * MS
 S = 1000 * MS
-
-
-def said(conversation: Conversation, now_ns: int) -> list[Message]:
-    """What the host says, taken as sent."""
-    messages = []
-    parser = FrameParser(DIGEST)
-    for data in conversation.say(now_ns):
-        conversation.sent(data, now_ns)
-        messages += [decode(*frame) for frame in parser.feed(data)]
-    return [message for message in messages if message is not None]
-
-
-def opened(nonce: int = 41) -> Conversation:
-    conversation = Conversation("port", FINGERS, nonce=nonce)
-    conversation.opened(T0)
-    return conversation
-
-
-def hear(conversation: Conversation, message: Message, now_ns: int) -> int:
-    """How many readings a message makes."""
-    return len(conversation.receive(encode(message), now_ns, now_ns))
 
 
 def state(conversation: Conversation) -> LinkState:
     return conversation.link.state
-
-
-def greeted(period_ms: int = 10) -> Conversation:
-    conversation = opened(nonce=40)
-    for nonce in (41, 42):
-        said(conversation, T0)
-        answer = dataclasses.replace(hello(nonce), period_ticks=1000 * period_ms)
-        assert hear(conversation, answer, T0) == 0
-    return conversation
 
 
 def test_a_bridge_is_asked_four_times_half_a_second_apart_and_given_up() -> None:
@@ -86,7 +65,7 @@ def test_a_nonce_is_never_that_of_a_reset() -> None:
 
 
 def test_eight_pings_come_each_50_ms_and_then_one_a_second() -> None:
-    conversation, sent_ms = greeted(1000), [0]
+    conversation, sent_ms = greeted(hello(0, period_ms=1000)), [0]
     assert said(conversation, T0) == [Start()]
     for number in range(10):
         now_ns = conversation.due_ns
@@ -101,10 +80,10 @@ def test_eight_pings_come_each_50_ms_and_then_one_a_second() -> None:
 def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
     period_ms: int, silence_ms: int
 ) -> None:
-    conversation = greeted(period_ms)
+    conversation = greeted(hello(0, period_ms=period_ms))
     assert said(conversation, T0) == [Start()]
     heard_ns = T0 + 7 * MS
-    assert hear(conversation, sweep(0, 10**9), heard_ns) == 1
+    assert len(hear(conversation, sweep(0, 10**9), heard_ns)) == 1
     assert state(conversation) is LinkState.UP
     said(conversation, heard_ns + silence_ms * MS - 1)
     assert state(conversation) is LinkState.UP
@@ -115,14 +94,42 @@ def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
 
 
 def test_a_bridge_that_sweeps_less_than_once_a_second_is_refused() -> None:
-    conversation = greeted(1001)
+    conversation = greeted(hello(0, period_ms=1001))
     assert conversation.link.reason == "port: the bridge sweeps once in 1.001 s only"
     assert conversation.link.cause is LinkCause.SETTINGS
     assert conversation.counters.refused_bridges == 1
 
 
+def test_a_bridge_with_too_few_sensors_is_refused() -> None:
+    conversation = greeted(hello(0, sensors=2))
+    why = "port: the bridge has 2 sensors, the scene needs 3"
+    assert (conversation.link.reason, conversation.counters.refused_bridges) == (why, 1)
+
+
+def test_a_board_that_was_reset_by_opening_it_is_asked_again_at_once() -> None:
+    conversation = opened()
+    assert said(conversation, T0) == [Stop(), Ping(42)]
+    assert said(conversation, T0) == []
+    hear(conversation, hello(0), T0)
+    assert said(conversation, T0) == [Stop(), Ping(43)]
+
+
+def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again() -> None:
+    conversation = greeted()
+    sent = [encode(message) for message in (sweep(0, 10_000), hello(0), sweep(1, 20_000))]
+    assert len(conversation.receive(b"".join(sent), T0, T0)) == 1
+    assert conversation.link.reason == "the bridge was reset"
+    assert conversation.counters.restarts == 1
+
+
+def test_a_bridge_that_changes_its_sampling_is_greeted_again() -> None:
+    conversation = greeted()
+    answer(conversation, hello(0, channels=SEQUENCE_ALL), T0 + 50 * MS)
+    assert conversation.link.reason == "the bridge changed what it samples"
+
+
 def test_of_pings_without_an_answer_eight_are_remembered() -> None:
-    conversation, now_ns = greeted(1000), T0
+    conversation, now_ns = greeted(hello(0, period_ms=1000)), T0
     said(conversation, T0)
     for _ in range(8):
         now_ns = conversation.due_ns
@@ -152,10 +159,7 @@ def words_of(conversation: Conversation) -> dict[str, str]:
 def test_sensors_that_are_absent_or_twice_there_are_a_fault(
     serials: tuple[str, ...], sensors: Fact, errors: Fact
 ) -> None:
-    conversation = opened()
-    for nonce in (42, 43):
-        said(conversation, T0)
-        hear(conversation, dataclasses.replace(hello(nonce), serials=serials), T0)
+    conversation = greeted(dataclasses.replace(hello(0), serials=serials))
     hear(conversation, BridgeStatus(1, 0, 0, 0, 0, (0,) * 3), T0)
     assert conversation.describe()["sensors"] == sensors
     assert conversation.describe()["spi errors"] == errors
@@ -169,10 +173,7 @@ def test_sensors_that_are_absent_or_twice_there_are_a_fault(
     ],
 )
 def test_spi_errors_where_no_sensor_is_are_no_fault(numbers: tuple[int, ...], errors: Fact) -> None:
-    conversation = opened()
-    for nonce in (42, 43):
-        said(conversation, T0)
-        hear(conversation, dataclasses.replace(hello(nonce), serials=("A", "", "C")), T0)
+    conversation = greeted(dataclasses.replace(hello(0), serials=("A", "", "C")))
     hear(conversation, BridgeStatus(1, 0, 0, 0, 0, numbers), T0)
     assert conversation.describe()["spi errors"] == errors
 
@@ -183,11 +184,11 @@ def test_people_are_told_what_is_known() -> None:
     conversation.lost(LinkCause.DISCONNECTED, "unplugged", T0)
     assert words_of(conversation) == {"port": "port", "link": "waiting", "why": "unplugged"}
     conversation.opened(T0)
+    serials = ("BTSP-1", "", "BTSP-3")
     for nonce, t_ns in ((42, T0), (43, T0 + 2 * MS)):
         said(conversation, t_ns)
-        told = ("BTSP-1", "", "BTSP-3")
-        answer = dataclasses.replace(hello(nonce), firmware=0x0203, serials=told)
-        hear(conversation, answer, t_ns + 2 * MS)
+        about_it = dataclasses.replace(hello(nonce), firmware=0x0203, serials=serials)
+        hear(conversation, about_it, t_ns + 2 * MS)
     about = {
         "board": "b",
         "firmware": "2.3",
@@ -214,24 +215,23 @@ def test_people_are_told_what_is_known() -> None:
 
 
 def test_people_are_told_how_the_bridge_keeps_time() -> None:
-    conversation = greeted(period_ms=500)
+    conversation = greeted(hello(0, period_ms=500))
     said(conversation, T0 + S)  # a PING, answered after 1 ms by a clock that is 100 ppm fast
-    answer = dataclasses.replace(hello(43, 1_000_100), period_ticks=500_000)
-    hear(conversation, answer, T0 + S + MS)
+    hear(conversation, hello(43, 1_000_100, period_ms=500), T0 + S + MS)
     for seq, took in enumerate((1910, 2209, 1900)):
         made = Sweep(seq, 1_000_200 + 3000 * seq, 1_000_200 + 3000 * seq + took, 7, words())
-        assert hear(conversation, made, T0 + S + 20 * MS) == 1
+        assert len(hear(conversation, made, T0 + S + 20 * MS)) == 1
     late = Sweep(3, 1_020_000, 1_520_000, 7, words())
     assert conversation.describe()["sweep"] == Fact("2.21 ms at most, of 500.00 ms")
     hear(conversation, late, T0 + S + 540 * MS)
     too_long = Fact("500.00 ms is too long for 500.00 ms", DeviceFault.SWEEP_TOO_LONG)
     assert conversation.describe()["sweep"] == too_long
     hear(conversation, BridgeStatus(1, 3, 0, 0, 0, (0, 7, 24)), T0 + S + 20 * MS)
-    told = words_of(conversation)
-    assert told["clock rate"] == "1000000 Hz"
-    assert told["spi errors"] == "0, 7, 24"
+    described = words_of(conversation)
+    assert described["clock rate"] == "1000000 Hz"
+    assert described["spi errors"] == "0, 7, 24"
     # 1000100 +- 1 us by its clock are between 1000 and 1001 ms by ours.
-    assert told["clock drift"] == "-900 to +101 ppm"
+    assert described["clock drift"] == "-900 to +101 ppm"
 
 
 @pytest.mark.parametrize(
@@ -239,12 +239,9 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
     [(FIRMWARE - 1, "0.2"), (FIRMWARE, None), (FIRMWARE + 1, None), (0x0200, None)],
 )
 def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None) -> None:
-    conversation = opened()
-    for nonce in (42, 43):
-        said(conversation, T0)
-        hear(conversation, dataclasses.replace(hello(nonce), firmware=firmware), T0)
-    told = None if newer is None else Fact(newer, DeviceFault.OLD_FIRMWARE)
-    assert conversation.describe().get("newer firmware") == told
+    conversation = greeted(dataclasses.replace(hello(0), firmware=firmware))
+    fact = None if newer is None else Fact(newer, DeviceFault.OLD_FIRMWARE)
+    assert conversation.describe().get("newer firmware") == fact
 
 
 def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words() -> None:
@@ -270,7 +267,7 @@ def test_a_frame_makes_no_sense_or_its_type_is_unknown(kind: int, bad: int) -> N
 @pytest.mark.parametrize(("first", "missed"), [(0, 0), (1, 1), (1000, 1000), (1001, 0)])
 def test_a_high_first_number_is_no_loss(first: int, missed: int) -> None:
     conversation = greeted()
-    assert hear(conversation, sweep(first, 10**9), T0) == 1
+    assert len(hear(conversation, sweep(first, 10**9), T0)) == 1
     assert conversation.counters.missed_readings == missed
 
 
@@ -289,20 +286,12 @@ def test_numbers_of_sweeps_go_round(
     step: int, taken: int, missed: int, duplicates: int, reordered: int
 ) -> None:
     conversation, first = greeted(), 900
-    assert hear(conversation, sweep(first, 10**9), T0) == 1
+    assert len(hear(conversation, sweep(first, 10**9), T0)) == 1
     assert conversation.counters.missed_readings == 900
-    assert hear(conversation, sweep((first + step) % (1 << 32), 2 * 10**9), T0 + MS) == taken
+    assert len(hear(conversation, sweep((first + step) % (1 << 32), 2 * 10**9), T0 + MS)) == taken
     counters = conversation.counters
     assert counters.missed_readings == 900 + missed
     assert (counters.duplicates, counters.reordered) == (duplicates, reordered)
-
-
-def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> None:
-    """A HELLO that answers the PING which is due; if the link is lost, it is opened again."""
-    (nonce,) = (each.nonce for each in said(conversation, now_ns) if isinstance(each, Ping))
-    hear(conversation, dataclasses.replace(hello(nonce), serials=serials), now_ns)
-    if state(conversation) is LinkState.WAITING:
-        conversation.opened(now_ns)
 
 
 SERIALS, MISREAD, OTHERS = ("A", "B", "C"), ("A", "8", "C"), ("A", "D", "C")
@@ -327,10 +316,9 @@ def test_nothing_is_handed_over_before_two_hellos_in_a_row_tell_the_same_sensors
     conversation = opened()
     for at, serials in enumerate(hellos, 1):
         assert conversation.hello is None
-        (nonce,) = (each.nonce for each in said(conversation, T0) if isinstance(each, Ping))
-        hear(conversation, dataclasses.replace(hello(nonce), serials=serials), T0)
+        answer(conversation, dataclasses.replace(hello(0), serials=serials))
         made = hear(conversation, sweep(0, 10**9), T0)
-        assert made == (at == len(hellos) and believed is not None)
+        assert bool(made) == (at == len(hellos) and believed is not None)
     assert conversation.serials.get("mf") == believed
 
 
@@ -359,15 +347,15 @@ def test_another_serial_number_stops_readings_until_it_is_told_again(
     conversation = opened()
     for _ in range(2):
         told(conversation, SERIALS, T0)
-    assert hear(conversation, sweep(0, 10**9), T0) == 1
+    assert len(hear(conversation, sweep(0, 10**9), T0)) == 1
     now_ns = T0 + 50 * MS
     told(conversation, OTHERS, now_ns)
     assert conversation.counters.link_losses == 1
     for at, each in enumerate((second, *(() if third is None else (third, third)))):
-        assert hear(conversation, sweep(1 + at, 2 * 10**9), now_ns) == 0
+        assert hear(conversation, sweep(1 + at, 2 * 10**9), now_ns) == []
         assert conversation.serials == BY_FINGER
         told(conversation, each, now_ns)
-    assert hear(conversation, sweep(9, 3 * 10**9), now_ns) == 1
+    assert len(hear(conversation, sweep(9, 3 * 10**9), now_ns)) == 1
     assert tuple(conversation.serials.values()) == serials
 
 
@@ -378,7 +366,7 @@ def test_a_sensor_that_does_not_answer_is_none_that_was_exchanged() -> None:
     now_ns = T0
     for serials in (("A", "", "C"), SERIALS):
         now_ns += 50 * MS
-        assert hear(conversation, sweep(now_ns // MS % 1000, now_ns), now_ns) == 1
+        assert len(hear(conversation, sweep(now_ns // MS % 1000, now_ns), now_ns)) == 1
         told(conversation, serials, now_ns)
         assert conversation.counters.link_losses == 0
         known = zip(("ff", "mf", "th"), serials, strict=True)

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 import pytest
 
 from drivers.base import Driver, DriverError
-from drivers.biotac import SEQUENCE_ALL
 from drivers.link import LinkState
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.line import SerialLine
@@ -103,21 +102,6 @@ def test_a_bridge_of_another_version_is_refused_in_one_line(
     assert rig.bridge.says_nothing_more(), "not even START"
 
 
-def test_a_bridge_with_too_few_sensors_is_refused(rig: Rig) -> None:
-    rig.greet(hello(0, sensors=2))
-    assert rig.driver.conversation.link.reason is not None
-    assert "the bridge has 2 sensors, the scene needs 3" in rig.driver.conversation.link.reason
-    assert rig.driver.counters.refused_bridges == 1
-
-
-def test_a_board_that_was_reset_by_opening_it_is_asked_again_at_once(rig: Rig) -> None:
-    rig.driver.open()
-    rig.bridge.heard(Ping)
-    rig.bridge.send(hello(0))
-    take(rig.driver, rig.bridge)
-    assert [type(message) for message in rig.bridge.heard(Ping)] == [Stop, Ping]
-
-
 def test_sweeps_that_waited_while_the_host_slept_are_no_silence(rig: Rig) -> None:
     rig.greet()
     for seq in range(50):
@@ -130,25 +114,6 @@ def test_sweeps_that_waited_while_the_host_slept_are_no_silence(rig: Rig) -> Non
     ages_ms = [(rig.clock.now_ns - reading.t_ns) / MS for reading in readings]
     assert ages_ms[0] == pytest.approx(498, abs=0.5)
     assert ages_ms[0] - ages_ms[-1] == pytest.approx(490, abs=0.5)
-
-
-def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again(rig: Rig) -> None:
-    rig.greet()
-    rig.bridge.send(sweep(0, 10_000), hello(0), sweep(1, 20_000))
-    assert len(take(rig.driver, rig.bridge)) == 1
-    assert rig.driver.conversation.link.reason == "the bridge was reset"
-    assert rig.driver.counters.restarts == 1
-
-
-def test_a_bridge_that_changes_its_sampling_is_greeted_again(rig: Rig) -> None:
-    rig.greet()
-    rig.bridge.send(sweep(0, 10_000))
-    take(rig.driver, rig.bridge)
-    rig.wait(50)
-    (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
-    rig.bridge.send(hello(ping.nonce, 60_000, channels=SEQUENCE_ALL))
-    take(rig.driver, rig.bridge)
-    assert rig.driver.conversation.link.reason == "the bridge changed what it samples"
 
 
 def test_a_port_that_another_program_has_is_said(rig: Rig) -> None:

@@ -1,0 +1,98 @@
+"""Sweeps of the serial bridge: what becomes of words, sensors and numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.base import ElectrodeFault
+from drivers.biotac import E1, PAC, SEQUENCE_ALL, SEQUENCE_ELECTRODES, SEQUENCE_INTERLEAVED, TDC
+from drivers.spi.conversation import Conversation
+from tests.drivers.spi.bridge_bench import FINGERS, T0, greeted, hear, hello, sweep, words
+
+
+@pytest.mark.parametrize("channels", [SEQUENCE_ELECTRODES, SEQUENCE_ALL, SEQUENCE_INTERLEAVED])
+def test_a_sweep_becomes_a_reading_by_slot_and_sensor(channels: tuple[int, ...]) -> None:
+    conversation = greeted(hello(0, channels=channels))
+    read = words(1000, len(channels))
+    (reading,) = hear(conversation, sweep(0, 100, read=read), T0)
+    assert reading.seq == 0
+    assert not reading.faults.any()
+    for electrode in range(24):
+        slot = channels.index(E1 + electrode)
+        assert reading.counts[:, electrode].tolist() == [1000 + 10 * slot + i for i in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("sensors", "columns"),
+    [(("th", "mf", "ff"), [2, 1, 0]), (("mf", "th", "ff"), [2, 0, 1])],
+)
+def test_the_order_of_the_wiring_does_not_matter_to_the_reading(
+    sensors: tuple[str, ...], columns: list[int]
+) -> None:
+    conversation = greeted(sensors=sensors)
+    present = 7 & ~(1 << columns[2])
+    (reading,) = hear(conversation, sweep(0, 100, present), T0)
+    assert reading.counts[:2, 0].tolist() == [1000 + column for column in columns[:2]]
+    assert (reading.faults[2] == ElectrodeFault.MISSING).all()
+    assert not reading.faults[:2].any()
+    assert not reading.counts[2].any(), "whatever its words say"
+    counters = conversation.counters
+    assert (counters.absent_sensors, counters.unplugged_words) == (1, 0)
+
+
+@pytest.mark.parametrize("sensors", [("ff", "mf"), ("ff", "ff", "mf", "th"), ("ff", "mf", "toe")])
+def test_sensors_that_do_not_hold_the_fingers_are_refused(sensors: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="fingers"):
+        Conversation("port", FINGERS, sensors)
+
+
+def test_electrodes_that_are_not_in_the_sequence_are_missing() -> None:
+    conversation = greeted(hello(0, channels=(PAC, E1 + 5, TDC, E1)))
+    (reading,) = hear(conversation, sweep(0, 100, read=words(1000, 4)), T0)
+    there = [0, 5]
+    assert reading.counts[1, there].tolist() == [1031, 1011]
+    assert not reading.faults[:, there].any()
+    missing = np.delete(reading.faults, there, axis=1)
+    assert (missing == ElectrodeFault.MISSING).all()
+    counters = conversation.counters
+    assert (counters.faulty_readings, counters.unplugged_words) == (1, 0)
+
+
+def test_bad_words_are_flagged_and_counted_and_never_a_count() -> None:
+    read = words()
+    read[3, 0] = 0xA52D  # insufficient sampling delay
+    read[4, 1] ^= 0x0100
+    read[5, 2] = 0xFFFF
+    read[6, 2] = 0x0000
+    conversation = greeted()
+    (reading,) = hear(conversation, sweep(0, 100, read=read), T0)
+    assert reading.faults[0, 3] == ElectrodeFault.ERROR_WORD
+    assert reading.faults[1, 4] == ElectrodeFault.PARITY
+    assert reading.faults[2, [5, 6]].tolist() == [ElectrodeFault.MISSING] * 2
+    assert np.count_nonzero(reading.faults) == 4
+    assert not reading.counts[reading.faults != 0].any()
+    counters = conversation.counters
+    assert (counters.error_words, counters.parity_words, counters.unplugged_words) == (1, 1, 2)
+
+
+def test_a_board_may_have_more_sensors_than_fingers_are_named() -> None:
+    conversation = greeted(hello(0, sensors=5))
+    (reading,) = hear(conversation, sweep(0, 100, 31, words(1000, 24, 5)), T0)
+    assert reading.counts[:, 0].tolist() == [1000, 1001, 1002]
+    assert not reading.faults.any()
+
+
+def test_the_sweep_that_was_under_way_at_stop_is_not_taken_for_a_new_one() -> None:
+    conversation = greeted(hello(0, tick=50_000))
+    sent = (sweep(4711, 49_000), sweep(0, 51_000), sweep(1, 61_000))
+    made = [reading.seq for each in sent for reading in hear(conversation, each, T0)]
+    assert made == [0, 1]
+    counters = conversation.counters
+    assert (counters.stale_sweeps, counters.missed_readings) == (1, 0)
+
+
+def test_a_sweep_of_another_shape_than_the_hello_says_is_bad() -> None:
+    conversation = greeted()
+    assert hear(conversation, sweep(0, 10_000, read=words(slots=23)), T0) == []
+    assert conversation.counters.bad_frames == 1
