@@ -189,7 +189,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
         grasps, state = outcomes, None
         if session is not None:
             grasps, state = session.grasps, session.state()
-            if not session.calibrated:
+            if not session.now.calibrated:
                 raise DriverError(
                     f"{grasps} grasps of {readings} readings are too few, or they are no grasps"
                 )

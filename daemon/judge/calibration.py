@@ -30,7 +30,7 @@ class Calibration:
     scale: NDArray[np.float64]
     """Spread in the training over that of the session, shape (fingers, 24)."""
     calibrated: bool
-    """Whether the grasps are enough for what the model's card says, and can have been grasps."""
+    """True if they are as many as the model's card asks for, and can have been grasps."""
     odd: bool
     """Whether what came cannot have been grasps of these fingers: see `is_odd`."""
     temperature: float
@@ -73,11 +73,6 @@ class SessionCalibration:
         """Grasps of this session that were taken in."""
         return self._statistics.grasps
 
-    @property
-    def calibrated(self) -> bool:
-        """True if they are as many as the model's card asks for, and can have been grasps."""
-        return self.now.calibrated
-
     def observe(self, counts: NDArray[np.generic], *, slip: bool | None = None) -> None:
         """Take in the counts (fingers, 24) of a grasp; `slip` is how it was judged, if it was."""
         values = np.concatenate((raw_features(counts), counts.ravel()))
@@ -104,10 +99,8 @@ class SessionCalibration:
     def _calibration(self) -> Calibration:
         features, shape = len(self._wanted.mean), self._training_mean.shape
         mean, spread = self._statistics.mean, self._statistics.spread
-        counts_mean, counts_spread = (
-            mean[features:].reshape(shape),
-            spread[features:].reshape(shape),
-        )
+        counts_mean = mean[features:].reshape(shape)
+        counts_spread = spread[features:].reshape(shape)
         enough = self.grasps >= self._wanted.calibrated_from
         training = self._training_mean, self._training_spread
         odd = is_odd(counts_mean, counts_spread, *training, enough=enough)

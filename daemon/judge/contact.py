@@ -1,14 +1,13 @@
 """Tare and contact: where each electrode rests, how much it wavers, and which finger touches.
 
-A touch lowers the counts of the electrodes under it (BioTac SP manual, section 5). It is a fall of
-several electrodes below where they rest, and below the finger as a whole: supply and temperature
-move all electrodes alike.
+A touch lowers the counts of several electrodes (BioTac SP manual, section 5) below where they rest,
+and below the finger as a whole: supply and temperature move all electrodes alike.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -68,9 +67,8 @@ class Touch:
     """Fall that makes a touch, counts."""
     touching: bool = False
     fall: float = 0.0
-    """Counts by which the third deepest electrode is below its baseline, and below the finger's
-    median electrode: the smaller of both, and the latter alone where the finger touches already,
-    for in a long hold the sensors drift. Zero without a baseline."""
+    """Counts by which the third deepest electrode is below its baseline and below the finger's
+    median electrode: the smaller; while it touches the latter, as sensors drift. 0: no baseline."""
     depth: float = 0.0
     """How deep it was held, counts, fading."""
     lowest: float = 0.0
@@ -194,28 +192,15 @@ class ContactMemory:
     window: Window
     touches: list[Touch]
     baseline: NDArray[np.float64]
-    """Where each electrode rests, counts; 0 without a tare."""
-    known: NDArray[np.bool_]
-    """True for electrodes whose baseline is known."""
+    """Where each electrode rests, counts; infinite where that is not known: nothing falls more."""
+    known: list[int]
+    """Electrodes of each finger whose baseline is known."""
     touching: NDArray[np.bool_]
     """Which fingers touch."""
     tared: NDArray[np.bool_]
     """True for fingers that have a baseline. Without one it is not known whether they touch."""
     last_ns: int | None = None
     """Time of the last sweep."""
-    rest: NDArray[np.float64] = field(init=False)
-    """The baseline, and infinity where it is not known: nothing falls further."""
-    numbers: list[int] = field(init=False)
-    """Electrodes of each finger whose baseline is known."""
-
-    def __post_init__(self) -> None:
-        """Work out what follows from the other fields."""
-        self.follow_known()
-
-    def follow_known(self) -> None:
-        """Bring `rest` and `numbers` up to date with `baseline` and `known`."""
-        self.rest = np.where(self.known, self.baseline, np.inf)
-        self.numbers = np.count_nonzero(self.known, axis=1).tolist()
 
 
 class Contact:
@@ -228,8 +213,8 @@ class Contact:
         self.memory = ContactMemory(
             window=Window.of(fingers),
             touches=[Touch(limits.counts) for _ in range(fingers)],
-            baseline=np.zeros(shape),
-            known=np.zeros(shape, dtype=np.bool_),
+            baseline=np.full(shape, np.inf),
+            known=[0] * fingers,
             touching=np.zeros(fingers, dtype=np.bool_),
             tared=np.zeros(fingers, dtype=np.bool_),
         )
@@ -290,34 +275,34 @@ class Contact:
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float64], list[int]]:
         """Return each finger's falls, ascending, and the number of those, the first, that count."""
-        falls, numbers = median.astype(np.float64), self.memory.numbers
-        np.subtract(self.memory.rest, falls, out=falls)
+        falls, numbers = median.astype(np.float64), self.memory.known
+        np.subtract(self.memory.baseline, falls, out=falls)
         if usable is not None:
             falls[~usable] = np.inf
-            numbers = (usable & self.memory.known).sum(axis=1).tolist()
+            numbers = np.isfinite(falls).sum(axis=1).tolist()
         falls.sort(axis=1)
         return falls, numbers
 
     def _forget(self, finger: int) -> None:
         memory = self.memory
-        memory.tared[finger] = memory.touching[finger] = memory.known[finger] = False
-        memory.follow_known()
+        memory.tared[finger] = memory.touching[finger] = False
+        memory.baseline[finger], memory.known[finger] = np.inf, 0
         memory.touches[finger] = Touch(memory.touches[finger].threshold)
 
     def _settle(self, finger: int, rest: Rest, t_ns: int) -> None:
         """Take over how a finger rests."""
         memory = self.memory
-        touch, step = memory.touches[finger], rest.baseline - memory.baseline[finger]
+        touch, former, baseline = memory.touches[finger], memory.baseline[finger], rest.baseline
         elapsed_s = 0.0 if touch.tared_ns is None else max(t_ns - touch.tared_ns, 0) / 1e9
         touch.tared_ns = t_ns
         if memory.tared[finger]:
-            limited = np.maximum(step, -DOWN_COUNTS_PER_S * elapsed_s)
-            np.minimum(limited, UP_COUNTS_PER_S * elapsed_s, out=limited)
+            lowest = former - DOWN_COUNTS_PER_S * elapsed_s
+            highest = former + UP_COUNTS_PER_S * elapsed_s
             # An electrode that was not known before is taken as it is.
-            step = np.where(memory.known[finger], limited, step)
-        memory.baseline[finger] += step
-        memory.known[finger] = rest.known
-        memory.follow_known()
+            limited = np.minimum(np.maximum(baseline, lowest), highest)
+            baseline = np.where(np.isfinite(former), limited, baseline)
+        memory.baseline[finger] = np.where(rest.known, baseline, np.inf)
+        memory.known[finger] = int(np.count_nonzero(rest.known))
         limits = self._limits
         touch.threshold = max(limits.counts, limits.sigmas * rest.sigma)
         memory.tared[finger] = True

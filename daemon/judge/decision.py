@@ -41,8 +41,8 @@ class GateLimits:
     """When a grasp has settled, and when it is another one. Times in ns, counts raw."""
 
     false_alarms: float = 0.03
-    """Share of the sweeps of a hand that holds in which it may be said to move. A slower slide is
-    told from a held touch by a larger share; deploy/JUDGING.md has the curve."""
+    """Share of the sweeps of a hand that holds in which it may be said to move. The larger, the
+    slower the slides that are seen: deploy/JUDGING.md."""
     early: bool = False
     """True if a grasp is judged as soon as fast motion is excluded, and again when slow slides
     are."""
@@ -103,9 +103,8 @@ class Limits:
     min_confidence: float = 0.0
     """Least `p_slip` of a slip, or `1 - p_slip` of a stable grasp, in 0..1."""
     steady_ns: int = 1_000_000_000
-    """A grasp that was judged otherwise is `stable` only after this long, ns, in which every
-    judgement says so: some twenty. So nothing flickers at a threshold, and who asks on gets no
-    lucky draw."""
+    """A grasp that was judged otherwise is `stable` only once all judgements have said so for this
+    long, ns: nothing flickers at a threshold, and asking often does not help."""
 
 
 class RecentVerdict(msgspec.Struct, frozen=True, gc=False):

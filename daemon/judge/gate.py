@@ -5,12 +5,10 @@
               +-----------+---------+     back to closing
     closing, settled, judged -> released -> idle   (or, touched at once again, -> closing)
 
-A grasp begins with the first touch and ends when nothing touches any more. It is judged when all
-fingers touch and everything has kept still until nothing can slide unseen; where `early` is wanted,
-first as soon as nothing moves fast. From then on the verdict is refreshed, without leaving
-`judged`, many times a second and when the controller asks. A grasp that has changed or moved on
-must settle again. Times are those of the readings, so a stall or a burst of old readings settles
-nothing.
+A grasp lasts from the first touch until nothing touches. It is judged when all fingers touch and
+have kept still until nothing can slide unseen; with `early`, first when nothing moves fast. From
+then on the verdict is refreshed many times a second and when the controller asks. Times are those
+of the readings, so a stall or a burst of old readings settles nothing.
 """
 
 from __future__ import annotations
@@ -53,8 +51,7 @@ class GateMemory:
     moved_since_ns: int | None = None
     """Time since which a judged grasp has moved. None: it does not move."""
     early: bool = False
-    """True if nothing moved fast when the grasp was judged, but something might slide slowly. It
-    is judged once more, unasked."""
+    """True if it was judged while something might slide slowly: it is judged again, unasked."""
     released_ns: int = 0
     """Time of the end of the last touch."""
     asked: bool = False
@@ -85,8 +82,6 @@ class Gate:
         self.memory = GateMemory(np.zeros((len(fingers), ELECTRODES), dtype=np.float32))
         self._changes: list[GateChange] = []
         """Those since the last moment: three of a reading, and one of a restart before it."""
-        unknown: dict[Finger, float | None] = dict.fromkeys(fingers)
-        self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
         """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
@@ -113,10 +108,9 @@ class Gate:
     ) -> Moment:
         """Take in one usable reading of `t_ns` and its median; return where in a grasp it is.
 
-        `usable`, shape (fingers, 24), None for all, are its electrodes that can be used; `touching`
-        are the fingers that touch. `objections` of other parts keep the grasp from settling: no
-        tare, joints that move. The grasp is judged only `in_time`, and by values that are all
-        `fresh`, or by the newest ones once the verdict is too old to stand.
+        `usable`: electrodes that can be used, shape (fingers, 24); None: all. `objections` of other
+        parts keep the grasp from settling: no tare, joints that move. The grasp is judged only
+        `in_time` and by `fresh` values, or by the newest once the verdict is too old to stand.
         """
         memory = self.memory
         self.skip(t_ns)
@@ -226,8 +220,6 @@ class Gate:
         motion: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
         now = self.motion
-        if not now.looked:
-            return self._not_looked
         windows = now.fast, now.fast_limits, now.slow, now.slow_limits
         for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * slide_limit:

@@ -72,8 +72,7 @@ class FreshMedian:
         """Take in one sweep, shape (fingers, 24).
 
         Electrodes that are not `usable` are forgotten; None: all are usable. A value that repeats
-        the one before is taken for held, so not fresh; the next one counts again, for no value of
-        71.43 Hz data is held twice.
+        the one before is not fresh; a second repetition is, as 71.43 Hz data is never held twice.
         """
         memory = self.memory
         oldest, middle, newest = memory.fresh

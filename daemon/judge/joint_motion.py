@@ -13,8 +13,6 @@ from drivers.base import JointReading
 
 ANGLES = 16
 """Angles remembered of a window; of faster readings, some are left out."""
-ANGLES_KEPT = ANGLES + 2
-"""And one at each end of the window."""
 LOST_MAX = 64
 """Names of lost joints that are remembered; a hand has 24."""
 SOURCES_MAX = 8
@@ -77,7 +75,7 @@ class JointMotion:
         if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
             angles = reading.position_rad[valid]
             past.append((t_ns, angles))
-            del past[:-ANGLES_KEPT]
+            del past[: -(ANGLES + 2)]  # and one at each end of the window
             # Joints that were not heard of before tell nothing: they may come and go.
             changed = before is not None and angles.tobytes() != before.tobytes()
             if changed or memory.changed_ns is None or t_ns < memory.changed_ns:

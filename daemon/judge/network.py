@@ -25,9 +25,7 @@ FLAT_SPREAD_COUNTS = 70.0
 """Standard deviation of a finger's electrodes below which it is not touching, or not working: half
 of the smallest of 4682 real grasps, 148."""
 ONES = np.ones(ELECTRODES)
-NO_FEATURES = np.empty(0, np.float32)
-TINY = 1e-12
-"""Used for a probability of zero, which has no logarithm."""
+TINY = 1e-12  # for a probability of zero, which has no logarithm
 
 
 class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
@@ -40,9 +38,8 @@ class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
     repaired: tuple[str, ...] = ()
     """Electrodes that were replaced, such as `ff_7`."""
     grasp: NDArray[np.generic] | None = None
-    """Shape (fingers, 24): what a session may take in, even if it is like nothing that was seen
-    before, because that is how a drifted sensor starts. Only electrodes that are certainly broken
-    are repaired in it. None where the reading tells nothing."""
+    """Shape (fingers, 24): what a session may take in, with only certainly broken electrodes
+    repaired. It may be like nothing seen before, as drift begins so. None: nothing to take in."""
 
 
 class Opinion(msgspec.Struct, frozen=True, gc=False):
@@ -151,9 +148,9 @@ class Network:
         """`slip_threshold`: probability, 0..1, that softening must not cross."""
         self._model = model
         self._threshold = math.log(slip_threshold) - math.log1p(-slip_threshold)
-        self.features = model.input if isinstance(model.inputs, SessionBuilder) else NO_FEATURES
-        """What the network was asked about last, shape (inputs,), standardised by the session.
-        Empty for models without a session: what they take is not of unit size."""
+        has_session = isinstance(model.inputs, SessionBuilder)
+        self.features = model.input if has_session else np.empty(0, np.float32)
+        """The network's last input, shape (inputs,), standardised by the session; else empty."""
 
     def judge(self, examined: Examined, session: Calibration | None = None) -> Opinion:
         """Return the probability of slip of examined counts, or why there is none.

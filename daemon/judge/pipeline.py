@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -36,11 +36,8 @@ if TYPE_CHECKING:
     from daemon.trust.trust import Trust
     from models.session_statistics import SessionState
 
-NOT_HELD: Final = {GateState.IDLE, GateState.RELEASED}
-"""States in which a grasp is over."""
 
-
-class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):  # noqa: PLW1641 (holds dicts)
+class Judgement(msgspec.Struct, frozen=True, gc=False):
     """What was found about one reading, or about the lack of one."""
 
     t_ns: int
@@ -61,12 +58,7 @@ class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):  # noqa: PLW16
     """True if the session is known well enough; None for a model that needs none."""
     judged_counts: NDArray[np.uint16] | None = None
     """Shape (fingers, 24): what the network judged, before any repair; None if it did not judge
-    this very reading, or if electrodes of it are broken. Not compared."""
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Judgement):
-            return NotImplemented
-        return msgspec.structs.astuple(self)[:-1] == msgspec.structs.astuple(other)[:-1]
+    this very reading, or if electrodes of it are broken."""
 
 
 @dataclass(slots=True, eq=False)
@@ -105,9 +97,8 @@ class Pipeline:
     ) -> None:
         """`clock` gives monotonic ns; without `hand` each reading is a grasp.
 
-        `trust` learns from outcomes and keeps the risk that is set. With `learns` false the session
-        stays what it is; with `needs_session` nothing is judged before it is calibrated. Raises
-        `ModelError` if the model is for other fingers.
+        Unless it `learns`, the session stays what it is; with `needs_session` nothing is judged
+        before it is calibrated. Raises `ModelError` if the model is for other fingers.
         """
         if model.contract.fingers != tuple(fingers):
             raise ModelError(
@@ -123,7 +114,6 @@ class Pipeline:
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
         self.clock = clock
-        """Gives monotonic ns, by which readings have an age."""
         self._learns = learns
         self._needs_session = needs_session
         self._fingers = contract.fingers
@@ -172,8 +162,7 @@ class Pipeline:
     ) -> None:
         """Forget session, tare and grasp: the sensors are others.
 
-        `session` and `learned` are what was known of them when they were there before. Raises
-        `ValueError` for ones that are of another model.
+        `session`, `learned`: what was known of them. Raises `ValueError` if of another model.
         """
         self._forget_opinion()
         self.memory.is_to_learn = False
@@ -296,7 +285,8 @@ class Pipeline:
         if self._session is None or not memory.is_to_learn:
             return
         now = None if self.hand is None else self.hand.gate.memory
-        if now is None or now.grasp != memory.learnt_grasp or now.state in NOT_HELD:
+        over = GateState.IDLE, GateState.RELEASED
+        if now is None or now.grasp != memory.learnt_grasp or now.state in over:
             memory.is_to_learn = False
             self._session.observe(memory.to_learn, slip=memory.to_learn_slip)
 

@@ -1,10 +1,8 @@
 """What a verdict may be, why it is `unknown`, and where in a grasp the hand is.
 
-A new reason for `unknown` starts here: a member of `Reason`, and what to do about it in `ADVICE`.
-Then the part that notices it adds it to the `reasons` of its result: `Checked`, `Moment`,
-`Examined` or `Opinion`. Any of them makes the verdict `unknown`. A verdict lists them in the order
-of the parts. Tests ask for the row in the table of deploy/wire/README.md and for
-`graspd schema > deploy/wire/messages.schema.json`.
+A new reason needs a member of `Reason`, a line of `ADVICE`, a row in deploy/wire/README.md, and
+`graspd schema > deploy/wire/messages.schema.json`. The part that notices it adds it to the
+`reasons` of its `Checked`, `Moment`, `Examined` or `Opinion`; any of them makes it `unknown`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""Whether the fingers keep still: how each moves, in units of its own noise.
-
-Fast motion shows in the slopes of the electrodes over a short window, slow slides, which stop and
-turn, in how far they spread over a long one. Steps of time are remembered, not sweeps, so memory is
-constant.
-"""
+"""Whether the fingers keep still: how each moves, in units of its own noise."""
 
 from __future__ import annotations
 
@@ -84,8 +79,9 @@ class Tails(NamedTuple):
 class Motion:
     """How each finger moves, in units of its own noise; constant memory, no clock.
 
-    Over the short window it is the mean of the electrodes' absolute slopes, over the long one the
-    root mean square of their deviations from their means, each over what noise alone makes of it.
+    Fast motion shows in a short window, as the mean of the electrodes' absolute slopes. Slow slides
+    stop and turn; they show in a long one, as the root mean square of the electrodes' deviations
+    from their means. Each is divided by what noise alone makes of it.
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
@@ -111,7 +107,6 @@ class Motion:
             block=np.zeros((APART, fingers)),
             blocks=np.zeros((BLOCKS, APART, fingers)),
         )
-        self._nothing = self.memory.lost.tobytes()
         self._jumps = np.zeros(shape, dtype=np.float32)
         self._unknown, self._no_limits = [math.inf] * fingers, [1.0] * fingers
         self.fast = self.slow = self._unknown
@@ -171,7 +166,9 @@ class Motion:
             memory.jumped.fill(0)
             memory.lost.fill(LOST_MAX)
             memory.usable_since_ns.fill(t_ns)
-        if usable is not None:
+        if usable is None:
+            memory.lost.fill(0)
+        else:
             sweep = np.where(usable, sweep, memory.clean)
             gone = ~usable & (memory.lost >= LOST_MAX)
             if gone.any():
@@ -184,9 +181,8 @@ class Motion:
                 memory.usable_since_ns[gone] = t_ns + STEP_NS
                 memory.jumped[gone] = SPIKE_SWEEPS_MAX
             memory.lost += ~usable & ~gone
+            memory.lost[usable] = 0
         self._clean(sweep)
-        if memory.lost.tobytes() != self._nothing:
-            memory.lost[... if usable is None else usable] = 0
         memory.total = memory.total + memory.clean if memory.sweeps else memory.clean
         memory.total_ns += t_ns - memory.last_ns
         memory.sweeps += 1
@@ -215,17 +211,11 @@ class Motion:
             memory.jumped.fill(0)
             return
         jumped = jumps > SPIKE_COUNTS
-        where = jumped.tobytes()
-        for finger in range(len(jumped)):
-            if where.count(1, finger * ELECTRODES, (finger + 1) * ELECTRODES) > SPIKES_MAX:
-                jumped[finger] = False
-        if memory.jumped.tobytes() == self._nothing:
-            memory.jumped = jumped.view(np.uint8)
-        else:
-            held = (counts == before) & (memory.jumped < SPIKE_SWEEPS_MAX)
-            jumped &= (memory.jumped == 0) | held
-            memory.jumped += 1
-            memory.jumped *= jumped
+        jumped[np.count_nonzero(jumped, axis=1) > SPIKES_MAX] = False
+        held = (counts == before) & (memory.jumped < SPIKE_SWEEPS_MAX)
+        jumped &= (memory.jumped == 0) | held
+        memory.jumped += 1
+        memory.jumped *= jumped
         memory.clean = np.where(jumped, memory.clean, counts)
 
     def _remember(self, t_ns: int) -> None:

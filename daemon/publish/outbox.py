@@ -288,7 +288,7 @@ class Outbox:
             drivers=drivers,
             repaired=dict(self._repaired),
             session_grasps=None if session is None else session.grasps,
-            session_calibrated=None if session is None else session.calibrated,
+            session_calibrated=None if session is None else session.now.calibrated,
             gate=None if hand is None else hand.gate.memory.state,
             tared=None if hand is None else list(hand.tared),
             health=health,

@@ -1,144 +1,100 @@
-"""Count what a reading costs, in instructions and cache lines: figures that no load changes.
+"""Count what a reading costs: instructions, and lines (64 bytes) of memory that it touches.
 
-    python -m tests.bench.count [--log FILE]
+    python -m tests.bench.count
 
-prints the medians of judged and of idle readings, from the bytes of a serial line to the message.
-Callgrind counts a round of the loop in a replay of a link log. Its caches are empty at the start
-of each counted round, so each line (64 bytes) that is used is fetched once. Needs valgrind and a C
-compiler. The figures depend on the Python that runs this: Debian's, for one, is built with PGO.
+judges idle readings and readings of a held grasp, from counts to judgement, in a program that
+cachegrind simulates, and prints what each adds. A buffer that fills the cache is read before each,
+so each line that a reading touches is a miss. On a busy machine start-up has once differed by 19
+million instructions: repeat a figure that surprises. Copied into an older commit, it counts that.
 """
 
 from __future__ import annotations
 
-import argparse
-import ctypes
-import re
-import shutil
-import statistics
+import os
 import subprocess
 import sys
-import tempfile
-from collections import deque
-from collections.abc import Callable, Sequence
+import tomllib
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from tempfile import TemporaryDirectory
 
-from daemon import cli
-from daemon.run.loop import Loop
-from models.runtime import TactileModel
-from tests.process_replay import streams
+import numpy as np
+from numpy.typing import NDArray
 
-EVERY: Final = 97
-"""One round in this many is counted, mostly idle ones: a counted one takes seconds."""
-AFTER: Final = 10
-"""Rounds after a judged one that are counted: a held grasp is judged again within 100 ms."""
-COUNTED: Final = 60
-"""Rounds that are counted."""
-SWITCH: Final = """
-#include <valgrind/callgrind.h>
-void begin(void) { CALLGRIND_START_INSTRUMENTATION; }
-void end(const char *kind) { CALLGRIND_STOP_INSTRUMENTATION; CALLGRIND_DUMP_STATS_AT(kind); }
-"""
-SCENE: Final = """
+from daemon.assembly import assembly
+from daemon.scene.scene import Scene
+from drivers.base import TactileReading
+from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.twins.grasps.grasps import recorded_counts
+
+READINGS = 100
+"""Readings of each kind that are counted."""
+IDLE, HELD = slice(100, 150), slice(255, 285)
+"""Sweeps of the demo in which nothing touches, and in which its first grasp is judged."""
+NOISE_COUNTS = 3.0
+"""Standard deviation of a sensor's noise: without any, readings would repeat."""
+PERIOD_NS = 10_000_000
+CACHE_BYTES = 1 << 21
+"""Size of the simulated cache whose misses count: larger than what a reading touches."""
+SCENE = """
 [tactile]
 driver = "spi"
-sensors = ["mf", "th", "ff"]
-port = "/dev/replayed"
+port = "/dev/none"
+sensors = ["ff", "mf", "th"]
 """
-CALLGRIND: Final = ("valgrind", "--tool=callgrind", "--cache-sim=yes", "--instr-atstart=no")
-CACHES: Final = ("--I1=32768,8,64", "--D1=32768,8,64", "--LL=33554432,16,64")
-"""The last one is so large that no line is fetched twice."""
 
 
-def calls_of(kind: type, name: str) -> Callable[[], int]:
-    """Count the calls of a method from now on; the function returned says how many there were."""
-    method, calls = getattr(kind, name), 0
+def judge(kind: str) -> None:
+    """Judge the demo's first grasp, and readings of one kind besides; runs within cachegrind."""
+    now_ns = 0
+    scene = Scene.model_validate(tomllib.loads(SCENE))
+    pipeline = assembly.build_pipeline(scene, assembly.load_model(scene), lambda: now_ns)
+    demo = np.array(list(islice(recorded_counts(DEMO_RECORDING), HELD.stop)))
+    faults = np.zeros(demo[0].shape, dtype=np.uint8)
+    noise = np.random.default_rng(1).normal(0.0, NOISE_COUNTS, (READINGS, *faults.shape))
+    filling = np.zeros(2 * CACHE_BYTES, dtype=np.uint8)
 
-    def counted(*arguments: Any) -> Any:  # noqa: ANN401
-        nonlocal calls
-        calls += 1
-        return method(*arguments)
+    def feed(counts: NDArray[np.uint16]) -> None:
+        nonlocal now_ns
+        now_ns += PERIOD_NS
+        pipeline.judge(TactileReading(now_ns, now_ns // PERIOD_NS, counts, faults))
 
-    setattr(kind, name, counted)
-    return lambda: calls
+    def feed_more(place: slice, *, is_counted: bool) -> None:
+        for counts in (demo[place].mean(axis=0) + noise).astype(np.uint16):
+            filling.max()
+            if is_counted:
+                pipeline.ask()
+                feed(counts)
 
-
-def count(switch: Path, log: Path) -> None:
-    """Replay a log, and have callgrind count some rounds of the loop; runs within valgrind."""
-    valgrind, go_round = ctypes.CDLL(str(switch)), Loop._go_round  # noqa: SLF001
-    judged, readings = calls_of(TactileModel, "run"), calls_of(Loop, "_judge")
-    rounds = counted = last = 0
-
-    def counted_round(*arguments: Any) -> None:  # noqa: ANN401
-        nonlocal rounds, counted, last
-        rounds += 1
-        before = readings(), judged()
-        if rounds % EVERY and rounds > last:
-            go_round(*arguments)
-            if judged() > before[1]:
-                last = rounds + AFTER
-            return
-        valgrind.begin()
-        go_round(*arguments)
-        kind = "judged" if judged() > before[1] else "idle"
-        if kind == "judged":
-            last = rounds + AFTER
-        valgrind.end((kind if readings() == before[0] + 1 else "other").encode())
-        counted += 1
-        if counted == COUNTED:
-            raise SystemExit
-
-    setattr(Loop, "_go_round", counted_round)  # noqa: B010
-    cli.main(["replay", "--json", "--scene", str(log.with_name("scene.toml")), str(log)])
+    for counts in demo[: IDLE.stop]:
+        feed(counts)
+    feed_more(IDLE, is_counted=kind == "idle")
+    for counts in demo[IDLE.stop :]:
+        feed(counts)
+    feed_more(HELD, is_counted=kind == "judged")
 
 
-def report(kind: str, dumps: Sequence[str]) -> None:
-    """Print the medians of one kind of readings."""
-    if not dumps:
-        sys.stdout.write(f"{kind}: none counted\n")
-        return
-    instructions, lines = [], []
-    for dump in dumps:
-        names = re.findall(r"^events: (.*)$", dump, re.M)[0].split()
-        totals = map(int, re.findall(r"^totals: (.*)$", dump, re.M)[0].split())
-        counts = dict(zip(names, totals, strict=False))
-        instructions.append(counts["Ir"])
-        lines.append(counts["ILmr"] + counts["DLmr"] + counts["DLmw"])
-    sys.stdout.write(
-        f"{kind}: {statistics.median(instructions):,.0f} instructions, "
-        f"{statistics.median(lines):,.0f} lines; median of {len(dumps)} readings\n"
-    )
-
-
-def main() -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.count", description=__doc__)
-    parser.add_argument("--log", type=Path, help="serial link log, such as of another version")
-    parser.add_argument("--switch", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.switch is not None:
-        count(given.switch, given.log)
-        return
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "switch.c").write_text(SWITCH)
-        (folder / "scene.toml").write_text(SCENE)
-        if given.log is None:
-            with (folder / "link.serial").open("wb") as file:
-                deque(streams.spi(file), maxlen=0)
-        else:
-            shutil.copy(given.log, folder / "link.serial")
+def count(kind: str) -> dict[str, int]:
+    """Return what cachegrind counts of `judge`, by the names of its events."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "counts")
+        options = "--cache-sim=yes", f"--LL={CACHE_BYTES},16,64", f"--cachegrind-out-file={path}"
         subprocess.run(
-            ["cc", "-shared", "-fPIC", folder / "switch.c", "-o", folder / "switch.so"], check=True
+            ["valgrind", "--tool=cachegrind", *options, sys.executable, "-m", __spec__.name, kind],
+            env=os.environ | {"PYTHONHASHSEED": "0"},
+            check=True,
         )
-        options = (*CALLGRIND, *CACHES, f"--callgrind-out-file={folder}/counts")
-        inside = (sys.executable, "-m", "tests.bench.count", "--switch", folder / "switch.so")
-        replayed = ("--log", folder / "link.serial")
-        subprocess.run([*options, *inside, *replayed], stdout=subprocess.DEVNULL, check=True)
-        dumps = [path.read_text() for path in folder.glob("counts.*")]
-    for kind in ("judged", "idle"):
-        report(kind, [dump for dump in dumps if f"Client Request: {kind}\n" in dump])
+        lines = dict(line.split(": ", 1) for line in path.read_text().splitlines() if ": " in line)
+    return dict(zip(lines["events"].split(), map(int, lines["summary"].split()), strict=True))
 
 
 if __name__ == "__main__":
-    main()
+    if len(sys.argv) == 2:
+        judge(sys.argv[1])
+        sys.exit()
+    none = count("none")
+    for kind in ("judged", "idle"):
+        counts = count(kind)
+        added = {event: (counts[event] - none[event]) / READINGS for event in none}
+        lines = added["ILmr"] + added["DLmr"] + added["DLmw"]
+        sys.stdout.write(f"{kind}: {added['Ir']:,.0f} instructions, {lines:,.0f} lines\n")

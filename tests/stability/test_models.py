@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("onnx", reason="the reference needs onnx, of the extra `train`")
 
-from daemon.judge.decision import HELD, Limits, decide
 from daemon.judge.network import Examined, Network
-from daemon.judge.reasons import Decision
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from drivers.recordings.csv_rows import read_rows
 from models import zoo
@@ -187,25 +185,3 @@ def test_inputs_and_probabilities_keep_their_bounds_over_the_12_bit_space(
 
 
 NOT_FINITE = st.sampled_from((np.nan, np.inf, -np.inf))
-
-
-@settings(max_examples=40)
-@given(counts=HAND, wrong=st.dictionaries(st.integers(0, 71), NOT_FINITE, min_size=1))
-def test_what_is_not_finite_never_gives_a_verdict(
-    model: str, counts: Raw, wrong: dict[int, float]
-) -> None:
-    judge = comparison(model).model
-    floats = counts[: len(judge.contract.fingers)].astype(np.float64)
-    for place, value in wrong.items():
-        floats.flat[place % floats.size] = value
-    with np.errstate(invalid="ignore"):
-        said = Network(judge, 0.5).judge(Examined((), floats))
-    assert said.p_slip is None
-    assert said.reasons
-
-
-@pytest.mark.parametrize("p_slip", [np.nan, np.inf, -np.inf, -1e-9, 1.0 + 1e-9, None])
-def test_a_probability_that_is_none_is_unknown(p_slip: float | None) -> None:
-    outcome, reasons = decide(p_slip, (), HELD, 0, Limits(max_age_ns=1))
-    assert outcome is Decision.UNKNOWN
-    assert reasons

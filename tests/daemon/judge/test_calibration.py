@@ -46,10 +46,10 @@ def test_a_session_is_calibrated_and_sharp_after_the_grasps_of_its_card(
     for counts in grasps(number):
         session.observe(counts)
     assert session.grasps == number
-    assert (session.calibrated, session.now.odd) == (calibrated, False)
+    assert (session.now.calibrated, session.now.odd) == (calibrated, False)
     assert session.now.temperature == temperature
     session.reset()
-    assert (session.grasps, session.calibrated, session.now.temperature) == (0, False, 2.5)
+    assert (session.grasps, session.now.calibrated, session.now.temperature) == (0, False, 2.5)
 
 
 @pytest.mark.parametrize("spread", [SPREAD, 1.0], ids=["far away", "standing still"])
@@ -58,7 +58,7 @@ def test_what_cannot_have_been_grasps_is_never_calibrated_nor_sharp(spread: floa
     for counts in grasps(50, 3200.0 if spread == SPREAD else MEAN, spread):
         session.observe(counts)
     assert session.grasps > 40, "a reading that stands still is no new grasp"
-    assert (session.now.odd, session.calibrated) == (True, False)
+    assert (session.now.odd, session.now.calibrated) == (True, False)
     assert session.now.temperature == 2.5
 
 

@@ -89,21 +89,6 @@ def test_a_table_without_a_finger_of_the_model_is_refused(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", SOME)
-def test_real_grasps_are_judged_better_than_others_of_another_day(
-    name: str, bts3_dir: Path, tmp_path: Path
-) -> None:
-    table = cut(bts3_dir / "palm_down.csv", HANDS[name], tmp_path)
-    result = graspd("replay", table, "--model", name, "--json")
-    assert result.returncode == 0, result.stderr
-    assert len(result.stdout.splitlines()) == 1276  # as published
-    summary = json.loads(result.stderr)
-    # These are calibrated as they come, too, and the model has seen them.
-    measured = {entry["protocol"]: entry for entry in zoo.card(name)["contract"]["measured"]}
-    assert summary["scores"]["f1"] > measured["session"]["f1_mean"]
-    assert summary["judged_and_labelled"] > 0.9 * 1276
-
-
-@pytest.mark.parametrize("name", SOME)
 def test_a_scene_with_fewer_fingers_judges_each_grasp_with_the_model_of_these(
     name: str, tmp_path: Path
 ) -> None:

@@ -83,16 +83,6 @@ def test_a_step_counts_as_motion_for_a_window_and_no_longer(
     assert all(reason is None for ms, reason in seen.items() if ms >= still_after_ms)
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 100.0, 1000.0])
-def test_hall_noise_of_one_count_is_still(rate_hz: float) -> None:
-    random, motion = np.random.default_rng(2), JointMotion(LIMITS)
-    for place in range(round(2 * rate_hz)):
-        t_ns = START_NS + round(place / rate_hz * 1e9)
-        send(motion, t_ns, *(np.array([0.3, 1.2, -0.1]) + HALL_RAD * random.integers(-1, 2, 3)))
-        if t_ns - START_NS >= 100 * MS:
-            assert motion.objection(t_ns) is None
-
-
 @pytest.mark.parametrize("joint", range(3))
 def test_a_joint_without_an_angle_hides_no_other(joint: int) -> None:
     for speed, reason in ((0.0, None), (0.3, Reason.MOVING)):
@@ -102,13 +92,6 @@ def test_a_joint_without_an_angle_hides_no_other(joint: int) -> None:
             angles[joint] = np.nan
             send(motion, START_NS + ms * MS, *angles)
         assert motion.objection(START_NS + 500 * MS) is reason
-
-
-def test_joints_of_which_none_can_be_compared_are_not_known_to_be_still() -> None:
-    motion = JointMotion(LIMITS)
-    for ms in range(0, 161, 10):
-        send(motion, START_NS + ms * MS, *((1.0, np.nan) if ms <= 100 else (np.nan, 1.0)))
-    assert motion.objection(START_NS + 160 * MS) is Reason.MOVING
 
 
 def test_angles_that_are_all_missing_are_as_good_as_none() -> None:
@@ -200,16 +183,6 @@ def test_a_sender_that_falls_silent_beside_another_is_late(silent_ms: int) -> No
 @pytest.mark.parametrize("silent_ms", [100, 1100, 5000])
 def test_a_sender_that_is_given_up_leaves_the_others(silent_ms: int) -> None:
     assert silent_beside_another(silent_ms) is None
-
-
-def test_time_that_goes_back_starts_a_new_window() -> None:
-    motion, _ = turning(100.0, 0.0)
-    early_ns = START_NS - 10**11
-    reasons = []
-    for ms in range(0, 121, 10):
-        send(motion, early_ns + ms * MS, 0.3, 2.5, -0.1)
-        reasons.append(motion.objection(early_ns + ms * MS))
-    assert reasons == [Reason.MOVING] * 8 + [None] * 5
 
 
 def test_angles_from_the_future_are_not_trusted() -> None:

@@ -41,18 +41,6 @@ OF_AN_ELECTRODE = (
 OF_A_READING = (ElectrodeFault.HELD, ElectrodeFault.CUT_OFF)
 
 
-@pytest.mark.parametrize("fault", OF_A_READING)
-def test_one_electrode_that_is_not_of_now_makes_the_verdict_unknown(fault: ElectrodeFault) -> None:
-    clock, model = Clock(), FakeModel()
-    bad = reading(clock())
-    bad.faults[2, 23] = fault
-    judgement = pipeline(model, clock).judge(bad)
-    assert judgement.decision is Decision.UNKNOWN
-    assert judgement.reasons == (REASON_OF_FAULT[fault],)
-    assert judgement.p_slip is None
-    assert model.runs == 0
-
-
 @pytest.mark.parametrize("fault", OF_AN_ELECTRODE)
 @pytest.mark.parametrize("value", [0, 1234, 4095, 65535])
 def test_a_flagged_electrode_is_repaired_and_named_whatever_it_reads(
@@ -72,35 +60,6 @@ def test_a_flagged_electrode_is_repaired_and_named_whatever_it_reads(
     expected = np.empty(model.inputs.shape, dtype=np.float32)
     model.inputs.build(bad.counts, expected)
     np.testing.assert_allclose(model.input, expected, atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("where", "reasons"),
-    [
-        ((slice(0, 1), slice(0, 8)), ()),
-        ((slice(0, 1), slice(0, 9)), (Reason.SENSOR_MISSING, Reason.ELECTRODES_BROKEN)),
-        ((slice(0, 3), slice(0, 4)), ()),
-        ((slice(0, 3), slice(0, 5)), (Reason.SENSOR_MISSING, Reason.ELECTRODES_BROKEN)),
-        ((slice(1, 2), slice(0, 24)), (Reason.SENSOR_MISSING, Reason.ELECTRODES_BROKEN)),
-    ],
-)
-def test_twelve_electrodes_and_eight_of_a_finger_are_repaired_and_no_more(
-    where: tuple[slice, slice], reasons: tuple[Reason, ...]
-) -> None:
-    clock, model = Clock(), FakeModel()
-    bad = reading(clock())
-    bad.faults[where] = ElectrodeFault.MISSING
-    judgement = pipeline(model, clock).judge(bad)
-    assert judgement.reasons == reasons
-    assert model.runs == (0 if reasons else 1)
-    assert len(judgement.opinion.repaired) == (0 if reasons else bad.faults.astype(bool).sum())
-
-
-def test_a_fault_flag_that_nobody_knows_is_still_a_fault() -> None:
-    clock = Clock()
-    bad = reading(clock())
-    bad.faults[0, 0] = 128
-    assert pipeline(FakeModel(), clock).judge(bad).decision is Decision.UNKNOWN
 
 
 def _set(finger: int, electrode: int, count: int) -> Callable[[TactileReading], None]:

@@ -98,7 +98,8 @@ def judged(
                 pipeline.ask()
             pipeline.observe_joints(reading)
         else:
-            found.append((pipeline.judge(reading), pipeline.health()))
+            said = msgspec.structs.replace(pipeline.judge(reading), judged_counts=None)
+            found.append((said, pipeline.health()))
     return found
 
 

@@ -189,18 +189,6 @@ def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
     assert all(Reason.FROZEN in reasons for reasons in said[9:])
 
 
-def test_old_sweeps_in_any_order_are_frozen() -> None:
-    health, random = Health(3), np.random.default_rng(2)
-    fresh = random.integers(500, 3500, (SWEEPS, 3, 24)).astype(np.uint16)
-    faults = np.zeros((3, 24), dtype=np.uint8)
-    for number, counts in enumerate(fresh):
-        assert not health.check(TactileReading(number, number, counts, faults)).reasons
-    for number in range(500):
-        counts = fresh[random.integers(SWEEPS)]
-        reading = TactileReading(SWEEPS + number, SWEEPS + number, counts, faults)
-        assert Reason.FROZEN in health.check(reading).reasons
-
-
 def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
     past, random = PastSweeps.none(3), np.random.default_rng(3)
     sound = np.ones((3, 24), dtype=np.bool_)
@@ -209,13 +197,6 @@ def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
         counts = random.integers(500, 3500, (3, 24)).astype(np.uint16)
         counts[1] = 0
         assert not past.recurs(counts, sound)
-
-
-def test_memory_does_not_grow() -> None:
-    past, random = PastSweeps.none(3), np.random.default_rng(5)
-    for _ in range(1000):
-        past.recurs(random.integers(0, 4096, (3, 24)).astype(np.uint16))
-        assert max(map(len, past.past)) <= SWEEPS
 
 
 @pytest.mark.parametrize(

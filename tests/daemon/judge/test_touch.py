@@ -74,6 +74,17 @@ def test_the_depth_of_a_hold_fades_by_five_counts_a_second_down_to_the_fall() ->
     assert (touch.touching, touch.depth, touch.since_ns) == (False, 0.0, None)
 
 
+def test_the_depth_of_a_hold_fades_by_the_time_between_sweeps() -> None:
+    contact, rest = Contact(1, ContactLimits()), np.full((1, 24), 3000, dtype=np.uint16)
+    for place in range(100):
+        contact.observe(place * 10 * MS, rest, rest, None)
+    for t_ns, fall in ((1 * S, 200), (2 * S, 100)):
+        pressed = rest.copy()
+        pressed[0, :6] -= np.uint16(fall)
+        contact.observe(t_ns, pressed, pressed, None)
+    assert contact.memory.touches[0].depth == 195.0
+
+
 @pytest.mark.parametrize(
     ("after_ns", "touches"),
     [(50 * MS - 1, False), (50 * MS, True), (0, False), (-1, True)],

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, Reason
-from daemon.trust.lift_book import NOT_ASSESSED, GraspId
+from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Permission, RiskLimits, Trust
 from drivers.base import ElectrodeFault
 from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
@@ -94,57 +90,6 @@ def test_when_too_many_slipped_nothing_is_stable_any_more() -> None:
     assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.RISK_EXCEEDED,)
     assert not judgement.supervised
-
-
-@pytest.mark.parametrize("p_slip", [math.nan, -0.5, 1.5, RuntimeError()])
-def test_a_network_that_gives_no_probability_is_asked_for_no_more(
-    p_slip: float | Exception,
-) -> None:
-    clock = Clock()
-    judge = trusting(FakeModel(p_slip), clock)
-    judgement = judge.judge(reading(clock()))
-    assert judgement.reasons == (Reason.MODEL_FAILED,)
-    assert judge.trust is not None
-    _, lift = judge.lifts.tell(GraspId(BOOT, judgement.moment.grasp), slipped=True)
-    assert lift is not None
-    assert lift.features == NOT_ASSESSED
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    alpha=st.sampled_from([0.001, 0.02, 0.05, 0.2, 0.5]),
-    lifts=st.lists(
-        st.tuples(st.floats(0.0, 1.0), st.booleans(), st.integers(0, 5)), min_size=1, max_size=60
-    ),
-)
-def test_the_bound_holds_for_what_is_said(
-    alpha: float, lifts: Sequence[tuple[float, bool, int]]
-) -> None:
-    """Outcomes come when they come; each that is out may add one."""
-    clock, model = Clock(), FakeModel(0.1)
-    judge = trusting(model, clock, RiskLimits(alpha))
-    waiting: list[tuple[int, bool]] = []
-    said_stable: set[int] = set()
-    told = slips = 0
-    for seed, (p_slip, slipped, late) in enumerate(lifts):
-        model.answer = p_slip
-        judgement = judge.judge(reading(clock(), seed))
-        if judgement.decision is Decision.STABLE:
-            said_stable.add(judgement.moment.grasp)
-        waiting.append((judgement.moment.grasp, slipped))
-        while len(waiting) > late:
-            grasp, ended = waiting.pop(0)
-            judge.outcome(GraspId(BOOT, grasp), slipped=ended)
-            told += grasp in said_stable
-            slips += ended and grasp in said_stable
-        assert judge.trust is not None
-        report = judge.trust.report()
-        assert (report.lifts, report.slips) == (told, slips)
-        assert report.outstanding == sum(grasp in said_stable for grasp, _ in waiting)
-        assert report.bound is not None
-        start = min(math.log(min(2 * alpha, 0.5) / (1 - min(2 * alpha, 0.5))), 0.0)
-        assert slips <= alpha * told + max(start, -6.0) + 6.0 + 6
-        assert slips <= report.bound + 1e-9
 
 
 def test_a_lift_after_the_outcome_was_told_is_counted_or_not_permitted() -> None:

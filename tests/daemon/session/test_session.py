@@ -66,7 +66,7 @@ def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
     with SessionFile(tmp_path / "right.json") as file:
         session_keeper(second, sensors(), file, clock)
     assert second.state() == first.state()
-    assert second.calibrated
+    assert second.now.calibrated
 
 
 def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
