@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from drivers.recordings.csv_rows import Columns
 
 DEFAULT_MODEL = "small-session"
+RECORDED_MAX_AGE_MS = 1000.0
+"""Age limit of recorded readings, ms: generous, because a recording has no wire to be late on."""
 MCAP = ".mcap"
 LINK_LOGS = (".log", ".serial")
 """Endings of candump text and of serial bytes."""

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 Source: TypeAlias = "_Tables | LinkLogs | RecordedRun"
 """Plays recordings. What graspd has recorded says itself how it was judged."""
 
-MAX_AGE_MS = 1000.0
-"""Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
 NO_SILENCE_NS = 3_600_000_000_000
 """A recording has its own silences: those of this machine must not count."""
 WAIT_MAX_S = 3600
@@ -255,7 +253,7 @@ class _Tables:
                 "strict": args.strict,
             },
             "model": model,
-            "gate": {"max_age_ms": MAX_AGE_MS, "mode": mode},
+            "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS, "mode": mode},
             "publish": publish,
         }
         if args.max_slip_when_stable is not None:

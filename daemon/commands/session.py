@@ -259,7 +259,9 @@ def _on_recordings(wanted: scene.Scene, recordings: list[Path]) -> scene.Scene:
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
     mode = "every" if assembly.is_mcap(replay) else None
-    gate = wanted.gate.model_copy(update={"mode": mode, "sweeps": None})
+    gate = wanted.gate.model_copy(
+        update={"mode": mode, "sweeps": None, "max_age_ms": assembly.RECORDED_MAX_AGE_MS}
+    )
     changes = {"tactile": replay, "joints": None, "gate": gate, "risk": None}
     return wanted.model_copy(update=changes)
 
