@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from models.session_statistics import SessionState
 
 
-class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):
+class Judgement(msgspec.Struct, frozen=True, gc=False):
     """What was found about one reading, or about the lack of one."""
 
     t_ns: int
