@@ -173,10 +173,9 @@ class NoveltyCheck:
         self._square_min, self._square_max = seen.distance_min**2, seen.distance_max**2
 
     def never_seen(self, counts: NDArray[np.generic], repaired: int = 0) -> NDArray[np.bool_]:
-        """Shape (N,): True for each of the counts (N, fingers, 24) that was never seen.
+        """Return shape (N,): True for each of the counts (N, fingers, 24) that was never seen.
 
-        So many electrodes of each were `repaired` by what the others let expect: they add nothing
-        to the distance, so it is taken over the others.
+        Each has `repaired` electrodes that add nothing to the distance, a mean over the others.
         """
         values = counts.astype(np.float64)
         outside = ((values < self._low) | (values > self._high)).any(axis=(1, 2))
@@ -187,10 +186,8 @@ class NoveltyCheck:
         return never
 
     def is_near(self, square: float, contradicted: int = 0) -> bool:
-        """Whether a reading of this `square` fits the training covariance; ranges do not matter.
-
-        So many of the electrodes that were repaired in it `contradicted` the others.
-        """
+        """Return True if a reading of this `square` fits the training covariance.
+        `contradicted`: how many of its repaired electrodes contradicted the others."""
         share = CONTRADICTED_DISTANCES if contradicted else 1.0
         return self._square_min <= square <= share**2 * self._square_max
 

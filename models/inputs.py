@@ -82,12 +82,10 @@ class _FlatBuilder:
     """One reading or many, by the same arithmetic; see `InputBuilder`."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> Floats:
-        """Write the input of counts (fingers, 24) into `out`; the spread of each finger, counts."""
         out[...], spread = self._values(counts.astype(np.float64))
         return spread
 
     def build_batch(self, counts: NDArray[np.generic]) -> tuple[NDArray[np.float32], Floats]:
-        """Inputs (N, width) and spreads (N, fingers) of counts (N, fingers, 24)."""
         values, spread = self._values(counts.astype(np.float64))
         return values.astype(np.float32), spread
 
@@ -138,9 +136,7 @@ class SessionBuilder(_FlatBuilder):
 
     def use(self, mean: Floats, spread: Floats) -> None:
         """Standardise by these from now on, each of shape (fingers * 26,), spreads above zero.
-
-        They must not change any more.
-        """
+        The arrays must not change any more."""
         if spread is not self._spread:
             self._scale = 1.0 / spread
         self._mean, self._spread = mean, spread

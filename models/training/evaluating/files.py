@@ -14,8 +14,7 @@ import msgspec
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a path to write to; the file written there then takes the place of `path`.
 
-    After an exception `path` is as it was before. Nothing else is left in the folder. Raises
-    `OSError` if the file cannot be written.
+    After an exception `path` is unchanged, and nothing else is left. Raises `OSError`.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -223,9 +223,7 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
 
 def difference(ours: SystemSummary, theirs: SystemSummary) -> tuple[float, float | None] | None:
     """Return our mean F1 less theirs on the splits that both have judged, and its standard error.
-
-    None: no split is the same, for other data or another number of folds, say.
-    """
+    None: no split is the same, for other data or another number of folds, say."""
     seeds = [seed for seed in ours.seeds if seed in theirs.seeds]
     if not seeds or ours.folds != theirs.folds or ours.data != theirs.data:
         return None
