@@ -30,15 +30,11 @@ class ModelFile:
 
 class TactileModel:
     """A loaded, warm model with its input and output bound to fixed buffers.
-
-    Fill `input` (float32, shape `inputs.shape`) with `inputs.build`, then call `run`.
-    """
+    Fill `input` (float32, shape `inputs.shape`) with `inputs.build`, then call `run`."""
 
     def __init__(self, path: Path, tried: ModelFile | None = None) -> None:
         """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent.
-
-        `tried` is its content, where that has been read and checked (`models.trial`).
-        """
+        `tried` is its content, where that has been read and checked (`models.trial`)."""
         file = read(path) if tried is None else tried
         self.path = path
         self.sha256 = file.sha256

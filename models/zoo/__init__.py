@@ -21,9 +21,7 @@ def names() -> list[str]:
 
 def for_hand(name: str, fingers: Collection[Finger]) -> str:
     """Return the name of a model's form for these fingers, such as `small-session-ff-th`.
-
-    Return the name itself if there is no such form, or if it is one already.
-    """
+    Return the name itself if there is no such form, or if it is one already."""
     hand = [finger for finger in get_args(Finger) if finger in fingers]
     form = "-".join((name, *hand))
     is_form = name.endswith(tuple(f"-{finger}" for finger in get_args(Finger)))

@@ -26,8 +26,6 @@ from models.training.estimators.configs import (
 
 PROBABILITY_FLOOR = 1e-3
 """A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
-
-
 INTERRUPTED = "Training interrupted"
 """How scikit-learn's warning begins that Ctrl-C has ended the training of a perceptron."""
 

@@ -85,7 +85,7 @@ class CurvePoint:
 
 def score(margins: Floats, slipped: Bools, probability: Floats | None = None) -> Scores:
     """Return the figures of margins (N,) against labels (N,).
-    Without a `probability` (N,) of slip, its figures are those of the uncalibrated one."""
+    Brier score, ECE and log loss are of `probability` (N,) of slip, else uncalibrated."""
     verdict = margins > 0.0
     precision, recall, f1, _ = precision_recall_fscore_support(
         slipped, verdict, average="binary", zero_division=0.0

@@ -142,7 +142,6 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
         f1 = {key: variant.spreads["f1"] for key, variant in variants.items()}
         shown.append((f"`{name}`", *(_value(f1.get(key)) for key in SESSION_VARIANTS)))
     yield _table(("system", *columns), shown)
-    # How right the verdicts of a running session are while it is young.
     young = {name: variants[RUNNING].ages for name, variants in here.items() if RUNNING in variants}
     if young:
         yield "Accuracy, %, in a running session (objects mixed) after at least so many grasps:"

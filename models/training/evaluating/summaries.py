@@ -186,10 +186,10 @@ def read_summary(path: Path) -> SystemSummary:
 
 
 def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[SystemSummary]:
-    """Return the folder's summaries of this data (a digest), in the order of `digests`.
+    """Return the folder's summaries of this data (a digest), by system and then by protocol.
 
-    `digests` are those of the systems by name. A summary that is of another configuration or
-    cannot be read is left out, with a warning.
+    `digests`: those of the systems by name, in their order. A summary that is of another
+    configuration or cannot be read is left out, with a warning.
     """
     found = []
     for path in sorted(folder.glob("*.json")):
