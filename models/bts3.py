@@ -1,7 +1,4 @@
-"""The published grasp tables (BTS3): names, digests, licence, and what to cite.
-
-Nothing heavy is imported here: fetching the tables needs this list and no training.
-"""
+"""The published grasp tables (BTS3). Imports nothing heavy: fetching them needs no training."""
 
 from __future__ import annotations
 

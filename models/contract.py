@@ -41,10 +41,7 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Error of the training recipe, measured on data that was left out. Slip is positive.
-
-    Mean and standard deviation over the folds.
-    """
+    """Mean and deviation over folds of the recipe's error on data left out; slip is positive."""
 
     protocol: str
     """`cv`: known objects; `unknown`, `objects`: others; `session`, `days`: on other days."""
@@ -75,10 +72,7 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A reading with a smaller one was never seen either: it is the mean of all, not a grasp."""
 
     def whitening_matrix(self) -> NDArray[np.float64]:
-        """L of `whitening`, shape (electrodes, electrodes), lower triangular, 1/counts.
-
-        That the rows are a triangle, `ModelContract.from_json` has checked.
-        """
+        """Return L of `whitening`, lower triangular, shape (electrodes, electrodes), 1/counts."""
         size = len(self.whitening)
         matrix = np.zeros((size, size))
         matrix[np.tril_indices(size)] = [value for row in self.whitening for value in row]

@@ -84,11 +84,8 @@ class Electrodes:
         return found.reshape(broken.shape)
 
     def plain_square(self, deviations: NDArray[np.float64]) -> float | None:
-        """Mean square whitened deviation (`NoveltyCheck.square`) of a reading that is plainly well.
-
-        `deviations` from `centre`, shape (fingers, 24). None where `implausible` finds an electrode
-        of them or `moved_finger` says yes, or might.
-        """
+        """Return `NoveltyCheck.square` of a reading, by `deviations` from `centre`, (fingers, 24).
+        None where `implausible` finds an electrode of them or `moved_finger` says yes, or might."""
         flat = deviations.reshape(-1)
         residuals = self._precision.dot(flat)
         if 0 in (np.abs(residuals) < self._plain_limits).tobytes():
@@ -173,11 +170,8 @@ class NoveltyCheck:
         self._square_min, self._square_max = seen.distance_min**2, seen.distance_max**2
 
     def never_seen(self, counts: NDArray[np.generic], repaired: int = 0) -> NDArray[np.bool_]:
-        """Shape (N,): True for each of the counts (N, fingers, 24) that was never seen.
-
-        So many electrodes of each were `repaired` by what the others let expect: they add nothing
-        to the distance, so it is taken over the others.
-        """
+        """Return shape (N,): True for each of the counts (N, fingers, 24) that was never seen.
+        Each has `repaired` electrodes that add nothing to the distance, a mean over the others."""
         values = counts.astype(np.float64)
         outside = ((values < self._low) | (values > self._high)).any(axis=(1, 2))
         squares = self._squares(values, repaired)
@@ -187,10 +181,8 @@ class NoveltyCheck:
         return never
 
     def is_near(self, square: float, contradicted: int = 0) -> bool:
-        """Whether a reading of this `square` fits the training covariance; ranges do not matter.
-
-        So many of the electrodes that were repaired in it `contradicted` the others.
-        """
+        """Return True if a reading of this `square` fits the covariance; ranges do not matter.
+        `contradicted`: how many of its repaired electrodes contradicted the others."""
         share = CONTRADICTED_DISTANCES if contradicted else 1.0
         return self._square_min <= square <= share**2 * self._square_max
 

@@ -36,10 +36,8 @@ class InputBuilder(Protocol):
         """Of one reading's input."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Write the input of counts (fingers, 24) into `out`; the spread of each finger, counts.
-
-        A finger whose spread is below `SPREAD_FLOOR_COUNTS` must not be judged.
-        """
+        """Write the input of counts (fingers, 24) into `out`; return each finger's spread, counts.
+        A finger whose spread is below `SPREAD_FLOOR_COUNTS` must not be judged."""
 
     def build_batch(
         self, counts: NDArray[np.generic]
@@ -82,12 +80,10 @@ class _FlatBuilder:
     """One reading or many, by the same arithmetic; see `InputBuilder`."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> Floats:
-        """Write the input of counts (fingers, 24) into `out`; the spread of each finger, counts."""
         out[...], spread = self._values(counts.astype(np.float64))
         return spread
 
     def build_batch(self, counts: NDArray[np.generic]) -> tuple[NDArray[np.float32], Floats]:
-        """Inputs (N, width) and spreads (N, fingers) of counts (N, fingers, 24)."""
         values, spread = self._values(counts.astype(np.float64))
         return values.astype(np.float32), spread
 
@@ -138,9 +134,7 @@ class SessionBuilder(_FlatBuilder):
 
     def use(self, mean: Floats, spread: Floats) -> None:
         """Standardise by these from now on, each of shape (fingers * 26,), spreads above zero.
-
-        They must not change any more.
-        """
+        The arrays must not change any more."""
         if spread is not self._spread:
             self._scale = 1.0 / spread
         self._mean, self._spread = mean, spread
@@ -158,10 +152,8 @@ def raw_features(counts: NDArray[np.generic]) -> Floats:
 
 
 def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What deviations are multiplied by: one over the spread, 0 where that must not be judged.
-
-    Writes NaN into `spread` where it is infinite: it overflowed, so it is no number to judge by.
-    """
+    """Return what deviations are multiplied by: 1 / spread, or 0 where that must not be judged.
+    An infinite `spread` has overflowed: it becomes NaN, in place."""
     if 0 not in ((spread >= SPREAD_FLOOR_COUNTS) & (spread < np.inf)).tobytes():
         return 1.0 / spread
     spread[np.isinf(spread)] = np.nan

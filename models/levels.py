@@ -61,10 +61,8 @@ class RestCounts:
 def fall_of(
     counts: NDArray[np.float64], sound: NDArray[np.bool_], rest: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """How far each electrode of a finger is below where it rests, counts; all shapes (24,).
-
-    Without a `rest` that is below the median of the `sound` ones, whose median the others get.
-    """
+    """Return how far each electrode of a finger is below `rest`, counts; all shapes (24,).
+    Without a `rest`, that is the median of the `sound` ones. The others get the median fall."""
     reference = np.median(counts[sound]) if rest is None and sound.any() else rest
     fall = np.zeros(ELECTRODES) if reference is None else reference - counts
     if sound.all():
@@ -73,10 +71,8 @@ def fall_of(
 
 
 def levels_of(fall: NDArray[np.float64], *, from_rest: bool) -> NDArray[np.int64]:
-    """By pixel, shape (`HEIGHT` * `WIDTH`,): 0 at rest, `FULL` pressed the most, below 0 risen.
-
-    `fall` is what `fall_of` gives, and `from_rest` whether it knew where the finger rests.
-    """
+    """Return levels (`HEIGHT` * `WIDTH`,): 0 at rest, `FULL` pressed the most, below 0 risen.
+    `fall` is what `fall_of` gives, and `from_rest` whether it knew where the finger rests."""
     pixels = _FILL @ fall
     if from_rest:
         share = np.sign(pixels) * np.sqrt(np.abs(pixels) / FULL_COUNTS)

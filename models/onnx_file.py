@@ -145,10 +145,8 @@ class _Reader:
             self._fixed.update(node.outputs)
 
     def _fields(self, message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
-        """Number and value of each field: an int, or the bytes of what is longer.
-
-        Raises `ModelError` for what is no message.
-        """
+        """Yield number and value of each field: an int, or the bytes of what is longer.
+        Raises `ModelError` for what is no message."""
         if isinstance(message, int):
             raise _broken("a number for a message")
         at, end = 0, len(message)

@@ -16,7 +16,6 @@ from models.runtime import ModelFile, read
 SYSTEM_FOLDER = Path("/var/lib/graspd/models")
 """Looked into by everybody; the service's user has no other."""
 NAME_MAX = 64
-"""Characters of a name."""
 
 
 def user_folder() -> Path | None:
@@ -47,10 +46,7 @@ def is_name(text: str) -> bool:
 
 
 def find(name: str) -> Path:
-    """File of a model by its name: one that ships with graspd, else the user's, else the system's.
-
-    Raises `ModelError` listing the names that there are.
-    """
+    """Return a model's file: the zoo's, else the user's, else the system's. Raises `ModelError`."""
     if name in zoo.names():
         return zoo.find(name)
     for folder in folders() if is_name(name) else ():

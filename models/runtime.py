@@ -21,26 +21,20 @@ WARM_UP_RUNS = 20
 
 
 class ModelFile:
-    """The content of a model file, and its digest."""
+    """The whole content of a model file, and its SHA-256 (hexadecimal; 12 MB take 10 ms)."""
 
     def __init__(self, data: bytes) -> None:
-        """`data` is all of it; 12 MB take 10 ms to digest."""
         self.data = data
         self.sha256 = hashlib.sha256(data).hexdigest()
 
 
 class TactileModel:
-    """One model, loaded and warm, with its input and output bound to fixed buffers.
-
-    Write an input into `input` (float32, shape `inputs.shape`) with `inputs.build`, then call
-    `run`.
-    """
+    """A loaded, warm model with its input and output bound to fixed buffers.
+    Fill `input` (float32, shape `inputs.shape`) with `inputs.build`, then call `run`."""
 
     def __init__(self, path: Path, tried: ModelFile | None = None) -> None:
         """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent.
-
-        `tried` is its content, where that has been read and checked (`models.trial`).
-        """
+        `tried` is its content, where that has been read and checked (`models.trial`)."""
         file = read(path) if tried is None else tried
         self.path = path
         self.sha256 = file.sha256

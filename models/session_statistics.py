@@ -71,9 +71,7 @@ class SessionStatistics:
         prior_grasps: float = 1.0,
     ) -> None:
         """Start from the training's statistics, which weigh `prior_grasps` grasps.
-
-        Raises `ValueError` unless the spreads and the weight are above zero.
-        """
+        Raises `ValueError` unless the spreads and the weight are above zero."""
         if not (np.all(prior_spread > 0.0) and prior_grasps > 0.0):
             raise ValueError("prior spreads and weight must be above zero")
         self._prior_mean = prior_mean

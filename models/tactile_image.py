@@ -46,10 +46,8 @@ class Composition(StrEnum):
 
 
 def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
-    """Linear part of the filling: shape (pixels, 25), pixels in row-major order.
-
-    The filled image is `matrix @ [24 counts, their maximum]`; each row sums to one.
-    """
+    """Return the matrix (pixels, 25) that gives a filled image from [24 counts, their maximum].
+    Pixels are in row-major order. Each row sums to one."""
     height, width = layout.shape
     matrix = np.zeros((height, width, ELECTRODES + 1))
     filled = np.zeros((height, width), dtype=bool)
@@ -144,10 +142,8 @@ class TactileImager:
     def build_batch(
         self, counts: NDArray[np.generic]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Images of many readings: counts (N, fingers, 24) to (N, *shape) and spreads (N, fingers).
-
-        Runs `build` on each reading, so training sees bit for bit what the daemon sees.
-        """
+        """Return images (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24).
+        Each is made by `build`, so training sees bit for bit what the daemon sees."""
         images = np.empty((len(counts), *self.shape), dtype=np.float32)
         spreads = np.empty((len(counts), self._planes[2]))
         for index, reading in enumerate(counts):

@@ -27,10 +27,8 @@ passed: deque[str] = deque(maxlen=8)
 
 
 def load(path: Path, file: ModelFile | None = None) -> TactileModel:
-    """The model at `path`, warm; `file` is its content where that was read.
-
-    Raises `ModelError`, for one that is too slow or large too.
-    """
+    """Return the model at `path`, warm; `file` is its content where that was read.
+    Raises `ModelError`, also for a model that is too slow or too large."""
     file = read(path) if file is None else file
     if file.sha256 not in passed and not zoo.ships(path, file.sha256):
         _try(path, file.data)

@@ -78,9 +78,7 @@ class Assembly:
 
     def keep_session(self) -> bool:
         """Watch for exchanged sensors; restore and keep the session if the scene wants it.
-
-        The file is saved for the last time when the stack closes. Return False without a file.
-        """
+        The file is saved a last time when the stack closes. Return False if none is kept."""
         scene, pipeline = self._parts.scene, self._parts.pipeline
         file = self._session_file()
         if file is None:

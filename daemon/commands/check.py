@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from daemon.measure.cost import Footprint
 
 TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
-"""Section types of the tactile drivers."""
 
 WRONG, FAILED = 2, 1
 USUAL_PERIOD_NS = 10_000_000
@@ -48,9 +47,7 @@ COIN = 0.5
 """Lowest possible confidence: a smaller `min_confidence` has no effect."""
 TYPICAL_COUNTS, TYPICAL_CORRELATIONS = 3.5 / math.sqrt(1.0 - 0.32), (0.32, 0.03)
 """Standard deviation of a held touch's electrode, and its correlation at one and two sweeps.
-
-Measured from differences of sweeps, which the correlation makes smaller: 3.5 counts (2.9 to 4.2).
-"""
+Measured from differences of sweeps, which correlation makes smaller: 3.5 counts (2.9 to 4.2)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,11 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the scenes, their models and files; 0 if all are right.
-
-    Whether devices and socket are there is for `graspd doctor`. A scene that is right and whose
-    cost cannot be measured gives 1.
-    """
+    """Check the scenes, their models and files; 0 if all are right, 1 if only a cost is not known.
+    Whether devices and socket are there is for `graspd doctor`."""
     costs: list[tuple[Path, Footprint]] = []
     codes = [_check(path, args, costs) for path in args.scene]
     if len(codes) > 1 and costs and not args.json:

@@ -108,9 +108,7 @@ def examine(
     driver: Driver, statistics: ElectrodeStatistics | None, seconds: float
 ) -> list[Finding]:
     """Return what is wrong with an open driver, causes only.
-
-    `statistics`: of its readings in `seconds`; None for joint angles.
-    """
+    `statistics`: of its readings in `seconds`; None for joint angles."""
     device, counters = driver.describe(), driver.counters.as_dict()
     told = device_findings(driver.name, device, counters)
     readings = None if statistics is None else statistics.readings
@@ -180,7 +178,6 @@ def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list
 
 
 def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
-    """Open the scene's drivers and listen to them for a while."""
     sections = [section for section in (wanted.tactile, wanted.joints) if section is not None]
     statistics = ElectrodeStatistics(wanted.hand.fingers)
     findings: list[Finding] = []

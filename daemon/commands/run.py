@@ -35,9 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording.
-
-    SIGHUP reads the scene again, but ends a daemon that has a terminal.
-    """
+    SIGHUP reads the scene again, but ends a daemon that has a terminal."""
     _allow_descriptors()
     try:
         with ExitStack() as stack:

@@ -230,9 +230,7 @@ def _learned_before(file: SessionFile) -> TrustState | None:
 
 def _taught(trust: Trust) -> TrustState:
     """Return what recorded outcomes have taught, also that the warm-up is over.
-
-    Their lifts were not made on a `stable` verdict: the bound of `[risk]` does not count them.
-    """
+    Their lifts were not made on a `stable` verdict: the bound of `[risk]` does not count them."""
     state = trust.state()
     risk = msgspec.structs.replace(state.risk, lifts=0, slips=0)
     return msgspec.structs.replace(state, risk=risk, lifts=LiftBook().state())

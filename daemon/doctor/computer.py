@@ -136,9 +136,7 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
 
 def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
     """Return other processes that have locked a file, or else have it open, if /proc may be read.
-
-    The program that made a pseudo-terminal has it open, too, and is left out.
-    """
+    The program that made a pseudo-terminal has it open, too, and is left out."""
     try:
         there = os.stat(path)
     except OSError:

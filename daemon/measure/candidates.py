@@ -1,7 +1,5 @@
 """Candidates of the report: graspd's models, and the published code around the network `cnn1`.
-
-That network is not trained here: its time does not depend on its weights.
-"""
+That network is not trained here: its time does not depend on its weights."""
 
 from __future__ import annotations
 

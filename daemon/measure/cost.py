@@ -62,9 +62,7 @@ class CostError(Exception):
 
 def measure(scene: Path) -> Footprint:
     """Run the scene's parts in a process of their own, for about a second. Raises `CostError`.
-
-    Nothing is published, and no device or kept session is touched.
-    """
+    Nothing is published, and no device or kept session is touched."""
     with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
         # -P, so that the files in the folder at hand are not taken for modules.
         command = [sys.executable, "-P", "-m", "daemon.measure.footprint", str(scene), folder]

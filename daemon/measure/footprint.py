@@ -1,7 +1,6 @@
 """The cost of a scene, measured in a process of its own, which `daemon.measure.cost` starts.
 
-It adds the parts one by one, in the order of `graspd run`, and measures after each. Imports stand
-where they are measured.
+It adds and measures parts in the order of `graspd run`. Imports stand where they are measured.
 """
 
 from __future__ import annotations
@@ -62,9 +61,7 @@ class Meter:
 
 def main(arguments: list[str]) -> int:
     """Measure and write a `cost.Footprint` to stdout; 2 if the scene or its files are wrong.
-
-    `arguments`: the scene, a folder for sockets, and the monotonic ns of the start.
-    """
+    `arguments`: the scene, a folder for sockets, and the monotonic ns of the start."""
     path, folder, started_ns = arguments
     meter = Meter(int(started_ns))
     import gc

@@ -24,9 +24,8 @@ PANELS = (
     (("objects", "objects-whole"), "other objects"),
     (("session",), "another day"),
 )
-"""Protocols and their question. A model has at most one of a group.
-
-A model without the first was measured on two palm poses only, and is drawn hollow."""
+"""Protocols and their question; a model has at most one of a group.
+Without the first it was measured on two palm poses only, and is drawn hollow."""
 COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
 MARKERS = {"model": "o", "peer": "s"}
 SIZE_IN = (9.5, 9.6)

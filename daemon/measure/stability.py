@@ -1,7 +1,5 @@
 """`graspd report stability`: numerical errors of the whole chain, against references and bounds.
-
-The rows are the test cases in `tests/stability` of the checkout, which note them for this command.
-"""
+The rows are the test cases in `tests/stability`, which note them for this command."""
 
 from __future__ import annotations
 

@@ -49,8 +49,7 @@ def streams(
 ) -> Iterator[Stream]:
     """Train the networks of each day and fold; yield the streams of the three tables.
 
-    Objects are split `seeds` times, and `folds` of each split are judged. `epochs` None are as many
-    as the systems have themselves.
+    Objects are split `seeds` times; `folds` of each are judged. `epochs` None: the systems' own.
     """
     systems = [SYSTEMS[name] for name in (OWN, PUBLISHED)]
     if epochs is not None:
@@ -77,10 +76,8 @@ def streams(
 def judged(
     system: System, training: Grasps, several: Sequence[NDArray[np.uint16]], seed: int
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-    """Train a system; return its margins (N,) and inputs (N, ...) for streams of counts.
-
-    Counts have the shape (N, 3, 24). Inputs are empty for a system without a session.
-    """
+    """Train a system; return its margins (N,) and inputs (N, ...) for streams of counts (N, 3, 24).
+    Inputs are empty for a system without a session."""
     trained, takes = train(system, training, seed), system.input
     answers = []
     for counts in several:

@@ -75,7 +75,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 Curves = dict[str, list[WorthPoint]]
-"""By method."""
 
 
 def measured(several: Sequence[Stream]) -> Curves:

@@ -11,9 +11,7 @@ from pathlib import Path
 
 def read_regular(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file; never wait for a pipe's writer.
-
-    Raises `OSError`, with a reason in `strerror`, also beyond `max_bytes`.
-    """
+    Raises `OSError`, with a reason in `strerror`, also beyond `max_bytes`."""
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "not a regular file")
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
@@ -27,10 +25,7 @@ def write_atomically(
     path: Path, content: bytes, mode: int = 0o600, *, former: Path | None = None
 ) -> None:
     """Replace the file at `path` in one step, keeping the former one at `former`.
-
-    A reader sees the former file or the whole new one, also after a power cut. Raises `OSError`,
-    and leaves the former file in place.
-    """
+    Readers see a whole file, also after a power cut; it is the former one after an `OSError`."""
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
     handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:

@@ -24,9 +24,7 @@ log = logging.getLogger("graspd")
 
 class Worker(Generic[R]):
     """Runs one job at a time in a thread of ordinary priority, on any processor.
-
-    The thread starts with the first job. All methods are for the loop's thread.
-    """
+    The thread starts with the first job. All methods are for the loop's thread."""
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -56,16 +56,12 @@ class Requests(Protocol):
 
     def outcome(self, report: Report, answer: Answer) -> None:
         """Tell how a lift has ended; `answer` gets None once that is on the disk.
-
-        Else `answer` gets `REPEATED`, or why the outcome is refused or not kept.
-        """
+        Else `answer` gets `REPEATED`, or why the outcome is refused or not kept."""
 
 
 class Companion:
     """Base class: a companion overrides the hooks that concern it.
-
-    The loop's thread calls them: they must not block, and what they raise ends the loop.
-    """
+    The loop's thread calls them: they must not block, and what they raise ends the loop."""
 
     def before_wait(self, requests: Requests) -> None:
         """Pass on to `requests` what has come from outside."""

@@ -291,9 +291,7 @@ class Door:
 
     def close(self) -> bool:
         """Disconnect all peers, after they had `LINGER_MS` to take what is queued.
-
-        False if libzmq's threads have not ended within `CLOSE_S`. May be called again.
-        """
+        False if libzmq's threads have not ended within `CLOSE_S`. May be called again."""
         if not self._echo.closed:
             self._await_last_status()
         self._close_monitor()

@@ -149,7 +149,6 @@ class Outbox:
         self._clock = clock
         self._wall_clock = wall_clock
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
-        """Identifies this start of the daemon."""
         self._versions = {
             "graspd": __version__,
             "onnxruntime": onnxruntime.__version__,

@@ -80,10 +80,8 @@ class Export:
 
 
 def collect(paths: Sequence[Path]) -> Export:
-    """Return the grasps of recordings, given in the order of time.
-
-    Raises `RecordingError` for a file that is damaged, of other fingers, or without judged counts.
-    """
+    """Return the grasps of recordings, given in the order of time. Raises `RecordingError` for a
+    file that is damaged, of other fingers, or without judged counts."""
     export = Export()
     told: set[GraspId | None] = set()
     for path in paths:

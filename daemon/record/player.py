@@ -58,9 +58,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`speed` is a factor of real time; None plays as fast as possible.
-
-        Raises `ValueError` without files or for a speed that is not positive.
-        """
+        Raises `ValueError` without files or for a speed that is not positive."""
         super().__init__(paths, speed, clock)
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)

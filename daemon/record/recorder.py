@@ -1,7 +1,5 @@
 """Records readings, published messages and events in files, without delaying the loop.
-
-The loop appends to a bounded queue and a thread writes: a slow disk costs entries, not time.
-"""
+The loop appends to a bounded queue and a thread writes: a slow disk costs entries, not time."""
 
 from __future__ import annotations
 

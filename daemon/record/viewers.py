@@ -104,9 +104,7 @@ class Viewer:
 
     def of(self, kind: str, content: object, wall_ns: int) -> Iterator[tuple[str, bytes]]:
         """Yield kind and payload of what a message comes to; nothing for a malformed one.
-
-        `content` is the message as JSON has it, `kind` the first part of its topic.
-        """
+        `content` is the message as JSON has it, `kind` the first part of its topic."""
         if kind not in MESSAGES:
             return
         try:

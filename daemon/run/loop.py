@@ -71,11 +71,8 @@ class LoopTiming:
     rest: Callable[[float], None] = time.sleep
     """Puts this thread to sleep, s."""
     selector: Callable[[], selectors.BaseSelector] = selectors.PollSelector
-    """Waits for descriptors, in whole milliseconds (poll(2)).
-
-    Unlike epoll(7), poll takes a descriptor for what it is now: a driver that reopens a device
-    mostly gets the same number.
-    """
+    """Waits for descriptors in whole milliseconds, by poll(2). Unlike epoll(7), it takes a number
+    for what it is now: a driver that reopens a device mostly gets the same one."""
 
 
 class Loop:
@@ -92,9 +89,7 @@ class Loop:
         keep: Callable[[Answer], None] = at_once,
     ) -> None:
         """Run these open drivers, the tactile one first; the caller closes them.
-
-        `keep` calls its argument once all outcomes until now are on the disk.
-        """
+        `keep` calls its argument once all outcomes until now are on the disk."""
         self._drivers = drivers
         self._tactile = drivers[0]
         self._pipeline = pipeline
@@ -133,9 +128,7 @@ class Loop:
 
     def run(self) -> Ended:
         """Run until something ends it; after `RELOAD`, continue. Raises `DriverError`.
-
-        Call `close` after the last call.
-        """
+        Call `close` after the last call."""
         self._watched = []
         with closing(self._new_selector()) as selector:
             selector.register(self._stop, selectors.EVENT_READ)
@@ -170,7 +163,6 @@ class Loop:
             after_round()
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
-        """Sleep until a driver, a timer, a companion or a signal wants attention."""
         self._register(selector)
         due_ns = self._next_due_ns()
         now_ns = began_ns = self._clock()

@@ -69,10 +69,8 @@ class LoadShedder:
         self._check_recovered(now_ns)
 
     def should_skip(self, backlog: int, age_ns: int, period_ns: int | None) -> bool:
-        """Return True if only the newest of `backlog` readings should be judged.
-
-        `age_ns`: time since they arrived. `period_ns`: sensor period, None if not known yet.
-        """
+        """Return True if only the newest of `backlog` readings, `age_ns` old, should be judged.
+        `period_ns`: sensor period, None if not known yet."""
         if backlog < 2 or not self._live:
             return False
         cost_ns = min(self._costs_ns, default=0)

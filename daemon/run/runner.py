@@ -90,9 +90,7 @@ class Runner:
 
     def run(self) -> None:
         """Run until stopped or until a recording ends. Errors of a reload are logged.
-
-        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`.
-        """
+        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`."""
         try:
             self._run(prepare(self._path))
         finally:

@@ -139,9 +139,7 @@ def _fractions(parts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
 
 class RunSummary:
     """Collects verdicts in constant memory.
-
-    Behind a gate a grasp counts once, by its first judgement; else each reading does.
-    """
+    Behind a gate a grasp counts once, by its first judgement; else each reading does."""
 
     def __init__(self) -> None:
         self.tally = Tally()
@@ -149,7 +147,6 @@ class RunSummary:
         """The same grasps judged in another way; empty unless tried."""
         self.trained_on: Sequence[str] = ()
         self._waiting: dict[int, list[tuple[Tally, Decision]]] = {}
-        """By grasp."""
         self.repaired = 0
         """Verdicts made with at least one repaired electrode."""
         self.latency = LatencyHistogram()

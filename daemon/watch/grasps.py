@@ -24,7 +24,6 @@ class GraspLog:
         self._judged: dict[Key, tuple[Verdict, int]] = {}
         """Last verdict of each grasp and when it came, ns; the newest last."""
         self._ended: dict[Key, str] = {}
-        """Outcomes that were told."""
         self._past: Counter[Decision] = Counter()
         self._current: Key | None = None
         """The grasp that is counted next, until another begins."""

@@ -105,8 +105,6 @@ class Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One request."""
-
     server: Server
     server_version = "graspd"
     sys_version = ""

@@ -20,11 +20,8 @@ def names() -> list[str]:
 
 
 def for_hand(name: str, fingers: Collection[Finger]) -> str:
-    """Name of the form of a model for a hand of these fingers alone, else the name as it is.
-
-    That of `small-session` for `ff` and `th`, in any order, is `small-session-ff-th`. What is such
-    a form itself has no other.
-    """
+    """Return the name of a model's form for these fingers, such as `small-session-ff-th`.
+    Return the name itself if there is no such form, or if it is one already."""
     hand = [finger for finger in get_args(Finger) if finger in fingers]
     form = "-".join((name, *hand))
     is_form = name.endswith(tuple(f"-{finger}" for finger in get_args(Finger)))

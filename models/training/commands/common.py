@@ -33,9 +33,7 @@ def exit_code(
     command: str, folder: Path, work: Callable[[], None], failure: type[Exception]
 ) -> int:
     """Do the work of a command that writes into `folder`, and say in one line why it ended.
-
-    Returns 0; 1 for `failure`; 2 for wrong input, data or folder; 130 for Ctrl-C.
-    """
+    Returns 0; 1 for `failure`; 2 for wrong input, data or folder; 130 for Ctrl-C."""
     try:
         work()
     except KeyboardInterrupt:
@@ -67,10 +65,9 @@ def say(command: str, text: str) -> None:
 
 @contextmanager
 def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
-    """Show on standard error, if that is a terminal, how many of `total` trainings are done.
+    """Show on stderr, if that is a terminal, how many of `total` trainings are done.
 
-    Call what it yields after each training, with the text to show before the bar. Until then the
-    text is `first`.
+    Call what it yields after each training, with the bar's next text; `first` is the first one.
     """
     from rich.console import Console
     from rich.progress import (

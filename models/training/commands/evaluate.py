@@ -69,10 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate. Returns 0, 1 (the cluster failed), 2 (input or folder), 130 (Ctrl-C).
-
-    Whatever was finished by then is kept and not run again.
-    """
+    """Evaluate; what is finished is kept and not run again.
+    Returns 0, 1 (the cluster failed), 2 (input or folder), 130 (Ctrl-C)."""
     from models.training.commands.evaluation import evaluate
     from models.training.evaluating.run_jobs import ClusterError
 

@@ -81,10 +81,8 @@ class Grasps:
         return np.flatnonzero(np.isin(self.table_of, wanted)).astype(np.int64)
 
     def of_fingers(self, fingers: Sequence[str]) -> Grasps:
-        """With these fingers alone, in this order, of grasps with all fingers of a table.
-
-        Raises `ValueError` for a finger that a table lacks, or if fingers are missing already.
-        """
+        """Return the grasps with these fingers alone, in this order.
+        Raises `ValueError` for a finger that a table lacks, or if fingers are missing already."""
         if self.counts.shape[1] != len(FINGERS) or not set(fingers) <= set(FINGERS):
             raise ValueError(f"the grasps have not the fingers {', '.join(fingers)}")
         chosen = [FINGERS.index(finger) for finger in fingers]

@@ -68,18 +68,14 @@ class Split:
 
 
 def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
-    """The splits of a protocol; `unknown` has one whatever `seed` and `folds` are.
-
-    Raises `TooFewGraspsError` if the data lack a table, objects or grasps that the protocol needs.
-    """
+    """Return the splits of a protocol; `unknown` has one whatever `seed` and `folds` are.
+    Raises `TooFewGraspsError` if the data lack a table, objects or grasps that it needs."""
     return _MAKERS[protocol](grasps, seed, folds)
 
 
 def folds_of(slipped: Bools, folds: int, seed: int) -> Ints:
     """Return the fold of each grasp, shape (N,): stratified, shuffled with the seed.
-
-    Raises `TooFewGraspsError` if a class has fewer grasps than there are folds.
-    """
+    Raises `TooFewGraspsError` if a class has fewer grasps than there are folds."""
     from sklearn.model_selection import StratifiedKFold
 
     fewest = min(int(slipped.sum()), int((~slipped).sum()))
@@ -101,9 +97,7 @@ def fold_seed(seed: int, fold: int) -> int:
 
 def object_folds(objects: Sequence[str], folds: int, seed: int) -> Ints:
     """Return the fold of each grasp, shape (N,): all grasps of an object are in one fold.
-
-    Raises `TooFewGraspsError` if there are fewer objects than folds.
-    """
+    Raises `TooFewGraspsError` if there are fewer objects than folds."""
     names = sorted(set(objects))
     if len(names) < folds:
         raise TooFewGraspsError(f"{folds} folds need {folds} objects, there are {len(names)}")

@@ -26,8 +26,6 @@ from models.training.estimators.configs import (
 
 PROBABILITY_FLOOR = 1e-3
 """A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
-
-
 INTERRUPTED = "Training interrupted"
 """How scikit-learn's warning begins that Ctrl-C has ended the training of a perceptron."""
 
@@ -52,10 +50,8 @@ ClassicalModel: TypeAlias = SVC | RandomForestClassifier | MLPClassifier | Boost
 def fit_classical(
     config: ClassicalConfig, inputs: Floats32, slipped: Bools, seed: int
 ) -> ClassicalModel:
-    """A classifier fitted to inputs (N, M) and labels (N,), on one thread.
-
-    Raises `ValueError` if the inputs are no vectors or a class is missing.
-    """
+    """Fit a classifier to inputs (N, M) and labels (N,), on one thread.
+    Raises `ValueError` if the inputs are no vectors or a class is missing."""
     if inputs.ndim != 2:
         raise ValueError(f"takes vectors, not inputs {inputs.shape[1:]}")
     if len(np.unique(slipped)) != 2:

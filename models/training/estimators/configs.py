@@ -1,7 +1,5 @@
-"""What estimators are made from: settings of classifiers, networks and their training.
-
-No library of the training is imported here, so that help and completion know every system.
-"""
+"""Settings of classifiers, networks and their training.
+No library of the training is imported here, so that help and completion know every system."""
 
 from __future__ import annotations
 

@@ -62,10 +62,7 @@ def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
 
 
 def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> onnx.ModelProto:
-    """One graph whose margin is the sum of the parts' margins times their factors.
-
-    The parts have the same input.
-    """
+    """Join graphs of one input: the margin is the sum of their margins times `factors`."""
     given = parts[0].graph.input[0]
     nodes: list[onnx.NodeProto] = []
     constants: list[onnx.TensorProto] = []
@@ -101,10 +98,7 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
 
 
 def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onnx.ModelProto:
-    """The graph, changed in place, with `(input - mean) * scale` before it.
-
-    Both have the shape of one input.
-    """
+    """Put `(input - mean) * scale`, both in the shape of one input, before a graph, in place."""
     graph = model.graph
     given = graph.input[0].name
     _feed(graph, given, "standardised")
@@ -272,10 +266,7 @@ def _from_torch(
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """Hold back what a logger says below an error, and what will be deprecated.
-
-    The exporter talks of its own insides: nothing that a user could act on.
-    """
+    """Hold back deprecations and a logger's warnings: no user could act on the exporter's."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)

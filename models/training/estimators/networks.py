@@ -28,12 +28,11 @@ class ChannelsFirst(nn.Module):
     """Images (N, height, width, fingers), as the daemon builds them, to (N, fingers, ...)."""
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Move the fingers from the last axis to the second."""
         return images.permute(0, 3, 1, 2)
 
 
 class FeatureImages(nn.Module):
-    """Values of the electrodes (N, fingers * 24) to filled D1 images (N, fingers, 12, 11)."""
+    """Electrodes (N, fingers * 24) to D1 images (N, fingers, 12, 11), gaps filled with means."""
 
     fill: torch.Tensor
 
@@ -44,7 +43,6 @@ class FeatureImages(nn.Module):
         self._fingers = fingers
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
-        """Fill the pixels between the electrodes with their neighbours' mean."""
         pixels = values.reshape(-1, self._fingers, ELECTRODES) @ self.fill
         return pixels.reshape(-1, self._fingers, *D1.shape)
 

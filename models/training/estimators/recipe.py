@@ -80,12 +80,10 @@ def logits(network: nn.Module, inputs: Floats32) -> Floats:
 
 
 def on_another_day(features: torch.Tensor, shift: DayShift) -> torch.Tensor:
-    """Shift standardised session features (N, fingers * 26), each grasp by a draw of its own.
+    """Shift standardised session features (N, fingers * 26) as they may be on another day.
 
-    They become as they might have been on another day: other sensors, another palm pose.
-
-    Draws from torch's global random state; the features themselves are not changed. Raises
-    `ValueError` if these are no session features.
+    Each grasp is shifted by a draw of its own, from torch's global random state; `features` do
+    not change. Raises `ValueError` if these are no session features.
     """
     if features.ndim != 2 or features.shape[1] % FEATURES_PER_FINGER:
         raise ValueError(f"inputs {tuple(features.shape[1:])} are no session features")

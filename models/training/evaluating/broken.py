@@ -64,9 +64,7 @@ class Study:
 
 def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
     """Train on folds of the grasps, break electrodes of the grasps left out, and judge these.
-
-    The grasps have the system's fingers alone. Raises `TooFewGraspsError`.
-    """
+    The grasps have the system's fingers alone. Raises `TooFewGraspsError`."""
     folds = [
         _Fold(system, grasps, out, fold_seed(seed, fold))
         for fold, out in enumerate(left_out(grasps, seed))
@@ -88,10 +86,8 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
 
 
 def left_out(grasps: Grasps, seed: int) -> list[Bools]:
-    """Of each training of the study, shape (N,): True for the grasps that it is judged by.
-
-    Raises `TooFewGraspsError` for less than two grasps of a label.
-    """
+    """Return, for each training of the study, True for the grasps (N,) that it is judged by.
+    Raises `TooFewGraspsError` for less than two grasps of a label."""
     slips = int(grasps.slipped.sum())
     folds = min(FOLDS, max(2, min(slips, len(grasps) - slips)))
     fold_of = folds_of(grasps.slipped, folds, seed)

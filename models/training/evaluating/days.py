@@ -62,10 +62,8 @@ class Day:
         self._sound = np.zeros(self.electrodes.centre.shape, np.bool_)
 
     def look(self, counts: Numbers, session: Standards | None = None) -> tuple[Numbers, bool, bool]:
-        """Counts (fingers, 24), repaired; whether they were seen; whether a session learns of them.
-
-        `session` is mean and spread of the counts in it.
-        """
+        """Return counts (fingers, 24), repaired; if they were seen; if a session learns of them.
+        `session` is mean and spread of the counts in it."""
         now = session or Standards(self.electrodes.centre, self.electrodes.spread)
         scale = self.electrodes.spread / now.spread
         values = self.electrodes.centre + (counts.astype(np.float64) - now.mean) * scale
@@ -89,7 +87,6 @@ class SessionDay:
     """A session from nothing, as the daemon's `SessionCalibration` has it."""
 
     def __init__(self, trained: Trained) -> None:
-        """Of a session system."""
         takes = trained.system.input
         if trained.standards is None or not isinstance(takes, SessionFeatures):
             raise ValueError(f"{trained.system.name} has no sessions")

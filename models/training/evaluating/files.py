@@ -12,11 +12,8 @@ import msgspec
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path to write to; the file written there then takes the place of `path`.
-
-    After an exception `path` is as it was before. Nothing else is left in the folder. Raises
-    `OSError` if the file cannot be written.
-    """
+    """Yield a path; the file written there then takes the place of `path`. Raises `OSError`.
+    After an exception `path` is unchanged, and nothing else is left in the folder."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part

@@ -71,9 +71,7 @@ def jobs_of(
     system: System, protocol: EvalProtocol, grasps: Grasps, seeds: Sequence[int], folds: int
 ) -> list[Job]:
     """Return the jobs of a system in a protocol: all folds of the first seed, then of the next.
-
-    Raises `TooFewGraspsError` if the grasps do not have the splits.
-    """
+    Raises `TooFewGraspsError` if the grasps do not have the splits."""
     return [
         Job(system, protocol, seed, fold, folds)
         for seed in seeds
@@ -155,10 +153,8 @@ def run(job: Job, grasps: Grasps) -> JobResult:
 
 
 def load(folder: Path, job: Job, data: str) -> JobResult | None:
-    """Read the stored result of a job on data of this digest.
-
-    None: nothing is stored, or what is stored is broken, which is logged.
-    """
+    """Return the stored result of a job on data of this digest.
+    None: nothing is stored, or what is stored is broken, which is logged."""
     path = folder / job.file_name(data)
     try:
         if path.stat().st_size > MAX_FILE_BYTES:

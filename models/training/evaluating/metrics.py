@@ -84,11 +84,8 @@ class CurvePoint:
 
 
 def score(margins: Floats, slipped: Bools, probability: Floats | None = None) -> Scores:
-    """Figures of margins (N,) against labels (N,).
-
-    Brier score, calibration error and log loss are those of `probability` (N,) of slip; without it
-    of the uncalibrated one.
-    """
+    """Return the figures of margins (N,) against labels (N,).
+    Brier score, ECE and log loss are of `probability` (N,) of slip, else uncalibrated."""
     verdict = margins > 0.0
     precision, recall, f1, _ = precision_recall_fscore_support(
         slipped, verdict, average="binary", zero_division=0.0
@@ -112,9 +109,7 @@ def score(margins: Floats, slipped: Bools, probability: Floats | None = None) ->
 
 def fit_temperature(margins: Floats, slipped: Bools) -> float:
     """Return the T that makes sigmoid(margin / T) most likely, of margins (N,) and labels (N,).
-
-    The grasps must not have been trained on.
-    """
+    The grasps must not have been trained on."""
     low, high = np.log(TEMPERATURE_RANGE)
     for _ in range(HALVINGS):
         middle = (low + high) / 2.0
@@ -205,10 +200,8 @@ def accuracy_at(probability: Floats, slipped: Bools, coverage: float) -> float:
 
 
 def reject_threshold(probability: Floats, slipped: Bools, wanted: float) -> CurvePoint | None:
-    """The lowest confidence from which on verdicts reach the wanted accuracy.
-
-    None if no confidence does so over `FEWEST_JUDGED` verdicts.
-    """
+    """Return the lowest confidence from which on verdicts reach the wanted accuracy.
+    None if no confidence does so over `FEWEST_JUDGED` verdicts."""
     least = FEWEST_JUDGED / len(slipped)
     reached = (
         point

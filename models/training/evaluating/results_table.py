@@ -142,7 +142,6 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
         f1 = {key: variant.spreads["f1"] for key, variant in variants.items()}
         shown.append((f"`{name}`", *(_value(f1.get(key)) for key in SESSION_VARIANTS)))
     yield _table(("system", *columns), shown)
-    # How right the verdicts of a running session are while it is young.
     young = {name: variants[RUNNING].ages for name, variants in here.items() if RUNNING in variants}
     if young:
         yield "Accuracy, %, in a running session (objects mixed) after at least so many grasps:"
@@ -223,9 +222,7 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
 
 def difference(ours: SystemSummary, theirs: SystemSummary) -> tuple[float, float | None] | None:
     """Return our mean F1 less theirs on the splits that both have judged, and its standard error.
-
-    None: no split is the same, for other data or another number of folds, say.
-    """
+    None: no split is the same, for other data or another number of folds, say."""
     seeds = [seed for seed in ours.seeds if seed in theirs.seeds]
     if not seeds or ours.folds != theirs.folds or ours.data != theirs.data:
         return None

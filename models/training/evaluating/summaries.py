@@ -137,9 +137,7 @@ class SystemSummary:
 
 def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> SystemSummary:
     """Return the figures of a system in a protocol.
-
-    `found` has its jobs, all folds of every seed in their order, and their results.
-    """
+    `found` has its jobs, all folds of every seed in their order, and their results."""
     flat = list(found.values())
     names = list(flat[0].margins)
     job = next(iter(found))
@@ -188,11 +186,10 @@ def read_summary(path: Path) -> SystemSummary:
 
 
 def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[SystemSummary]:
-    """The summaries in a folder that are of this data and of these systems.
+    """Return the folder's summaries of this data (a digest), by system and then by protocol.
 
-    `data` is the digest of the grasps, `digests` are those of the systems by name. In the order of
-    systems and protocols. A summary that is of another configuration or cannot be read is left
-    out, with a warning.
+    `digests`: those of the systems by name, in their order. A summary that is of another
+    configuration or cannot be read is left out, with a warning.
     """
     found = []
     for path in sorted(folder.glob("*.json")):

@@ -53,10 +53,8 @@ def seen_counts(counts: Numbers, margin: int = MARGIN_COUNTS) -> SeenCounts:
 
 
 def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN_COUNTS) -> float:
-    """Fraction of counts (N, fingers, 24) that are refused if their own group is left out.
-
-    `group_of` (N,) are the folds or objects; each is compared with all others.
-    """
+    """Return the fraction of counts (N, fingers, 24) that are refused if their group is left out.
+    `group_of` (N,) are the folds or objects; each is compared with all others."""
     never = np.empty(len(counts), dtype=np.bool_)
     for group in np.unique(group_of):
         inside = group_of == group
@@ -67,10 +65,8 @@ def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN
 
 
 def made_up_never_seen(counts: Numbers, seen: SeenCounts, seed: int) -> dict[str, float]:
-    """Fraction refused of readings that no hand ever made, by the way they were made up.
-
-    `counts` (N, fingers, 24) are real ones, `seen` is what they look like.
-    """
+    """Return the fraction refused of readings that no hand ever made, by how they are made up.
+    `counts` (N, fingers, 24) are real ones, `seen` is what they look like."""
     random = np.random.default_rng(seed)
     shape = (RANDOM_READINGS, *counts.shape[1:])
     low, high = np.array(seen.low), np.array(seen.high)

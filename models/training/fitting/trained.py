@@ -78,10 +78,8 @@ class Trained:
 
 
 def train(system: System, grasps: Grasps, seed: int) -> Trained:
-    """The system trained on these grasps, which have its fingers alone, on one thread.
-
-    Raises `ValueError` if they are too few.
-    """
+    """Train a system on these grasps, which have its fingers alone, on one thread.
+    Raises `ValueError` if they are too few."""
     counts, table_of = grasps.counts, grasps.table_of
     session = isinstance(system.input, SessionFeatures)
     standards = TrainingStandards.of(raw_features(counts), table_of) if session else None

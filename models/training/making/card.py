@@ -43,7 +43,6 @@ class ExportedFile(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, path: Path, parity: Parity) -> ExportedFile:
-        """Of a file that was just exported."""
         data = path.read_bytes()
         return cls(hashlib.sha256(data).hexdigest(), len(data), OPSET, parity)
 

@@ -26,10 +26,8 @@ FEWEST_STANDARD = 2
 
 
 def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
-    """Raise `TooFewGraspsError` if one of the plan's trainings lacks grasps of a label.
-
-    A training of a session model also needs `FEWEST_STANDARD` of each table that it is judged by.
-    """
+    """Raise `TooFewGraspsError` if a training of the plan lacks grasps of a label.
+    That of a session model also needs `FEWEST_STANDARD` of each table that it is judged by."""
     session = isinstance(plan.system.input, SessionFeatures)
     for where, of, train, test in _trainings(plan, grasps):
         slips = int(of.slipped[train].sum())
@@ -88,10 +86,8 @@ def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
 
 
 def _trainings(plan: TrainingPlan, grasps: Grasps) -> Iterator[tuple[str, Grasps, Ints, Ints]]:
-    """Of each training: its name, grasps, and the rows that it trains on and is judged by.
-
-    A session that is calibrated while it is judged needs nothing of the training: no rows.
-    """
+    """Yield each training's name and grasps, and the rows that it trains on and is judged by.
+    A session that is calibrated while it is judged needs no rows of the training."""
     for protocol in plan.protocols(grasps):
         for split in splits(protocol, grasps, plan.seed, plan.folds):
             alone = protocol == "days" or split.calibration is not None

@@ -235,7 +235,6 @@ _SESSION = (
     ),
 )
 
-
 _HAND: tuple[Finger, ...] = FINGERS
 _FEWER_FINGERS = tuple(
     replace(
@@ -247,7 +246,6 @@ _FEWER_FINGERS = tuple(
     for fingers in (*combinations(_HAND, 1), *combinations(_HAND, 2))
 )
 """The default system for hands with fewer sensors: fewer channels, no padding."""
-
 
 SYSTEMS = {
     system.name: system

@@ -76,7 +76,6 @@ class System:
     standardise: bool = False
     """Each value of an input by its own mean and spread in the training, within the model."""
     fingers: tuple[Finger, ...] = FINGERS
-    """Those that it judges by."""
     tables: tuple[str, ...] = WHOLE
     """What the model that is kept is trained on; protocols say for themselves."""
     published: tuple[PaperFigure, ...] = ()
