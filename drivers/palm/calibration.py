@@ -196,7 +196,6 @@ class CalibrationError(DriverError):
 
     def __init__(self, path: Path, problems: Sequence[str]) -> None:
         super().__init__("\n".join(f"{path}: {problem}" for problem in problems))
-        self.path = path
         self.problems = tuple(problems)
         """Mistakes, each beginning with the name of its joint."""
 

@@ -171,10 +171,6 @@ class Conversation:
                 self._pings[message.nonce] = t_ns
                 self._pings_sent += 1
 
-    def not_sent(self) -> None:
-        """Count a frame that was given up, as there was no room for it."""
-        self.counters.host_tx_dropped += 1
-
     def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
         """Return the readings that these bytes complete, oldest first. Never raises.
 

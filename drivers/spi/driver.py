@@ -143,7 +143,7 @@ class SpiBridgeDriver(Opened):
             for frame in self.conversation.say(self._clock()):
                 self.conversation.sent(frame, self._clock())
                 if not self._line.write(frame):
-                    self.conversation.not_sent()
+                    self.counters.host_tx_dropped += 1
         except LinkError as error:
             self._lose(error)
         if self.conversation.link.state is WAITING:

@@ -94,7 +94,6 @@ class CanTwin(Opened):
         self._bus: can.BusABC | None = None
         self._sweep = first_sweep
         self._stuck_tick_us = self._tick_us()
-        self.frames_sent = 0
         self.unsent = 0
         """Frames that the bus did not take."""
 
@@ -207,8 +206,6 @@ class CanTwin(Opened):
             bus.send(message, timeout=self._send_timeout_s)
         except can.CanError:
             self.unsent += 1
-        else:
-            self.frames_sent += 1
 
     def _discard_received(self) -> None:
         """Empty the queue of a virtual bus, which has no bound."""

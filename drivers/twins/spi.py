@@ -212,14 +212,12 @@ class SpiTwin(Opened):
         waiting = [master] if self._unsent else []
         readable, _, _ = select.select([master], waiting, [], timeout_s)
         if readable:
-            self._hear()
+            self._hear(os.read(master, READ_BYTES))
         self._drain()
         self._do_what_is_due()
 
-    def _hear(self) -> None:
-        if self._master is None:
-            return
-        for kind, payload in self._parser.feed(os.read(self._master, READ_BYTES)):
+    def _hear(self, data: bytes) -> None:
+        for kind, payload in self._parser.feed(data):
             message = decode(kind, payload)
             if isinstance(message, Ping):
                 self._send(self._hello(message.nonce), waits=False)
