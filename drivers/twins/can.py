@@ -42,11 +42,8 @@ Outgoing = tuple[int, bytes]
 
 
 class CanTwin(Opened):
-    """Sends the sweeps of `counts` in one of the two formats.
-
-    `send_sweep` sends one at once; `serve` sends at `rate_hz`. `first_sweep`: number of the
-    first sweep frame. The constructor raises `ValueError`.
-    """
+    """Sends the sweeps of `counts` in one of the two formats. The constructor raises `ValueError`.
+    `rate_hz`: sweeps/s of `serve`. `first_sweep`: number of the first sweep frame."""
 
     def __init__(
         self,

@@ -93,7 +93,6 @@ class SpiTwin(Opened):
         self.tx_dropped = 0
         """Frames that the host did not take in time, in all."""
         self.exhausted = False
-        """The source has ended."""
         self._sensors = first.shape[0]
         self._source = itertools.chain([first], counts)
         self._period_ns = round(1e9 / (rate_hz or NOMINAL_HZ))

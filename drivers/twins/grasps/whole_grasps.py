@@ -101,11 +101,8 @@ class WholeGrasps:
         loop: bool = False,
         seed: int = 0,
     ) -> None:
-        """`rest`: untouched counts, shape (fingers, 24). `loop`: play the end points without end.
-
-        `noise`: by default `MeasuredNoise`. Raises `ValueError` for a rate that is not positive or,
-        held, not 100 Hz.
-        """
+        """`rest`: untouched counts, shape (fingers, 24). `noise`: by default `MeasuredNoise`.
+        `loop`: play the end points without end. Raises `ValueError` for a wrong rate."""
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         if sampling is Sampling.HELD and rate_hz != RATE_HZ:
