@@ -29,10 +29,8 @@ def check_fingers(fingers: Sequence[str]) -> None:
 
 
 def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the sensor of a device, from 0, for each row of a reading.
-
-    `sensors`: all fingers in the order of the device, None for `fingers`. Raises `ValueError`.
-    """
+    """Return the sensor of a device, from 0, for each of `fingers`. Raises `ValueError`.
+    `sensors`: all fingers in the order of the device; None: `fingers`."""
     check_fingers(fingers)
     if sensors is None:
         return tuple(range(len(fingers)))
@@ -250,15 +248,11 @@ class Driver(Protocol):
     @property
     def serials(self) -> dict[str, str]:
         """Known serial numbers of the sensors by finger, or the sender if a link has none.
-
-        Another number is another sensor; between the two, `read_ready` has returned nothing once.
-        """
+        Another number is another sensor; between the two, `read_ready` returns nothing once."""
 
     def describe(self) -> dict[str, Fact]:
         """Return facts about the device by name: versions, serials, why a link is down.
-
-        Live links have the fact `link`, whose fault is None while it is up.
-        """
+        Live links have the fact `link`, whose fault is None while it is up."""
 
     def open(self) -> None:
         """Take the device. Raises `DriverError`."""

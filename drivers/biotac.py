@@ -22,7 +22,6 @@ FORBIDDEN_COMMAND = 0xA1
 """Channel 16 starts the streaming loop of the old protocol V1.1, which a sensor leaves only after
 five seconds of idle clock. Never sent."""
 CHANNELS = (PAC, PDC, TAC, TDC, *range(E1, E24 + 1))
-"""All channels that are sampled."""
 
 ERROR_WORDS: dict[int, str] = {
     0xA52D: "insufficient sampling delay",

@@ -25,10 +25,8 @@ class WordCounters(Protocol):
 def make_reading(
     words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int, counters: WordCounters
 ) -> TactileReading:
-    """Return the reading of `words`, shape (fingers, 24), and count it.
-
-    `marks`: faults that are known already. Words under `MISSING` mean nothing and are not counted.
-    """
+    """Return the reading of `words`, shape (fingers, 24), and count it. `marks`: faults that are
+    known already; words under `MISSING` mean nothing and are not counted."""
     counts, faults = decode_words(words)
     if np.count_nonzero(faults) or np.count_nonzero(marks):
         absent = marks & np.uint8(ElectrodeFault.MISSING) != 0

@@ -17,7 +17,10 @@ def check_endpoint(endpoint: str) -> str:
     if "\0" in endpoint:
         raise ValueError("has a NUL character")
     if scheme == "tcp":
-        _check_tcp(address)
+        host, _, port = address.rpartition(":")
+        if not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
+            raise ValueError("needs a port of 1 to 65535, as in tcp://127.0.0.1:5555")
+        _ip_address(host)
     elif address.startswith("@"):
         raise ValueError("needs a path: abstract sockets have no file mode, all may connect")
     elif not address or len(address.encode()) > IPC_PATH_MAX_BYTES:
@@ -31,13 +34,6 @@ def is_private(endpoint: str) -> bool:
     """Return True if only this computer can connect to an endpoint of `check_endpoint`."""
     scheme, _, address = endpoint.partition("://")
     return scheme == "ipc" or _ip_address(address.rpartition(":")[0]).is_loopback
-
-
-def _check_tcp(address: str) -> None:
-    host, _, port = address.rpartition(":")
-    if not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
-        raise ValueError("needs a port of 1 to 65535, as in tcp://127.0.0.1:5555")
-    _ip_address(host)
 
 
 def _ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

@@ -14,7 +14,7 @@ from daemon.process.text import did_you_mean, printable
 Section = type[BaseModel]
 
 LINES_MAX = 20
-"""Whoever has made more mistakes has named the wrong file."""
+"""Most mistakes that are told: with more, the wrong file was named."""
 SHOWN_MAX = 80
 """Characters of a key or value that are shown."""
 MESSAGE_MAX = 320
@@ -65,11 +65,8 @@ def _shown(value: object) -> str:
 
 
 def _place(scene: Section, location: tuple[int | str, ...]) -> tuple[list[str], Section | None]:
-    """Keys of the file that lead to a location, and the section that holds the last of them.
-
-    Where a section depends on its driver, pydantic puts the driver's name between the keys; it is
-    left out here.
-    """
+    """Return the keys that lead to a location, and the section that holds the last of them.
+    The driver's name, which pydantic puts between the keys, is left out."""
     keys: list[str] = []
     section: Section | None = scene
     inside: Section | None = scene

@@ -1,5 +1,4 @@
-"""The scene explained from its own classes: a JSON Schema for editors and the page deploy/SCENE.md;
-and the example scenes."""
+"""The scene explained from its own classes: JSON Schema, deploy/SCENE.md, example scenes."""
 
 from __future__ import annotations
 

@@ -121,8 +121,12 @@ class CanBus:
         self.descriptor = _fileno(bus)
         if self.descriptor is not None:
             _enlarge_buffer(self.descriptor)
-        if self._interface == "socketcan":
-            self._use_socket(bus)
+        raw = getattr(bus, "socket", None)
+        if self._interface == "socketcan" and isinstance(raw, socket.socket):
+            self._drops_seen = 0
+            with contextlib.suppress(OSError):
+                raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
+            self._socket = raw
 
     def close(self) -> None:
         bus, self._bus = self._bus, None
@@ -155,15 +159,6 @@ class CanBus:
         if self.tap is not None and frames:
             self.tap(frames)
         return frames
-
-    def _use_socket(self, bus: can.BusABC) -> None:
-        raw = getattr(bus, "socket", None)
-        if not isinstance(raw, socket.socket):
-            return
-        self._drops_seen = 0
-        with contextlib.suppress(OSError):
-            raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
-        self._socket = raw
 
     def _drain_socket(self, raw: socket.socket, frames: list[Stamped]) -> None:
         now_ns = self._clock()

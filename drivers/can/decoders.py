@@ -56,10 +56,8 @@ class SynTouchDecoder:
     def push(
         self, frame: CanFrame, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
-        """Return the readings that a data frame completes, oldest first.
-
-        It was received at `t_ns`, or with `until_ns` at any time between the two.
-        """
+        """Return the readings, oldest first, that a data frame completes.
+        It was received at `t_ns`, or with `until_ns` at any time between the two."""
         identifier = self.arbitration_id
         if identifier is not None and (
             frame.arbitration_id != identifier or frame.flags & EXTENDED != self._flags

@@ -59,10 +59,8 @@ class CanBridgeDriver(Opened):
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`bitrate` and `data_bitrate`, bit/s: not with socketcan, where they belong to `ip link`.
-
-        `fingers` and `board`: see `drivers.can.decoders.make_decoder`.
-        """
+        """`fingers` and `board`: see `drivers.can.decoders.make_decoder`.
+        `bitrate` and `data_bitrate`, bit/s: not with socketcan, where `ip link` sets them."""
         self._stamped = interface in STAMPED_INTERFACES
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)
         self.stream = self._make_stream()

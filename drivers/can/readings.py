@@ -45,7 +45,6 @@ class CanCounters(DriverCounters):
     parity_words: int = 0
     """Response words with a byte of even parity."""
     error_words: int = 0
-    """Response words that are error words."""
     unplugged_words: int = 0
     """Response words of a line that nothing drives, or of a sensor that is reported absent."""
     frames: int = 0

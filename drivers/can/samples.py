@@ -53,9 +53,7 @@ class SampleAssembler:
         rows: Sequence[int] | None = None,
     ) -> None:
         """`sensors`: words of a sample. `rows`: the sensor, from 0, of each row of a reading.
-
-        `sequence`: channels in order. Raises `ValueError` unless it has E1 to E24 once each.
-        """
+        `sequence`: channels in order. Raises `ValueError` unless it has E1 to E24 once each."""
         electrodes = [channel for channel in sequence if E1 <= channel <= E24]
         if sorted(electrodes) != list(range(E1, E24 + 1)):
             raise ValueError("the sequence does not have every electrode exactly once")
@@ -168,7 +166,6 @@ class SampleAssembler:
         self._finished = False
 
     def _starts(self, place: int) -> bool:
-        """Return True if a sweep begins with this sample."""
         self._synchronised = place == 0 or place < self._last
         self._last = -1 if self._synchronised else place
         return self._synchronised

@@ -86,9 +86,7 @@ class CanStream:
 
     def watch(self, now_ns: int, *, more: bool = False) -> None:
         """Take the link up at the first frame of ours, and down after none for too long.
-
-        `more`: frames wait that were not taken yet, so that there is no silence.
-        """
+        `more`: frames wait that were not taken yet, so that there is no silence."""
         if self.counters.accepted_frames > self._accepted:
             self._accepted = self.counters.accepted_frames
             self._silent_at_ns = now_ns + self._silence_ns()

@@ -174,9 +174,7 @@ def _raw(sensors: Sequence[int], words: Sequence[int]) -> float | None:
 
 def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return triangles, shape (n, 3), whose circumcircle has no point inside; points: (p, 2).
-
-    All triples are tried. Four points on one circle give both pairs of triangles.
-    """
+    Four points on one circle give both pairs of triangles."""
     triples = np.array(list(itertools.combinations(range(len(points)), 3)), dtype=np.intp)
     a, b, c = (points[triples[:, corner]] for corner in range(3))
     edges = np.stack([b - a, c - a], axis=1)
@@ -196,7 +194,6 @@ class CalibrationError(DriverError):
 
     def __init__(self, path: Path, problems: Sequence[str]) -> None:
         super().__init__("\n".join(f"{path}: {problem}" for problem in problems))
-        self.path = path
         self.problems = tuple(problems)
         """Mistakes, each beginning with the name of its joint."""
 
@@ -295,7 +292,6 @@ def _shape_problems(rows: object, width: int, least: int, most: int) -> Iterator
 
 
 def _is_number(value: object) -> bool:
-    """Return True for a finite number of a plausible size."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e9 < value < 1e9
 
 

@@ -157,7 +157,6 @@ class PalmCounters(DatagramCounters):
     absent_fingers: int = 0
     """Fingers of rounds without a sensor: channels that are no counts, or only zeros."""
     joint_readings: int = 0
-    """Joint readings handed over."""
     bad_angles: int = 0
     """Angles handed over as NaN although the joint is calibrated: its raw value is no count."""
     impossible_angles: int = 0

@@ -183,7 +183,6 @@ class PalmStream:
         return (*finished, self._finish()) if self._have == _COMPLETE else finished
 
     def _repeats(self, packet: PalmPacket) -> bool:
-        """Return True if the current round already has this very packet."""
         position = position_of(packet.tactile_type)
         return position is not None and self.packets[position] == packet
 

@@ -93,7 +93,6 @@ class CanLog:
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
-        """Yield times, ns, and frames; skip other lines. Raises `RecordingError`."""
         with open_recording(path) as stream:
             while line := stream.readline(LINE_MAX + 1):
                 found = frame_of(line.decode("ascii", "replace"))
@@ -101,12 +100,10 @@ class CanLog:
                     yield found
 
     def begin(self) -> None:
-        """Forget all that came."""
         self.stream = CanStream("link log", self._fingers, **self._board)
         self.stream.link.greeting()
 
     def feed(self, t_ns: int, record: CanFrame) -> Sequence[Reading]:
-        """The readings that one frame completes."""
         self.stream.watch(t_ns)
         readings, trouble = self.stream.receive([(record, t_ns, t_ns)])
         self.stream.counters.frames += 1

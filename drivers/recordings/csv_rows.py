@@ -242,7 +242,6 @@ class Recording:
         return position_rad
 
     def _error(self, problem: str, column: str | None = None) -> RecordingError:
-        """What is wrong with the present line."""
         if not self._has_end:
             problem += "; the file ends here without a line end, so it may be cut off"
         return RecordingError(self._path, problem, line=self._line, column=column)

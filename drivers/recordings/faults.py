@@ -73,14 +73,13 @@ class FaultInjector:
         self._index = 0
         self._seq = 0
         self._held: tuple[NDArray[np.uint16], NDArray[np.uint8]] | None = None
-        """Counts and faults that a stuck sensor repeats."""
 
     def inject(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> int | None:
         """Spoil the next reading in place; return its sequence number, or None if it is lost."""
         faults, counters = self._faults, self._counters
-        index = self._index
+        index, held = self._index, self._held
         self._index += 1
-        if faults.stuck_from is not None and index == faults.stuck_from - 1:
+        if self._index == faults.stuck_from:
             self._held = counts.copy(), flags.copy()
         if faults.off_from is not None and index >= faults.off_from:
             counters.injected_off += 1
@@ -94,17 +93,12 @@ class FaultInjector:
             counters.injected_intermittent += 1
             counters.missed_readings += 1
             return None
-        if faults.stuck_from is not None and index >= faults.stuck_from:
-            self._repeat(counts, flags)
+        if held is not None:
+            np.copyto(counts, held[0], where=self._where)
+            np.copyto(flags, held[1], where=self._where)
+            counters.injected_stuck += 1
         self._spoil(counts, flags)
         return seq
-
-    def _repeat(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> None:
-        if self._held is None:
-            return
-        np.copyto(counts, self._held[0], where=self._where)
-        np.copyto(flags, self._held[1], where=self._where)
-        self._counters.injected_stuck += 1
 
     def _spoil(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> None:
         faults, where = self._faults, self._where

@@ -36,20 +36,17 @@ class LinkLog(Protocol[Record]):
         """The one that a driver of this link has."""
 
     def records(self, path: Path) -> Iterator[tuple[int, Record]]:
-        """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
+        """Yield times, ns, and records of a file; skip damage. Raises `RecordingError`."""
 
     def begin(self) -> None:
         """Forget all that came. Raises `DriverError`."""
 
     def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:
-        """The readings that a record of `t_ns` completes."""
+        """Return the readings that a record of `t_ns` completes."""
 
 
 class LinkLogDriver(RecordedDriver[Record]):
-    """Plays link logs in a row, as one run; without `speed` as fast as possible.
-
-    `open` raises `DriverError`, `read_ready` `RecordingError`.
-    """
+    """Plays link logs in a row, as one run; without `speed` as fast as possible."""
 
     def __init__(
         self,
@@ -65,7 +62,6 @@ class LinkLogDriver(RecordedDriver[Record]):
 
     @property
     def counters(self) -> DriverCounters:
-        """Those of the decoder."""
         return self._log.stream.counters
 
     @property

@@ -47,7 +47,6 @@ class PalmFile:
         self.stream = self._make_stream(calibration=self._calibration)
 
     def feed(self, t_ns: int, record: bytes) -> Sequence[Reading]:
-        """The readings that one packet completes."""
         return self.stream.receive(record, t_ns) or ()
 
 

@@ -65,7 +65,6 @@ class SerialLog:
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, SerialRecord]]:
-        """Yield times, ns, and records; skip damage. Raises `RecordingError`."""
         parser = FrameParser()
         with open_recording(path) as stream:
             while chunk := stream.read(CHUNK_BYTES):
@@ -73,13 +72,11 @@ class SerialLog:
                     yield record.t_ns, record
 
     def begin(self) -> None:
-        """Forget all that came."""
         self.stream = Conversation("link log", self._fingers, self._sensors)
         self.stream.opened(0)
         self._idle_ns = 0
 
     def feed(self, t_ns: int, record: SerialRecord) -> Sequence[Reading]:
-        """The readings that one record completes."""
         conversation, readings = self.stream, []
         if record.event is LineEvent.SENT:
             conversation.sent(record.data, t_ns)

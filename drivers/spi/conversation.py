@@ -65,11 +65,8 @@ class Conversation:
         *,
         nonce: int = 0,
     ) -> None:
-        """`port`: its name, for people. `nonce`: that of the PING before the first.
-
-        `fingers`: the rows of a reading. `sensors`: the fingers by chip select, by default the
-        same. Raises `ValueError`.
-        """
+        """`fingers`: rows of a reading. `sensors`: fingers by chip select, by default the same.
+        `port`: for people. `nonce`: that of the PING before the first. Raises `ValueError`."""
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
@@ -171,15 +168,9 @@ class Conversation:
                 self._pings[message.nonce] = t_ns
                 self._pings_sent += 1
 
-    def not_sent(self) -> None:
-        """Count a frame that was given up, as there was no room for it."""
-        self.counters.host_tx_dropped += 1
-
     def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
         """Return the readings that these bytes complete, oldest first. Never raises.
-
-        `idle_ns`: last time before they came at which nothing was waiting to be read.
-        """
+        `idle_ns`: last time before they came at which nothing was waiting to be read."""
         readings: list[Reading] = []
         for kind, payload in self._parser.feed(chunk):
             if self.link.state is WAITING:
@@ -338,7 +329,6 @@ def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
 
 
 def _about_time(sweeps: SweepDecoder) -> dict[str, Fact]:
-    """Return facts about the clock and the duration of sweeps."""
     clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
     trust = Fact("trusted") if clock.trusted else Fact("not trusted", DeviceFault.CLOCK_NOT_TRUSTED)
     facts = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}

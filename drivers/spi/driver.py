@@ -23,11 +23,9 @@ class SpiBridgeDriver(Opened):
     """Readings of the sensors behind one bridge; reconnects after every loss.
 
     `t_ns` of a reading is when the bridge finished the sweep; `seq` continues across losses of the
-    link. Electrodes that are not sampled, and those of an absent sensor, are `MISSING`.
-
-    Ports without a descriptor (`rfc2217://`, `loop://`) are polled. The constructor raises
-    `ValueError`, `open` `DriverError` for a port name that can never work. A missing device raises
-    nothing: `describe` tells of it.
+    link. Electrodes that are not sampled, and those of an absent sensor, are `MISSING`. Ports
+    without a descriptor (`rfc2217://`, `loop://`) are polled. The constructor raises `ValueError`.
+    A missing device raises nothing: `describe` tells of it.
     """
 
     name = NAME
@@ -143,7 +141,7 @@ class SpiBridgeDriver(Opened):
             for frame in self.conversation.say(self._clock()):
                 self.conversation.sent(frame, self._clock())
                 if not self._line.write(frame):
-                    self.conversation.not_sent()
+                    self.counters.host_tx_dropped += 1
         except LinkError as error:
             self._lose(error)
         if self.conversation.link.state is WAITING:

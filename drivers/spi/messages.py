@@ -70,7 +70,6 @@ class FrameCounters(DriverCounters):
     frames: int = 0
     """Whole frames with the right checksum."""
     bad_cobs: int = 0
-    """Frames that are no COBS."""
     bad_crc: int = 0
     """Frames with a wrong checksum, or without room for one."""
     too_long: int = 0
@@ -281,7 +280,6 @@ class BridgeStatus:
 
     tick: int
     sweeps: int
-    """Sweeps finished."""
     overruns: int
     """Sweeps that began late because the one before took too long."""
     tx_dropped: int

@@ -42,11 +42,8 @@ Outgoing = tuple[int, bytes]
 
 
 class CanTwin(Opened):
-    """Sends the sweeps of `counts` in one of the two formats.
-
-    `send_sweep` sends one at once; `serve` sends at `rate_hz`. `first_sweep`: number of the
-    first sweep frame. The constructor raises `ValueError`.
-    """
+    """Sends the sweeps of `counts` in one of the two formats. The constructor raises `ValueError`.
+    `rate_hz`: sweeps/s of `serve`. `first_sweep`: number of the first sweep frame."""
 
     def __init__(
         self,
@@ -94,7 +91,6 @@ class CanTwin(Opened):
         self._bus: can.BusABC | None = None
         self._sweep = first_sweep
         self._stuck_tick_us = self._tick_us()
-        self.frames_sent = 0
         self.unsent = 0
         """Frames that the bus did not take."""
 
@@ -207,8 +203,6 @@ class CanTwin(Opened):
             bus.send(message, timeout=self._send_timeout_s)
         except can.CanError:
             self.unsent += 1
-        else:
-            self.frames_sent += 1
 
     def _discard_received(self) -> None:
         """Empty the queue of a virtual bus, which has no bound."""

@@ -12,16 +12,12 @@ import numpy as np
 @dataclass(frozen=True, slots=True)
 class LinkFaults:
     """Which faults a twin injects; by default none. Raises `ValueError` for a value out of range.
-
-    Chances are per frame. Fingers and electrodes are numbered as in a reading, from 0.
-    """
+    Chances are per frame. Fingers and electrodes are numbered as in a reading, from 0."""
 
     bit_flip_probability: float = 0.0
     """Chance that one random bit of a frame flips."""
     drop_probability: float = 0.0
-    """Chance that a frame is lost."""
     duplicate_probability: float = 0.0
-    """Chance that a frame comes twice."""
     reorder_probability: float = 0.0
     """Chance that a frame comes after the next one instead of before it."""
     one_byte_at_a_time: bool = False
@@ -37,7 +33,6 @@ class LinkFaults:
     unplugged_fingers: tuple[int, ...] = ()
     """Fingers whose line nothing drives."""
     stuck_clock: bool = False
-    """The device's clock does not move."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -72,9 +67,7 @@ class LinkFaultInjector:
 
     def spoil(self, frame: bytes, *, waits: bool = True) -> list[bytes]:
         """Return the frames to send now instead of this one.
-
-        A frame that does not wait is sent at once, after those held back.
-        """
+        A frame that does not wait is sent at once, after those held back."""
         faults = self.faults
         if self._happens(faults.drop_probability, "drop"):
             return []

@@ -93,7 +93,6 @@ class SpiTwin(Opened):
         self.tx_dropped = 0
         """Frames that the host did not take in time, in all."""
         self.exhausted = False
-        """The source has ended."""
         self._sensors = first.shape[0]
         self._source = itertools.chain([first], counts)
         self._period_ns = round(1e9 / (rate_hz or NOMINAL_HZ))
@@ -212,14 +211,12 @@ class SpiTwin(Opened):
         waiting = [master] if self._unsent else []
         readable, _, _ = select.select([master], waiting, [], timeout_s)
         if readable:
-            self._hear()
+            self._hear(os.read(master, READ_BYTES))
         self._drain()
         self._do_what_is_due()
 
-    def _hear(self) -> None:
-        if self._master is None:
-            return
-        for kind, payload in self._parser.feed(os.read(self._master, READ_BYTES)):
+    def _hear(self, data: bytes) -> None:
+        for kind, payload in self._parser.feed(data):
             message = decode(kind, payload)
             if isinstance(message, Ping):
                 self._send(self._hello(message.nonce), waits=False)

@@ -54,10 +54,8 @@ class DatagramDriver(Opened, Generic[Stream]):
     """Passes the datagrams of one sender to a stream.
 
     The sender of the first good datagram, by address and port, is the only one until the link is
-    lost: two hands on one port look like one.
-
-    The constructor raises `ValueError`. `open` raises `LinkError` if it cannot listen, which at the
-    start means that the scene is wrong. `read_ready` raises nothing.
+    lost: two hands on one port look like one. The constructor raises `ValueError`, and `open`
+    `LinkError` if it cannot listen, as the scene is wrong then. `read_ready` raises nothing.
     """
 
     name: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision
 from drivers.base import JointReading, TactileReading
-from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
+from drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.grasps.whole_grasps import (
     GraspRow,
@@ -30,8 +29,6 @@ MAX_AGE_NS = 100_000_000
 STILL_COUNTS_PER_S = 20.0
 """A hand is still when its electrodes move no faster, in the mean: so does a held touch of a real
 sensor, which relaxes."""
-QUIET_PHASES = (Phase.REST, Phase.APPROACH, Phase.TOUCH, Phase.CLOSE)
-"""No verdict may come in these."""
 
 
 @dataclass(slots=True)
@@ -60,8 +57,8 @@ class Study:
     """All grasps of one stream."""
 
     grasps: list[Seen]
-    too_early: Counter[str] = field(default_factory=Counter)
-    """Verdicts other than unknown, by phase, in phases in which there may be none."""
+    too_early: int = 0
+    """Verdicts other than unknown before the hand has closed, or after it has opened."""
     outlived_s: float = 0.0
     """Longest time, s, for which a verdict still stood when the hand had begun to open."""
 
@@ -98,11 +95,12 @@ def study(
     ]
     result = Study(grasps)
     for moment, judgement in judge.stream(stream):
-        if judgement.decision is not Decision.UNKNOWN and moment.phase in QUIET_PHASES:
-            result.too_early[moment.phase] += 1
-        if judgement.decision is not Decision.UNKNOWN and moment.phase is Phase.RELEASE:
-            release_s = grasps[moment.grasp - 1].truth.release_s
-            result.outlived_s = max(result.outlived_s, moment.t_s - release_s)
+        truth = grasps[max(moment.grasp - 1, 0)].truth  # grasp 0: the rest before the first
+        if judgement.decision is not Decision.UNKNOWN:
+            is_held = truth.closed_s <= moment.t_s < truth.open_s
+            result.too_early += not is_held
+            if is_held:
+                result.outlived_s = max(result.outlived_s, moment.t_s - truth.release_s)
         if judgement.moment.judged:
             grasps[moment.grasp - 1].judged.append((moment.t_s, judgement))
     return result

@@ -31,7 +31,7 @@ from drivers.base import FINGERS
 from drivers.spi.messages import Message, Sweep
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasp_script import Durations, Phase
+from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.spi import SpiTwin
@@ -89,9 +89,11 @@ def judged_counts() -> Iterator[Counts]:
     """Counts of a hand that rests, and then holds a grasp for ever."""
     drawn: list[Counts] = []
     settled = 0
-    for moment in synthetic_grasps(1, durations=HELD, seed=SEED):
+    grasp = synthetic_grasps(1, durations=HELD, seed=SEED)
+    (timetable,) = grasp.timetables()
+    for moment in grasp:
         yield moment.counts
-        settled += moment.phase is Phase.SETTLE
+        settled += moment.t_s >= timetable.closed_s
         if settled > SETTLED_SWEEPS:
             drawn.append(moment.counts)
         if len(drawn) == HELD_SWEEPS:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,18 +34,6 @@ OPEN_RAD = 0.2
 """Joint angle of an open hand, rad."""
 CLOSED_RAD: Range = (0.8, 1.0)
 """Joint angle at the end of closing, rad: another one for each grasp and joint."""
-
-
-class Phase(StrEnum):
-    """What the hand does."""
-
-    REST = "rest"
-    APPROACH = "approach"
-    TOUCH = "touch"
-    CLOSE = "close"
-    SETTLE = "settle"
-    LIFT = "lift"
-    RELEASE = "release"
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,19 +92,6 @@ class Timetable:
     creep_tau_s: float
     creep_counts_per_s: float
     """Mean over all electrodes of how fast they creep at `closed_s`, counts/s."""
-
-    def phase(self, t_s: float) -> Phase:
-        """What the hand does at a time; outside of the grasp it rests."""
-        if t_s < self.approach_s or t_s >= self.open_s:
-            return Phase.REST
-        ends = (
-            (min(self.touched_s), Phase.APPROACH),
-            (max(self.touched_s), Phase.TOUCH),
-            (self.closed_s, Phase.CLOSE),
-            (self.lift_s, Phase.SETTLE),
-            (self.release_s, Phase.LIFT),
-        )
-        return next((phase for end_s, phase in ends if t_s < end_s), Phase.RELEASE)
 
 
 class GraspScript:

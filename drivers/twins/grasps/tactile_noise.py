@@ -30,9 +30,7 @@ class TactileNoise(Protocol):
 
 class MeasuredNoise:
     """Gaussian noise, downward spikes of single electrodes, and the warm-up drift.
-
-    At most one electrode of a finger spikes in a sweep, and never twice in a row, as recorded.
-    """
+    At most one electrode of a finger spikes in a sweep, and never twice in a row, as recorded."""
 
     def __init__(
         self,

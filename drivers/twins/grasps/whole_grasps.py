@@ -27,7 +27,6 @@ from drivers.twins.grasps.grasp_script import (
     Durations,
     EndPoint,
     GraspScript,
-    Phase,
     Timetable,
 )
 from drivers.twins.grasps.tactile_noise import MeasuredNoise, TactileNoise
@@ -80,7 +79,6 @@ class GraspRow:
     joint_names: tuple[str, ...]
     position_rad: NDArray[np.float64]
     """Shape (joints,), in the order of `joint_names`."""
-    phase: Phase
     grasp: int
     """From 1, from the beginning of the approach to the end of the rest after it; 0 before."""
     slipped: bool | None
@@ -103,11 +101,8 @@ class WholeGrasps:
         loop: bool = False,
         seed: int = 0,
     ) -> None:
-        """`rest`: untouched counts, shape (fingers, 24). `loop`: play the end points without end.
-
-        `noise`: by default `MeasuredNoise`. Raises `ValueError` for a rate that is not positive or,
-        held, not 100 Hz.
-        """
+        """`rest`: untouched counts, shape (fingers, 24). `noise`: by default `MeasuredNoise`.
+        `loop`: play the end points without end. Raises `ValueError` for a wrong rate."""
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         if sampling is Sampling.HELD and rate_hz != RATE_HZ:
@@ -124,7 +119,9 @@ class WholeGrasps:
     def __iter__(self) -> Iterator[GraspRow]:
         noise_seed, joint_seed = np.random.SeedSequence([self._seed, 0]).spawn(2)
         joint_rng = np.random.default_rng(joint_seed)
-        sampler = self._sampler(np.random.default_rng(noise_seed))
+        kind = HeldSampler if self._sampling is Sampling.HELD else FreshSampler
+        noise = self._noise(len(self._rest), np.random.default_rng(noise_seed))
+        sampler = kind(self._rest, noise)
         scripts = self._scripts()
         script = next(scripts)
         for row in count():
@@ -142,7 +139,6 @@ class WholeGrasps:
                 counts=sampler.sample(script, t_s),
                 joint_names=JOINT_NAMES,
                 position_rad=script.position_rad(t_s) + jitter,
-                phase=timetable.phase(t_s),
                 grasp=timetable.grasp if has_begun else 0,
                 slipped=timetable.slipped if has_begun else None,
                 object_name=timetable.object_name if has_begun else None,
@@ -167,10 +163,6 @@ class WholeGrasps:
 
     def _measured_noise(self, fingers: int, rng: np.random.Generator) -> MeasuredNoise:
         return MeasuredNoise(fingers, rng, np.maximum(WARM_REST_MAX - self._rest, 0.0))
-
-    def _sampler(self, rng: np.random.Generator) -> FreshSampler:
-        kind = HeldSampler if self._sampling is Sampling.HELD else FreshSampler
-        return kind(self._rest, self._noise(len(self._rest), rng))
 
 
 class Course(Protocol):

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from daemon.judge.hand import FreshMedian
 from daemon.publish.messages import Tactile, Verdict
-from drivers.twins.grasps.grasp_script import Phase
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.spi import SpiTwin
@@ -60,8 +59,9 @@ class Network:
 @cache
 def drift() -> NDArray[np.float64]:
     """Towards what the network calls slip, counts, shape (3, 24)."""
-    moments = iter(synthetic_grasps(1, durations=HELD, seed=SEED))
-    settled = (moment.counts for moment in moments if moment.phase is Phase.SETTLE)
+    grasp = synthetic_grasps(1, durations=HELD, seed=SEED)
+    (timetable,) = grasp.timetables()
+    settled = (moment.counts for moment in grasp if moment.t_s >= timetable.closed_s)
     base = np.median(list(itertools.islice(settled, HELD_SWEEPS, HELD_SWEEPS + 30)), axis=0)
     network, found = Network(), np.zeros(SHAPE)
     while network.p_slip(base + found) < 0.8 and np.abs(found).min() < DRIFT_COUNTS:
@@ -77,8 +77,10 @@ def drift() -> NDArray[np.float64]:
 def drifting() -> Iterator[Counts]:
     """Rest, a grasp that is held, drifts for some seconds, and stays there."""
     towards, held = drift(), 0
-    for moment in synthetic_grasps(1, durations=HELD, seed=SEED):
-        held += moment.phase is Phase.SETTLE
+    grasp = synthetic_grasps(1, durations=HELD, seed=SEED)
+    (timetable,) = grasp.timetables()
+    for moment in grasp:
+        held += timetable.closed_s <= moment.t_s < timetable.lift_s
         share = np.clip((held - HELD_SWEEPS) / DRIFT_SWEEPS, 0.0, 1.0)
         yield np.rint(moment.counts + share * towards).astype(np.uint16)
 

@@ -19,7 +19,6 @@ from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import RiskLimits, Trust
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.twins.grasps.grasp_script import Phase
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from models import zoo
@@ -193,11 +192,13 @@ def test_a_grasp_is_judged_without_what_it_taught_the_session_until_it_is_over(
     model, clock = TactileModel(zoo.find("small-session")), Clock()
     judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=limits())
     faults, held, judged = np.zeros((3, 24), dtype=np.uint8), 0, []
-    for number, moment in enumerate(synthetic_grasps(1, seed=1)):
+    grasp = synthetic_grasps(1, seed=1)
+    (timetable,) = grasp.timetables()
+    for number, moment in enumerate(grasp):
         clock.now_ns += 10 * MS
         said = judge.judge(TactileReading(clock(), number, moment.counts, faults))
         judge.learn()
-        held += moment.phase is Phase.SETTLE
+        held += timetable.closed_s <= moment.t_s < timetable.lift_s
         judged += [said.judged_counts] if said.moment.judged else []
         if said.moment.state is GateState.JUDGED:
             assert not taken

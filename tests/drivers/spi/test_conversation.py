@@ -248,9 +248,7 @@ def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words()
     conversation = greeted()
     hear(conversation, BridgeStatus(1, 2, 3, 4, 5, (6,)), T0)
     hear(conversation, Ping(7), T0)
-    conversation.not_sent()
     counters = conversation.counters
-    assert counters.host_tx_dropped == 1
     shown = counters.bridge_overruns, counters.bridge_tx_dropped, counters.bridge_rx_errors
     assert (*shown, counters.unknown_frames) == (3, 4, 5, 1)
 

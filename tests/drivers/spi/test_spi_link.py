@@ -172,3 +172,9 @@ def test_a_bridge_that_does_not_read_never_blocks_the_host(rig: Rig) -> None:
         assert writes < 10_000
     line.close()
     assert time.monotonic() - began_s < 2.0
+
+
+def test_frames_that_find_no_room_are_counted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SerialLine, "write", lambda _line, _frame: False)
+    rig.driver.open()
+    assert rig.driver.counters.host_tx_dropped == len([Stop, Ping])
