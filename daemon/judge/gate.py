@@ -82,6 +82,8 @@ class Gate:
         self.memory = GateMemory(np.zeros((len(fingers), ELECTRODES), dtype=np.float32))
         self._changes: list[GateChange] = []
         """Those since the last moment: three of a reading, and one of a restart before it."""
+        unknown: dict[Finger, float | None] = dict.fromkeys(fingers)
+        self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
         """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
@@ -220,6 +222,8 @@ class Gate:
         motion: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
         now = self.motion
+        if not now.looked:
+            return self._not_looked
         windows = now.fast, now.fast_limits, now.slow, now.slow_limits
         for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * slide_limit:

@@ -86,7 +86,8 @@ class FreshMedian:
         if usable is not None or not memory.all_full:
             self._fill(counts, usable, fresh)
         memory.last = counts if usable is None else np.where(usable, counts, memory.last)
-        self.counts = np.sort(memory.fresh, axis=0)[1]
+        low, high = np.minimum(oldest, middle), np.maximum(oldest, middle)
+        self.counts = np.maximum(low, np.minimum(high, newest))
 
     def is_full(self, usable: NDArray[np.bool_] | None) -> bool:
         """Return True if each `usable` electrode has three fresh values."""
