@@ -62,6 +62,8 @@ constexpr std::int64_t SLICE_MS = 10;
 constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
 // By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 constexpr double DRIFT = 1e-3;
+// By which they may have run apart in all: a delay that grows as slowly looks the same.
+constexpr Nanoseconds DRIFT_MAX_NS = 20'000'000;
 constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembered as over
 // On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
@@ -463,7 +465,8 @@ public:
         said.age_ms = static_cast<double>(reading_age_ns) / 1e6;
         const bool counts_on_it = said.decision != Decision::unknown || said.supervised;
         if (!published_ns_) return said.unknown({"joining"});
-        if (age_ns < -CLOCK_SLACK_NS) return said.unknown({"clock"});
+        const bool may_have_crept = best_ && best_->first - least_ns_ > DRIFT_MAX_NS;
+        if (age_ns < -CLOCK_SLACK_NS || may_have_crept) return said.unknown({"clock"});
         if (age_ns > message_->silence_ns) return said.unknown({"silent"});
         if (counts_on_it && reading_age_ns > max_age_ns_) return said.unknown({"stale"});
         return said;
@@ -513,12 +516,16 @@ private:
         const std::pair here{now_ns - published_ns, now_ns};
         if (!best_) {
             best_ = here;
+            least_ns_ = here.first;
             return std::nullopt;
         }
         const auto [best_ns, at_ns] = *best_;
         const Nanoseconds late_ns =
             here.first - best_ns - std::llrint(static_cast<double>(now_ns - at_ns) * DRIFT);
-        if (late_ns <= 0) best_ = here;
+        if (late_ns <= 0) {
+            best_ = here;
+            least_ns_ = std::min(least_ns_, here.first);
+        }
         return std::min(empty_ns, now_ns - std::max<Nanoseconds>(late_ns, 0));
     }
 
@@ -533,6 +540,7 @@ private:
     std::int64_t seq_ = -1;
     std::deque<std::string> former_;
     std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;  // of the clocks, and when
+    Nanoseconds least_ns_ = 0;  // of these differences
 };
 
 // The next message, if one waits.

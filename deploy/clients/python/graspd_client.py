@@ -64,6 +64,8 @@ SLICE_MS = 10
 CLOCK_SLACK_NS = 1_000_000
 # By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 DRIFT = 1e-3
+# By which they may have run apart in all: a delay that grows as slowly looks the same.
+DRIFT_MAX_NS = 20_000_000
 FORMER_MAX = 16  # starts of the daemon that are remembered as over
 # On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
@@ -464,6 +466,8 @@ class Newest:
         self._former: deque[str] = deque(maxlen=FORMER_MAX)
         self._best: tuple[int, int] | None = None
         """The fastest way of a message so far, as the difference of the clocks, and when, ns."""
+        self._least_ns = 0
+        """The least of these differences."""
 
     @property
     def silence_ns(self) -> int:
@@ -504,7 +508,7 @@ class Newest:
         said = replace(message.verdict, age_ms=reading_age_ns / 1e6)
         if self._published_ns is None:
             return said.unknown("joining")
-        if age_ns < -CLOCK_SLACK_NS:
+        if age_ns < -CLOCK_SLACK_NS or self._may_have_crept():
             return said.unknown("clock")
         if age_ns > message.silence_ns:
             return said.unknown("silent")
@@ -563,13 +567,18 @@ class Newest:
         """
         difference_ns = now_ns - published_ns
         if self._best is None:
-            self._best = difference_ns, now_ns
+            self._best, self._least_ns = (difference_ns, now_ns), difference_ns
             return None
         best_ns, at_ns = self._best
         late_ns = difference_ns - best_ns - round((now_ns - at_ns) * DRIFT)
         if late_ns <= 0:
             self._best = difference_ns, now_ns
+            self._least_ns = min(self._least_ns, difference_ns)
         return min(empty_ns, now_ns - max(late_ns, 0))
+
+    def _may_have_crept(self) -> bool:
+        """Whether messages may take much longer than they did, and only the clocks differ."""
+        return self._best is not None and self._best[0] - self._least_ns > DRIFT_MAX_NS
 
 
 class _Question:
