@@ -185,7 +185,7 @@ class Pipeline:
         """
         self._forget_opinion()
         self.memory.is_to_learn = False
-        self.memory.needs_session = session is None
+        self.memory.needs_session = True
         if self._session is not None:
             self._session.reset()
             if session is not None:

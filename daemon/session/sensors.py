@@ -47,6 +47,8 @@ class SensorWatch(Companion):
         self._is_first_tare = True
         """True from a start, an outage or an exchange to the tare after it."""
         self._readings = 0
+        self._looked_at = b""
+        """The rest that was compared last: it changes four times a second at most."""
 
     def on_reading(self, reading: Reading) -> None:
         serials = self._tactile.serials
@@ -57,8 +59,12 @@ class SensorWatch(Companion):
                 self._rest = None
             self._serials.update(serials)
         self._readings += 1
-        if self._read_rest is not None and self._readings % LOOK_EVERY == 0:
-            self._look_at(self._read_rest())
+        if self._read_rest is None or self._readings % LOOK_EVERY:
+            return
+        rest = self._read_rest()
+        if rest.tobytes() != self._looked_at:
+            self._looked_at = rest.tobytes()
+            self._look_at(rest)
 
     def _look_at(self, rest: Rest) -> None:
         """Compare where the electrodes rest with where they did."""
@@ -67,13 +73,16 @@ class SensorWatch(Companion):
             self._is_first_tare = True
         if not all(tared):
             return
-        moved = [] if self._rest is None else moved_fingers(self._rest, rest)
-        # Later tares of a single finger may be of one that touches.
-        if moved and (self._is_first_tare or self._is_known(rest)):
-            self._exchange_untold(len(moved), rest)
+        if self._rest is None:
             self._rest = rest
-        elif self._rest is None or (not moved and has_drifted(self._rest, rest)):
-            self._rest = rest
+        elif has_drifted(self._rest, rest):
+            moved = moved_fingers(self._rest, rest)
+            # Later tares of a single finger may be of one that touches.
+            if moved and (self._is_first_tare or self._is_known(rest)):
+                self._exchange_untold(len(moved), rest)
+                self._rest = rest
+            elif not moved:
+                self._rest = rest
         self._is_first_tare = False
 
     def _is_known(self, _rest: Rest) -> bool:
