@@ -82,7 +82,9 @@ class Assembly:
         scene, pipeline = self._parts.scene, self._parts.pipeline
         file = self._session_file()
         if file is None:
-            watch = SensorWatch(self._parts.drivers[0], pipeline.sensors_exchanged)
+            watch = SensorWatch(
+                self._parts.drivers[0], pipeline.sensors_exchanged, pipeline.read_rest
+            )
             self.companions.append(watch)
             return False
         from daemon.session.keeper import SessionKeeper
@@ -95,6 +97,7 @@ class Assembly:
             file,
             pipeline.sensors_exchanged,
             trust=pipeline.trust,
+            read_rest=pipeline.read_rest,
         )
         self._stack.callback(keeper.save)
         self.keep = keeper.keep

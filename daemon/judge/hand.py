@@ -144,6 +144,13 @@ class HandTracker:
         """Fingers whose baseline is known."""
         return self._named(self._contact.memory.tared)
 
+    @property
+    def rest(self) -> NDArray[np.float64]:
+        """Where each electrode rests, counts, shape (fingers, 24); 0 where it is not known."""
+        contact = self._contact.memory
+        known = contact.known & contact.tared[:, np.newaxis]
+        return np.where(known, contact.baseline, 0.0)
+
     def health(self) -> dict[str, Reason]:
         """Return what is not well: fingers without a tare, and `joints`."""
         tared, joints, last_ns = self.tared, self._joints, self.memory.last_ns

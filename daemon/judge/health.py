@@ -58,13 +58,14 @@ LIMITS = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
 """Above them are a count less 1 that is at a rail, a step and `JUMP_COUNTS` that is far, and a step
 that is one at all. Modulo 2**16, so that what is below zero is large."""
 SWEEPS = 128
-"""Different sweeps of each finger that are remembered: rings up to this length are seen at once. Of
-any two real sweeps of a finger at most 14 electrodes of 24 were equal, in 1.4 million pairs."""
+"""Sweeps of each finger that are remembered: rings up to this length are seen at once."""
+EQUAL_MIN = 20
+"""Electrodes of 24 that are equal, or not read, in an old sweep that comes again. Of any two real
+sweeps of a finger at most 14 were equal, in 1.4 million pairs."""
 READ_MIN = 12
-"""Electrodes that must have been read in both sweeps: by chance one in 14 is equal."""
+"""Electrodes of them that must have been read in both: by chance one in 14 is equal."""
 NO_COUNT = 0x8000
 """In place of a count: far from every one of 12 bits, upwards and, modulo 2**16, downwards."""
-SWEEP_BYTES = ELECTRODES * 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,56 +76,6 @@ class Checked:
     """Against using it at all."""
     broken: NDArray[np.bool_] | None
     """Shape (fingers, 24): electrodes that mean nothing in it. None: all are sound."""
-
-
-@dataclass(slots=True, eq=False)
-class PastSweeps:
-    """The last sweeps of each finger of a hand."""
-
-    past: list[dict[bytes, None]]
-    """Different ones, 24 counts of 16 bits each, oldest first; `NO_COUNT` where none was read."""
-    lacking: list[int]
-    """Sweeps of the finger to come until one with a `NO_COUNT` is forgotten."""
-
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for what cannot have been read."""
-        if len(self.past) != len(self.lacking) or max(map(len, self.past), default=0) > SWEEPS:
-            raise ValueError(f"at most {SWEEPS} sweeps of each finger are remembered")
-        if any(set(map(len, past)) - {SWEEP_BYTES} for past in self.past):
-            raise ValueError(f"a sweep has {ELECTRODES} counts")
-
-    @classmethod
-    def none(cls, fingers: int) -> PastSweeps:
-        """Return those of a hand that has sent nothing yet."""
-        return cls([{} for _ in range(fingers)], [0] * fingers)
-
-    def recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None = None) -> bool:
-        """Take in a sweep, shape (fingers, 24). Return True if some finger sent the same before.
-
-        `sound` tells which of the counts were read; None: all. The others may be anything.
-        """
-        if sound is not None or any(self.lacking):
-            return self._recurs_in_part(counts, sound)
-        sweeps, found = counts.tobytes(), False
-        for finger, past in enumerate(self.past):
-            found |= _known(past, sweeps[finger * SWEEP_BYTES : (finger + 1) * SWEEP_BYTES])
-        return found
-
-    def _recurs_in_part(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
-        """Do the same where some counts, of this sweep or of one before, were not read."""
-        found = False
-        for finger, past in enumerate(self.past):
-            read = np.full(ELECTRODES, True) if sound is None else sound[finger]
-            number = np.count_nonzero(read)
-            left = max(self.lacking[finger] - 1, 0)
-            self.lacking[finger] = SWEEPS if number < ELECTRODES else left
-            if number < READ_MIN:
-                continue
-            now = np.where(read, counts[finger], np.uint16(NO_COUNT))
-            if self.lacking[finger]:
-                found |= _equals_one(np.frombuffer(b"".join(past), np.uint16), now)
-            found |= _known(past, now.tobytes())
-        return found
 
 
 @dataclass(slots=True, eq=False)
@@ -143,12 +94,8 @@ class HealthMemory:
     """True if there are any."""
     faults: NDArray[np.uint8]
     """What the driver flagged in the last reading."""
-    sweeps: PastSweeps
-
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for the sweeps of another hand."""
-        if len(self.sweeps.past) != len(self.previous):
-            raise ValueError("sweeps of as many fingers as counts are needed")
+    past: NDArray[np.uint16]
+    """Shape (24, fingers, 128): sweeps of each finger; `NO_COUNT` where none was read."""
 
 
 class Health:
@@ -163,7 +110,7 @@ class Health:
             jumps=np.zeros(shape),
             has_jumped=False,
             faults=np.zeros(shape, dtype=np.uint8),
-            sweeps=PastSweeps.none(fingers),
+            past=np.full((ELECTRODES, fingers, SWEEPS), NO_COUNT, dtype=np.uint16),
         )
         self._no_faults = self.memory.faults.tobytes()
         # Constants of full shape, and buffers: numpy takes half the time.
@@ -172,6 +119,8 @@ class Health:
         )
         self._limits = np.stack(limits)
         self._above = np.empty_like(self._limits)
+        self._equal = np.empty((ELECTRODES, fingers, SWEEPS), dtype=np.bool_)
+        self._equals = np.empty((fingers, SWEEPS), dtype=np.uint8)
 
     def check(self, reading: TactileReading) -> Checked:
         """Return what is wrong with a reading and its electrodes, by it and by those before it."""
@@ -193,13 +142,9 @@ class Health:
         broken = railed | self._worn_out()
         if sound is not None:
             broken |= ~sound
-        repeats = memory.sweeps.recurs(counts, sound)
+        repeats = self._recurs(counts, sound)
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
             return Checked(_fault_reasons(faults), broken)
-        if differs.tobytes().count(0) >= ELECTRODES:
-            # A sweep that was flagged as a whole is not among those that can recur.
-            read = np.True_ if sound is None else sound.any(axis=1)
-            repeats |= bool((read & ~differs.any(axis=1)).any())
         if repeats:
             also = (Reason.SATURATED,) if too_many(railed) else ()
             return Checked((Reason.FROZEN, *also), broken)
@@ -248,6 +193,31 @@ class Health:
         memory.previous = counts
         return railed, differs
 
+    def _recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
+        """Take in a sweep, shape (fingers, 24). Return True if some finger sent it before.
+
+        `sound` tells which of the counts were read; None: all. The others may be anything.
+        """
+        past, place = self.memory.past, self.memory.number % SWEEPS
+        now = kept = counts.T
+        if sound is not None:
+            now = np.where(sound, counts, np.uint16(NO_COUNT)).T
+            kept = np.where(sound.sum(axis=1) >= READ_MIN, now, past[:, :, place])
+        equal = np.equal(past, now[:, :, np.newaxis], out=self._equal)
+        equals = np.add.reduce(equal.view(np.uint8), axis=0, out=self._equals)
+        again = False
+        if equals.item(equals.argmax()) >= READ_MIN:
+            read = (past != NO_COUNT) & (now[:, :, np.newaxis] != NO_COUNT)
+            both = np.count_nonzero(equal & read, axis=0)
+            unread = ELECTRODES - np.count_nonzero(read, axis=0)
+            same = (both >= READ_MIN) & (both + unread >= EQUAL_MIN)
+            for finger in np.flatnonzero(same.any(axis=1)):
+                again = True
+                # A sweep that comes again takes the place of the former one: none is forgotten.
+                past[:, finger, same[finger].argmax()] = past[:, finger, place]
+        past[:, :, place] = kept
+        return again
+
     def _worn_out(self) -> NDArray[np.bool_]:
         """Return the electrodes, (fingers, 24), that the last readings show to be broken."""
         memory = self.memory
@@ -285,22 +255,3 @@ def _fault_reasons(bits: int) -> tuple[Reason, ...]:
         return ()
     known = tuple(reason for fault, reason in REASON_OF_FAULT.items() if bits & fault)
     return known or (Reason.NOT_A_COUNT,)  # an unknown flag is still a flag
-
-
-def _known(past: dict[bytes, None], sweep: bytes) -> bool:
-    """Return True if `past` contains the sweep; move it to the newest place."""
-    known = sweep in past
-    if known:
-        del past[sweep]
-    elif len(past) >= SWEEPS:
-        del past[next(iter(past))]
-    past[sweep] = None
-    return known
-
-
-def _equals_one(past: NDArray[np.uint16], now: NDArray[np.uint16]) -> bool:
-    """Return True if the sweep equals some other in all electrodes that were read in both."""
-    others = past.reshape(-1, ELECTRODES)
-    equal = (others == now) | (others == NO_COUNT) | (now == NO_COUNT)
-    alike = others[equal.all(axis=1)]
-    return any(np.count_nonzero((one != NO_COUNT) & (now != NO_COUNT)) >= READ_MIN for one in alike)

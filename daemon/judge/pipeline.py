@@ -78,6 +78,8 @@ class PipelineMemory:
     assessment: Assessment | None = None
     """What `opinion` was worth when it was given."""
     recent: RecentVerdict = NO_RECENT_VERDICT
+    needs_session: bool = False
+    """True if sensors were exchanged: nothing is judged before their session is calibrated."""
 
 
 class Pipeline:
@@ -152,6 +154,12 @@ class Pipeline:
         t_ns, made_ns = self._latest_ns
         return t_ns - made_ns
 
+    @property
+    def read_rest(self) -> Callable[[], NDArray[np.float64]] | None:
+        """Gives where each electrode rests; None where each reading is a grasp."""
+        hand = self.hand
+        return None if hand is None else lambda: hand.rest
+
     def ask(self) -> None:
         """Judge the current grasp once it has settled: the controller waits for the verdict."""
         if self.hand is not None:
@@ -166,6 +174,7 @@ class Pipeline:
         """
         self._forget_opinion()
         self.memory.is_to_learn = False
+        self.memory.needs_session = True
         if self._session is not None:
             self._session.reset()
             if session is not None:
@@ -337,7 +346,7 @@ class Pipeline:
         """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
         calibrated = None if self._session is None else self._session.now.calibrated
         objections = (*unusable, *opinion.reasons)
-        if self._needs_session and calibrated is False:
+        if calibrated is False and (self._needs_session or self.memory.needs_session):
             objections = (*objections, Reason.NOT_CALIBRATED)
         p_slip, withheld = opinion.p_slip, None
         if assessment is not None:

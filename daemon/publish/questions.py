@@ -17,6 +17,8 @@ from daemon.trust.lift_book import GraspId, Report
 
 JUDGE, LIFT = b"judge", b"lift"
 """Questions. Only `lift` makes the peer the owner of the grasp."""
+CLOCK = b"clock"
+"""Asks for the daemon's monotonic clock: a client on another computer compares it with its own."""
 OUTCOME = b"outcome"
 WAITING_MAX: Final = 256
 """Questions that wait, one of each peer. A newer one replaces the oldest."""
@@ -64,6 +66,10 @@ class Questions:
                 due_ns = now_ns + self._patience_ns
                 self._wait(peer, Question([peer, *envelope], due_ns, text == LIFT))
                 asked += 1
+            elif well_formed and text == CLOCK:
+                # `now_ns` is later than the question: an age by it is never too small.
+                self._answer([peer, *envelope], b'{"v":1,"t_mono_ns":%d}' % now_ns)
+                self.counters["clocks"] += 1
             else:
                 self.counters["malformed"] += 1
         if asked:

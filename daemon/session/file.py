@@ -17,6 +17,7 @@ import msgspec
 
 from daemon.process.files import read_regular, write_atomically
 from daemon.trust.trust import TrustState, encode
+from drivers.base import COUNT_MAX
 from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
@@ -46,6 +47,8 @@ class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """None if no model has needed any."""
     trust: bytes | None = None
     """From `daemon.trust.trust.encode`; None if nothing learns."""
+    rest: tuple[Annotated[float, msgspec.Meta(ge=0.0, le=COUNT_MAX)], ...] | None = None
+    """Where the electrodes rest, finger by finger, counts; 0 where it is not known."""
 
 
 class _Version1(KeptSession, frozen=True, tag_field="version", tag=1):
@@ -159,10 +162,11 @@ def kept_now(
     fingers: Sequence[str],
     serials: Mapping[str, str],
     trust: TrustState | None = None,
+    rest: tuple[float, ...] | None = None,
 ) -> KeptSession:
     """Return what to keep at this time."""
     learned = None if trust is None else encode(trust)
-    return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned)
+    return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned, rest)
 
 
 def others(path: Path) -> dict[Path, KeptSession]:

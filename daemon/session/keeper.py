@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from daemon.judge.calibration import SessionCalibration
 from daemon.process.worker import Worker
 from daemon.publish.companion import Answer, Requests
@@ -23,9 +25,10 @@ from daemon.session.file import (
     others,
     statistics_of,
 )
-from daemon.session.sensors import OnExchange, SensorWatch
+from daemon.session.rest import Rest, moved_fingers
+from daemon.session.sensors import UNTOLD, OnExchange, SensorWatch
 from daemon.trust.trust import Trust, TrustState, decode
-from drivers.base import Driver
+from drivers.base import ELECTRODES, Driver
 from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
@@ -47,6 +50,7 @@ class SavedState(NamedTuple):
     serials: dict[str, str]
     statistics: SessionState | None = None
     trust: TrustState | None = None
+    rest: tuple[float, ...] | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -67,6 +71,7 @@ class SessionKeeper(SensorWatch):
         on_exchange: OnExchange,
         *,
         trust: Trust | None = None,
+        read_rest: Callable[[], Rest] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Restore what `file` holds; warn, and start a new session, if it is of other fingers.
@@ -76,7 +81,7 @@ class SessionKeeper(SensorWatch):
         """
         self._session = session
         self._trust = trust
-        super().__init__(tactile, on_exchange)
+        super().__init__(tactile, on_exchange, read_rest)
         self._fingers = tuple(fingers)
         self._file = file
         self._clock = clock
@@ -165,7 +170,7 @@ class SessionKeeper(SensorWatch):
         return state
 
     def _kept(self, state: SavedState) -> KeptSession:
-        return kept_now(state.statistics, self._fingers, state.serials, state.trust)
+        return kept_now(state.statistics, self._fingers, state.serials, state.trust, state.rest)
 
     def _answer(self, number: int, why: str | None) -> None:
         """Answer those who have waited longest."""
@@ -179,7 +184,8 @@ class SessionKeeper(SensorWatch):
             statistics = self._session.state()
         if self._trust is not None:
             trust = self._trust.state()
-        return SavedState(dict(self._serials), statistics, trust)
+        rest = None if self._rest is None else tuple(self._rest.ravel().tolist())
+        return SavedState(dict(self._serials), statistics, trust, rest)
 
     def _restore(self) -> None:
         try:
@@ -195,6 +201,7 @@ class SessionKeeper(SensorWatch):
             log.warning("%s; a new session begins", error)
             return
         self._serials = dict(kept.serials)
+        self._rest = self._rest_of(kept.rest)
         grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
         log.info("session%s restored from %s", grasps, self._file.path)
         self._restore_trust(kept)
@@ -213,11 +220,37 @@ class SessionKeeper(SensorWatch):
             log.warning("%s: what was learned %s; learning begins anew", self._file.path, error)
 
     def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
-        """Put the session aside, and take up that of the new sensors, if any."""
+        """Begin the session of sensors with other serial numbers."""
         grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
         log.warning("new sensor on %s: the session%s no longer count", ", ".join(changed), grasps)
         now = serials.items()
         former = next((each for each in self._others if now <= each.serials.items()), None)
+        self._begin(former)
+
+    def _is_known(self, rest: Rest) -> bool:
+        return self._with_rest(rest) is not None
+
+    def _exchange_untold(self, number: int, rest: Rest) -> None:
+        log.warning(UNTOLD, number)
+        self._begin(self._with_rest(rest))
+
+    def _with_rest(self, rest: Rest) -> SavedState | None:
+        """Return the session of other sensors that rested like this."""
+        for each in self._others:
+            former = self._rest_of(each.rest)
+            same_serials = each.serials == self._serials
+            if same_serials and former is not None and not moved_fingers(former, rest):
+                return each
+        return None
+
+    def _rest_of(self, kept: tuple[float, ...] | None) -> Rest | None:
+        shape = len(self._fingers), ELECTRODES
+        if kept is None or len(kept) != shape[0] * shape[1]:
+            return None
+        return np.array(kept).reshape(shape)
+
+    def _begin(self, former: SavedState | None) -> None:
+        """Put the session aside, and go on with that of the new sensors, if any."""
         leaving = self._now()
         if not leaving.is_empty:
             rest = [each for each in self._others if each.serials != leaving.serials]
@@ -255,4 +288,4 @@ def _state_of(kept: KeptSession) -> SavedState:
     if kept.trust is not None:
         with contextlib.suppress(ValueError):
             learned = decode(kept.trust)
-    return SavedState(dict(kept.serials), kept.statistics, learned)
+    return SavedState(dict(kept.serials), kept.statistics, learned, kept.rest)

@@ -1,12 +1,13 @@
-"""Notices by their serial numbers that the hand's sensors were exchanged."""
+"""Notices by serial numbers, or by where electrodes rest, that sensors were exchanged."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from daemon.publish.companion import Companion
+from daemon.session.rest import Rest, has_drifted, moved_fingers
 from drivers.base import Driver, Reading
 
 if TYPE_CHECKING:
@@ -16,26 +17,81 @@ if TYPE_CHECKING:
 OnExchange = Callable[["SessionState | None", "LearnerState | None"], None]
 """Takes what is known of the new sensors, or None."""
 
+UNTOLD: Final = (
+    "%d fingers rest in another pattern than before: taken for other sensors, not calibrated; "
+    "open the hand"
+)
+LOOK_EVERY: Final = 5
+"""Readings between two looks at the rest; a grasp takes more to settle."""
+
 log = logging.getLogger("graspd")
 
 
 class SensorWatch(Companion):
     """Has the judge forget exchanged sensors, before it judges the new ones."""
 
-    def __init__(self, tactile: Driver, on_exchange: OnExchange) -> None:
+    def __init__(
+        self,
+        tactile: Driver,
+        on_exchange: OnExchange,
+        read_rest: Callable[[], Rest] | None = None,
+    ) -> None:
+        """`read_rest` gives where the electrodes rest now; None: never known."""
         self._tactile = tactile
         self._on_exchange = on_exchange
+        self._read_rest = read_rest
         self._serials: dict[str, str] = {}
         """Last known, by finger."""
+        self._rest: Rest | None = None
+        """Where the electrodes of these sensors rest, as last kept; None: not known yet."""
+        self._is_first_tare = True
+        """True from a start, an outage or an exchange to the tare after it."""
+        self._readings = 0
+        self._looked_at = b""
+        """The rest that was compared last: it changes four times a second at most."""
 
     def on_reading(self, reading: Reading) -> None:
         serials = self._tactile.serials
-        if serials == self._serials:
+        if serials != self._serials:
+            changed = exchanged(self._serials, serials)
+            if changed:
+                self._exchange(changed, serials)
+                self._rest = None
+            self._serials.update(serials)
+        self._readings += 1
+        if self._read_rest is None or self._readings % LOOK_EVERY:
             return
-        changed = exchanged(self._serials, serials)
-        if changed:
-            self._exchange(changed, serials)
-        self._serials.update(serials)
+        rest = self._read_rest()
+        if rest.tobytes() != self._looked_at:
+            self._looked_at = rest.tobytes()
+            self._look_at(rest)
+
+    def _look_at(self, rest: Rest) -> None:
+        """Compare where the electrodes rest with where they did."""
+        tared = [bool(finger.any()) for finger in rest]
+        if not any(tared):
+            self._is_first_tare = True
+        if not all(tared):
+            return
+        if self._rest is None:
+            self._rest = rest
+        elif has_drifted(self._rest, rest):
+            moved = moved_fingers(self._rest, rest)
+            # Later tares of a single finger may be of one that touches.
+            if moved and (self._is_first_tare or self._is_known(rest)):
+                self._exchange_untold(len(moved), rest)
+                self._rest = rest
+            elif not moved:
+                self._rest = rest
+        self._is_first_tare = False
+
+    def _is_known(self, _rest: Rest) -> bool:
+        """Return True if other sensors than the present ones rested like this."""
+        return False
+
+    def _exchange_untold(self, number: int, _rest: Rest) -> None:
+        log.warning(UNTOLD, number)
+        self._on_exchange(None, None)
 
     def _exchange(self, changed: list[str], _serials: Mapping[str, str]) -> None:
         log.warning("new sensor on %s: the hand must be seen open first", ", ".join(changed))

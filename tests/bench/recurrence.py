@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from daemon.judge.health import PastSweeps
+import numpy as np
+
+from daemon.judge.health import Health
+from daemon.judge.reasons import Reason
+from drivers.base import TactileReading
 from drivers.twins.grasps.grasps import Counts
 
 TABLES = ("palm_45", "palm_down", "palm_side")
@@ -13,7 +17,8 @@ UNTOUCHED = Path("untouched") / "untouched.csv"
 
 
 def again(sweeps: Iterable[Counts]) -> tuple[int, int]:
-    """How many sweeps there are, and in how many a finger comes again."""
-    past = PastSweeps.none(3)
-    found = [past.recurs(counts) for counts in sweeps]
-    return len(found), sum(found)
+    """Return the number of sweeps, and of those in which a finger comes again."""
+    health, faults = Health(3), np.zeros((3, 24), dtype=np.uint8)
+    readings = [TactileReading(place, place, counts, faults) for place, counts in enumerate(sweeps)]
+    frozen = [Reason.FROZEN in health.check(reading).reasons for reading in readings]
+    return len(frozen), sum(frozen)

@@ -1,7 +1,7 @@
 // The C++ client's rules, line by line, for comparison with the Python client's.
 //
 // `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
-// takes a message; `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift`
+// takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift`
 // asks it and answers with a line, `tell` tells it that the lift held.
 #include "graspd_client.hpp"
 
@@ -64,6 +64,10 @@ int main() {
             std::vector<std::string> frames;
             for (std::string frame; words >> frame;) frames.push_back(unhexed(frame));
             newest.take({frames.begin(), frames.end()}, empty_ns, now_ns);
+        } else if (order == "clock") {
+            graspd::Nanoseconds asked_ns = 0, told_ns = 0;
+            words >> asked_ns >> told_ns;
+            newest.compare_clocks(asked_ns, told_ns);
         } else if (order == "client") {
             graspd::Options options;
             words >> options.endpoint >> options.ask_endpoint;

@@ -38,6 +38,21 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_p
             assert client.counts.malformed == 0
 
 
+def test_a_client_on_another_computer_asks_for_the_clock(tmp_path: Path) -> None:
+    with (
+        Daemon(tmp_path, whole_grasps=True) as daemon,
+        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint, same_computer=False) as remote,
+    ):
+
+        def compared() -> bool:
+            remote.verdict(0.1)
+            return remote._newest._bound is not None  # noqa: SLF001
+
+        until(compared)
+        until(lambda: bool(remote.may_i_lift(0.5)))
+        assert remote.counts.malformed == 0
+
+
 def test_soon_or_sure_is_for_who_lifts_to_choose(tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, "[gate]\nearly = true\n", whole_grasps=True) as daemon,

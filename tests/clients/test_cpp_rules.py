@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python.graspd_client import Newest
-from tests.clients.messages import MS, TOPIC, Event, events
+from tests.clients.messages import MS, TOPIC, Event, events, frames, verdict
 from tests.clients.oracle import MAX_AGE_NS
 
 START_NS = 1000 * MS
@@ -97,4 +97,38 @@ def test_both_clients_say_the_same(
         probe.tell("take", empty_ns, now_ns, *map(as_hex, event.frames))
         assert probe.at(now_ns) == said(newest, now_ns)
         empty_ns, now_ns = now_ns, now_ns + event.wait_ns
+        assert probe.at(now_ns) == said(newest, now_ns)
+
+
+def test_both_clients_limit_how_far_the_clocks_of_two_computers_drift(probe: Probe) -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    probe.tell("new", MAX_AGE_NS, 0)
+    unknown = []
+    for seq, delay_us in enumerate([0, *range(0, 30_000, 900), 19_000]):
+        sent_ns = START_NS + seq * 1000 * MS
+        now_ns = sent_ns + delay_us * 1000
+        message = frames(verdict(seq, sent_ns))
+        newest.take(message, sent_ns, now_ns)
+        probe.tell("take", sent_ns, now_ns, *map(as_hex, message))
+        assert probe.at(now_ns) == said(newest, now_ns)
+        unknown.append(newest.at(now_ns).reasons == ("clock",))
+    assert unknown == [False] * 24 + [True] * 11 + [False]
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.integers(0, 200), st.integers(0, 200), st.booleans()), max_size=20))
+def test_both_clients_count_age_by_a_clock_that_was_told(
+    probe: Probe, steps: Sequence[tuple[int, int, bool]]
+) -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    probe.tell("new", MAX_AGE_NS, 0)
+    for seq, (delay_ms, asking_ms, compares) in enumerate(steps):
+        sent_ns = START_NS + seq * 300 * MS
+        now_ns = sent_ns + delay_ms * MS
+        if compares:
+            newest.compare_clocks(sent_ns - asking_ms * MS, sent_ns + 77_000 * MS)
+            probe.tell("clock", sent_ns - asking_ms * MS, sent_ns + 77_000 * MS)
+        message = frames(verdict(seq, sent_ns + 77_000 * MS))
+        newest.take(message, now_ns, now_ns)
+        probe.tell("take", now_ns, now_ns, *map(as_hex, message))
         assert probe.at(now_ns) == said(newest, now_ns)

@@ -72,6 +72,7 @@ class World:
 
     def __post_init__(self) -> None:
         self.asking, self.telling = Call(self, self.answers), Call(self, self.acknowledged)
+        self.timing = Call(self, [])
 
     def monotonic_ns(self) -> int:
         self.now_ns += LOOK_NS
@@ -99,13 +100,14 @@ class World:
 
 
 @contextmanager
-def client(world: World, ask: bool = False) -> Iterator[Client]:
+def client(world: World, ask: bool = False, same: bool | None = None) -> Iterator[Client]:
     """A client in that world."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graspd_client, "_Link", lambda *_: world)
         clocks = {"monotonic_ns": world.monotonic_ns, "clock_gettime_ns": world.boot_ns}
         patch.setattr(graspd_client, "time", SimpleNamespace(**clocks, CLOCK_BOOTTIME=7))
-        with Client("ipc:///nowhere", ask_endpoint=ASK if ask else None) as made:
+        asks = ASK if ask else None
+        with Client("ipc:///nowhere", ask_endpoint=asks, same_computer=same) as made:
             yield made
 
 

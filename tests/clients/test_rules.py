@@ -180,6 +180,50 @@ def test_another_computer_that_was_rebooted_is_heard_again() -> None:
         assert bool(newest.at(now_ns)) == (number in (1, 3))
 
 
+def test_a_delay_that_creeps_as_slowly_as_a_clock_may_is_at_most_20_ms() -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    newest.take(frames(verdict(0, OFFSET_NS)), START_NS, START_NS)
+    for seq, delay_us in enumerate([*range(0, 30_000, 900), 19_000], 1):
+        sent_ns = START_NS + seq * 1000 * MS  # the delay grows by 0.9 ms a second
+        now_ns = sent_ns + delay_us * 1000
+        newest.take(frames(verdict(seq, OFFSET_NS + seq * 1000 * MS)), sent_ns, now_ns)
+        expected = ("clock",) if delay_us > 20_000 else ()
+        assert newest.at(now_ns).reasons == expected, f"delayed by {delay_us} us"
+
+
+@settings(max_examples=150)
+@given(
+    st.lists(st.tuples(st.integers(0, 300), st.integers(0, 300)), max_size=40),
+    st.sampled_from([0.0, 5e-4, -5e-4]),
+)
+def test_where_the_daemon_tells_its_clock_no_delay_is_hidden(
+    delays_ms: list[tuple[int, int]], drift: float
+) -> None:
+    """Of each message, and of each question before it; from the first message on."""
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    for seq, (delay_ms, asking_ms) in enumerate([(1, 1), *delays_ms]):
+        sent_ns = START_NS + seq * 1000 * MS
+        drifted_ns = OFFSET_NS + round((sent_ns - START_NS) * drift)
+        if seq:
+            newest.compare_clocks(sent_ns - asking_ms * MS, drifted_ns + sent_ns)
+        now_ns = sent_ns + delay_ms * MS
+        newest.take(frames(verdict(seq, drifted_ns + sent_ns - MS)), now_ns, now_ns)
+        if newest.at(now_ns):
+            assert now_ns - sent_ns <= MAX_AGE_NS + MS
+        elif seq and delay_ms + min(asking_ms, delays_ms[0][1]) + 2 * seq < 90:
+            pytest.fail(f"late by {delay_ms} ms, asked for {asking_ms} ms: {newest.at(now_ns)}")
+
+
+def test_a_clock_that_was_told_makes_up_for_any_drift() -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    for seq in range(200):  # to 100 ms
+        now_ns = START_NS + seq * 1000 * MS
+        theirs_ns = OFFSET_NS + now_ns - round(seq * 0.5 * MS)
+        newest.compare_clocks(now_ns - MS, theirs_ns)
+        newest.take(frames(verdict(seq, theirs_ns)), now_ns, now_ns)
+        assert seq < 1 or newest.at(now_ns)
+
+
 def test_what_is_forgotten_comes_back_only_with_a_newer_message() -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     for seq in range(3):

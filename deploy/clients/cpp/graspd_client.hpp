@@ -62,6 +62,10 @@ constexpr std::int64_t SLICE_MS = 10;
 constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
 // By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 constexpr double DRIFT = 1e-3;
+// By which they may have run apart in all: a delay that grows as slowly looks the same.
+constexpr Nanoseconds DRIFT_MAX_NS = 20'000'000;
+// Between two questions for the daemon's clock, and after one that was not answered.
+constexpr Nanoseconds CLOCK_EVERY_NS = 1'000'000'000, CLOCK_RETRY_NS = 10'000'000'000;
 constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembered as over
 // On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
@@ -414,6 +418,18 @@ inline std::optional<OutcomeAnswer> taken(std::string_view payload) {
     }
 }
 
+// The daemon's clock; none if the answer is not understood.
+inline std::optional<Nanoseconds> told_clock(std::string_view payload) {
+    const json told = parsed(payload);
+    if (!told.is_object()) return std::nullopt;
+    try {
+        if (integer(told, "v") != VERSION) return std::nullopt;
+        return integer(told, "t_mono_ns");
+    } catch (const Malformed&) {
+        return std::nullopt;
+    }
+}
+
 // What the newest message says; no socket and no clock of its own.
 class Newest {
 public:
@@ -430,7 +446,15 @@ public:
     void forget(std::string why) {
         message_.reset();
         best_.reset();
+        bound_.reset();
         why_ = std::move(why);
+    }
+
+    // The daemon's clock read `told_ns` at some time after `asked_ns` (own clock).
+    void compare_clocks(Nanoseconds asked_ns, Nanoseconds told_ns) {
+        Nanoseconds least_ns = asked_ns - told_ns;
+        if (bound_) least_ns = std::max(least_ns, at_least(*bound_, asked_ns));
+        bound_ = {least_ns, asked_ns};
     }
 
     // Take in a message, which came after `empty_ns` and not after `now_ns` (own clock).
@@ -463,7 +487,8 @@ public:
         said.age_ms = static_cast<double>(reading_age_ns) / 1e6;
         const bool counts_on_it = said.decision != Decision::unknown || said.supervised;
         if (!published_ns_) return said.unknown({"joining"});
-        if (age_ns < -CLOCK_SLACK_NS) return said.unknown({"clock"});
+        const bool may_have_crept = !bound_ && best_ && best_->first - least_ns_ > DRIFT_MAX_NS;
+        if (age_ns < -CLOCK_SLACK_NS || may_have_crept) return said.unknown({"clock"});
         if (age_ns > message_->silence_ns) return said.unknown({"silent"});
         if (counts_on_it && reading_age_ns > max_age_ns_) return said.unknown({"stale"});
         return said;
@@ -498,6 +523,7 @@ private:
             boot_id_ = found.boot_id;
             seq_ = *found.seq;
             best_.reset();
+            bound_.reset();
             return true;
         }
         if (*found.seq <= seq_) return ++counts.repeats, false;
@@ -506,19 +532,31 @@ private:
         return true;
     }
 
+    // What the clocks still differ by at least, so long after they were compared.
+    static Nanoseconds at_least(const std::pair<Nanoseconds, Nanoseconds>& bound,
+                                Nanoseconds now_ns) {
+        return bound.first - std::llrint(static_cast<double>(now_ns - bound.second) * DRIFT);
+    }
+
     // When a message went out, by one's own clock: what it took longer than the fastest is age.
     // None for the first: it may have been kept for those who come late.
     std::optional<Nanoseconds> by_arrival(Nanoseconds published_ns, Nanoseconds empty_ns,
                                           Nanoseconds now_ns) {
+        if (bound_)
+            return std::min({empty_ns, published_ns + at_least(*bound_, now_ns), now_ns});
         const std::pair here{now_ns - published_ns, now_ns};
         if (!best_) {
             best_ = here;
+            least_ns_ = here.first;
             return std::nullopt;
         }
         const auto [best_ns, at_ns] = *best_;
         const Nanoseconds late_ns =
             here.first - best_ns - std::llrint(static_cast<double>(now_ns - at_ns) * DRIFT);
-        if (late_ns <= 0) best_ = here;
+        if (late_ns <= 0) {
+            best_ = here;
+            least_ns_ = std::min(least_ns_, here.first);
+        }
         return std::min(empty_ns, now_ns - std::max<Nanoseconds>(late_ns, 0));
     }
 
@@ -533,6 +571,9 @@ private:
     std::int64_t seq_ = -1;
     std::deque<std::string> former_;
     std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;  // of the clocks, and when
+    Nanoseconds least_ns_ = 0;  // of these differences
+    // What the clocks differ by at least, as the daemon told its own, and when.
+    std::optional<std::pair<Nanoseconds, Nanoseconds>> bound_;
 };
 
 // The next message, if one waits.
@@ -631,7 +672,7 @@ private:
     zmq::socket_t socket_;
 
 public:
-    Call asking, telling;  // closed before the context
+    Call asking, telling, timing;  // closed before the context
 };
 
 // Whether the message that is the answer is still to come.
@@ -720,7 +761,10 @@ public:
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
                   options.same_computer.value_or(detail::is_same_computer(options.endpoint)),
                   probability(options.max_p_slip)),
-          link_(options), asks_(!options.ask_endpoint.empty()), warn_(options.warn) {}
+          link_(options), asks_(!options.ask_endpoint.empty()),
+          compares_clocks_(asks_ && !options.same_computer.value_or(
+                                        detail::is_same_computer(options.endpoint))),
+          warn_(options.warn) {}
 
     const Counts& counts() const { return newest_.counts; }
 
@@ -844,11 +888,34 @@ private:
         for (auto& [grasp, told] : lifts_) told = told || (*told_ && grasp == telling_);
     }
 
+    // Ask another computer's daemon for its clock once a second, and take in the answer.
+    void compare_clocks() {
+        if (!compares_clocks_) return;
+        const Nanoseconds now_ns = detail::now_ns();
+        const auto payload = clock_asked_ns_ ? link_.timing.answer() : std::nullopt;
+        if (payload) {
+            const auto told_ns = detail::told_clock(*payload);
+            if (told_ns) {
+                newest_.compare_clocks(*clock_asked_ns_, *told_ns);
+                clock_due_ns_ = *clock_asked_ns_ + CLOCK_EVERY_NS;
+            }
+            newest_.counts.malformed += !told_ns;
+            clock_asked_ns_.reset();
+        }
+        if (now_ns < clock_due_ns_) return;
+        // A late answer must not be taken for one to this question.
+        if (clock_asked_ns_) link_.timing.hang_up();
+        clock_asked_ns_ = now_ns;
+        clock_due_ns_ = now_ns + CLOCK_RETRY_NS;
+        link_.ask(link_.timing, "clock");
+    }
+
     // Read all that waits, without waiting; whether there was anything new.
     bool drain() {
         bool anything_new = false;
         const Nanoseconds heard_ns = forget_what_is_old();
         hear();
+        compare_clocks();
         behind_ = true;
         for (int taken = 0; behind_ && taken < QUEUE_MAX; ++taken) {
             const Nanoseconds before_ns = detail::now_ns();
@@ -886,6 +953,9 @@ private:
 
     void connect_anew() {
         link_.renew();
+        link_.timing.hang_up();
+        clock_asked_ns_.reset();
+        clock_due_ns_ = 0;
         empty_ns_ = heard_ns_ = detail::now_ns();
     }
 
@@ -899,7 +969,9 @@ private:
 
     detail::Newest newest_;
     detail::Link link_;
-    bool asks_;
+    bool asks_, compares_clocks_;
+    std::optional<Nanoseconds> clock_asked_ns_;
+    Nanoseconds clock_due_ns_ = 0;
     std::function<void(const std::string&)> warn_;
     std::deque<std::pair<Key, bool>> lifts_;  // that were allowed, and whether graspd has it
     Key last_, telling_;                      // of them, and that is being told

@@ -64,6 +64,10 @@ SLICE_MS = 10
 CLOCK_SLACK_NS = 1_000_000
 # By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 DRIFT = 1e-3
+# By which they may have run apart in all: a delay that grows as slowly looks the same.
+DRIFT_MAX_NS = 20_000_000
+# Between two questions for the daemon's clock, and after one that was not answered.
+CLOCK_EVERY_NS, CLOCK_RETRY_NS = 1_000_000_000, 10_000_000_000
 FORMER_MAX = 16  # starts of the daemon that are remembered as over
 # On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
@@ -255,6 +259,9 @@ class Client:
         self._told = OutcomeAnswer("no-answer")
         self._forgotten, self._warn_at = 0, 1
         self._link = _Link(endpoint, topic, ask_endpoint, keys)
+        self._compares_clocks = self._asks and not same_computer
+        self._clock_asked_ns: int | None = None
+        self._clock_due_ns = 0
         self._read_ns = self._empty_ns = self._heard_ns = time.monotonic_ns()
         self._quiet_ns, self._slept_ns = QUIET_NS, _slept_ns()
 
@@ -387,10 +394,30 @@ class Client:
             self._lifts[self._telling] = True
         self._telling = "", 0
 
+    def _compare_clocks(self) -> None:
+        """Ask another computer's daemon for its clock once a second, and take in the answer."""
+        if not self._compares_clocks:
+            return
+        calling, now_ns = self._link.timing, time.monotonic_ns()
+        if self._clock_asked_ns is not None and (payload := calling.answer()) is not None:
+            told_ns = _told_clock(payload)
+            if told_ns is None:
+                self.counts.malformed += 1
+            else:
+                self._newest.compare_clocks(self._clock_asked_ns, told_ns)
+                self._clock_due_ns = self._clock_asked_ns + CLOCK_EVERY_NS
+            self._clock_asked_ns = None
+        if now_ns >= self._clock_due_ns:
+            if self._clock_asked_ns is not None:
+                calling.hang_up()  # a late answer must not be taken for one to this question
+            self._clock_asked_ns, self._clock_due_ns = now_ns, now_ns + CLOCK_RETRY_NS
+            calling.ask(b"clock")
+
     def _drain(self) -> bool:
         """Read all that waits, without waiting; whether there was anything new."""
         self._forget_what_is_old()
         self._hear()
+        self._compare_clocks()
         new, heard_ns, self._behind = False, self._heard_ns, True
         for _ in range(QUEUE_MAX):
             before_ns = time.monotonic_ns()
@@ -424,6 +451,8 @@ class Client:
 
     def _connect_anew(self) -> None:
         self._link.renew()
+        self._link.timing.hang_up()
+        self._clock_asked_ns, self._clock_due_ns = None, 0
         self._empty_ns = self._heard_ns = time.monotonic_ns()
 
     def _wait(self, due_ns: int) -> bool:
@@ -464,6 +493,10 @@ class Newest:
         self._former: deque[str] = deque(maxlen=FORMER_MAX)
         self._best: tuple[int, int] | None = None
         """The fastest way of a message so far, as the difference of the clocks, and when, ns."""
+        self._least_ns = 0
+        """The least of these differences."""
+        self._bound: tuple[int, int] | None = None
+        """What the clocks differ by at least, as the daemon told its own, and when, ns."""
 
     @property
     def silence_ns(self) -> int:
@@ -472,7 +505,20 @@ class Newest:
 
     def forget(self, why: str) -> None:
         """What came is not known any more, nor how the clocks differ; repeats stay repeats."""
-        self._message, self._why, self._best = None, why, None
+        self._message, self._why = None, why
+        self._best = self._bound = None
+
+    def compare_clocks(self, asked_ns: int, told_ns: int) -> None:
+        """The daemon's clock read `told_ns` at some time after `asked_ns` (own clock)."""
+        least_ns = asked_ns - told_ns
+        if self._bound is not None:
+            least_ns = max(least_ns, self._at_least(self._bound, asked_ns))
+        self._bound = least_ns, asked_ns
+
+    @staticmethod
+    def _at_least(bound: tuple[int, int], now_ns: int) -> int:
+        """What the clocks still differ by at least, so long after they were compared."""
+        return bound[0] - round((now_ns - bound[1]) * DRIFT)
 
     def take(self, frames: Sequence[bytes], empty_ns: int, now_ns: int) -> bool:
         """Take in a message, which came after `empty_ns` and not after `now_ns` (own clock).
@@ -504,7 +550,7 @@ class Newest:
         said = replace(message.verdict, age_ms=reading_age_ns / 1e6)
         if self._published_ns is None:
             return said.unknown("joining")
-        if age_ns < -CLOCK_SLACK_NS:
+        if age_ns < -CLOCK_SLACK_NS or self._may_have_crept():
             return said.unknown("clock")
         if age_ns > message.silence_ns:
             return said.unknown("silent")
@@ -542,7 +588,8 @@ class Newest:
             if self._boot_id is not None:
                 self._former.append(self._boot_id)
                 self.counts.restarts += 1
-            self._boot_id, self._seq, self._best = boot_id, seq, None
+            self._boot_id, self._seq = boot_id, seq
+            self._best = self._bound = None
             return True
         if seq <= self._seq:
             self.counts.repeats += 1
@@ -562,14 +609,23 @@ class Newest:
         None for the first: it may have been kept for those who come late.
         """
         difference_ns = now_ns - published_ns
+        if self._bound is not None:
+            return min(empty_ns, published_ns + self._at_least(self._bound, now_ns), now_ns)
         if self._best is None:
-            self._best = difference_ns, now_ns
+            self._best, self._least_ns = (difference_ns, now_ns), difference_ns
             return None
         best_ns, at_ns = self._best
         late_ns = difference_ns - best_ns - round((now_ns - at_ns) * DRIFT)
         if late_ns <= 0:
             self._best = difference_ns, now_ns
+            self._least_ns = min(self._least_ns, difference_ns)
         return min(empty_ns, now_ns - max(late_ns, 0))
+
+    def _may_have_crept(self) -> bool:
+        """Whether messages may take much longer than they did, and only the clocks differ."""
+        if self._bound is not None or self._best is None:
+            return False
+        return self._best[0] - self._least_ns > DRIFT_MAX_NS
 
 
 class _Question:
@@ -648,7 +704,7 @@ class _Link:
         self._endpoint, self._topic, self._keys = endpoint, topic, keys
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._name, self._calls = b"g" + os.urandom(NAME_BYTES - 1), 0
-        self.asking, self.telling = _Call(self, ask or ""), _Call(self, ask or "")
+        self.asking, self.telling, self.timing = (_Call(self, ask or "") for _ in range(3))
         try:
             self._socket = self.connected(zmq.SUB, endpoint)
         except BaseException:
@@ -854,6 +910,15 @@ def _taken(payload: bytes) -> OutcomeAnswer:
         return OutcomeAnswer("malformed")
     fits = isinstance(said, bool) and isinstance(why, str) and bool(why) is not said
     return OutcomeAnswer(why if fits else "malformed")
+
+
+def _told_clock(payload: bytes) -> int | None:
+    """The daemon's clock, ns; None for what is not understood."""
+    try:
+        told = _parsed(payload)
+        return _number(told, "t_mono_ns") if _number(told, "v") == VERSION else None
+    except (ValueError, KeyError, RecursionError):
+        return None
 
 
 def _numbers(told: dict[str, Any], *names: str) -> list[int]:

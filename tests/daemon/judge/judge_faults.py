@@ -105,16 +105,20 @@ def standing_still(reading: TactileReading, before: TactileReading) -> TactileRe
     return msgspec.structs.replace(reading, t_ns=before.t_ns)
 
 
-def ring(sweeps: int, fingers: tuple[int, ...] = (0, 1, 2)) -> Fault:
-    """So many sweeps come once more as they were read, and again and again, of these fingers."""
+def ring(sweeps: int, fingers: tuple[int, ...] = (0, 1, 2), live: int = 0) -> Fault:
+    """The first `sweeps` come once more, and again and again, of these fingers.
+
+    The first `live` electrodes of a finger differ by one count from turn to turn.
+    """
 
     def spoil(sound: Sequence[Step]) -> list[Step]:
         steps: list[Step] = []
         for number, step in enumerate(sound[1:]):
-            old = steps[number - sweeps].tactile if number >= sweeps else None
+            old = steps[number % sweeps].tactile if number >= sweeps else None
             if step.tactile is not None and old is not None:
                 counts = step.tactile.counts.copy()
                 counts[fingers, :] = old.counts[fingers, :]
+                counts[fingers, :live] += np.uint16(number // sweeps % 2)
                 tactile = msgspec.structs.replace(step.tactile, counts=counts)
                 step = dataclasses.replace(step, tactile=tactile)
             steps.append(step)
@@ -211,6 +215,7 @@ FAULTS: dict[str, Fault] = {
     "ring of 8": ring(8),
     "ring of 64": ring(64),
     "ring of 8, finger": ring(8, (1,)),
+    "ring of 64, one live": ring(64, live=1),
     "joints silent": without_joints,
     "joints lost": without_joints,
     "joints not valid": in_joints(lambda angles, _: np.full_like(angles, np.nan)),
@@ -240,6 +245,7 @@ EARLIER = {
     "ring of 2": 2,
     "ring of 8": 8,
     "ring of 64": 64,
+    "ring of 64, one live": 64,
     "ring of 8, finger": 8,
     "palm, ring of 8": 8,
 }

@@ -61,6 +61,7 @@ ring of 2             frozen          frozen          frozen          frozen    
 ring of 8             frozen          frozen          frozen          frozen          frozen
 ring of 64            frozen          frozen          frozen          frozen          frozen
 ring of 8, finger     frozen          frozen          frozen          frozen          frozen
+ring of 64, one live  frozen          frozen          frozen          frozen          frozen
 joints silent         =               joints-late     joints-late     ~joints-late    =
 joints lost           =               =               =               =               =
 joints not valid      =               joints-late     joints-late     ~joints-late    =

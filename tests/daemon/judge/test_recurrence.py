@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.decision import HandLimits, Limits
-from daemon.judge.health import Health, PastSweeps
+from daemon.judge.health import Health
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from drivers.base import ElectrodeFault, TactileReading
@@ -28,10 +28,10 @@ from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, netwo
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
 from tests.drivers.palm.palm_stream import tactile
 
-# By the words of `daemon.judge.recurrence`.
-SWEEPS, READ_MIN = 128, 12
+# By the words of `daemon.judge.health`.
+SWEEPS, EQUAL_MIN, READ_MIN = 128, 20, 12
 GRACE = 3
-"""So many sweeps after the first turn of a ring no verdict may be `stable` any more."""
+"""Sweeps after the first turn of a ring from which no verdict may be `stable` any more."""
 UNDER_RING = 30
 """Sweeps after that."""
 HELD = Durations(first_rest_s=(3.0, 3.0), settle_s=(4.0, 4.0))
@@ -43,19 +43,19 @@ def held(rate_hz: float) -> Grasp:
     return Grasp(rate_hz, on_request=False, durations=HELD)
 
 
-def under_ring(rate_hz: float, sweeps: int, fingers: tuple[int, ...]) -> list[Finding]:
+def under_ring(rate_hz: float, sweeps: int, fingers: tuple[int, ...], live: int) -> list[Finding]:
     """What is said of a judged hand from the first sweep of the ring on."""
     periods = 2 * sweeps + GRACE + UNDER_RING
-    return held(rate_hz).under(ring(sweeps, fingers), GateState.JUDGED, periods=periods)
+    return held(rate_hz).under(ring(sweeps, fingers, live), GateState.JUDGED, periods=periods)
 
 
-@pytest.mark.parametrize("sweeps", [2, 64])
+@pytest.mark.parametrize(("sweeps", "live"), [(2, 0), (64, 0), (64, 1), (64, 4)])
 @pytest.mark.parametrize("fingers", [(0, 1, 2), (0,), (2,)])
 @pytest.mark.parametrize("rate_hz", [PALM_RATE_HZ, RATE_HZ])
 def test_a_ring_is_frozen_from_the_first_sweep_that_comes_again(
-    rate_hz: float, fingers: tuple[int, ...], sweeps: int
+    rate_hz: float, fingers: tuple[int, ...], sweeps: int, live: int
 ) -> None:
-    found = under_ring(rate_hz, sweeps, fingers)
+    found = under_ring(rate_hz, sweeps, fingers, live)
     assert {finding.sound.decision for finding in found} == {Decision.STABLE}, "it is held"
     first, again = found[:sweeps], found[sweeps:]
     assert {finding.decision for finding in first} == {Decision.STABLE}
@@ -118,39 +118,42 @@ class Definition:
     """Which sweeps come again: plain lists, the counts that were not read are None."""
 
     def __init__(self) -> None:
-        self.past: list[list[Sweep]] = [[] for _ in FINGERS]
+        self.slots: list[list[Sweep]] = [[[None] * 24] * SWEEPS for _ in FINGERS]
+        self.number = 0
 
     def recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_]) -> bool:
-        found = False
-        for past, values, read in zip(self.past, counts.tolist(), sound.tolist(), strict=True):
+        self.number += 1
+        place, recurs = self.number % SWEEPS, False
+        for slots, values, read in zip(self.slots, counts.tolist(), sound.tolist(), strict=True):
             now = [value if is_read else None for value, is_read in zip(values, read, strict=True)]
             if sum(read) < READ_MIN:
                 continue
-            for former in past:
-                both = [
-                    (one, other)
-                    for one, other in zip(former, now, strict=True)
-                    if one is not None and other is not None
-                ]
-                equal = all(one == other for one, other in both)
-                found |= equal and (len(both) >= READ_MIN)
-            if now in past:
-                past.remove(now)
-            past.append(now)
-            del past[:-SWEEPS]
-        return found
+            former = [slot for slot, old in enumerate(slots) if comes_again(old, now)]
+            if former:
+                slots[former[0]] = slots[place]
+                recurs = True
+            slots[place] = now
+        return recurs
+
+
+def comes_again(old: Sweep, now: Sweep) -> bool:
+    pairs = [pair for pair in zip(old, now, strict=True) if None not in pair]
+    equal = sum(one == other for one, other in pairs)
+    return equal >= READ_MIN and equal + 24 - len(pairs) >= EQUAL_MIN
 
 
 def sweeps_of(
     random: np.random.Generator, number: int, flagged: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
     """Few different counts, old sweeps among them, and electrodes that were not read."""
-    counts = 1000 + random.integers(0, 2, (number, len(FINGERS), 24))
+    counts = 1000 + random.integers(0, 3, (number, len(FINGERS), 24))
     for sweep in range(1, number):
         for finger in range(len(FINGERS)):
             if random.random() < 0.1:
                 old = max(0, sweep - int(random.integers(1, 150)))
                 counts[sweep, finger] = counts[old, finger]
+                live = random.integers(0, 7)
+                counts[sweep, finger, random.choice(24, live, replace=False)] += 5
     sound = random.random(counts.shape) >= flagged * (random.random((number, 1, 1)) < 0.5)
     return counts.astype(np.uint16), sound
 
@@ -158,14 +161,28 @@ def sweeps_of(
 @pytest.mark.parametrize("flagged", [0.0, 0.02, 0.2, 0.5])
 @pytest.mark.parametrize("seed", [1])
 def test_what_recurs_is_what_the_definition_says(flagged: float, seed: int) -> None:
-    past, definition = PastSweeps.none(len(FINGERS)), Definition()
-    found = 0
+    health, definition = Health(len(FINGERS)), Definition()
+    number_of_frozen = 0
     random = np.random.default_rng(seed)
     for number, (counts, sound) in enumerate(zip(*sweeps_of(random, 500, flagged), strict=True)):
-        recurs = past.recurs(counts, None if sound.all() else sound)
-        assert recurs == definition.recurs(counts, sound), f"seed {seed}, sweep {number}"
-        found += recurs
-    assert 20 < found < 480
+        faults = np.where(sound, 0, ElectrodeFault.PARITY).astype(np.uint8)
+        checked = health.check(TactileReading(number, number, counts, faults))
+        is_frozen = Reason.FROZEN in checked.reasons
+        assert is_frozen == definition.recurs(counts, sound), f"seed {seed}, sweep {number}"
+        number_of_frozen += is_frozen
+    assert 20 < number_of_frozen < 480
+
+
+@pytest.mark.parametrize(("equal", "is_frozen"), [(19, False), (20, True), (23, True)])
+def test_a_sweep_of_twenty_equal_electrodes_comes_again(equal: int, is_frozen: bool) -> None:
+    health, random = Health(3), np.random.default_rng(4)
+    faults = np.zeros((3, 24), dtype=np.uint8)
+    sweeps = random.integers(500, 3500, (9, 3, 24)).astype(np.uint16)
+    sweeps[8, 1] = sweeps[2, 1]
+    sweeps[8, 1, equal:] += 1
+    for number, counts in enumerate(sweeps):
+        checked = health.check(TactileReading(number, number, counts, faults))
+    assert (Reason.FROZEN in checked.reasons) == is_frozen
 
 
 @pytest.mark.parametrize("faulty", ["always the same", "another each time", "at first", "later"])
@@ -190,28 +207,14 @@ def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
 
 
 def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
-    past, random = PastSweeps.none(3), np.random.default_rng(3)
-    sound = np.ones((3, 24), dtype=np.bool_)
-    sound[1] = False
-    for _ in range(300):
+    health, random = Health(3), np.random.default_rng(3)
+    faults = np.zeros((3, 24), dtype=np.uint8)
+    faults[1] = ElectrodeFault.MISSING
+    for number in range(300):
         counts = random.integers(500, 3500, (3, 24)).astype(np.uint16)
         counts[1] = 0
-        assert not past.recurs(counts, sound)
-
-
-@pytest.mark.parametrize(
-    ("past", "lacking"),
-    [
-        ([{}, {}], [0]),
-        ([{b"short": None}], [0]),
-        ([{bytes(46) + number.to_bytes(2, "big"): None for number in range(129)}], [0]),
-    ],
-)
-def test_sweeps_that_nobody_can_have_read_are_refused(
-    past: list[dict[bytes, None]], lacking: list[int]
-) -> None:
-    with pytest.raises(ValueError, match="sweep"):
-        PastSweeps(past, lacking)
+        reasons = health.check(TactileReading(number, number, counts, faults)).reasons
+        assert Reason.FROZEN not in reasons
 
 
 def test_no_real_sweep_comes_again(bts3_dir: Path) -> None:

@@ -45,6 +45,15 @@ def peers() -> Iterator[Peers]:
     made.close()
 
 
+def test_the_daemons_clock_is_told_at_once_and_judges_nothing(
+    questions: Questions, sent: list[Frames]
+) -> None:
+    requests = Asked()
+    questions.take([[b"asker", b"clock"]], 1_234_567_890_123, requests)
+    assert sent == [[b"asker", b'{"v":1,"t_mono_ns":1234567890123}']]
+    assert (requests.times, questions.counters["clocks"], questions.waiting) == (0, 1, {})
+
+
 @pytest.mark.parametrize("text", [b"judge", b"lift"])
 @pytest.mark.parametrize("delimiter", [[], [b""]], ids=["DEALER", "REQ"])
 def test_a_question_gets_one_answer(
