@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from daemon.process.text import progress
 from daemon.trust.learner import sigmoid
 from daemon.trust.lift_book import GraspId
-from daemon.trust.trust import Permission, RiskLimits, Trust
+from daemon.trust.risk import Permission, RiskLimits
+from daemon.trust.trust import Trust
 from models.inputs import SessionBuilder, builder, raw_features
 from models.training.data.datasets import Grasps
 from models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds

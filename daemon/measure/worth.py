@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from daemon.measure.streams import Plan, Stream, live, streams
 from daemon.process.text import complain, markdown_table, progress
-from daemon.trust.trust import RiskLimits
+from daemon.trust.risk import RiskLimits
 from models.training.data.datasets import DatasetError, read_all
 
 ALLOWED: Final = 0.05

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, Reason
 from daemon.trust.lift_book import NOT_ASSESSED, GraspId
-from daemon.trust.trust import Permission, RiskLimits, Trust
+from daemon.trust.risk import Permission, RiskLimits
+from daemon.trust.trust import Trust
 from drivers.base import ElectrodeFault
 from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
 

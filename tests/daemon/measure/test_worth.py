@@ -20,7 +20,7 @@ from daemon.measure import streams as module
 from daemon.measure import worth
 from daemon.measure.streams import Plan, Stream, live, streams
 from daemon.measure.worth import ALLOWED, ALONE, LEARNING, PUBLISHED, RISK, draw, measured
-from daemon.trust.trust import RiskLimits
+from daemon.trust.risk import RiskLimits
 from models.training.data.datasets import Grasps, read_all
 from models.training.systems.system import System
 
