@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import zlib
 
 import msgspec
 import numpy as np
@@ -368,6 +369,27 @@ def test_what_is_whole_and_no_state_is_refused() -> None:
     for content in (b"\x80", b"\xc1", msgspec.msgpack.encode({"version": 2})):
         with pytest.raises(ValueError, match="nothing that was learned"):
             decode(hashlib.sha256(content).digest() + content)
+
+
+def test_what_a_former_graspd_kept_is_read() -> None:
+    """It had a threshold that moved, and knew of no announcement."""
+    state = msgspec.to_builtins(full().state(), builtin_types=(bytes,))
+    state["risk"] = {
+        "max_slip_when_stable": 0.1,
+        "theta": -2.4,
+        "lifts": 3,
+        "slips": 1,
+        "overdue": 0,
+        "proven": 3,
+    }
+    del state["ledger"]["announced"]
+    for lift in state["ledger"]["records"]:
+        del lift["announced"]
+    content = zlib.compress(msgspec.msgpack.encode(state))
+    part = trust()
+    part.restore(decode(hashlib.sha256(content).digest() + content))
+    assert (part.report().lifts, part.report().slips, part.learner.outcomes) == (3, 1, 3)
+    assert part.risk.budget == pytest.approx(5.0 + 3 * 0.1 - 1.0)
 
 
 def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
