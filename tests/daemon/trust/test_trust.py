@@ -11,39 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from daemon.trust.learner import sigmoid
-from daemon.trust.lift_book import LIFTS_MAX, GraspId, OutcomeStatus
+from daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
 from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
-
-BOOT = "0123456789abcdef" * 2
-INPUTS = 26
-RULE = RiskLimits(0.1)
-TABLE = np.clip(np.random.default_rng(5).normal(0.0, 1.0, (997, INPUTS)), -3, 3).astype(np.float32)
-
-
-def trust(limits: RiskLimits = RULE, *, learns: bool = True) -> Trust:
-    return Trust("model", INPUTS, limits, learns=learns)
-
-
-def named(grasp: int, boot: str = BOOT) -> GraspId:
-    return GraspId(boot, grasp)
-
-
-def inputs(grasp: int) -> NDArray[np.float32]:
-    row: NDArray[np.float32] = TABLE[grasp % len(TABLE)]
-    return row
-
-
-def judge(part: Trust, grasp: int, margin: float = -6.0, boot: str = BOOT) -> bool:
-    """Judge and note a grasp; returns whether it was called stable."""
-    name = named(grasp, boot)
-    assessment = part.judge(name, sigmoid(margin), margin, inputs(grasp))
-    stable = assessment.permission is Permission.ALLOWED and (assessment.p_slip or 0.0) < 0.5
-    part.note(name, assessment, stable=stable)
-    return stable
+from tests.daemon.trust.grasps import INPUTS, RULE, inputs, judge, named, trust
 
 
 def p_slip(part: Trust, grasp: int = 0, margin: float = -1.0) -> float:
@@ -223,86 +196,6 @@ def test_no_adversary_breaks_the_bound(
         assert part.lifts.outstanding == sum(said.values()) - len(lifts)
         assert part.risk.bound is not None
         assert part.risk.slips <= part.risk.bound + 1e-9
-
-
-OUTSTANDING = (1, 2, 5, 9)
-
-
-@pytest.mark.parametrize("first", range(0, 1000, 100))
-def test_announced_lifts_never_slip_beyond_the_bound(
-    first: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of 1,000 controllers some tell late, in any order, or never, and let slip what is stable."""
-    monkeypatch.setattr("daemon.trust.lift_book.LIFTS_MAX", 12)  # lifts are soon forgotten
-    for seed in range(first, first + 100):
-        Protocol(seed).run(60)
-
-
-class Protocol:
-    """One controller, and what became of its lifts."""
-
-    def __init__(self, seed: int) -> None:
-        self.random = random = np.random.default_rng(seed)
-        self.alpha = float(random.choice((0.001, 0.05, 0.1, 0.5)))
-        self.limits = RiskLimits(self.alpha, outstanding_max=int(random.choice(OUTSTANDING)))
-        self.announces, self.tells, self.slips = random.random(3) ** (0.3, 0.5, 0.2)
-        self.part = trust(self.limits)
-        self.waiting: list[int] = []
-        """Announced, and not told yet."""
-        self.abandoned = self.told = self.slipped = 0
-        """Announced lifts that were never told; told lifts, and slips among these."""
-
-    def run(self, grasps: int) -> None:
-        allowed = 5.0 + self.limits.outstanding_max * (1.0 - self.alpha)
-        for grasp in range(grasps):
-            self.lift(grasp)
-            assert self.part.lifts.awaited == len(self.waiting) <= self.limits.outstanding_max
-            untold = self.abandoned + len(self.waiting)
-            # At worst all that was not told has slipped.
-            assert self.slipped + untold <= self.alpha * (self.told + untold) + allowed + 1e-6
-            if self.random.random() < 0.03:
-                kept, self.part = encode(self.part.state()), trust(self.limits)
-                self.part.restore(decode(kept))
-
-    def lift(self, grasp: int) -> None:
-        """Judge a grasp, and tell its outcome and others or not."""
-        stable = judge(self.part, grasp, -9.0)
-        known = [each for each in self.waiting if named(each) in self.part.lifts]
-        self.abandoned += len(self.waiting) - len(known)
-        self.waiting = known
-        if stable and self.random.random() < self.announces:
-            self.part.lifts.announce()
-            self.waiting.append(grasp)
-        elif stable and self.random.random() < self.tells:
-            self.tell(grasp)
-        while self.waiting and self.random.random() < self.tells:
-            self.tell(self.waiting.pop(int(self.random.integers(len(self.waiting)))))
-
-    def tell(self, grasp: int) -> None:
-        slipped = bool(self.random.random() < self.slips)
-        assert self.part.outcome(named(grasp), slipped=slipped) is OutcomeStatus.TAKEN
-        self.told, self.slipped = self.told + 1, self.slipped + slipped
-
-
-def test_unannounced_lifts_neither_block_nor_count_until_they_are_told() -> None:
-    part = trust(RiskLimits(0.1, outstanding_max=1))
-    assert all(judge(part, grasp, -9.0) for grasp in range(20))
-    assert (part.report().announced, part.report().awaited, part.report().slips) == (0, 0, 0)
-    part.lifts.announce()
-    assert part.report().awaited == 1
-    assert not judge(part, 20, -9.0)
-    part.outcome(named(19), slipped=False)
-    assert judge(part, 21, -9.0)
-
-
-def test_another_risk_forgets_what_was_announced_under_the_former_one() -> None:
-    part, other = trust(RiskLimits()), trust(RULE)
-    for grasp in range(9):
-        judge(part, grasp, -9.0)
-        part.lifts.announce()
-    other.restore(part.state())
-    assert (other.report().announced, other.report().awaited) == (0, 0)
-    assert judge(other, 10, -9.0)
 
 
 def test_a_restart_in_the_middle_changes_nothing() -> None:
