@@ -123,7 +123,7 @@ class Risk:
     6. An announced grasp was called `stable` at b >= 1 - a and m < M. So w >= -(M - 1) (1 - a)
        after its announcement.
     7. An outcome of an announced lift lowers neither w nor this minimum: a slip takes 1 - a from b
-       and m by one. The cap leaves b = BUDGET_MAX, and m <= M.
+       and m by one. Caps leave b >= BUDGET_START, and m <= M.
     8. A lift that leaves the book untold is taken for a slip. So 6 holds at every moment.
     9. With the m lifts counted as slips, 2 is S <= a N + BUDGET_START - w: the third bound.
     10. Lifts that are told late without an announcement can leave b < 0; `bound` adds that.
