@@ -23,7 +23,8 @@ from daemon.scene.drivers import (
     StreamJoints,
 )
 from daemon.scene.scene import GateMode
-from daemon.trust.trust import RiskLimits, Trust
+from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import Trust
 from drivers.base import Driver, DriverError, LinkError
 from models import own, trial, zoo
 from models.contract import ModelError, SessionInput

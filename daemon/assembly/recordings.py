@@ -112,6 +112,8 @@ class RecordedRun:
                 pipeline.ask()
             case Topic.SKIPPED:
                 pipeline.skip()
+            case Topic.ANNOUNCED if self._same_grasps:
+                pipeline.lifts.announce()
             case Exchanged():
                 try:
                     pipeline.sensors_exchanged(event.session, event.learned)

@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 
 from daemon.judge.reasons import Decision, Moment, Reason
-from daemon.trust.trust import Permission
+from daemon.trust.risk import Permission
 from models.contract import Finger
 
 MEDIAN_SWEEPS: Final = 3

@@ -82,7 +82,8 @@ ADVICE: dict[Reason, str] = {
     Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",
     Reason.NOT_CALIBRATED: "the session has too few grasps: `graspd session seed`, or grasp more",
     Reason.LOW_CONFIDENCE: "too close to call for min_confidence or for [risk]: grasp again",
-    Reason.UNPROVEN: "too few outcomes are known for [risk]: lift under supervision, tell outcomes",
+    Reason.UNPROVEN: "too few outcomes are known for [risk], or too many lifts are out: lift under "
+    "supervision, tell outcomes",
     Reason.RISK_EXCEEDED: "more `stable` lifts slipped than [risk] can make good: find out why, "
     "then `graspd session reset`",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",

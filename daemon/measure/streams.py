@@ -1,15 +1,15 @@
 """Streams of grasps of another day, and what graspd says of them as outcomes are told.
 
 Networks saw neither the objects nor the pose of a stream. The days are those of the protocol
-`days`. Session statistics start empty, as in the daemon. No grasp is refused.
+`days`. Each stream is a session that starts empty, as in the daemon, with the daemon's refusals.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,31 +17,53 @@ from numpy.typing import NDArray
 from daemon.process.text import progress
 from daemon.trust.learner import sigmoid
 from daemon.trust.lift_book import GraspId
-from daemon.trust.trust import Permission, RiskLimits, Trust
-from models.inputs import SessionBuilder, builder, raw_features
+from daemon.trust.risk import Permission, RiskLimits
+from daemon.trust.trust import Trust
+from models.training.arrays import Ints
 from models.training.data.datasets import Grasps
 from models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
-from models.training.fitting.trained import train
+from models.training.evaluating.days import SessionDay
+from models.training.fitting.trained import Trained, train
 from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import SessionFeatures, System, with_recipes
+from models.training.systems.system import with_recipes
 
 OWN, PUBLISHED = "small-session", "cnn1"
 """Systems that judge: graspd's default, and the published network on the plain image."""
 DRAWS: Final = 2
-"""Streams of each table and fold, in random order."""
+"""Streams of each table, fold and order."""
+Order = Literal["random", "by object"]
+ORDERS: Final[tuple[Order, ...]] = ("random", "by object")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """The grasps of one table and fold in random order."""
+    """The grasps of one table and fold."""
 
+    protocol: str
+    table: str
+    order: Order
     margins: NDArray[np.float64]
     """Log-odds of slip (N,) of graspd's network."""
     features: NDArray[np.float32]
     """Inputs of that network, shape (N, 78)."""
+    refused: NDArray[np.bool_]
+    """Shape (N,): grasps that the daemon does not judge, such as ones that are never seen."""
     published: NDArray[np.float64]
-    """Log-odds of slip (N,) of the published network."""
+    """Log-odds of slip (N,) of the published network, which refuses nothing."""
     slipped: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Life:
+    """What was said of a stream's grasps (N,), each after the outcomes of those before it."""
+
+    p_slip: NDArray[np.float64]
+    """NaN: refused."""
+    stable: NDArray[np.bool_]
+    outcomes: NDArray[np.int64]
+    """Number of outcomes that each verdict rests on."""
+    within: bool
+    """True if slips among stable lifts never exceeded the bound."""
 
 
 def streams(
@@ -60,52 +82,58 @@ def streams(
         for protocol, training, tables in DAYS:
             progress(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {protocol}")
             others = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
+            own, published = (train(system, others, fold_seed(seed, fold)) for system in systems)
             random = np.random.default_rng([seed, fold])
-            rows = []
-            for table, _ in itertools.product(tables, range(DRAWS)):
+            for table, _, order in itertools.product(tables, range(DRAWS), ORDERS):
                 inside = np.flatnonzero((names == table) & (fold_of == fold))
-                rows.append(random.permutation(inside))
-            counts = [grasps.counts[chosen] for chosen in rows]
-            own, published = (
-                judged(system, others, counts, fold_seed(seed, fold)) for system in systems
-            )
-            for chosen, (margins, features), (theirs, _) in zip(rows, own, published, strict=True):
-                yield Stream(margins, features, theirs, grasps.slipped[chosen])
+                rows = ordered(random, inside, np.array(grasps.objects), order)
+                margins, features, refused = judged(own, grasps, rows)
+                theirs = published.margins(grasps.counts[rows], grasps.table_of[rows])
+                slipped = grasps.slipped[rows]
+                yield Stream(protocol, table, order, margins, features, refused, theirs, slipped)
+
+
+def ordered(
+    random: np.random.Generator, rows: Ints, objects: NDArray[np.str_], order: Order
+) -> Ints:
+    """Shuffle rows; `by object` shuffles the objects and the grasps of each."""
+    shuffled = random.permutation(rows)
+    if order == "random":
+        return shuffled
+    several = random.permutation(np.unique(objects[rows]))
+    return np.concatenate([shuffled[objects[shuffled] == name] for name in several])
 
 
 def judged(
-    system: System, training: Grasps, several: Sequence[NDArray[np.uint16]], seed: int
-) -> list[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-    """Train a system; return its margins (N,) and inputs (N, ...) for streams of counts (N, 3, 24).
-    Inputs are empty for a system without a session."""
-    trained, takes = train(system, training, seed), system.input
-    answers = []
-    for counts in several:
-        if trained.standards is not None and isinstance(takes, SessionFeatures):
-            session = trained.standards.statistics()
-            builds = SessionBuilder(counts.shape[1], takes.clip)
-            inputs = np.empty((len(counts), *builds.shape), np.float32)
-            for row, reading in zip(inputs, counts, strict=True):
-                builds.use(session.mean, session.spread)
-                builds.build(reading, row)
-                session.observe(raw_features(reading))
-            answers.append((trained.fitted.margins(inputs), inputs))
-        elif not isinstance(takes, SessionFeatures):
-            images, _ = builder(takes, counts.shape[1]).build_batch(counts)
-            answers.append((trained.fitted.margins(images), np.empty((len(counts), 0), np.float32)))
-    return answers
+    trained: Trained, grasps: Grasps, rows: Ints
+) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]:
+    """Judge rows as one session; return margins (N,), inputs (N, features) and what is refused."""
+    day = SessionDay(trained)
+    margins, refused = np.empty(len(rows)), np.empty(len(rows), np.bool_)
+    inputs = np.empty((len(rows), len(day.inputs)), np.float32)
+    for index, counts in enumerate(grasps.counts[rows]):
+        margins[index], refused[index] = day.judge(counts)
+        inputs[index] = day.inputs
+    return margins, inputs, refused
 
 
-def stable_of(stream: Stream, limits: RiskLimits) -> NDArray[np.bool_]:
-    """Judge, lift and tell one grasp after the other; return which were said to be stable (N,)."""
-    trust = Trust("worth", stream.features.shape[1], limits)
-    verdicts = []
-    for index, margin in enumerate(stream.margins.tolist()):
-        grasp = GraspId("worth", index)
+def live(stream: Stream, limits: RiskLimits, *, every: bool) -> Life:
+    """Judge, lift and tell one grasp after the other; refused ones are left alone.
+
+    Without `every`, only stable and supervised grasps are lifted and their outcomes told.
+    """
+    trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
+    p_slip, stable = np.full(count, np.nan), np.zeros(count, np.bool_)
+    outcomes, within = np.zeros(count, np.int64), True
+    for index in np.flatnonzero(~stream.refused).tolist():
+        grasp = GraspId(f"{stream.table} {stream.order}", index)
+        margin, slipped = float(stream.margins[index]), bool(stream.slipped[index])
         assessed = trust.judge(grasp, sigmoid(margin), margin, stream.features[index])
-        p_slip = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
-        stable = assessed.permission is Permission.ALLOWED and p_slip < 0.5
-        trust.note(grasp, assessed, stable=stable)
-        trust.outcome(grasp, slipped=bool(stream.slipped[index]))
-        verdicts.append(stable)
-    return np.array(verdicts, np.bool_)
+        p_slip[index] = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
+        outcomes[index] = assessed.outcomes
+        stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5
+        trust.note(grasp, assessed, stable=bool(stable[index]))
+        if every or stable[index] or assessed.supervised:
+            trust.outcome(grasp, slipped=slipped)
+        within &= trust.risk.bound is None or trust.risk.slips <= trust.risk.bound + 1e-9
+    return Life(p_slip, stable, outcomes, within)

@@ -31,6 +31,8 @@ class LoopEvent(Enum):
     ASKED = "asked"
     SKIPPED = "skipped"
     """Readings before the next one were skipped."""
+    ANNOUNCED = "announced"
+    """A controller asked whether it may lift, and the answer was `stable`."""
 
 
 class PublishedVerdict(NamedTuple):

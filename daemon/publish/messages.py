@@ -13,7 +13,7 @@ import msgspec
 
 from daemon.judge.reasons import Decision, GateCause, GateState, Reason
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.trust import RiskReport
+from daemon.trust.risk import RiskReport
 from models.contract import Finger
 
 WIRE_VERSION: Final = 1
@@ -172,7 +172,15 @@ class Lifts(msgspec.Struct, frozen=True, kw_only=True):
     outstanding: Count
     """Grasps whose outcome can still come."""
     unreported: Count
-    """Grasps that were forgotten before an outcome came: they are in no bound."""
+    """Grasps that were forgotten before an outcome came. Of these, announced ones count as slips
+    where a risk is set; the others are in no bound."""
+    announced: Count = 0
+    """`lift` questions that were answered `stable`, one a grasp."""
+    awaited: Count = 0
+    """Those of them whose outcome is out."""
+    covered: bool | None = None
+    """False: no lift was announced, so the risk that is set covers only lifts that were told. Null:
+    no risk is set."""
 
 
 class LearnerHealth(msgspec.Struct, frozen=True, kw_only=True):

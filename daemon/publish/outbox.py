@@ -308,9 +308,14 @@ class Outbox:
 
 
 def _lifts(trust: Trust) -> Lifts:
-    book = trust.lifts
+    book, target = trust.lifts, trust.risk.limits.max_slip_when_stable
     return Lifts(
-        reported=trust.risk.lifts, outstanding=book.outstanding, unreported=book.unreported
+        reported=trust.risk.lifts,
+        outstanding=book.outstanding,
+        unreported=book.unreported,
+        announced=book.announced,
+        awaited=book.awaited,
+        covered=None if target is None else book.announced > 0,
     )
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from daemon.judge.reasons import Decision
 from daemon.publish.companion import Companion, PublishedVerdict, Requests
 from daemon.publish.door import Admission, Door
 from daemon.publish.listener import Listener, PublishError
@@ -135,6 +136,8 @@ class Sockets(Companion):
         lifters = self.questions.answer(published.payload, now_ns)
         for peer in lifters if published.grasp.grasp else ():
             published.lifts.claim(published.grasp, peer)
+        if lifters and published.verdict.verdict is Decision.STABLE:
+            published.lifts.announce()
 
     def on_status(self, status: Status) -> None:
         """Check the sockets and the list of keys. Raises `PublishError`, which ends the daemon."""

@@ -25,7 +25,7 @@ from drivers.recordings.player import RecordedDriver
 _log = logging.getLogger(__name__)
 
 RecordedEvent = Topic | OutcomeMessage | Exchanged
-"""`ASKED` or `SKIPPED`, an outcome, or an exchange of sensors."""
+"""One of `EVENTS`, an outcome, or an exchange of sensors."""
 _Item = Reading | RecordedEvent
 
 

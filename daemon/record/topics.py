@@ -102,6 +102,8 @@ class Topic(StrEnum):
     EXCHANGED = "exchanged"
     SKIPPED = "skipped"
     """Readings before the next one were left out."""
+    ANNOUNCED = "announced"
+    """A controller asked whether it may lift, and the answer was `stable`."""
     # Made of them for viewers:
     IMAGE = "image"
     LOG = "log"
@@ -114,11 +116,12 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
     "asked": Event,
     "exchanged": Exchanged,
     "skipped": Event,
+    "announced": Event,
     "image": RawImage,
     "log": Log,
 }
 """Messages by the first part of their topic."""
-EVENTS: Final = (Topic.ASKED, Topic.SKIPPED)
+EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED)
 EVENT: Final = b"{}"
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode

@@ -294,8 +294,12 @@ class Loop:
         published = PublishedVerdict(
             judgement, verdict, payload, reading, is_answer, grasp, self._pipeline.lifts
         )
+        announced = published.lifts.announced
         for on_verdict in self._on_verdict:
             on_verdict(published)
+        if published.lifts.announced != announced:
+            for on_event in self._on_event:
+                on_event(LoopEvent.ANNOUNCED)
         return verdict
 
     @property

@@ -109,6 +109,9 @@ class RiskSection(Section):
     explore: Annotated[float, Field(ge=0.0, le=1.0), unit()] = 0.05
     """Share of the grasps that are not `stable` to lift under supervision after that: only their
     outcomes show that the rule is too strict."""
+    outstanding_max: Annotated[int, Field(ge=1, le=100), unit("lifts")] = 5
+    """Number of lifts, announced by the question `lift`, whose outcome may be out at once. From
+    there on nothing is `stable`."""
 
 
 class Learn(Section):

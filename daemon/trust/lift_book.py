@@ -71,6 +71,13 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     not learn from it, because its outcome is known or a sensor was exchanged since."""
     slipped: bool | None = None
     """None until the outcome is told."""
+    announced: bool = False
+    """True once a `lift` question was answered `stable`."""
+
+    @property
+    def is_awaited(self) -> bool:
+        """True if the lift was announced and its outcome is out."""
+        return self.announced and self.slipped is None
 
 
 class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,11 +87,17 @@ class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Oldest first."""
     told: dict[OutcomeStatus, Annotated[int, msgspec.Meta(ge=0)]]
     unreported: Annotated[int, msgspec.Meta(ge=0)]
+    announced: Annotated[int, msgspec.Meta(ge=0)] = 0
 
     @property
     def outstanding(self) -> int:
         """Number of grasps called `stable` whose outcome can still come."""
         return sum(each.stable and each.slipped is None for each in self.records)
+
+    @property
+    def awaited(self) -> int:
+        """Number of announced lifts whose outcome is out."""
+        return sum(each.is_awaited for each in self.records)
 
 
 class LiftBook:
@@ -108,6 +121,12 @@ class LiftBook:
         """Number of grasps called `stable` that left the book before an outcome came."""
         self.outstanding = 0
         """Number of grasps called `stable` whose outcome can still come."""
+        self.announced = 0
+        """Number of lifts that were announced."""
+        self.awaited = 0
+        """Number of announced lifts whose outcome is out."""
+        self.abandoned = 0
+        """Number of announced lifts that left the book before an outcome came."""
 
     def __contains__(self, grasp: object) -> bool:
         """True if the grasp was judged and is in the book."""
@@ -138,7 +157,8 @@ class LiftBook:
                 return False
             stable = stable or lift.stable
             self.outstanding -= lift.stable
-        self._lifts[grasp] = Lift(grasp, stable, features)
+        announced = lift is not None and lift.announced
+        self._lifts[grasp] = Lift(grasp, stable, features, announced=announced)
         self.outstanding += stable
         if len(self._lifts) > LIFTS_MAX:
             self._forget(next(iter(self._lifts)))
@@ -149,6 +169,20 @@ class LiftBook:
         self._owners.setdefault(grasp, owner)
         if len(self._owners) > LIFTS_MAX:
             del self._owners[next(iter(self._owners))]
+
+    def announce(self) -> None:
+        """Note that a `lift` question about the newest grasp was answered `stable`."""
+        lift = next(reversed(self._lifts.values()), None)
+        if lift is None or not lift.stable or lift.announced or lift.slipped is not None:
+            return
+        self._lifts[lift.id] = replace(lift, announced=True)
+        self.announced += 1
+        self.awaited += 1
+
+    def withdraw(self) -> None:
+        """Take back all announcements: another risk is set, which counts from the start."""
+        self._lifts = {grasp: replace(lift, announced=False) for grasp, lift in self._lifts.items()}
+        self.announced = self.awaited = 0
 
     def may_report(self, grasp: GraspId, peer: bytes | None) -> bool:
         """True if this peer may tell the outcome: the owner of the grasp, or the daemon itself.
@@ -171,7 +205,8 @@ class LiftBook:
         elif lift.slipped is None:
             status = OutcomeStatus.TAKEN
             self.outstanding -= lift.stable
-            self._lifts[grasp] = Lift(grasp, lift.stable, None, slipped)
+            self.awaited -= lift.announced
+            self._lifts[grasp] = replace(lift, features=None, slipped=slipped)
             self._unkept.add(grasp)
         elif lift.slipped == slipped:
             status = OutcomeStatus.REPEATED
@@ -198,7 +233,8 @@ class LiftBook:
 
     def state(self) -> LiftBookState:
         """Return what `restore` needs."""
-        return LiftBookState(tuple(self._lifts.values()), dict(self.told), self.unreported)
+        lifts, told = tuple(self._lifts.values()), dict(self.told)
+        return LiftBookState(lifts, told, self.unreported, self.announced)
 
     def restore(self, state: LiftBookState, width: int) -> None:
         """Go on from an earlier state, with features (width,). Raises `ValueError`."""
@@ -215,6 +251,7 @@ class LiftBook:
         self.told = Counter(state.told)
         self.unreported = state.unreported
         self.outstanding = state.outstanding
+        self.announced, self.awaited = state.announced, state.awaited
 
     def _forget(self, grasp: GraspId) -> None:
         """Drop the oldest grasp: its outcome is refused from now on."""
@@ -223,3 +260,5 @@ class LiftBook:
         forgotten = lift.stable and lift.slipped is None
         self.unreported += forgotten
         self.outstanding -= forgotten
+        self.awaited -= lift.is_awaited
+        self.abandoned += lift.is_awaited

@@ -11,6 +11,7 @@ SURE_MS = LONG_NS / 1e6
 """Time without motion, ms, after which a slow slide is excluded."""
 LIKELY = 0.25
 """A likelier slip is never shown as a promise."""
+UNCOVERED = Line("risk", "covers only lifts that are told: none was announced")
 NO_OUTCOME = "no outcome told yet"
 SUPERVISED = Line(
     "supervised", "lift only while a person watches, and tell the outcome: it teaches"
@@ -80,9 +81,12 @@ def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
     lines = []
     if status is not None and status.lifts is not None:
         lines.append(Line("never told", counted(status.lifts.unreported, "lift")))
+        if status.lifts.covered is False:
+            lines.append(UNCOVERED)
     if risk is not None:
         lines.append(Line("warm-up left", counted(risk.warm_up_left, "outcome")))
         lines.append(Line("still out", counted(risk.outstanding, "lift")))
+        lines.append(Line("announced", f"{counted(risk.announced, 'lift')}, {risk.awaited} out"))
     learner = None if status is None else status.learner
     if learner is not None:
         lines.append(Line("learner", "on" if learner.enabled else "off"))

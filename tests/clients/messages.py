@@ -18,6 +18,7 @@ NEEDED = (
 """Fields that a lift relies on."""
 RISK = {
     "target": 0.05, "lifts": 41, "slips": 2, "outstanding": 1, "bound": 6.1, "warm_up_left": 0,
+    "announced": 40, "awaited": 1,
 }  # fmt: skip
 ADDED: dict[str, Any] = {
     "p_slip_model": 0.3, "outcomes": 57, "supervised": False, "risk": RISK,

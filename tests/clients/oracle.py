@@ -38,6 +38,8 @@ class RiskTold(msgspec.Struct):
     outstanding: Whole
     bound: Duration | None
     warm_up_left: Whole
+    announced: Whole = 0
+    awaited: Whole = 0
 
 
 class Former(msgspec.Struct):

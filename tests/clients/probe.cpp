@@ -30,7 +30,8 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
     if (const auto& risk = verdict.risk)
         std::cout << std::llrint(risk->target.value_or(-1) * 1e9) << ' ' << risk->lifts << ' '
                   << risk->slips << ' ' << risk->outstanding << ' '
-                  << std::llrint(risk->bound.value_or(-1)) << ' ' << risk->warm_up_left << ' ';
+                  << std::llrint(risk->bound.value_or(-1)) << ' ' << risk->warm_up_left << ' '
+                  << risk->announced << ' ' << risk->awaited << ' ';
     std::cout << verdict.early << ' ' << std::llrint(verdict.still_ms.value_or(-1) * 1e6) << ' ';
     for (const auto& [finger, moves] : verdict.motion)
         std::cout << finger << '=' << std::llrint(moves.value_or(-1) * 1e3) << ' ';

@@ -63,6 +63,7 @@ def said(newest: Newest, now_ns: int) -> str:
     if risk := verdict.risk:
         words += [fixed(risk.target), risk.lifts, risk.slips, risk.outstanding]
         words += [-1 if risk.bound is None else round(risk.bound), risk.warm_up_left]
+        words += [risk.announced, risk.awaited]
     words += [int(verdict.early)]
     words += [-1000000 if verdict.still_ms is None else round(verdict.still_ms * 1e6)]
     for finger, moves in sorted((verdict.motion or {}).items()):

@@ -76,7 +76,7 @@ def test_what_a_verdict_rests_on_is_told() -> None:
     found = said(verdict(0, START_NS, **ADDED))
     assert found
     assert (found.p_slip, found.p_slip_model, found.outcomes) == (0.125, 0.3, 57)
-    assert found.risk == Risk(0.05, 41, 2, 1, 6.1, 0)
+    assert found.risk == Risk(0.05, 41, 2, 1, 6.1, 0, 40, 1)
     assert (found.early, found.still_ms) == (False, 250.0)
     assert found.motion == {"ff": 0.9, "th": None}
     assert found.motion_limits == {"ff": 1.5, "th": 1.0}

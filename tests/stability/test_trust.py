@@ -1,6 +1,6 @@
 """What outcomes teach and what a risk allows, under streams made up for the worst.
 
-The rule's threshold is compared with fractions.
+The rule's budget is compared with fractions.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.trust.learner import Learner
-from daemon.trust.trust import LOWEST, Permission, Risk, RiskLimits
+from daemon.trust.risk import Permission, Risk, RiskLimits
 
 Note = Callable[..., None]
 Random = np.random.Generator
@@ -35,8 +35,8 @@ ERROR_MAX = 1e-6
 EIGENVALUE_MIN = 0.99 * DRIFT * 0.3**2
 """What the learner's docstring derives, with room for rounding."""
 LIFTS = 20_000
-THETA_ERROR_MAX = 1e-9
-"""Log-odds. A lift rounds by 1e-15."""
+BUDGET_ERROR_MAX = 1e-9
+"""Slips. A lift rounds by 1e-15."""
 
 
 def varied(random: Random) -> Iterator[Outcome]:
@@ -117,9 +117,7 @@ def test_the_learner_stays_bounded_and_positive_definite(
 @pytest.mark.parametrize("alpha", [0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5])
 def test_no_adversary_slips_beyond_the_bound(note: Note, alpha: float) -> None:
     worst = max(
-        beyond_the_bound(alpha, late, slips_from)
-        for late in (1, 20)
-        for slips_from in (LOWEST, LOWEST + 1.0, -1.0)
+        beyond_the_bound(alpha, late, slips_from) for late in (1, 20) for slips_from in (1.0, 2.0)
     )
     note(
         step=f"risk of {alpha:g} against adversaries, {LIFTS} grasps each",
@@ -130,18 +128,19 @@ def test_no_adversary_slips_beyond_the_bound(note: Note, alpha: float) -> None:
 
 
 def beyond_the_bound(alpha: float, late: int, slips_from: float) -> float:
-    """Return the most slips beyond the bound, by an adversary that knows the rule and theta.
+    """Return the most slips beyond the bound, by an adversary that knows the rule and its budget.
 
-    It lifts the surest grasps, which hold until theta is at `slips_from` and slip from then on.
-    Outcomes come `late` at a time.
+    It lifts the surest grasps, which hold until the budget is at `slips_from` and slip from then
+    on. Outcomes come `late` at a time.
     """
     rule, worst, waiting = Risk(RiskLimits(alpha)), -math.inf, list[bool]()
     for _ in range(LIFTS):
-        if rule.decide(LOWEST) is Permission.ALLOWED:
-            waiting.append(rule.theta >= slips_from)
+        allowed = rule.decide(-math.inf) is Permission.ALLOWED
+        if allowed:
+            waiting.append(rule.budget >= slips_from)
         elif not waiting:
             break  # silent for ever
-        if len(waiting) == late or rule.theta < LOWEST:
+        if len(waiting) == late or not allowed:
             for slipped in waiting:
                 rule.take(stable=True, slipped=slipped, proves=True)
                 worst = max(worst, rule.slips - (rule.bound or 0.0))
@@ -149,19 +148,19 @@ def beyond_the_bound(alpha: float, late: int, slips_from: float) -> float:
     return worst
 
 
-def test_the_threshold_is_that_of_fractions(note: Note) -> None:
+def test_the_budget_is_that_of_fractions(note: Note) -> None:
     random, worst = np.random.default_rng(0), 0.0
     for alpha in (0.001, 0.05, 0.5):
         rule = Risk(RiskLimits(alpha))
-        theta = Fraction(rule.theta)
+        budget = Fraction(rule.budget)
         for unlucky in (random.random(LIFTS) < 1.2 * alpha).tolist():
-            slipped = unlucky and rule.theta >= LOWEST  # else nothing would be lifted
+            slipped = unlucky and rule.decide(-math.inf) is Permission.ALLOWED
             rule.take(stable=True, slipped=slipped, proves=True)
-            theta = min(theta + Fraction(alpha) - slipped, Fraction(0))
-            worst = max(worst, abs(float(Fraction(rule.theta) - theta)))
+            budget = min(budget + Fraction(alpha) - slipped, Fraction(8))
+            worst = max(worst, abs(float(Fraction(rule.budget) - budget)))
     note(
-        step=f"risk, threshold after {LIFTS} lifts",
-        expected=f"of fractions to {THETA_ERROR_MAX:.0e}",
+        step=f"risk, budget after {LIFTS} lifts",
+        expected=f"of fractions to {BUDGET_ERROR_MAX:.0e}",
         found=f"{worst:.1e}",
     )
-    assert worst <= THETA_ERROR_MAX
+    assert worst <= BUDGET_ERROR_MAX

@@ -93,6 +93,8 @@ struct Risk {
     std::int64_t outstanding = 0;  // outcomes that can still come
     std::optional<double> bound;   // of `slips`, but for one more each that is outstanding
     std::int64_t warm_up_left = 0;  // outcomes until most grasps need no supervision
+    std::int64_t announced = 0;     // `lift` questions that were answered `stable`
+    std::int64_t awaited = 0;  // outcomes of these that are out; too many, and nothing is `stable`
 };
 
 // What is known of the grasp. True in an `if` exactly when it is stable, and nobody need watch.
@@ -275,6 +277,9 @@ inline Risk risk(const json& told) {
     Risk found{maybe(told, "target", 1.0), integer(told, "lifts"), integer(told, "slips"),
                integer(told, "outstanding"), maybe(told, "bound", REAL_MAX),
                integer(told, "warm_up_left")};
+    // What older daemons leave out.
+    if (told.contains("announced")) found.announced = integer(told, "announced");
+    if (told.contains("awaited")) found.awaited = integer(told, "awaited");
     if (found.slips > found.lifts) throw Malformed{};
     return found;
 }

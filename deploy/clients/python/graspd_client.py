@@ -117,6 +117,8 @@ class Risk:
     outstanding: int  # outcomes that can still come
     bound: float | None  # of `slips`, but for one more each that is outstanding
     warm_up_left: int  # outcomes until most grasps need no supervision
+    announced: int = 0  # `lift` questions that were answered `stable`
+    awaited: int = 0  # outcomes of these that are out; too many, and nothing is `stable`
 
 
 @dataclass(frozen=True)
@@ -875,10 +877,13 @@ def _by_finger(told: Any, read: Callable[[dict[str, Any], str], Any]) -> Any:  #
 def _risk(told: Any) -> Risk:  # noqa: ANN401
     if not isinstance(told, dict):
         raise ValueError
-    lifts, slips, *rest = _numbers(told, "lifts", "slips", "outstanding", "warm_up_left")
+    told = {"announced": 0, "awaited": 0, **told}  # older daemons tell nothing
+    lifts, slips, out, left = _numbers(told, "lifts", "slips", "outstanding", "warm_up_left")
+    announced, awaited = _numbers(told, "announced", "awaited")
     if slips > lifts:
         raise ValueError
-    return Risk(_maybe(told, "target", 1), lifts, slips, rest[0], _maybe(told, "bound"), rest[1])
+    target, bound = _maybe(told, "target", 1), _maybe(told, "bound")
+    return Risk(target, lifts, slips, out, bound, left, announced, awaited)
 
 
 def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes:

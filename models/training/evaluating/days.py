@@ -97,6 +97,8 @@ class SessionDay:
         mean = np.concatenate((prior.mean, self._training.mean.ravel()))
         spread = np.concatenate((prior.spread, self._training.spread.ravel()))
         self.session = SessionStatistics(mean, spread, PRIOR)
+        self.inputs = np.zeros(self._features, np.float32)
+        """Inputs of the network, (features,), for the grasp that was judged last."""
 
     def look(self, counts: Numbers) -> tuple[Numbers, bool, bool]:
         """What `Day.look` finds, of a session that may be odd."""
@@ -116,6 +118,7 @@ class SessionDay:
         features = slice(self._features)
         by = Standards(self.session.mean[features], self.session.spread[features])
         inputs = by.apply(raw_features(repaired if seen else counts)[np.newaxis], self._clip)
+        self.inputs = inputs[0]
         (margin,) = self._fitted.margins(inputs).tolist()
         if learned:
             values = np.concatenate((raw_features(counts), counts.ravel().astype(np.float64)))

@@ -70,7 +70,7 @@ def test_a_table_teaches_and_ends_the_warm_up_and_counts_no_lift(tmp_path: Path)
     assert trust.risk.warm_up_left == 0
     report = trust.report()
     assert (report.lifts, report.slips, report.outstanding) == (0, 0, 0)
-    assert (trust.risk.theta, trust.risk.bound) == (fresh.risk.theta, fresh.risk.bound)
+    assert (trust.risk.budget, trust.risk.bound) == (fresh.risk.budget, fresh.risk.bound)
     document = shown(path)
     assert document["session"]["trust"] == {
         "model": learned.model,

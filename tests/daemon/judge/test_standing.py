@@ -17,7 +17,8 @@ from daemon.judge.decision import Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.trust.lift_book import GraspId
-from daemon.trust.trust import RiskLimits, Trust
+from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import Trust
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -171,7 +172,7 @@ def test_under_a_risk_a_grasp_that_is_judged_on_and_on_is_one_lift() -> None:
 
 def test_under_a_risk_nobody_gets_a_lucky_draw_by_waiting() -> None:
     hand, trust = risky(RiskLimits(0.05))
-    theta = 1.0 / (1.0 + math.exp(-trust.risk.theta))
+    theta = 1.0 / (1.0 + math.exp(-trust.risk.threshold))
     said = [
         each
         for number in range(200)

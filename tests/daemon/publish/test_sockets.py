@@ -21,11 +21,11 @@ from daemon.judge.reasons import Decision, Moment
 from daemon.publish.companion import PublishedVerdict
 from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets, plan
-from daemon.trust.lift_book import GraspId, LiftBook
+from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
 from tests.kit.inside import graspd
-from tests.kit.messages import GOLDEN_VERDICT
+from tests.kit.messages import GOLDEN, GOLDEN_VERDICT, decode_verdict
 from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S, wait_until
 
@@ -116,6 +116,24 @@ def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
         assert len(sockets.questions.waiting) == 0
     assert lifts.may_report(grasp, b"controller")
     assert lifts.may_report(grasp, b"dashboard") == (number == 0)
+
+
+@pytest.mark.parametrize(
+    ("question", "answer", "announced"),
+    [(b"lift", "stable", 1), (b"lift", "slip", 0), (b"judge", "stable", 0)],
+)
+def test_only_a_lift_question_that_is_answered_stable_announces_a_lift(
+    tmp_path: Path, question: bytes, answer: str, announced: int
+) -> None:
+    lifts, grasp = LiftBook(), GraspId("0" * 32, 7)
+    lifts.note(grasp, NOT_ASSESSED, stable=True)
+    with Sockets(wanted(tmp_path)) as sockets:
+        assert sockets.questions is not None
+        sockets.questions.take([[b"peer", question], [b"other", question]], 0, Asked())
+        verdict = decode_verdict((GOLDEN / f"verdict_{answer}.json").read_bytes())
+        judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(7), Opinion(0.1, ()))
+        sockets.on_verdict(PublishedVerdict(judgement, verdict, b"{}", None, True, grasp, lifts))
+    assert (lifts.announced, lifts.awaited) == (announced, announced)
 
 
 def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers: Peers) -> None:

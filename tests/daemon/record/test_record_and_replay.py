@@ -149,14 +149,15 @@ def test_files_that_do_not_follow_each_other_are_named(
     assert f"{third}: does not go on where the file before it ends" in caplog.text
 
 
-def test_questions_are_in_the_recording_and_are_asked_again(tmp_path: Path) -> None:
+def test_questions_and_announcements_are_in_the_recording_and_repeated(tmp_path: Path) -> None:
     import zmq
 
     from tests.daemon.processes import start, wait_for
     from tests.daemon.record.recorded import scene
 
+    risk = "[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 0\noutstanding_max = 1\n"
     with (
-        start("run", scene(tmp_path, gate='mode = "request"\n')) as daemon,
+        start("run", scene(tmp_path, more=risk, gate='mode = "request"\n')) as daemon,
         zmq.Context() as context,
         context.socket(zmq.REQ) as asker,
     ):
@@ -164,17 +165,19 @@ def test_questions_are_in_the_recording_and_are_asked_again(tmp_path: Path) -> N
         asker.linger = 0
         asker.connect(f"ipc://{tmp_path}/ask")
         judged = 0
-        for _ in range(40):
-            asker.send(b"judge")
+        for _ in range(1000):
+            asker.send(b"lift")
             assert asker.poll(100_000)
-            judged += json.loads(asker.recv())["judged"]
-            if judged == 2:
+            answer = json.loads(asker.recv())
+            judged += answer["judged"]
+            if judged >= 2 and answer["risk"]["awaited"]:
                 break
         daemon.terminate()
         daemon.communicate(timeout=200)
     (path,) = (tmp_path / "record").glob("*.mcap")
     before = of_readings(path)
     assert sum(verdict["judged"] for verdict in before) >= 2
+    assert before[-1]["risk"]["announced"] == before[-1]["risk"]["awaited"] == 1
     assert [compared(v) for v in again(path)] == [compared(v) for v in before]
 
 

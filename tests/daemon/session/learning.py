@@ -13,7 +13,8 @@ from daemon.session.file import KeptSession, SessionFile
 from daemon.session.keeper import SessionKeeper
 from daemon.trust.learner import LearnerState, sigmoid
 from daemon.trust.lift_book import GraspId, OutcomeStatus
-from daemon.trust.trust import Permission, RiskLimits, Trust
+from daemon.trust.risk import Permission, RiskLimits
+from daemon.trust.trust import Trust
 from drivers.base import Driver
 from models.contract import Finger, SessionInput, Sharpness
 from models.session_statistics import SessionState

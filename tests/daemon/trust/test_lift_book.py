@@ -103,3 +103,34 @@ def test_a_restored_outcome_is_kept_and_its_owner_is_not() -> None:
     assert other.may_report(named(1), DASHBOARD)
     assert other.tell(named(1), slipped=False)[0] is OutcomeStatus.REPEATED
     assert other.tell(named(1), slipped=True)[0] is OutcomeStatus.CONTRADICTS
+
+
+def test_a_lift_is_announced_once_and_awaited_until_it_is_told() -> None:
+    lifts = LiftBook()
+    lifts.announce()  # of no grasp
+    lifts.note(named(1), bytes(8), stable=False)
+    lifts.announce()  # of one that was not stable
+    lifts.note(named(2), bytes(8), stable=True)
+    lifts.announce()
+    lifts.announce()
+    assert (lifts.announced, lifts.awaited) == (1, 1)
+    other = LiftBook()
+    other.restore(lifts.state(), 1)
+    assert (other.announced, other.awaited) == (1, 1)
+    other.tell(named(2), slipped=False)
+    other.announce()  # of one that was told
+    assert (other.announced, other.awaited) == (1, 0)
+    lifts.withdraw()
+    assert (lifts.announced, lifts.awaited, lifts.outstanding) == (0, 0, 1)
+
+
+def test_an_announced_lift_that_is_forgotten_is_abandoned() -> None:
+    lifts = LiftBook()
+    for grasp in range(2):
+        lifts.note(named(grasp), bytes(8), stable=True)
+        lifts.announce()
+    lifts.tell(named(0), slipped=False)
+    for grasp in range(2, LIFTS_MAX + 2):
+        assert lifts.abandoned == 0
+        lifts.note(named(grasp), bytes(8), stable=False)
+    assert (lifts.announced, lifts.awaited, lifts.abandoned) == (2, 0, 1)

@@ -4,44 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import math
+import zlib
 
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from daemon.trust.learner import sigmoid
-from daemon.trust.lift_book import LIFTS_MAX, GraspId, OutcomeStatus
-from daemon.trust.trust import MAX_BYTES, Permission, RiskLimits, Trust, TrustState, decode, encode
-
-BOOT = "0123456789abcdef" * 2
-INPUTS = 26
-RULE = RiskLimits(0.1)
-TABLE = np.clip(np.random.default_rng(5).normal(0.0, 1.0, (997, INPUTS)), -3, 3).astype(np.float32)
-
-
-def trust(limits: RiskLimits = RULE, *, learns: bool = True) -> Trust:
-    return Trust("model", INPUTS, limits, learns=learns)
-
-
-def named(grasp: int, boot: str = BOOT) -> GraspId:
-    return GraspId(boot, grasp)
-
-
-def inputs(grasp: int) -> NDArray[np.float32]:
-    row: NDArray[np.float32] = TABLE[grasp % len(TABLE)]
-    return row
-
-
-def judge(part: Trust, grasp: int, margin: float = -6.0, boot: str = BOOT) -> bool:
-    """Judge and note a grasp; returns whether it was called stable."""
-    name = named(grasp, boot)
-    assessment = part.judge(name, sigmoid(margin), margin, inputs(grasp))
-    stable = assessment.permission is Permission.ALLOWED and (assessment.p_slip or 0.0) < 0.5
-    part.note(name, assessment, stable=stable)
-    return stable
+from daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
+from daemon.trust.risk import Permission, RiskLimits
+from daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
+from tests.daemon.trust.grasps import INPUTS, RULE, inputs, judge, named, trust
 
 
 def p_slip(part: Trust, grasp: int = 0, margin: float = -1.0) -> float:
@@ -287,6 +262,27 @@ def test_what_is_whole_and_no_state_is_refused() -> None:
     for content in (b"\x80", b"\xc1", msgspec.msgpack.encode({"version": 2})):
         with pytest.raises(ValueError, match="nothing that was learned"):
             decode(hashlib.sha256(content).digest() + content)
+
+
+def test_what_a_former_graspd_kept_is_read() -> None:
+    """It had a threshold that moved, and knew of no announcement."""
+    state = msgspec.to_builtins(full().state(), builtin_types=(bytes,))
+    state["risk"] = {
+        "max_slip_when_stable": 0.1,
+        "theta": -2.4,
+        "lifts": 3,
+        "slips": 1,
+        "overdue": 0,
+        "proven": 3,
+    }
+    del state["ledger"]["announced"]
+    for lift in state["ledger"]["records"]:
+        del lift["announced"]
+    content = zlib.compress(msgspec.msgpack.encode(state))
+    part = trust()
+    part.restore(decode(hashlib.sha256(content).digest() + content))
+    assert (part.report().lifts, part.report().slips, part.learner.outcomes) == (3, 1, 3)
+    assert part.risk.budget == pytest.approx(5.0 + 3 * 0.1 - 1.0)
 
 
 def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:

@@ -13,7 +13,7 @@ from msgspec import structs
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.trust import RiskReport
+from daemon.trust.risk import RiskReport
 from daemon.watch.figures import SUPERVISED
 from daemon.watch.snapshot import Line, Snapshot, Tone
 from daemon.watch.view import History
@@ -201,7 +201,7 @@ def test_a_supervised_lift_is_told_apart(
 
 
 def test_learning_shows_untold_lifts_first() -> None:
-    lifts = Lifts(reported=41, outstanding=1, unreported=3)
+    lifts = Lifts(reported=41, outstanding=1, unreported=3, covered=False)
     told = {OutcomeStatus.TAKEN: 57, OutcomeStatus.CONTRADICTS: 1}
     learner = LearnerHealth(enabled=True, outcomes=57, told=told, uncertainty=0.41)
     seen = after(
@@ -210,8 +210,10 @@ def test_learning_shows_untold_lifts_first() -> None:
     ).snapshot(0)
     assert seen.learning == [
         Line("never told", "3 lifts"),
+        Line("risk", "covers only lifts that are told: none was announced"),
         Line("warm-up left", "0 outcomes"),
         Line("still out", "1 lift"),
+        Line("announced", "40 lifts, 1 out"),
         Line("learner", "on"),
         Line("learned from", "57 outcomes"),
         Line("uncertainty", "41 %"),

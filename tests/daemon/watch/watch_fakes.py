@@ -21,13 +21,22 @@ from daemon.publish.messages import (
     encode,
 )
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.trust import RiskReport
+from daemon.trust.risk import RiskReport
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.terminal import draw
 from daemon.watch.view import View
 from tests.daemon.publish.doors import Publisher
 
-RISK = RiskReport(target=0.1, lifts=41, slips=2, outstanding=1, bound=9.5, warm_up_left=0)
+RISK = RiskReport(
+    target=0.1,
+    lifts=41,
+    slips=2,
+    outstanding=1,
+    bound=9.5,
+    warm_up_left=0,
+    announced=40,
+    awaited=1,
+)
 """Enough to show `stable` as a promise: the lifts are more than 1 / target, 4.9 % slipped."""
 BOOT = "0f0e0d0c0b0a09080706050403020100"
 MS = 1_000_000

@@ -1,0 +1,242 @@
+"""How many lifts of `stable` verdicts may slip: a budget of slips that every outcome changes."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Final
+
+import msgspec
+
+BUDGET_START: Final = 5.0
+"""Slips beyond the allowed share that a session may have. With 3 a session is blocked early, with
+4 fewer good lifts are kept."""
+BUDGET_MAX: Final = 8.0
+"""Most slips that are saved up. It bounds the slips of every stretch of lifts."""
+SHARE_YOUNG: Final = 1.5
+"""Probability of slip that may be called `stable` before an outcome, in units of the share that is
+set: with a full budget the surest grasps slip much less often than the threshold says."""
+SHARE_PROVEN: Final = 4.25
+"""The same once `PROVEN_FROM` outcomes are known. From 3 to 5 both the good lifts that are kept and
+the sessions above the target rise; deploy/JUDGING.md has the curve."""
+PROVEN_FROM: Final = 40
+"""Outcomes after which the learner knows the day."""
+ROUNDING: Final = 1e-9
+"""Slips. A budget is a sum of shares."""
+
+Count = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class Permission(StrEnum):
+    """Whether a grasp may be called `stable`."""
+
+    ALLOWED = "allowed"
+    WITHHELD = "withheld"
+    """Too likely to slip for the risk that is set."""
+    UNPROVEN = "unproven"
+    """Too few outcomes are known, or too many announced lifts are out: lift under supervision."""
+    RISK_EXCEEDED = "risk-exceeded"
+    """More slipped than the rule can make good: nothing is `stable` until the user resets it."""
+
+
+@dataclass(frozen=True, slots=True)
+class RiskLimits:
+    """What the user sets."""
+
+    max_slip_when_stable: float | None = None
+    """Share of the `stable` lifts that may slip, 0.001..0.5; None: no rule, all is allowed."""
+    warm_up: int = 0
+    """Outcomes, since the start or an exchange of a sensor, before which each grasp that is not
+    `stable` is to be lifted under supervision."""
+    explore: float = 0.0
+    """Share, 0..1, of the withheld grasps to be lifted under supervision: only their outcomes show
+    that the rule is too strict."""
+    outstanding_max: int = 5
+    """Announced lifts, from 1 on, whose outcome may be out at once."""
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for what is out of range."""
+        alpha = self.max_slip_when_stable
+        if alpha is not None and not 0.001 <= alpha <= 0.5:
+            raise ValueError("max_slip_when_stable must be 0.001..0.5")
+        if self.warm_up < 0 or not 0.0 <= self.explore <= 1.0:
+            raise ValueError("warm_up must not be negative, explore must be 0..1")
+        if self.outstanding_max < 1:
+            raise ValueError("outstanding_max must be at least 1")
+
+
+class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What lifts of `stable` verdicts came to, for those who decide whether to lift."""
+
+    target: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] | None
+    """`[risk] max_slip_when_stable`; null: none is set."""
+    lifts: Count
+    """Lifts of `stable` verdicts whose outcome was told."""
+    slips: Count
+    """Slips among them."""
+    outstanding: Count
+    """`stable` verdicts whose outcome can still come; each may add one slip to the bound."""
+    bound: Annotated[float, msgspec.Meta(ge=0.0)] | None
+    """What `slips` cannot exceed, but for `outstanding`; null: no risk is set."""
+    warm_up_left: Count
+    """Outcomes that are missing until the warm-up is over; 0 without a risk."""
+    announced: Count = 0
+    """`lift` questions that were answered `stable`, one a grasp."""
+    awaited: Count = 0
+    """Those of them whose outcome is out. From `[risk] outstanding_max` on nothing is `stable`."""
+
+    @property
+    def beyond_share(self) -> float:
+        """Slips that the bound allows beyond the target's share of the lifts; 0 without a bound."""
+        if self.target is None or self.bound is None:
+            return 0.0
+        return self.bound - self.target * self.lifts
+
+
+class RiskState(msgspec.Struct, frozen=True):
+    """State of `Risk`; see its attributes. Fields of the former rule are ignored."""
+
+    max_slip_when_stable: float | None
+    lifts: Count
+    slips: Count
+    proven: Count
+    budget: float | None = None
+    """None: of the former rule, which had a threshold and no budget."""
+
+
+class Risk:
+    """The online rule: `stable` only while a slip is affordable, and only of what is likely held.
+
+    With a = `max_slip_when_stable`, N `stable` lifts and S slips among them, M = `outstanding_max`:
+
+        S <= a N + BUDGET_START            S <= a N + BUDGET_MAX of any stretch of lifts
+        S <= a N + BUDGET_START + M (1 - a)     of all lifts that were told or announced
+
+    1. A told `stable` lift adds a - y to the budget b, y = 1 for a slip; all else only lowers b.
+    2. So b <= BUDGET_START + a N - S, that is S <= a N + BUDGET_START - b.
+    3. A stretch begins at b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it.
+    4. `stable` is said only while b >= 1 - a. If each outcome is told before the next `stable`,
+       a slip leaves b >= 0. This gives the first two bounds.
+    5. Let m announced lifts be out. w = b - m (1 - a) is what is left of b if all of them slip.
+    6. An announced grasp was called `stable` at b >= 1 - a and m < M. So w >= -(M - 1) (1 - a)
+       after its announcement.
+    7. An outcome of an announced lift lowers neither w nor this minimum: a slip takes 1 - a from b
+       and m by one. Caps leave b >= BUDGET_START, and m <= M.
+    8. A lift that leaves the book untold is taken for a slip. So 6 holds at every moment.
+    9. With the m lifts counted as slips, 2 is S <= a N + BUDGET_START - w: the third bound.
+    10. Lifts that are told late without an announcement can leave b < 0; `bound` adds that.
+
+    The threshold, the learner, the model and the data play no part: any threshold has these bounds.
+    They count what was told, true or not. It is a rule of online selective inference: Gibbs and
+    Candes, arXiv 2106.00170; Humbert, Gazin, Heller and Roquain, arXiv 2508.10336.
+    """
+
+    def __init__(self, limits: RiskLimits) -> None:
+        self.limits = limits
+        self.budget = BUDGET_START
+        """Slips that are affordable now, b."""
+        self.lifts = 0
+        """`stable` lifts whose outcome is known."""
+        self.slips = 0
+        """Slips among them."""
+        self.proven = 0
+        """Outcomes of any lift since the start or the last exchange of a sensor."""
+
+    @property
+    def warm_up_left(self) -> int:
+        """Outcomes that are missing until the warm-up is over."""
+        return max(self.limits.warm_up - self.proven, 0)
+
+    @property
+    def bound(self) -> float | None:
+        """What `slips` cannot exceed; each lift whose outcome is out adds one. None: no rule."""
+        alpha = self.limits.max_slip_when_stable
+        if alpha is None:
+            return None
+        return alpha * self.lifts + BUDGET_START + max(-self.budget, 0.0)
+
+    @property
+    def threshold(self) -> float:
+        """Highest log-odds of slip that may be called `stable` now; -inf: none."""
+        alpha = self.limits.max_slip_when_stable
+        if alpha is None:
+            return math.inf
+        left = self.budget - (1.0 - alpha)
+        if left <= ROUNDING:
+            return -math.inf
+        known = min(self.proven / PROVEN_FROM, 1.0)
+        share = min(alpha * (SHARE_YOUNG + (SHARE_PROVEN - SHARE_YOUNG) * known), 0.5)
+        odds = share / (1.0 - share) * left / (BUDGET_START - (1.0 - alpha))
+        return min(math.log(odds), 0.0)
+
+    def decide(self, log_odds: float, awaited: int = 0) -> Permission:
+        """Return whether a grasp with these log-odds of slip may be called `stable`.
+
+        `awaited`: announced lifts whose outcome is out.
+        """
+        threshold = self.threshold
+        if threshold == math.inf:
+            return Permission.ALLOWED
+        if threshold == -math.inf:
+            return Permission.RISK_EXCEEDED
+        if not log_odds <= threshold:  # true for NaN
+            return Permission.UNPROVEN if self.warm_up_left else Permission.WITHHELD
+        return Permission.UNPROVEN if awaited >= self.limits.outstanding_max else Permission.ALLOWED
+
+    def supervised(self, permission: Permission, seed: str, grasp: int) -> bool:
+        """Return True to ask for a lift under supervision; the same for the same seed and grasp."""
+        if permission is not Permission.WITHHELD:
+            return permission is Permission.UNPROVEN
+        digest = hashlib.blake2b(f"{seed} {grasp}".encode(), digest_size=8).digest()
+        return int.from_bytes(digest) / 2.0**64 < self.limits.explore
+
+    def take(self, *, stable: bool, slipped: bool, proves: bool) -> None:
+        """Take in an outcome, and whether the grasp had been called `stable`.
+
+        `proves` is false for lifts with former sensors: they count, but not for the warm-up.
+        """
+        self.proven += proves
+        if not stable:
+            return
+        self.lifts += 1
+        self.slips += slipped
+        alpha = self.limits.max_slip_when_stable
+        if alpha is not None:
+            self.budget = min(self.budget + alpha - slipped, BUDGET_MAX)
+
+    def take_untold(self) -> None:
+        """Take an announced lift whose outcome cannot come any more for a slip."""
+        if self.limits.max_slip_when_stable is not None:
+            self.take(stable=True, slipped=True, proves=False)
+
+    def exchanged(self) -> None:
+        """Keep what slipped, not what was learned or saved up: a sensor was exchanged."""
+        self.budget = min(self.budget, BUDGET_START)
+        self.proven = 0
+
+    def state(self) -> RiskState:
+        """Return what `restore` needs."""
+        alpha = self.limits.max_slip_when_stable
+        return RiskState(alpha, self.lifts, self.slips, self.proven, self.budget)
+
+    def restore(self, state: RiskState) -> None:
+        """Go on from an earlier state; with another risk than now, only the warm-up counts.
+
+        Raises `ValueError`, and changes nothing, if no outcomes lead to such a state.
+        """
+        alpha = state.max_slip_when_stable
+        if alpha != self.limits.max_slip_when_stable:
+            self.proven = state.proven
+            return
+        if state.slips > state.lifts:
+            raise ValueError("counts more slips than lifts")
+        earned = 0.0 if alpha is None else alpha * state.lifts - state.slips
+        highest = min(BUDGET_START + earned, BUDGET_MAX)
+        budget = highest if state.budget is None else state.budget
+        rounding = ROUNDING * (state.lifts + 1)
+        if not -float(state.slips) <= budget <= highest + rounding:  # also true for NaN
+            raise ValueError("has a budget that these outcomes do not lead to")
+        self.budget, self.lifts, self.slips = budget, state.lifts, state.slips
+        self.proven = state.proven
