@@ -148,7 +148,7 @@ class HandTracker:
     def rest(self) -> NDArray[np.float64]:
         """Where each electrode rests, counts, shape (fingers, 24); 0 where it is not known."""
         contact = self._contact.memory
-        known = contact.known & contact.tared[:, np.newaxis]
+        known = np.isfinite(contact.baseline) & contact.tared[:, np.newaxis]
         return np.where(known, contact.baseline, 0.0)
 
     def health(self) -> dict[str, Reason]:
