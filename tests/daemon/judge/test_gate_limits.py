@@ -33,7 +33,6 @@ from tests.daemon.judge.test_gate import (
 )
 
 NOTHING: tuple[Finger, ...] = ()
-"""No finger touches."""
 
 
 class Steps:
@@ -76,7 +75,6 @@ class Steps:
             self.step()
 
     def grasp(self) -> None:
-        """Hold until it is judged."""
         self.hold()
         assert self.now.settled
 
@@ -266,11 +264,6 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
     assert {change.state for change in changes} == set(GateState), "the walk saw all of it"
 
 
-def settle_s(scenario: Scenario) -> float:
-    """When a scenario settles, s."""
-    return play(scenario).first_s(GateState.SETTLED)
-
-
 def test_after_a_gap_three_fresh_sweeps_are_judged_and_none_from_before() -> None:
     hasty = replace(GATE, early=True)
     firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, gate=hasty))
@@ -343,7 +336,7 @@ def test_a_request_expires_though_time_went_back() -> None:
 
 def test_an_electrode_that_comes_back_as_the_grasp_settles_is_not_judged_by_old_values() -> None:
     firm = Scenario("firm", GRASPED, UP)
-    moment_s = settle_s(firm)
+    moment_s = play(firm).first_s(GateState.SETTLED)
     hand, lost = HandTracker(FINGERS, LIMITS), ~ALL
     lost[0, [0, 3, 6, 9, 12]] = True  # five of the eight that are pressed by 300 counts
     for t_s, reading in readings(firm):
