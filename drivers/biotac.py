@@ -1,4 +1,4 @@
-"""BioTac SP on SPI: command bytes, response words, error words, sampling sequences. Bytes only.
+"""BioTac SP on SPI: command bytes, response words, error words, sampling sequences; no I/O.
 
 Source: BioTac SP Product Manual V2 (October 2015), sections 8 and 9; the C library published by
 SynTouch where the manual is silent.
@@ -6,12 +6,12 @@ SynTouch where the manual is silent.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault
+from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 
 PAC, PDC, TAC, TDC = 0, 1, 2, 3
 """Channels of pressure (AC, DC) and temperature (AC, DC) (manual table 7)."""
@@ -98,3 +98,34 @@ def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
 
 _CHANNEL_OF_COMMAND: Final = {sample_command(channel): channel for channel in CHANNELS}
 _COUNT_OF_WORD, _FAULT_OF_WORD = _tables()
+
+
+class WordCounters(Protocol):
+    """Counters that a driver of words has."""
+
+    readings: int
+    faulty_readings: int
+    missed_readings: int
+    parity_words: int
+    error_words: int
+    unplugged_words: int
+
+
+def make_reading(
+    words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int, counters: WordCounters
+) -> TactileReading:
+    """Return the reading of `words`, shape (fingers, 24), and count it. `marks`: faults that are
+    known already; words under `MISSING` mean nothing and are not counted."""
+    counts, faults = decode_words(words)
+    if np.count_nonzero(faults) or np.count_nonzero(marks):
+        absent = marks & np.uint8(ElectrodeFault.MISSING) != 0
+        faults[absent] = 0
+        counters.parity_words += int((faults == ElectrodeFault.PARITY).sum())
+        counters.error_words += int((faults == ElectrodeFault.ERROR_WORD).sum())
+        counters.unplugged_words += int((faults == ElectrodeFault.MISSING).sum())
+        faults |= marks
+        counts[absent] = 0
+        counters.faulty_readings += bool(faults.any())
+    seq = counters.readings + counters.missed_readings
+    counters.readings += 1
+    return TactileReading(t_ns, seq, counts, faults)

@@ -22,9 +22,8 @@ from typing import Final
 import numpy as np
 
 from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.biotac import E1, E24
+from drivers.biotac import E1, E24, make_reading
 from drivers.can.readings import OUTAGE_NS, CanCounters, SweepPeriod
-from drivers.words import make_reading
 
 REORDER_MAX: Final = 3
 """Most electrodes by which a sample may be late: adapters with few buffers swap neighbours."""

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.biotac import E1, E24, channel_of
+from drivers.biotac import E1, E24, channel_of, make_reading
 from drivers.spi.messages import FrameCounters, Hello, Sweep
-from drivers.words import make_reading
 
 SEQ_HALF, SEQ_END = 1 << 31, 1 << 32
 SEQ_FIRST_MAX = 1_000
