@@ -33,7 +33,6 @@ class ViewerClient:
 
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=20)
-        self._subscriptions = 0
         key = base64.b64encode(os.urandom(16)).decode()
         lines = ["GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket"]
         lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {key}"]
@@ -75,12 +74,6 @@ class ViewerClient:
                 told = json.loads(frame)
                 found |= {one["topic"]: one for one in told.get("channels", [])}
         return found
-
-    def subscribe(self, channel: dict[str, Any]) -> None:
-        """Subscribe, maybe once more: once a subscription had no effect for five minutes."""
-        self._subscriptions += 1
-        wanted = {"id": self._subscriptions, "channelId": channel["id"]}
-        self.tell({"op": "subscribe", "subscriptions": [wanted]})
 
     def message(self) -> dict[str, Any] | None:
         """A message, if one comes soon; before its JSON stand opcode 1, subscription and time."""
@@ -142,9 +135,9 @@ def test_a_viewer_gets_channels_and_messages_that_their_schemas_allow(hand: Hand
             assert channel["schemaEncoding"] == "jsonschema"
             assert json.loads(channel["schema"]) == json.loads(text)
         verdict = channels["verdict.right"]
+        viewer.tell({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": verdict["id"]}]})
         message = None
         while message is None:
-            viewer.subscribe(verdict)
             hand.send("verdict.right", sent["verdict"])
             message = viewer.message()
         viewer.close()
@@ -166,9 +159,9 @@ def test_no_thread_of_the_library_asks_python_to_log() -> None:
             server.send(b"status.right", b"{}")
             viewer = ViewerClient(server.port)
             (channel,) = viewer.channels({"status.right"}).values()
-            viewer.subscribe(channel)
+            wanted = [{"id": 7, "channelId": channel["id"]}]
+            viewer.tell({"op": "subscribe", "subscriptions": wanted})
             while viewer.message() is None:
-                viewer.subscribe(channel)
                 server.send(b"status.right", b"{}")
             viewer.close()
         print([name for name in logging.root.manager.loggerDict if "foxglove" in name])
