@@ -22,7 +22,7 @@ from daemon.trust.trust import Trust
 from models.training.arrays import Ints
 from models.training.data.datasets import Grasps
 from models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
-from models.training.evaluating.days import SessionDay
+from models.training.evaluating.days import SessionDay, by_object
 from models.training.fitting.trained import Trained, train
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import with_recipes
@@ -86,22 +86,13 @@ def streams(
             random = np.random.default_rng([seed, fold])
             for table, _, order in itertools.product(tables, range(DRAWS), ORDERS):
                 inside = np.flatnonzero((names == table) & (fold_of == fold))
-                rows = ordered(random, inside, np.array(grasps.objects), order)
+                rows = random.permutation(inside)
+                if order == "by object":
+                    rows = by_object(random, rows, np.array(grasps.objects)[rows])
                 margins, features, refused = judged(own, grasps, rows)
                 theirs = published.margins(grasps.counts[rows], grasps.table_of[rows])
                 slipped = grasps.slipped[rows]
                 yield Stream(protocol, table, order, margins, features, refused, theirs, slipped)
-
-
-def ordered(
-    random: np.random.Generator, rows: Ints, objects: NDArray[np.str_], order: Order
-) -> Ints:
-    """Shuffle rows; `by object` shuffles the objects and the grasps of each."""
-    shuffled = random.permutation(rows)
-    if order == "random":
-        return shuffled
-    several = random.permutation(np.unique(objects[rows]))
-    return np.concatenate([shuffled[objects[shuffled] == name] for name in several])
 
 
 def judged(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models.electrodes import CONTRADICTING_MAX, Electrodes, NoveltyCheck
 from models.inputs import builder, raw_features
@@ -42,15 +43,22 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judg
         ages = np.empty(len(test), np.int64)
         order = random.permutation(len(test))
         if variant == RUNNING_SORTED:
-            names = np.array(grasps.objects)[test[order]]
-            several = random.permutation(np.unique(names))
-            order = np.concatenate([order[names == name] for name in several])
+            order = by_object(random, order, np.array(grasps.objects)[test[order]])
         for place in order.tolist():
             day = days[table_of[place]]
             ages[place] = day.session.grasps
             margins[place], refused[place] = day.judge(counts[place])
         judged[0][variant], judged[1][variant], judged[2][variant] = margins, refused, ages
     return judged
+
+
+def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]) -> Ints:
+    """Return rows (N,) sorted by their `objects` (N,), which come in random order.
+
+    The rows of each object stay in the order given.
+    """
+    several = random.permutation(np.unique(objects))
+    return np.concatenate([rows[objects == name] for name in several])
 
 
 class Day:
