@@ -537,7 +537,7 @@ private:
         return true;
     }
 
-    // What the clocks still differ by at least, so long after they were compared.
+    // Least difference of the clocks at `now_ns`, ns: they may have drifted since `bound`.
     static Nanoseconds at_least(const std::pair<Nanoseconds, Nanoseconds>& bound,
                                 Nanoseconds now_ns) {
         return bound.first - std::llrint(static_cast<double>(now_ns - bound.second) * DRIFT);

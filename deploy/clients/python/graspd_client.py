@@ -519,7 +519,7 @@ class Newest:
 
     @staticmethod
     def _at_least(bound: tuple[int, int], now_ns: int) -> int:
-        """What the clocks still differ by at least, so long after they were compared."""
+        """Least difference of the clocks at `now_ns`, ns: they may have drifted since `bound`."""
         return bound[0] - round((now_ns - bound[1]) * DRIFT)
 
     def take(self, frames: Sequence[bytes], empty_ns: int, now_ns: int) -> bool:
