@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.process.text import progress
-from daemon.trust.learner import sigmoid
+from daemon.trust.learner import SCALE, sigmoid
 from daemon.trust.lift_book import GraspId
 from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import Trust
@@ -33,12 +33,15 @@ DRAWS: Final = 2
 """Streams of each table, fold and order."""
 Order = Literal["random", "by object"]
 ORDERS: Final[tuple[Order, ...]] = ("random", "by object")
+Group = tuple[int, int]
+"""Objects of a stream: seed of the split, and fold. Folds of one split share no object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
     """The grasps of one table and fold."""
 
+    group: Group
     protocol: str
     table: str
     order: Order
@@ -92,7 +95,10 @@ def streams(
                 margins, features, refused = judged(own, grasps, rows)
                 theirs = published.margins(grasps.counts[rows], grasps.table_of[rows])
                 slipped = grasps.slipped[rows]
-                yield Stream(protocol, table, order, margins, features, refused, theirs, slipped)
+                yield Stream(
+                    (seed, fold), protocol, table, order,
+                    margins, features, refused, theirs, slipped,
+                )  # fmt: skip
 
 
 def judged(
@@ -108,12 +114,14 @@ def judged(
     return margins, inputs, refused
 
 
-def live(stream: Stream, limits: RiskLimits, *, every: bool) -> Life:
+def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCALE) -> Life:
     """Judge, lift and tell one grasp after the other; refused ones are left alone.
 
-    Without `every`, only stable and supervised grasps are lifted and their outcomes told.
+    Without `every`, only stable and supervised grasps are lifted and their outcomes told. `scale`
+    takes the place of the learner's own.
     """
     trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
+    trust.learner.scale = scale
     p_slip, stable = np.full(count, np.nan), np.zeros(count, np.bool_)
     outcomes, within = np.zeros(count, np.int64), True
     for index in np.flatnonzero(~stream.refused).tolist():

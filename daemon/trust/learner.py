@@ -59,6 +59,8 @@ class Learner:
     def __init__(self, inputs: int) -> None:
         """Start at the prior of a model with `inputs` features."""
         self._width = inputs + 2
+        self.scale = SCALE
+        """Factor on the moderated log-odds."""
         self._prior_mean = np.zeros(self._width)
         self._prior_mean[0] = 1.0
         spread = np.full(self._width, FEATURE_SPREAD)
@@ -103,7 +105,7 @@ class Learner:
         seen = self._covariance @ features if prior is None else prior * features
         variance = float(features @ seen)
         moderation = math.sqrt(1.0 + math.pi / 8.0 * variance)  # MacKay's moderated output
-        return SCALE * float(features @ self._mean) / moderation, features
+        return self.scale * float(features @ self._mean) / moderation, features
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
         """Take in how the lift of a grasp with these features ended."""

@@ -163,7 +163,7 @@ def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
     if args.plots:
         from models.training.evaluating.plots import draw
 
-        draw(summaries, args.plots)
+        draw(summaries, args.plots, quick=args.quick)
 
 
 def _command(args: argparse.Namespace) -> Iterator[str]:
