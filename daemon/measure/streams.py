@@ -63,6 +63,8 @@ class Life:
     p_slip: NDArray[np.float64]
     """NaN: refused."""
     stable: NDArray[np.bool_]
+    supervised: NDArray[np.bool_]
+    """Grasps whose lift under supervision was asked for."""
     outcomes: NDArray[np.int64]
     """Number of outcomes that each verdict rests on."""
     within: bool
@@ -123,16 +125,16 @@ def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCAL
     trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
     trust.learner.scale = scale
     p_slip, stable = np.full(count, np.nan), np.zeros(count, np.bool_)
-    outcomes, within = np.zeros(count, np.int64), True
+    supervised, outcomes, within = np.zeros(count, np.bool_), np.zeros(count, np.int64), True
     for index in np.flatnonzero(~stream.refused).tolist():
         grasp = GraspId(f"{stream.table} {stream.order}", index)
         margin, slipped = float(stream.margins[index]), bool(stream.slipped[index])
         assessed = trust.judge(grasp, sigmoid(margin), margin, stream.features[index])
         p_slip[index] = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
-        outcomes[index] = assessed.outcomes
+        supervised[index], outcomes[index] = assessed.supervised, assessed.outcomes
         stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5
         trust.note(grasp, assessed, stable=bool(stable[index]))
         if every or stable[index] or assessed.supervised:
             trust.outcome(grasp, slipped=slipped)
         within &= trust.risk.bound is None or trust.risk.slips <= trust.risk.bound + 1e-9
-    return Life(p_slip, stable, outcomes, within)
+    return Life(p_slip, stable, supervised, outcomes, within)

@@ -41,9 +41,12 @@ from models.training.evaluating.style import (
 from models.zoo import read_card
 
 ALLOWED: Final = 0.05
-TARGETS: Final = (ALLOWED, 0.1)
+TARGETS: Final = (0.02, ALLOWED, 0.1, 0.2)
 WARM_UP, EXPLORE = 50, 0.05
 """Of the scene's `[risk]`, as it is unless it is set."""
+WARM_UPS: Final = (0, 20, WARM_UP, 100)
+"""Lengths of the warm-up that are compared, outcomes."""
+ALL_DAYS: Final = "all"
 GRASPS: Final = (0, 10, 25, 50, 75, 100, 150, 200, 250, 300)
 """Ends of the parts that the figures are means of, grasps of the day."""
 LEAST: Final = 100
@@ -79,6 +82,8 @@ class RiskFigures:
     """What became of a target in the sessions of one day, as fractions."""
 
     target: float
+    warm_up: int
+    """Outcomes."""
     day: str
     sessions: int
     kept: float
@@ -87,6 +92,8 @@ class RiskFigures:
     """Of all that was called stable."""
     above: float
     """Of the sessions: those of which more than the target slipped."""
+    supervised: float
+    """Lifts under supervision that a session asks for, mean of the sessions; no fraction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +115,9 @@ class Worth:
     sessions: int
     curves: Curves
     risk: list[RiskFigures]
+    """By target and day."""
+    warm_up: list[RiskFigures]
+    """Of `ALLOWED` by length of the warm-up, all days together."""
     days: list[DayF1]
     reliability: Reliability
 
@@ -152,19 +162,27 @@ def worth_of(several: Sequence[Stream], command: str) -> Worth:
 
     learning = lives(RiskLimits(), every=True)
     risks = {target: lives(limits(target), every=False) for target in TARGETS}
+    warm_ups = {
+        count: risks[ALLOWED] if count == WARM_UP else lives(limits(ALLOWED, count), every=False)
+        for count in WARM_UPS
+    }
     return Worth(
         command,
         len(several),
         measured(several, learning, risks[ALLOWED]),
         list(_risks(several, risks)),
+        [
+            risk_figures(several, lived, ALLOWED, ALL_DAYS, count)
+            for count, lived in warm_ups.items()
+        ],
         list(_days(several, learning)),
         reliability(several, learning, scales),
     )
 
 
-def limits(share: float) -> RiskLimits:
-    """Return the limits of a scene that sets this share and nothing else."""
-    return RiskLimits(share, WARM_UP, EXPLORE)
+def limits(share: float, warm_up: int = WARM_UP) -> RiskLimits:
+    """Return the limits of a scene that sets this share and this warm-up."""
+    return RiskLimits(share, warm_up, EXPLORE)
 
 
 def measured(several: Sequence[Stream], learning: Sequence[Life], risk: Sequence[Life]) -> Curves:
@@ -194,7 +212,11 @@ def _curve(
 
 
 def risk_figures(
-    several: Sequence[Stream], lives: Sequence[Life], target: float, day: str
+    several: Sequence[Stream],
+    lives: Sequence[Life],
+    target: float,
+    day: str,
+    warm_up: int = WARM_UP,
 ) -> RiskFigures:
     """Return what a target kept; every life must be of its stream."""
     kept, stable, slips, above = [], 0, 0, 0
@@ -203,9 +225,15 @@ def risk_figures(
         kept.append((called - slipped) / max(int((~one.slipped).sum()), 1))
         stable, slips = stable + called, slips + slipped
         above += slipped > target * called
-    sessions = len(kept)
     return RiskFigures(
-        target, day, sessions, float(np.mean(kept)), slips / max(stable, 1), above / sessions
+        target,
+        warm_up,
+        day,
+        len(lives),
+        float(np.mean(kept)),
+        slips / max(stable, 1),
+        above / len(lives),
+        float(np.mean([life.supervised.sum() for life in lives])),
     )
 
 
@@ -238,13 +266,13 @@ def lines(worth: Worth) -> Iterator[str]:
     """Yield the report in Markdown, figures in %."""
     yield from curve_lines(worth.curves)
     yield ""
-    titles = ["target", "day", "sessions", "good lifts kept, %", "slips among `stable`, %",
-              "sessions above the target, %"]  # fmt: skip
-    risk = (
-        [f"{one.target:g}", one.day, str(one.sessions), *_percents(one.kept, one.slips, one.above)]
-        for one in worth.risk
-    )
-    yield from markdown_table(titles, risk)
+    shown = ["sessions", "good lifts kept, %", "slips among `stable`, %",
+             "sessions above the target, %", "supervised lifts of a session"]  # fmt: skip
+    risk = ([f"{one.target:g}", one.day, *_risk_cells(one)] for one in worth.risk)
+    yield from markdown_table(["target", "day", *shown], risk)
+    yield ""
+    warm_ups = ([str(one.warm_up), *_risk_cells(one)] for one in worth.warm_up)
+    yield from markdown_table([f"warm-up, target {ALLOWED:g}", *shown], warm_ups)
     yield ""
     titles = ["day", "sessions", "F1 of judged, nothing told, %", "F1 of judged, learning, %"]
     days = ([one.day, str(one.sessions), *_percents(one.alone, one.learning)] for one in worth.days)
@@ -253,6 +281,11 @@ def lines(worth: Worth) -> Iterator[str]:
     yield from reliability_lines(worth.reliability)
     yield ""
     yield f"{worth.sessions} sessions, each from nothing; `{worth.command}`."
+
+
+def _risk_cells(one: RiskFigures) -> list[str]:
+    shares = _percents(one.kept, one.slips, one.above)
+    return [str(one.sessions), *shares, f"{one.supervised:.0f}"]
 
 
 def _percents(*fractions: float) -> list[str]:
