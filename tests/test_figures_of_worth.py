@@ -69,7 +69,7 @@ def test_what_stable_is_worth_stands_on_the_card() -> None:
     ]
 
 
-def risk_cells(one: Any) -> list[str]:
+def risk_cells(one: Mapping[str, float]) -> list[str]:
     shares = percents(one["kept"], one["slips"], one["above"])
     return [str(one["sessions"]), *shares, f"{one['supervised']:.0f}"]
 
