@@ -49,8 +49,15 @@ def draw(page: str) -> str:
         for (name, window_ms), cell in zip(GATE_WINDOWS_MS.items(), row(page, GATE), strict=True):
             share = float(cell.removesuffix(" %"))
             axes.plot(window_ms, share, "o", color=INK)
-            axes.annotate(f"{name}: {cell}", (window_ms, share), xytext=(-8, -4), ha="right", va="top",
-                          textcoords="offset points", color=INK)  # fmt: skip
+            axes.annotate(
+                f"{name}: {cell}",
+                (window_ms, share),
+                xytext=(-8, -4),
+                textcoords="offset points",
+                ha="right",
+                va="top",
+                color=INK,
+            )
         axes.set(xlabel="time in which it is looked at, ms", ylim=(0, 100))
         axes.set_ylabel("of a sliding finger's time called still, %")
         axes.legend()
