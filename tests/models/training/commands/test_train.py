@@ -154,7 +154,7 @@ def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
     assert card["data"]["licence"].startswith("MIT")
     assert "lab 1" in card["data"]["not_published"]
     assert {
-        "The data is of 20 objects in 3 tables, of which lab 1 is not published.",
+        "The data is of 20 objects in 3 tables. Not published: lab 1.",
         "The figures of another day are of the published tables alone.",
     } < set(card["weak_points"])
     assert "lab 1.csv is not" not in capsys.readouterr().err
@@ -182,7 +182,7 @@ def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
         "not_published": ["lab"],
     }
     assert card["weak_points"][1:3] == [
-        "The data is of 2 objects in 1 table, of which lab is not published.",
+        "The data is of 2 objects in 1 table. Not published: lab.",
         "What it is worth on another day than those of its data was not measured.",
     ]
     assert card["weak_points"][3].startswith("20 grasps, 10 of which slipped, are few: the daemon")
