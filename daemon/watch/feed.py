@@ -27,11 +27,12 @@ HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Heartbeats on TCP, as the daemon's, ms."""
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 """Shortest and longest time before connecting again, ms."""
+CONNECTED: Final = "connected"
 NOT_CONNECTED: Final = "not connected"
 NOT_ALLOWED: Final = ": this user may not open the socket; is it in the group graspd?"
 WANTS_KEY: Final = "turned away: the daemon wants a key (--keys)"
 EVENTS: Final = {
-    int(zmq.EVENT_HANDSHAKE_SUCCEEDED): "connected",
+    int(zmq.EVENT_HANDSHAKE_SUCCEEDED): CONNECTED,
     int(zmq.EVENT_DISCONNECTED): NOT_CONNECTED,
     int(zmq.EVENT_CONNECT_RETRIED): NOT_CONNECTED,
     int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "turned away: the daemon does not know this key",

@@ -67,7 +67,7 @@ def draw(hands: Sequence[Snapshot], screen: Screen) -> RenderableType:
         beside.add_row(*[_hand(hand, screen, "q ends") for hand in hands])
         return beside
     chosen = hands[screen.chosen]
-    others = [_verdict(hand) for hand in hands if hand is not chosen]
+    others = [_verdict(hand, wraps=True) for hand in hands if hand is not chosen]
     return _hand(chosen, screen, "q ends, tab shows the next hand", others)
 
 
@@ -124,7 +124,8 @@ def _table() -> Table:
     return table
 
 
-def _verdict(seen: Snapshot) -> Text:
+def _verdict(seen: Snapshot, *, wraps: bool = False) -> Text:
+    """Return the verdict and what is not well. `wraps`: no other line says it."""
     name = printable(seen.hand or "-", NAME_MAX)
     why = seen.why[0].what if seen.why else ""
     if seen.not_well:
@@ -132,7 +133,7 @@ def _verdict(seen: Snapshot) -> Text:
     word = f" {seen.headline.upper()} "
     probability = "" if seen.p_slip is None else f" slip probability {100 * seen.p_slip:.0f} %,"
     return Text.assemble(
-        (f"{name} ", "bold"), (word, STYLES[seen.tone]), f"{probability} {why}", no_wrap=True
+        (f"{name} ", "bold"), (word, STYLES[seen.tone]), f"{probability} {why}", no_wrap=not wraps
     )
 
 

@@ -28,7 +28,7 @@ from daemon.publish.messages import (
     Verdict,
 )
 from daemon.watch import figures
-from daemon.watch.feed import Feed
+from daemon.watch.feed import CONNECTED, Feed
 from daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
 from daemon.watch.fingers import Fingers
 from daemon.watch.grasps import OPEN, GraspLog
@@ -40,6 +40,7 @@ SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
+LATE = "the daemon is there and says nothing: top shows whether this computer is too busy"
 SECONDS = 300
 SECOND_NS = 1_000_000_000
 LATE_UNKNOWNS = 3
@@ -262,6 +263,8 @@ class View:
 
     def _where_to_look(self) -> list[Line]:
         lines = [Line("link", self.link)]
+        if self.link == CONNECTED:
+            return [*lines, Line("look", LATE)]
         if self._look and not self.link.startswith("turned away"):
             lines.append(Line("look", self._look))
         return lines

@@ -162,6 +162,7 @@ def test_another_hand_shows_its_dead_electrode_beside_its_verdict() -> None:
     assert text_of(hands, 80)[0].rstrip() == (
         "right  SLIP  slip probability 75 %, do not lift; not well: ff_7 electrode-dead"
     )
+    assert "ff_7 electrode-dead" in " ".join(" ".join(text_of(hands, 60)[:2]).split())
 
 
 def test_several_hands_all_show_their_verdicts() -> None:

@@ -59,6 +59,8 @@ def test_a_silent_daemon_has_the_commands_to_look_with() -> None:
     look = "systemctl status graspd@right; journalctl -u graspd@right"
     view = View(ENDPOINT, look=look)
     assert view.snapshot(0).why[-1] == Line("look", look)
+    view.link = "connected"
+    assert "the daemon is there" in view.snapshot(0).why[-1].advice
     view.link = "turned away: the daemon wants a key (--keys)"
     assert [line.what for line in view.snapshot(0).why] == ["silent", "link"]
 
