@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,18 @@ from typing import Any
 import zmq
 
 from deploy.clients.python.graspd_client import Client, Outcome
+from drivers.twins.grasps.grasp_script import Durations
+from drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
 from tests.clients.bench import Daemon, until
 from tests.daemon.processes import TIMEOUT_S
 
 WARM_UP = "[risk]\nmax_slip_when_stable = 0.2\nwarm_up = 50\n"
 """Each grasp is to be lifted under supervision."""
-ASK_S = 0.02
-MESSAGES_AT_ONCE = 5
-Lift = Callable[[], int | None]
-"""Asks whether to lift under supervision; the grasp, None for a no."""
+LIFT_S, AGAIN_S = 1.0, 0.05
+"""How long to wait for a first lift of a grasp, and for another one that must not be allowed."""
+HELD_S = 3.0
+ENOUGH = 20
+"""Verdicts of a grasp that is held after its outcome, four refreshes long."""
 
 
 class InCpp:
@@ -29,8 +32,8 @@ class InCpp:
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
-    def may_i_lift(self) -> int | None:
-        may, grasp, _ = self._told(f"watch {ASK_S}").split()
+    def may_i_lift(self, deadline_s: float) -> int | None:
+        may, grasp, _ = self._told(f"watch {deadline_s}").split()
         return int(grasp) if may == "1" else None
 
     def slipped(self) -> bool:
@@ -64,8 +67,8 @@ class InPython:
         self._client = client
         self._lifted_on = client.verdict()
 
-    def may_i_lift(self) -> int | None:
-        answer = self._client.may_i_lift(ASK_S, supervised=True)
+    def may_i_lift(self, deadline_s: float) -> int | None:
+        answer = self._client.may_i_lift(deadline_s, supervised=True)
         if not answer:
             return None
         self._lifted_on = answer.verdict
@@ -90,16 +93,16 @@ class Listener:
         self.is_held = False
 
     def listen(self) -> None:
-        """Take in some messages: no grasp is offered after its outcome."""
-        for _ in range(MESSAGES_AT_ONCE):
-            assert self._socket.poll(TIMEOUT_S * 1e3)
+        """Take in a message, and all that wait: no grasp is offered after its outcome."""
+        assert self._socket.poll(TIMEOUT_S * 1e3)
+        while self._socket.poll(0):
             topic, payload = self._socket.recv_multipart()
             message: dict[str, Any] = json.loads(payload)
             if topic == b"outcome.right":
                 self.told.add(message["grasp"])
                 continue
             is_told = message["grasp"] in self.told
-            self.is_held = is_told and "no-contact" not in message["reasons"]
+            self.is_held = is_told and message["gate"] not in ("idle", "released")
             if is_told:
                 assert (message["verdict"], message["supervised"]) == ("unknown", False)
                 assert ("outcome-told" in message["reasons"]) is self.is_held
@@ -108,7 +111,7 @@ class Listener:
 
 def test_a_told_grasp_is_offered_no_more_in_either_language(binary: Path, tmp_path: Path) -> None:
     with (
-        Daemon(tmp_path, WARM_UP, whole_grasps=True) as daemon,
+        Daemon(tmp_path, WARM_UP, recording=long_holds(tmp_path / "held.csv")) as daemon,
         zmq.Context() as context,
         context.socket(zmq.SUB) as socket,
         Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as python,
@@ -120,14 +123,22 @@ def test_a_told_grasp_is_offered_no_more_in_either_language(binary: Path, tmp_pa
             told_while_held(listener, lifts, asks_too)
 
 
+def long_holds(path: Path) -> Path:
+    """Write a recording of grasps that are held for longer than telling an outcome takes."""
+    durations = Durations(first_rest_s=(1.5, 1.5), settle_s=(HELD_S, HELD_S))
+    with path.open("w") as file:
+        write_stream(synthetic_grasps(2, durations=durations), file, t_decimals=2)
+    return path
+
+
 def told_while_held(
     listener: Listener, lifts: InPython | InCpp, asks_too: InPython | InCpp
 ) -> None:
     """Lift grasps, and tell their outcomes, until one is held for long after it was told."""
-    enough = listener.held_on + 10 * MESSAGES_AT_ONCE
+    enough = listener.held_on + ENOUGH
 
     def is_enough() -> bool:
-        grasp = lifts.may_i_lift()
+        grasp = lifts.may_i_lift(LIFT_S)
         listener.listen()
         if grasp is None:
             return False
@@ -136,7 +147,7 @@ def told_while_held(
         until(lambda: listener.listen() or grasp in listener.told)
         while listener.is_held:
             for each in (lifts, asks_too):
-                assert each.may_i_lift() != grasp
+                assert each.may_i_lift(AGAIN_S) != grasp
             listener.listen()
         return listener.held_on >= enough
 
