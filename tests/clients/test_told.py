@@ -94,7 +94,7 @@ class Listener:
 
     def listen(self) -> None:
         """Take in a message, and all that wait: no grasp is offered after its outcome."""
-        assert self._socket.poll(TIMEOUT_S * 1e3)
+        assert self._socket.poll(round(TIMEOUT_S * 1e3))
         while self._socket.poll(0):
             topic, payload = self._socket.recv_multipart()
             message: dict[str, Any] = json.loads(payload)
@@ -144,7 +144,8 @@ def told_while_held(
             return False
         assert grasp not in listener.told
         assert lifts.slipped()
-        until(lambda: listener.listen() or grasp in listener.told)
+        while grasp not in listener.told:
+            listener.listen()
         while listener.is_held:
             for each in (lifts, asks_too):
                 assert each.may_i_lift(AGAIN_S) != grasp

@@ -83,8 +83,8 @@ _WITHHELD = {"unproven", "low-confidence"}
 _OBJECT = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{OBJECT_MAX - 1}}}")
 _OBJECT_IS = f"1 to {OBJECT_MAX} ASCII letters, digits, _, -, ., the first no - and no ."
 
-T = TypeVar("T")
-Waits = Generator[int, None, T]
+_T = TypeVar("_T")
+Waits = Generator[int, None, _T]
 """A call, step by step: it yields for how long to wait for a message, ms, before the next step."""
 
 log = logging.getLogger("graspd_client")
@@ -511,12 +511,12 @@ class Client(_Hand):
     def __exit__(self, *_details: object) -> None:
         self.close()
 
-    def _finish(self, steps: Waits[T]) -> T:
+    def _finish(self, steps: Waits[_T]) -> _T:
         while True:
             try:
                 timeout_ms = next(steps)
             except StopIteration as end:
-                result: T = end.value
+                result: _T = end.value
                 return result
             self._link.wait(timeout_ms)
 
@@ -561,7 +561,7 @@ class AsyncClient(_Hand):
     async def __aexit__(self, *_details: object) -> None:
         self.close()
 
-    async def _finish(self, steps: Waits[T]) -> T:
+    async def _finish(self, steps: Waits[_T]) -> _T:
         from zmq.asyncio import Poller  # only here: it loads asyncio
 
         if self._is_busy:
@@ -572,7 +572,7 @@ class AsyncClient(_Hand):
                 try:
                     timeout_ms = next(steps)
                 except StopIteration as end:
-                    result: T = end.value
+                    result: _T = end.value
                     return result
                 poller = Poller()
                 for each in self._link.sockets:
