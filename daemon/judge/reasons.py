@@ -7,6 +7,7 @@ A new reason needs a member of `Reason`, a line of `ADVICE`, a row in deploy/wir
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -93,8 +94,38 @@ ADVICE: dict[Reason, str] = {
 }
 
 
+OF_THE_HAND = frozenset(
+    {Reason.NO_CONTACT, Reason.MOVING, Reason.SETTLING, Reason.NOT_TARED, Reason.NOT_ASKED}
+)
+"""Reasons of an open hand, or of a grasp that settles."""
+UNREADABLE = frozenset(
+    {
+        Reason.STALE,
+        Reason.SENSOR_MISSING,
+        Reason.NOT_A_COUNT,
+        Reason.CUT_OFF,
+        Reason.PARITY,
+        Reason.ERROR_WORD,
+        Reason.HELD,
+        Reason.FROZEN,
+        Reason.SATURATED,
+        Reason.ELECTRODES_BROKEN,
+        Reason.MODEL_MISMATCH,
+    }
+)
+"""Reasons with which a reading says nothing of the hand now."""
 WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
 """Reasons with which a grasp may still be lifted under supervision; with any other it may not."""
+
+
+def to_act_on(reasons: Sequence[Reason]) -> list[Reason]:
+    """Return the reasons that tell a person what to do.
+
+    Where the sensors cannot be read, what is said of the hand is old: closing it helps nothing.
+    """
+    if UNREADABLE.isdisjoint(reasons):
+        return list(reasons)
+    return [reason for reason in reasons if reason not in OF_THE_HAND]
 
 
 class GateState(StrEnum):
