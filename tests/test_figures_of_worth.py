@@ -135,9 +135,7 @@ def drawn_rows(drawing: str) -> list[list[str]]:
 def test_the_pictures_of_worth_and_stillness_have_the_figures_of_their_tables() -> None:
     drawn = drawn_rows("worth")
     assert drawn[2:] == rows_of(MEASURED, "slips among `stable` / good lifts kept")
-    *windows, gate = drawn_rows("stillness")
-    assert windows[1:] == rows_of(JUDGING, "window, ms")
-    assert gate in rows_of(JUDGING, "generated slides")
+    assert drawn_rows("stillness")[1:] == rows_of(JUDGING, "window, ms")
 
 
 def test_the_picture_of_run_times_has_the_figures_of_its_table() -> None:

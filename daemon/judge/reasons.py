@@ -53,6 +53,7 @@ class Reason(StrEnum):
     LOW_CONFIDENCE = "low-confidence"
     UNPROVEN = "unproven"
     RISK_EXCEEDED = "risk-exceeded"
+    OUTCOME_TOLD = "outcome-told"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
 
@@ -87,6 +88,7 @@ ADVICE: dict[Reason, str] = {
     "supervision, tell outcomes",
     Reason.RISK_EXCEEDED: "more `stable` lifts slipped than [risk] can make good: find out why, "
     "then `graspd session reset`",
+    Reason.OUTCOME_TOLD: "the outcome of its lift is known: release the object, then grasp again",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
 }
@@ -192,6 +194,8 @@ class Moment(NamedTuple):
     """Time for which the hand has touched and kept still, ms."""
     early: bool = False
     """True if it was judged while something might still slide slowly."""
+    steady: bool = True
+    """True if motion keeps to the strict limit: else a session learns nothing from the reading."""
     motion: dict[Finger, float | None] | None = None
     """How each finger moves, in units of its noise; None where that is not known."""
     motion_limits: dict[Finger, float] | None = None

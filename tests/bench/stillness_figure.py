@@ -1,8 +1,8 @@
-"""The picture of what each window sees of slides, drawn from the tables in deploy/JUDGING.md.
+"""The picture of what each window sees of slides, drawn from the table in deploy/JUDGING.md.
 
     python -m tests.bench.stillness_figure
 
-writes deploy/stillness.svg. Put new figures in the tables and run it again.
+writes deploy/stillness.svg. Put new figures in the table and run it again.
 """
 
 from __future__ import annotations
@@ -13,22 +13,13 @@ from typing import Final
 
 from matplotlib.figure import Figure
 
-from models.training.evaluating.style import BLUE, INK, OLIVE, style, to_svg
+from models.training.evaluating.style import BLUE, OLIVE, style, to_svg
 from tests.conftest import ROOT
 
 PAGE: Final = ROOT / "deploy" / "JUDGING.md"
 PICTURE: Final = ROOT / "deploy" / "stillness.svg"
 WINDOWS: Final = "window, ms"
-GATE: Final = "one of three fingers slides: of that time called still"
-GATE_WINDOWS_MS: Final = {"early": 100.0, "sure": 240.0}
-"""The gate's two windows, by the titles of their columns."""
 COLOURS: Final = (BLUE, OLIVE)
-
-
-def row(page: str, title: str) -> list[str]:
-    """Return the cells of the table's row that begins with this title."""
-    (line,) = re.findall(rf"^\| {re.escape(title)} \|(.*)\|$", page, re.MULTILINE)
-    return [cell.strip() for cell in line.split("|")]
 
 
 def curves(page: str) -> list[list[str]]:
@@ -39,30 +30,17 @@ def curves(page: str) -> list[list[str]]:
 
 
 def draw(page: str) -> str:
-    """Return the picture of this page's tables, as SVG."""
+    """Return the picture of this page's table, as SVG."""
     (_, *windows), *lines = curves(page)
     with style():
         figure = Figure(figsize=(7.0, 4.2), layout="constrained")
         axes = figure.subplots()
         for (name, *missed), colour in zip(lines, COLOURS, strict=True):
             axes.plot([*map(float, windows)], [*map(float, missed)], color=colour, label=name)
-        for (name, window_ms), cell in zip(GATE_WINDOWS_MS.items(), row(page, GATE), strict=True):
-            share = float(cell.removesuffix(" %"))
-            axes.plot(window_ms, share, "o", color=INK)
-            axes.annotate(
-                f"{name}: {cell}",
-                (window_ms, share),
-                xytext=(-8, -4),
-                textcoords="offset points",
-                ha="right",
-                va="top",
-                color=INK,
-            )
         axes.set(xlabel="time in which it is looked at, ms", ylim=(0, 100))
         axes.set_ylabel("of a sliding finger's time called still, %")
         axes.legend()
         said = [f"| {' | '.join(cells)} |" for cells in curves(page)]
-        said.append(f"| {GATE} | {' | '.join(row(page, GATE))} |")
         return to_svg(figure, "Time looked at against the share of slides missed", said)
 
 
