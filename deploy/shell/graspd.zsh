@@ -252,8 +252,9 @@ _shtab_graspd_report_stability_defaults_added=0
 _shtab_graspd_report_worth_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--data[folder with the grasp tables]:DIR:_files"
-  "--out[folder for the picture and the table (runs\/worth)]:DIR:_files"
+  "--out[folder for the picture, the tables and the figures (runs\/worth)]:DIR:_files"
   "--seeds[of the object folds]:N:_files"
+  "--card[card of a \`small-session\`, to put the figures on as well]:FILE:_files"
   "--quick[few grasps, one epoch\: does it run\?]"
 )
 
