@@ -37,6 +37,8 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
         std::cout << finger << '=' << std::llrint(moves.value_or(-1) * 1e3) << ' ';
     for (const auto& [finger, limit] : verdict.motion_limits)
         std::cout << finger << '<' << std::llrint(limit * 1e3) << ' ';
+    for (const auto& [finger, felt] : verdict.fingers)
+        std::cout << finger << '-' << (felt ? graspd::name(*felt) : "unknown") << ' ';
     std::cout << counts.messages << ' '
               << counts.lost << ' ' << counts.repeats << ' ' << counts.malformed << ' '
               << counts.restarts << ' ' << counts.former << std::endl;
