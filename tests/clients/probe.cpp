@@ -1,8 +1,9 @@
 // The C++ client's rules, line by line, for comparison with the Python client's.
 //
 // `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
-// takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift`
-// asks it and answers with a line, `tell` tells it that the lift held.
+// takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT
+// [MAX_AGE_MS]` makes one, `lift` asks it and answers with a line, `tell` tells it that the lift held,
+// `slide TIMEOUT_S` watches over a lift and answers with a line.
 #include "graspd_client.hpp"
 
 #include <iostream>
@@ -74,6 +75,8 @@ int main() {
         } else if (order == "client") {
             graspd::Options options;
             words >> options.endpoint >> options.ask_endpoint;
+            double max_age_ms = 0.0;
+            if (words >> max_age_ms) options.max_age_ms = max_age_ms;
             options.warn = [](const std::string& text) {
                 std::cout << "warn " << text << std::endl;
             };
@@ -82,6 +85,13 @@ int main() {
             answer = client.value().may_i_lift(30.0);
             std::cout << static_cast<bool>(answer) << ' ' << answer.verdict.grasp.value_or(0) << ' '
                       << client->unreported() << std::endl;
+        } else if (order == "slide") {
+            double timeout_s = 0.0;
+            words >> timeout_s;
+            const graspd::SlideAnswer slide = client.value().wait_for_slide(timeout_s);
+            std::cout << static_cast<bool>(slide) << ' ' << slide.held;
+            for (const std::string& finger : slide.sliding) std::cout << ' ' << finger;
+            std::cout << std::endl;
         } else if (order == "tell") {
             const bool taken{client.value().tell(answer.verdict, graspd::Outcome::held, {}, 30.0)};
             std::cout << (taken ? "told" : "not taken") << std::endl;

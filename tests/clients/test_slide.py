@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from deploy.clients.python.graspd_client import SlideAnswer
 from tests.clients.messages import MS, frames, verdict
+from tests.clients.test_both_ask import false_daemon, told
 from tests.clients.test_lift import START_NS, World, client
 
 Words = Mapping[str, str | None]
@@ -105,3 +109,40 @@ def test_a_closed_client_stops_the_lift() -> None:
 def test_a_time_that_is_none_is_refused(timeout_s: float) -> None:
     with client(World([])) as graspd, pytest.raises(ValueError, match="timeout_s"):
         graspd.wait_for_slide(timeout_s)
+
+
+@pytest.mark.parametrize(
+    ("max_age_ms", "timeout_s", "later", "answer"),
+    [
+        (5000, 0.1, {}, "0 1"),
+        (5000, 60.0, {"th": "slide"}, "1 0 th"),
+        (5000, 60.0, {"ff": "free"}, "1 0"),
+        (100, 60.0, {"ff": None}, "1 0"),
+    ],
+    ids=["held", "slide", "let go", "not known"],
+)
+def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
+    binary: Path, tmp_path: Path, max_age_ms: int, timeout_s: float, later: Words, answer: str
+) -> None:
+    fingers = dict(HELD)
+    with (
+        false_daemon(tmp_path, told(), "unknown", fingers=fingers),
+        subprocess.Popen(
+            [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as probe,
+    ):
+        assert probe.stdin is not None
+        assert probe.stdout is not None
+        probe.stdin.write(f"client ipc://{tmp_path}/out ipc://{tmp_path}/ask {max_age_ms}\n")
+        line, deadline_s = "", time.monotonic() + 60.0
+        while line != "0 1\n" and time.monotonic() < deadline_s:  # until it has heard of them
+            probe.stdin.write("slide 0.01\n")
+            probe.stdin.flush()
+            line = probe.stdout.readline()
+        probe.stdin.write(f"slide {timeout_s}\n")
+        probe.stdin.flush()
+        time.sleep(0.1)
+        fingers.update(later)
+        assert probe.stdout.readline() == f"{answer}\n"
+        probe.communicate(timeout=200)
+        assert probe.returncode == 0, "the sanitizers found something"
