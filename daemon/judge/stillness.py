@@ -53,8 +53,8 @@ its logarithm. With the noise it is what 44 held touches of one sensor showed, i
 FAST_SHARE = 0.1
 """Share of the false alarms that the short window may have where the long one decides."""
 LOOSE_SHARE = 0.1
-"""Share of the false alarms that a hand may have once it has settled. With a smaller one a slide
-that begins then would be told later, and holds would hardly be steadier."""
+"""Share of `false_alarms` by which the loose limit is laid, as noise and creep alone pass it. The
+pressure of a real hold wanders as well: together they pass it in `false_alarms` of the time."""
 
 Times = NDArray[np.float64]
 SlowNoise = tuple[float, list[float], list[float]]
@@ -104,7 +104,7 @@ class Motion:
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
-        """`false_alarms`: share of a holding hand's sweeps that may pass the strict limit, 0..0.5.
+        """`false_alarms`: share of a settled hand's sweeps that may pass the loose limit, 0..0.5.
 
         With `early` the short window may have as large a share itself. Raises `ValueError` for
         another share.

@@ -247,11 +247,18 @@ def follow(
 
 
 def tell(episodes: int, false_alarms: float, sampling: Sampling) -> str:
-    """One row: of holds, of slides, and of slides that begin."""
+    """One row of the table."""
     seeds = range(episodes)
-    holds = [follow(false_alarms, seed, sampling=sampling) for seed in seeds]
-    slides = [follow(false_alarms, seed, slides=True, sampling=sampling) for seed in seeds]
-    begun = [follow(false_alarms, seed, begins=True, sampling=sampling) for seed in seeds]
+    return row(
+        false_alarms,
+        [follow(false_alarms, seed, sampling=sampling) for seed in seeds],
+        [follow(false_alarms, seed, slides=True, sampling=sampling) for seed in seeds],
+        [follow(false_alarms, seed, begins=True, sampling=sampling) for seed in seeds],
+    )
+
+
+def row(false_alarms: float, holds: list[Held], slides: list[Held], begun: list[Held]) -> str:
+    """The cells of hands that hold, of slides, and of slides that begin."""
     since = np.concatenate([hold.since for hold in holds])
     revoked = [each.revoked_ms for each in begun if each.revoked_ms is not None]
     waits = 10 * np.array([hold.stands.argmax() for hold in holds if hold.stands.any()])

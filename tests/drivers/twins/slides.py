@@ -49,9 +49,11 @@ SLIDE_DIRECTIONS = (0.81, 0.14, 0.05)
 """The same of a slide: along one, along a second, and along others."""
 STANDSTILL_S = (0.0, 0.2)
 """For so long nothing slides at the beginning, and again at the end, s."""
-SPEED_COUNTS_PER_S = 88.0
+SLIDE_WANDER = 1.5
+"""The pressure of a slide wanders faster than that of a hold by this factor."""
+SPEED_COUNTS_PER_S = 76.0
 """Root mean square of an electrode's speed in the median slide, counts/s ..."""
-SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.45
+SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.5
 """... and by which factor slides, and moments of a slide, differ: standard deviations of the
 logarithm. These and the times fit the quantiles of slides."""
 MOMENT_TAU_S = 0.2
@@ -85,11 +87,10 @@ class Hold:
         have the speed of the median one.
         """
         self._times = np.arange(0.0, seconds + STEP_S, STEP_S)
-        since_s = self._times - rest_s
         ways = [
             (
-                *_relaxation(since_s, rng),
-                *_wander(since_s, rng),
+                *_relaxation(self._times - rest_s, rng),
+                *_wander(self._times, rest_s, slide_s, rng, slides=slides),
                 *(_slide(self._times, rest_s, slide_s, slide_spread, rng) if slides else ()),
             )
             for slides in sliding
@@ -157,14 +158,23 @@ def _relaxation(times: NDArray[np.float64], rng: np.random.Generator) -> Iterato
         yield np.sqrt(share) * along, _direction(rng)
 
 
-def _wander(times: NDArray[np.float64], rng: np.random.Generator) -> Iterator[Way]:
+def _wander(
+    times: NDArray[np.float64],
+    rest_s: float,
+    slide_s: float | None,
+    rng: np.random.Generator,
+    *,
+    slides: bool,
+) -> Iterator[Way]:
     speed = WANDER_COUNTS_PER_S * np.exp(
         rng.normal(0.0, WANDER_SPREAD)
         + WANDER_MOMENT_SPREAD * _noise(len(times), MOMENT_TAU_S, rng)
     )
+    if slides:
+        speed[times >= (rest_s if slide_s is None else slide_s)] *= SLIDE_WANDER
     keeps = np.exp(-STEP_S / WANDER_TAU_S)
     for share in HOLD_DIRECTIONS:
-        along = np.sqrt(share) * (times >= 0.0) * speed * STEP_S
+        along = np.sqrt(share) * (times >= rest_s) * speed * STEP_S
         along *= _noise(len(times), WANDER_TURN_TAU_S, rng)
         for index in range(1, len(along)):
             along[index] += keeps * along[index - 1]
