@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 OUTAGE_NS = 1_000_000_000
 """After this long without a usable reading the sensors may have been exchanged or powered again."""
-SLIDE_HOLD_NS = 100_000_000
-"""How long a finger goes on to `slide` after it last moved, ns: an object that sticks and slips
-stands still for shorter moments, and the word must not flicker."""
+SLIDE_AFTER_NS = 20_000_000
+"""How long a finger that was still must move before it says `slide`, ns: a quarter of the moments
+in which the wander of a real hold passes the limit are over by then."""
 
 
 @dataclass(slots=True, eq=False)
@@ -119,10 +119,12 @@ class FreshMedian:
 
 @dataclass(slots=True)
 class FingerMemory:
-    """When something slid along a finger."""
+    """How a finger has touched; without a touch, or after a gap, as at the start."""
 
-    slid_ns: int | None = None
-    """Time of its last motion, ns. None: none since it has touched and its motion is known."""
+    was_still: bool = False
+    """True if it has kept still since it touches."""
+    moves_since_ns: int | None = None
+    """Since when it moves. None: it does not."""
 
     def touch(self, t_ns: int, moves: bool | None) -> FingerState | None:
         """Return in a word what the finger, which touches, feels at `t_ns`.
@@ -130,12 +132,19 @@ class FingerMemory:
         `moves` says whether it moves more than one that holds; None: not known.
         """
         if moves is None:
-            self.slid_ns = None
+            self.let_go()
             return None
-        if moves:
-            self.slid_ns = t_ns
-        slides = self.slid_ns is not None and 0 <= t_ns - self.slid_ns < SLIDE_HOLD_NS
-        return FingerState.SLIDE if slides else FingerState.TOUCH
+        if not moves:
+            self.was_still, self.moves_since_ns = True, None
+            return FingerState.TOUCH
+        if self.moves_since_ns is None:
+            self.moves_since_ns = t_ns
+        is_short = 0 <= t_ns - self.moves_since_ns < SLIDE_AFTER_NS
+        return FingerState.TOUCH if self.was_still and is_short else FingerState.SLIDE
+
+    def let_go(self) -> None:
+        """Forget the touch."""
+        self.was_still, self.moves_since_ns = False, None
 
 
 @dataclass(slots=True)
@@ -273,7 +282,7 @@ class HandTracker:
             if touching[place]:
                 feelings[finger] = memory.touch(t_ns, _moves(motion, place))
             else:
-                memory.slid_ns = None
+                memory.let_go()
                 feelings[finger] = FingerState.FREE if tared[place] else None
         return feelings
 
