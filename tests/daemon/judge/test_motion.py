@@ -39,7 +39,10 @@ def moves(motion: Motion) -> NDArray[np.float64]:
 
 
 def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
-    """Sweeps of generated streams called still, early and surely; without a slide's standstill."""
+    """Sweeps of generated streams called still, early and surely; without a slide's standstill.
+
+    Hands that hold have settled: the loose limit holds.
+    """
     standstill_s = STANDSTILL_S[1] if any(sliding) else 0.0
     early, sure = [], []
     for seed in range(STREAMS):
@@ -54,17 +57,18 @@ def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
         for t_s, counts in stream:
             motion.add(round(t_s * 1e9), counts, HAND)
             if t_s >= REST_S + 0.24 + standstill_s:
-                early.append(motion.strict.early)
-                sure.append(motion.strict.sure)
+                limits = motion.strict if any(sliding) else motion.loose
+                early.append(limits.early)
+                sure.append(limits.sure)
     return float(np.mean(early)), float(np.mean(sure))
 
 
 @pytest.mark.parametrize("sampling", Sampling)
 def test_held_hands_are_still_and_slides_are_not(sampling: Sampling) -> None:
     early, sure = shares([False] * 3, sampling)
-    # 5 % are wanted; of a dozen streams' windows, which overlap, it is more or less.
-    assert early > 0.93
-    assert 0.90 < sure < 0.995
+    # 5 % are wanted, within a factor of two.
+    assert early > 0.9
+    assert 0.90 < sure < 0.975
     # Measured on real slides at 5 % of false alarms: 59 % at 80 ms and 35 % at 240 ms; a fifth more
     # for a dozen generated ones. Of three fingers that slide, the third power is left, and some.
     early, sure = shares([True, False, False], sampling)
