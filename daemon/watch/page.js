@@ -84,13 +84,15 @@ function drawFinger(canvas, finger) {
 }
 
 // Up to the mark in the middle a finger is still; at the right end it moves twice as much.
-function drawMotion(bar, words, motion) {
+function drawMotion(bar, words, motion, state) {
   bar.hidden = words.hidden = motion === null;
   if (motion === null) return;
   const {now, limit} = motion;
   bar.dataset.motion = now === null ? "unknown" : now > limit ? "moving" : "still";
   bar.style.setProperty("--share", `${now === null ? 0 : Math.min(50 * now / limit, 100)}%`);
-  text(words, now === null ? "motion unknown" : `moves ${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`);
+  words.dataset.state = state ?? "unknown";
+  const figures = now === null ? "" : ` ${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`;
+  text(words, (state ?? (now === null ? "motion unknown" : "moves")) + figures);
 }
 
 // A lane for each kind of verdict, below it the probability of slip, and the minutes before now.
@@ -210,7 +212,7 @@ class Hand {
         canvas.role = "img"; canvas.ariaLabel = `tactile image of ${finger.name}: ${touch.textContent} ${depth.textContent}`;
         drawFinger(canvas, finger);
         bar.className = "moves"; words.className = "faint";
-        drawMotion(bar, words, finger.motion);
+        drawMotion(bar, words, finger.motion, finger.state);
       });
     const canvas = this.part("legend").querySelector("canvas"), context = sized(canvas);
     for (let x = 0; x < canvas.width; x++) {

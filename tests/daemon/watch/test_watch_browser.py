@@ -122,11 +122,13 @@ def test_a_stable_that_lifts_have_not_earned_is_hollow(
 def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    def bars() -> object:
-        return browser.value(
+    def bars() -> list[list[object]]:
+        told = browser.value(
             "[...document.querySelectorAll('.moves')].map(bar => [bar.dataset.motion,"
             " bar.style.getPropertyValue('--share'), bar.hidden, bar.nextSibling.innerText])"
         )
+        assert isinstance(told, list)
+        return told
 
     browser.look(1280, 800)
     browser.go(page.address)
@@ -147,6 +149,12 @@ def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
         ["moving", "80%", False, "moves 2.0 / 1.3 \u03c3"],
         ["moving", "100%", False, "moves 9.0 / 1.0 \u03c3"],
     ]
+    talker.more |= {"fingers": {"ff": "slide", "th": None}}
+    browser.wait_for("document.querySelector('.moves').nextSibling.innerText[0] == 's'")
+    assert [words for *_, words in bars()] == ["slide 2.0 / 1.3 \u03c3", "moves 9.0 / 1.0 \u03c3"]
+    talker.more |= {"motion": {"ff": None, "th": 0.5}, "fingers": {"ff": "free", "th": "touch"}}
+    browser.wait_for("document.querySelector('.moves').nextSibling.innerText == 'free'")
+    assert [words for *_, words in bars()] == ["free", "touch 0.5 / 1.0 \u03c3"]
     talker.decision = None
     see(browser, "silent")
     assert text(browser, "still") == "-"
