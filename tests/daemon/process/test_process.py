@@ -225,7 +225,9 @@ def recording_of(folder: Path, name: str) -> Path:
 
 def test_an_object_may_have_any_name_on_any_terminal(tmp_path: Path) -> None:
     recording = recording_of(tmp_path, "größe 漢")
-    code, output, errors = redirected("", "replay", "--verbose", recording, PYTHONIOENCODING="latin-1")
+    code, output, errors = redirected(
+        "", "replay", "--verbose", recording, PYTHONIOENCODING="latin-1"
+    )
     assert (code, errors) == (0, "")
     assert "  größe \\u6f22 (was " in output.splitlines()[0]
 
