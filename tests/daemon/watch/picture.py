@@ -1,7 +1,7 @@
 """Makes `deploy/watch.png`: `python -m tests.daemon.watch.picture`, six minutes long.
 
 It runs the demo scene and `graspd watch --web`, waits until five minutes are behind it and a grasp
-is `stable` by what lifts have shown, and takes a picture of 1280 x 800.
+is `stable` by what lifts have shown, and takes a picture of 1280 x 860.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.daemon.watch.browser import Browser
 
 ROOT = Path(__file__).parents[3]
 SCENE, PICTURE = ROOT / "deploy" / "scenes" / "demo.toml", ROOT / "deploy" / "watch.png"
-WIDTH, HEIGHT = 1280, 800
+WIDTH, HEIGHT = 1280, 860
 HISTORY_S, GRASP_S = 300.0, 120.0
 """Length of the timeline, and longest wait for a `stable` grasp after it, s."""
 SOLID = "document.querySelector('.banner').dataset.tone == 'stable'"
