@@ -272,7 +272,7 @@ class Hand {
     });
     const ago = newest === null ? 0 : newest.ago_s + quiet / 1000;
     this.say("judged", newest === null || none || seen.tone === "silent" ? "-" :
-      `${called(newest)}, ${ago.toFixed(0)} s ago${newest.held ? "" : ", past"}; its lift ${newest.lift}`);
+      `${called(newest)}, ${ago.toFixed(0)} s ago${newest.held ? "" : ", past"}${newest.lift === "-" ? "" : `; lift: ${newest.lift}`}`);
     this.say("still", none ? "-" : seen.still);
   }
 
