@@ -39,8 +39,10 @@ def main(picture: Path = PICTURE) -> None:
         stack.enter_context(browser.blank())
         browser.look(WIDTH, HEIGHT)
         browser.go("http://127.0.0.1:8377/")
-        browser.wait_for(SOLID, GRASP_S)
-        image = browser.ask("Page.captureScreenshot", format="png")["data"]
+        image = ""
+        while not image or not browser.value(SOLID):  # it may be let go meanwhile
+            browser.wait_for(SOLID, GRASP_S)
+            image = browser.ask("Page.captureScreenshot", format="png")["data"]
         picture.write_bytes(base64.b64decode(image))
     sys.stdout.write(f"{picture}\n")
 
