@@ -81,7 +81,7 @@ complete -c graspd -n '_shtab_graspd_using replay' -l gate -xka "settled every" 
 complete -c graspd -n '_shtab_graspd_using replay' -l publish -xka "(__fish_complete_path (commandline -ct))" -d 'publish too, as `graspd run` does'
 complete -c graspd -n '_shtab_graspd_using replay' -l wait -xka "(__fish_complete_path (commandline -ct))" -d 'with --publish: start when somebody has subscribed, fail after S seconds'
 complete -c graspd -n '_shtab_graspd_using replay' -l json -d 'verdict messages on stdout, summary on stderr'
-complete -c graspd -n '_shtab_graspd_using replay' -l verbose -d 'of the demo: each verdict, as of other recordings'
+complete -c graspd -n '_shtab_graspd_using replay' -l verbose -d 'of grasp tables with outcomes: a line for each verdict and all scores, in place of a line for 25 grasps'
 complete -c graspd -n '_shtab_graspd_using replay; and test $_shtab_graspd_npos -ge 0' -ka "(__fish_complete_path (commandline -ct))" -d 'grasp tables or streams (CSV); what `graspd run` has recorded (.mcap); what came over a link (candump text .log, serial bytes .serial); without any, the demo: a synthetic day, with --outcomes and --max-slip-when-stable 0.05'
 complete -c graspd -n '_shtab_graspd_using; and test $_shtab_graspd_npos -eq 0' -a watch -d 'See it live, in a terminal (extra: watch) or a browser.'
 complete -c graspd -n '_shtab_graspd_using watch' -s h -l help -d 'show this help message and exit'

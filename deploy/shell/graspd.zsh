@@ -212,7 +212,7 @@ _shtab_graspd_replay_options=(
   "--publish[publish too, as \`graspd run\` does]:ENDPOINT:_files"
   "--wait[with --publish\: start when somebody has subscribed, fail after S seconds]:S:_files"
   "--json[verdict messages on stdout, summary on stderr]"
-  "--verbose[of the demo\: each verdict, as of other recordings]"
+  "--verbose[of grasp tables with outcomes\: a line for each verdict and all scores, in place of a line for 25 grasps]"
   "(*)::grasp tables or streams (CSV)\; what \`graspd run\` has recorded (.mcap)\; what came over a link (candump text .log, serial bytes .serial)\; without any, the demo\: a synthetic day, with --outcomes and --max-slip-when-stable 0.05:_files"
 )
 
