@@ -1,9 +1,9 @@
 """Convert sweeps of a bridge to readings with the time at which they were made. No I/O.
 
-The answer to a PING holds a tick of the bridge's clock. That tick was not before the PING was sent,
-which gives a lower bound of its time. Time then goes on at the bridge's measured rate. The latest
-bound is used, so a reading is never made to look too new. It looks too old by at most the
-shortest time that a PING takes to the bridge.
+The answer to a PING holds a tick of the bridge's clock. The tick was not before the PING was sent,
+which gives a lower bound of its time. From there, time goes on at the bridge's measured rate. The
+latest bound is used. A reading never looks too new, and looks too old by at most the shortest time
+that a PING takes to the bridge.
 
 The rate comes from a decaying linear regression that leaves out late PINGs, as in Klipper. Arrival
 times of readings are not used, so batches of a USB adapter and stalls of the host do no harm.
