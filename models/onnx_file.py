@@ -1,7 +1,7 @@
-"""What an ONNX file computes with, read from its bytes: a file whose digest is not the whole of it,
-or that may take for ever, is refused before onnxruntime sees it.
+"""Check an ONNX file before onnxruntime reads it.
 
-The wire format is that of Protocol Buffers, the numbers of the fields those of onnx.proto.
+A file is refused if it needs other files, which its digest would not cover, or if it could run for
+ever. Files are Protocol Buffers; the numbers of the fields are those of onnx.proto.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from models.contract import ModelError
 
 FIELDS_MAX = 4_000_000
-"""Of a file. A forest has most: each number of its 34,000 nodes is one, 350,000 in all."""
+"""Most fields of a file; a forest of 34,000 nodes has 350,000."""
 VARINT_BYTES_MAX = 10
-"""Of 64 bits, seven in each byte."""
+"""Longest variable-length integer, bytes: 64 bits, seven in each byte."""
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-"""Kinds of fields. The other two, groups, are out of use."""
+"""Wire types of fields; the other two, groups, are out of use."""
 
 _OF_ONNX = """
     Abs Add And ArgMax ArgMin AveragePool BatchNormalization Cast CastLike Ceil Celu Clip Concat
@@ -43,18 +43,23 @@ OPERATORS = {
     "ai.onnx": frozenset(_OF_ONNX.split()),
     "ai.onnx.ml": frozenset(_OF_ML.split()),
 }
-"""What a model may compute with, by domain (the first two are one): no loops, branches, chance,
-sequences or texts, and nothing whose result has as many values as it finds."""
+"""Operators that a model may use, by domain; the first two domains are one.
+
+They exclude loops, branches, chance, sequences and texts. They also exclude operators whose result
+has a size that depends on its values.
+"""
 _SHAPED = """
     ConstantOfShape Expand Pad Range Reshape Resize Slice Split Squeeze Tile TopK Unsqueeze Upsample
     ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd
     ReduceSum ReduceSumSquare
     """
 SHAPED = frozenset(_SHAPED.split())
-"""Operators whose inputs say how large the result is. They must follow from the model alone: then
-every run takes as long as the first."""
+"""Operators whose further inputs give the size of the result.
+
+These inputs must be constants of the model, so that each run takes as long as the first.
+"""
 ALL_INPUTS = frozenset({"ConstantOfShape", "Range"})
-"""Those of which the first input says it too."""
+"""Operators of `SHAPED` whose first input also gives the size."""
 
 
 @dataclass(slots=True)
@@ -66,22 +71,22 @@ class _Node:
 
 
 def check(content: bytes) -> None:
-    """Raise `ModelError` unless a model is whole, and of operators that always come to an end."""
+    """Raise `ModelError` unless a model is complete and each of its operators surely ends."""
     _Reader(memoryview(content)).check()
 
 
 class _Reader:
-    """Reads one file, once."""
+    """Reader of one file."""
 
     def __init__(self, content: memoryview) -> None:
         self._content = content
         self._left = FIELDS_MAX
         self._nodes: list[_Node] = []
         self._fixed: set[str] = set()
-        """Names of values that are the same in every run."""
+        """Names of values that are constants of the model."""
 
     def check(self) -> None:
-        # A message may be given in several pieces: each field of that number is looked at.
+        # A message may come in several pieces, so each field with that number is checked.
         for number, value in self._fields(self._content):
             if number == 7:
                 self._read_graph(value)
@@ -124,7 +129,7 @@ class _Reader:
                 raise ModelError("has sparse weights")
 
     def _read_tensor(self, tensor: memoryview | int) -> str:
-        """Its name."""
+        """Check a tensor; return its name."""
         name = ""
         for number, value in self._fields(tensor):
             if number == 8:
@@ -140,13 +145,15 @@ class _Reader:
         if operator not in OPERATORS[node.domain]:
             raise ModelError(f"has an operator that no model may use: {operator!r}")
         if operator in SHAPED and not all(known if operator in ALL_INPUTS else known[1:]):
-            raise ModelError(f"has a {operator} whose size depends on what is felt")
+            raise ModelError(f"has a {operator} whose size depends on the counts")
         if operator in ("Shape", "Size") or all(known):
             self._fixed.update(node.outputs)
 
     def _fields(self, message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
-        """Yield number and value of each field: an int, or the bytes of what is longer.
-        Raises `ModelError` for what is no message."""
+        """Yield number and value of each field: an integer, or bytes.
+
+        Raises `ModelError` if the bytes are no message.
+        """
         if isinstance(message, int):
             raise _broken("a number for a message")
         at, end = 0, len(message)
@@ -175,7 +182,7 @@ class _Reader:
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """A number of variable length, and where it ends."""
+    """Return the variable-length integer at `at`, and the place after it."""
     value = 0
     for place in range(VARINT_BYTES_MAX):
         if at + place >= len(message):

@@ -286,8 +286,8 @@ class SampleAssembler:
         Otherwise a wrong period that cuts every sweep would never be corrected. If the widest gap
         has room for a whole sweep, only a board that always pauses there teaches the period.
         """
-        known = not self._broken or self._run > ELECTRODES
-        if known and self._previous_end_ns is not None:
+        is_usable = not self._broken or self._run > ELECTRODES
+        if is_usable and self._previous_end_ns is not None:
             gap_ns = end_ns - self._previous_end_ns
             is_even = self._widest_ns < EVEN_SHARE * gap_ns
             if is_even and not self._is_steady:
