@@ -81,17 +81,17 @@ class Electrodes:
         fit = np.abs(residuals) <= self._limits
         if np.count_nonzero(fit) == fit.size and not np.count_nonzero(broken):
             return broken
-        found = broken.ravel().copy()
+        bad = broken.ravel().copy()
         others = _Others(self._precision, residuals)
-        for electrode in np.flatnonzero(found).tolist():
+        for electrode in np.flatnonzero(bad).tolist():
             others.forget(electrode)
         for _ in range(at_most - len(others.forgotten)):
             worst = others.worst()
             if worst is None:
                 break
-            found[worst] = True
+            bad[worst] = True
             others.forget(worst)
-        return found.reshape(broken.shape)
+        return bad.reshape(broken.shape)
 
     def plain_square(self, deviations: NDArray[np.float64]) -> float | None:
         """Return `NoveltyCheck.square` of a reading; None if it is not plainly sound.
@@ -153,14 +153,14 @@ class _Others:
 
     def forget(self, electrode: int) -> None:
         """Leave an electrode out, and remove its effect on the residuals of the others."""
-        number = len(self.forgotten)
-        columns = self._columns[:number]
+        count = len(self.forgotten)
+        columns = self._columns[:count]
         pivot = math.sqrt(self._diagonal[electrode])
         column = (self._precision[electrode] - columns[:, electrode] @ columns) / pivot
         self._residuals -= column * (self._residuals[electrode] / pivot)
         self._diagonal -= column**2
         self._diagonal[electrode] = np.inf  # so that it is never the worst again
-        self._columns[number] = column
+        self._columns[count] = column
         self.forgotten.append(electrode)
 
 

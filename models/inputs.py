@@ -50,9 +50,9 @@ class InputBuilder(Protocol):
         """Return inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24)."""
 
 
-def builder(wanted: Input, fingers: int) -> InputBuilder:
+def builder(kind: Input, fingers: int) -> InputBuilder:
     """Return the builder that a contract asks for. Raises `ModelError` for an unknown one."""
-    match wanted:
+    match kind:
         case ImageInput():
             from models.tactile_image import (  # only where it is needed
                 Composition,
@@ -64,10 +64,10 @@ def builder(wanted: Input, fingers: int) -> InputBuilder:
             try:
                 return TactileImager(
                     fingers,
-                    LAYOUTS[wanted.layout],
-                    Fill(wanted.fill),
-                    Normalisation(wanted.normalisation),
-                    Composition(wanted.composition),
+                    LAYOUTS[kind.layout],
+                    Fill(kind.fill),
+                    Normalisation(kind.normalisation),
+                    Composition(kind.composition),
                 )
             except (KeyError, ValueError) as error:
                 raise ModelError(f"asks for an image that is not known: {error}") from error
@@ -76,8 +76,8 @@ def builder(wanted: Input, fingers: int) -> InputBuilder:
         case CountsInput():
             return CountsBuilder(fingers)
         case SessionInput():
-            features = SessionBuilder(fingers, wanted.clip)
-            features.use(np.array(wanted.mean), np.array(wanted.spread))
+            features = SessionBuilder(fingers, kind.clip)
+            features.use(np.array(kind.mean), np.array(kind.spread))
             return features
 
 

@@ -87,66 +87,66 @@ class _Reader:
 
     def check(self) -> None:
         # A message may come in several pieces, so each field with that number is checked.
-        for number, value in self._fields(self._content):
-            if number == 7:
+        for field_number, value in self._fields(self._content):
+            if field_number == 7:
                 self._read_graph(value)
-            elif number in (20, 25):
+            elif field_number in (20, 25):
                 raise ModelError("has functions or training steps of its own")
         for node in self._nodes:
             self._check_node(node)
 
     def _read_graph(self, graph: memoryview | int) -> None:
-        for number, value in self._fields(graph):
-            if number == 1:
+        for field_number, value in self._fields(graph):
+            if field_number == 1:
                 self._nodes.append(self._read_node(value))
-            elif number == 5:
+            elif field_number == 5:
                 self._fixed.add(self._read_tensor(value))
-            elif number == 15:
+            elif field_number == 15:
                 raise ModelError("has sparse weights")
 
     def _read_node(self, node: memoryview | int) -> _Node:
-        found = _Node()
-        for number, value in self._fields(node):
-            if number == 1:
-                found.inputs.append(_text(value))
-            elif number == 2:
-                found.outputs.append(_text(value))
-            elif number == 4:
-                found.operator = _text(value)
-            elif number == 5:
+        result = _Node()
+        for field_number, value in self._fields(node):
+            if field_number == 1:
+                result.inputs.append(_text(value))
+            elif field_number == 2:
+                result.outputs.append(_text(value))
+            elif field_number == 4:
+                result.operator = _text(value)
+            elif field_number == 5:
                 self._read_attribute(value)
-            elif number == 7:
-                found.domain = _text(value)
-        return found
+            elif field_number == 7:
+                result.domain = _text(value)
+        return result
 
     def _read_attribute(self, attribute: memoryview | int) -> None:
-        for number, value in self._fields(attribute):
-            if number in (5, 10):
+        for field_number, value in self._fields(attribute):
+            if field_number in (5, 10):
                 self._read_tensor(value)
-            elif number in (6, 11):
+            elif field_number in (6, 11):
                 raise ModelError("has a loop or branch: a graph within its graph")
-            elif number in (22, 23):
+            elif field_number in (22, 23):
                 raise ModelError("has sparse weights")
 
     def _read_tensor(self, tensor: memoryview | int) -> str:
         """Check a tensor; return its name."""
         name = ""
-        for number, value in self._fields(tensor):
-            if number == 8:
+        for field_number, value in self._fields(tensor):
+            if field_number == 8:
                 name = _text(value)
-            elif number == 13 or (number == 14 and value != 0):
+            elif field_number == 13 or (field_number == 14 and value != 0):
                 raise ModelError("has weights in another file: its digest would not be theirs")
         return name
 
     def _check_node(self, node: _Node) -> None:
-        operator, known = node.operator, [not name or name in self._fixed for name in node.inputs]
+        operator, fixed = node.operator, [not name or name in self._fixed for name in node.inputs]
         if node.domain not in OPERATORS:
             raise ModelError(f"has an operator {operator!r} of another domain, {node.domain!r}")
         if operator not in OPERATORS[node.domain]:
             raise ModelError(f"has an operator that no model may use: {operator!r}")
-        if operator in SHAPED and not all(known if operator in ALL_INPUTS else known[1:]):
+        if operator in SHAPED and not all(fixed if operator in ALL_INPUTS else fixed[1:]):
             raise ModelError(f"has a {operator} whose size depends on the counts")
-        if operator in ("Shape", "Size") or all(known):
+        if operator in ("Shape", "Size") or all(fixed):
             self._fixed.update(node.outputs)
 
     def _fields(self, message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
@@ -162,12 +162,12 @@ class _Reader:
             if self._left < 0:
                 raise ModelError(f"has more than {FIELDS_MAX} fields")
             tag, at = _varint(message, at)
-            number, kind = tag >> 3, tag & 7
-            if not 0 < number < 1 << 29:
-                raise _broken(f"a field of number {number}")
+            field_number, kind = tag >> 3, tag & 7
+            if not 0 < field_number < 1 << 29:
+                raise _broken(f"a field of number {field_number}")
             if kind == VARINT:
                 value, at = _varint(message, at)
-                yield number, value
+                yield field_number, value
                 continue
             if kind == BYTES:
                 size, at = _varint(message, at)
@@ -177,7 +177,7 @@ class _Reader:
                 raise _broken(f"a field of kind {kind}")
             if size > end - at:
                 raise _broken("cut off")
-            yield number, message[at : at + size]
+            yield field_number, message[at : at + size]
             at += size
 
 

@@ -35,10 +35,10 @@ def folders() -> list[Path]:
 
 def added() -> dict[str, Path]:
     """Return the files of the added models by name, sorted; unreadable ones are left out."""
-    found: dict[str, Path] = {}
+    models: dict[str, Path] = {}
     for folder in reversed(folders()):
-        found |= {path.stem: path for path in folder.glob("*.onnx") if is_name(path.stem)}
-    return {name: path for name, path in sorted(found.items()) if name not in zoo.names()}
+        models |= {path.stem: path for path in folder.glob("*.onnx") if is_name(path.stem)}
+    return {name: path for name, path in sorted(models.items()) if name not in zoo.names()}
 
 
 def is_name(text: str) -> bool:

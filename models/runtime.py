@@ -131,18 +131,18 @@ def _contract(path: Path, session: ort.InferenceSession) -> tuple[ModelContract,
         raise ModelError(f"{path}: {error}") from error
 
 
-def _check_signature(path: Path, session: ort.InferenceSession, wanted: InputBuilder) -> None:
+def _check_signature(path: Path, session: ort.InferenceSession, expected: InputBuilder) -> None:
     inputs = {node.name: node for node in session.get_inputs()}
     outputs = {node.name: node for node in session.get_outputs()}
-    if set(inputs) != {wanted.name} or OUTPUT_NAME not in outputs:
+    if set(inputs) != {expected.name} or OUTPUT_NAME not in outputs:
         raise ModelError(
             f"{path}: has inputs {sorted(inputs)} and outputs {sorted(outputs)}, "
-            f"not {wanted.name} and {OUTPUT_NAME}"
+            f"not {expected.name} and {OUTPUT_NAME}"
         )
-    node = inputs[wanted.name]
-    if node.type != "tensor(float)" or tuple(node.shape[1:]) != wanted.shape:
+    node = inputs[expected.name]
+    if node.type != "tensor(float)" or tuple(node.shape[1:]) != expected.shape:
         raise ModelError(
-            f"{path}: takes {node.type} {node.shape}, its contract says {wanted.shape}"
+            f"{path}: takes {node.type} {node.shape}, its contract says {expected.shape}"
         )
     node = outputs[OUTPUT_NAME]
     if node.type != "tensor(float)" or tuple(node.shape[1:]) != (2,):

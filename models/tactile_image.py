@@ -59,11 +59,11 @@ def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
     if fill is Fill.LEAST_CONTACT:
         matrix[~filled, ELECTRODES] = 1.0
     while not filled.all() and fill is Fill.NEIGHBOUR_MEAN:
-        before, known = matrix.copy(), filled.copy()
-        for row, column in np.argwhere(~known):
+        before, was_filled = matrix.copy(), filled.copy()
+        for row, column in np.argwhere(~was_filled):
             window = (slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2))
-            if known[window].any():
-                matrix[row, column] = before[window][known[window]].mean(axis=0)
+            if was_filled[window].any():
+                matrix[row, column] = before[window][was_filled[window]].mean(axis=0)
                 filled[row, column] = True
     return matrix.reshape(height * width, ELECTRODES + 1)
 

@@ -44,8 +44,8 @@ class JournalFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the message; each line has a prefix such as `<4>`."""
-        number = next((n for level, n in SYSLOG_LEVELS if record.levelno >= level), 7)
-        return "\n".join(f"<{number}>{line}" for line in super().format(record).splitlines())
+        priority = next((n for level, n in SYSLOG_LEVELS if record.levelno >= level), 7)
+        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
 
 
 class RateLimit(logging.Filter):

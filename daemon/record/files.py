@@ -29,10 +29,10 @@ class Retention:
     """Largest size of all files of the hand, bytes."""
     wall_clock: Callable[[], int] = time.time_ns
 
-    def path(self, number: int, ending: str) -> Path:
-        """Return the path of the run's file `number`; names sort by time."""
+    def path(self, file: int, ending: str) -> Path:
+        """Return the path of the run's file number `file`; names sort by time."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.wall_clock() // 1_000_000_000))
-        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{number:04}{ending}"
+        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{file:04}{ending}"
 
     def make_room(self, expected_bytes: int) -> int:
         """Delete the oldest recordings until `expected_bytes` fit; return their number.

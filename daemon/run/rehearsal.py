@@ -33,10 +33,10 @@ def grasps(training: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
     place_of = np.arange(typical.size).reshape(typical.shape)
     rest = np.minimum(typical + FALL_COUNTS * (place_of % 4), COUNTS_MAX)
     chance = Random(1)
-    for number in range(REST + readings):
-        place = (number - REST) % GRASP_EVERY
+    for index in range(REST + readings):
+        place = (index - REST) % GRASP_EVERY
         far = min(place + 1, CLOSING, max(2 * CLOSING + HELD - 1 - place, 0)) / CLOSING
-        touch = 0.0 if number < REST else far
+        touch = 0.0 if index < REST else far
         # No sweep may repeat, or it counts as frozen. numpy.random would take megabytes.
         drawn = np.frombuffer(chance.randbytes(typical.size), dtype=np.uint8)
         noise = drawn.reshape(typical.shape) % 7 - 3.0

@@ -56,8 +56,8 @@ _MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
     """Open a bus of python-can. Raises `LinkError`; `DriverError` if no retry can succeed."""
     if interface not in can.VALID_INTERFACES:
-        known = "socketcan, slcan, udp_multicast, virtual"
-        raise DriverError(f"python-can has no interface {interface!r}; it has {known} and others")
+        common = "socketcan, slcan, udp_multicast, virtual"
+        raise DriverError(f"python-can has no interface {interface!r}; it has {common} and others")
     where = f"cannot open {interface} {channel}"
     if interface == "socketcan":
         try:

@@ -68,17 +68,17 @@ def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> by
 
 def frame_of(line: str) -> tuple[int, CanFrame] | None:
     """Return a line's time, ns since 1970, and frame; None if it is no such line."""
-    found = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
-    if found is None:
+    match = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
+    if match is None:
         return None
-    wall_ns = int(found[1]) * 1_000_000_000 + int(found[2]) * NS_PER_US
-    word, data = int(found[4], 16), bytes.fromhex(found[6] or "")
-    flags = FD if found[5] else 0
+    wall_ns = int(match[1]) * 1_000_000_000 + int(match[2]) * NS_PER_US
+    word, data = int(match[4], 16), bytes.fromhex(match[6] or "")
+    flags = FD if match[5] else 0
     if len(data) > (FD_DATA_MAX if flags else CLASSIC_DATA_MAX):
         return None
-    if found[7]:
+    if match[7]:
         flags |= REMOTE
-    if len(found[4]) == 3:
+    if len(match[4]) == 3:
         return (wall_ns, CanFrame(word, data, flags)) if word <= STANDARD_ID_MAX else None
     flags |= ERROR if word & ERR_FLAG else EXTENDED
     return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags)
@@ -95,9 +95,9 @@ class CanLog:
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
         with open_recording(path) as stream:
             while line := stream.readline(LINE_MAX + 1):
-                found = frame_of(line.decode("ascii", "replace"))
-                if found is not None:
-                    yield found
+                timed_frame = frame_of(line.decode("ascii", "replace"))
+                if timed_frame is not None:
+                    yield timed_frame
 
     def begin(self) -> None:
         self.stream = CanStream("link log", self._fingers, **self._board)

@@ -69,8 +69,8 @@ class Columns:
     @classmethod
     def of(cls, names: Sequence[str], fingers: Sequence[str]) -> Self:
         """Return the columns to read for `fingers`. `names`: the header."""
-        known = {name for finger in FINGERS for name in electrode_columns(finger)}
-        known |= {TIME, OBJECT, SLIPPED}
+        own_columns = {name for finger in FINGERS for name in electrode_columns(finger)}
+        own_columns |= {TIME, OBJECT, SLIPPED}
         is_stream = TIME in names
         joints: dict[str, str] = {}
         if is_stream:
@@ -80,7 +80,7 @@ class Columns:
             joints=joints,
             is_stream=is_stream,
             has_labels=SLIPPED in names,
-            ignored=tuple(name for name in names if name not in known and name not in joints),
+            ignored=tuple(name for name in names if name not in own_columns and name not in joints),
         )
 
 
