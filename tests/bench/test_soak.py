@@ -124,6 +124,10 @@ CASES: dict[str, tuple[Found, set[str]]] = {
         dataclasses.replace(well(), samples=samples(lambda t_s: 10_240 * min(t_s / 25, 1))),
         set(),
     ),
+    "1 MiB in the first minute of two": (
+        dataclasses.replace(well(), samples=samples(lambda t_s: 1024 * min(t_s / 60, 1), 120.0)),
+        set(),
+    ),
     "a descriptor": (last_third({"descriptors": 15}), {"descriptors more at the end"}),
     "a thread": (last_third({"threads": 4}), {"threads more at the end"}),
     "a gap in seq": (with_heard(gaps=1), {"gaps in seq"}),

@@ -15,7 +15,7 @@ class Aim(Enum):
 
     FALSE_STABLE = "a false `stable`"
     FALLS = "the daemon falls or is late"
-    WHO_MAY = "somebody may what they may not"
+    WHO_MAY = "a peer gets what it may not have"
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,7 +119,7 @@ class Hand:
         lives = self.process.process.poll() is None
         heard = lives and self.friend.take(2.0) is not None
         happened = f"{said}memory {self.rest_mib:.0f} + {grown_mib:.1f} MiB, "
-        happened += "the others hear it" if heard else "nobody hears it"
+        happened += "the others hear it" if heard else "no subscriber hears it"
         if not lives:
             happened += f", it has ended with {self.process.process.returncode}"
         return Outcome(tried, happened, well and heard and grown_mib < MEMORY_MAX_MIB)
