@@ -9,6 +9,6 @@ Numbers = NDArray[np.generic]
 """Counts of whatever type: as read (uint16) or mapped to other sensors (float64)."""
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-"""What a model takes."""
+"""Input of a model."""
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]

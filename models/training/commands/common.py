@@ -1,4 +1,4 @@
-"""What the commands of the training half share: arguments, messages, progress, exit codes."""
+"""Shared parts of the training commands: arguments, messages, progress, exit codes."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 from models.training.arrays import Bools, Floats32
 
 COPIES = 4
-"""What is left of each grasp: itself, flipped both ways, rotated."""
+"""Copies of each grasp: itself, flipped both ways, rotated."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,13 @@ from models.bts3 import TABLES
 from models.training.data.datasets import DatasetError, Grasps, concatenate, read_all, read_table
 
 FEWEST_GRASPS = 20
-"""Of one lab table: the number from which the daemon takes a session for calibrated."""
+"""Fewest grasps of a lab table; from this number a session counts as calibrated."""
 ENOUGH_GRASPS = 200
-"""Of lab tables without the published ones. The daemon refuses readings that are unlike all of the
-training: of other grasps of palm_45, 98 % by 20 of its grasps, 20 % by 100, 6 % by 200, 2.5 % by
-500."""
+"""Fewest grasps of lab tables without the published ones.
+
+The daemon refuses readings that are unlike the training. With 20 grasps of palm_45 in the training
+it refuses 98 % of the others; with 100 grasps 20 %, with 200 6 %, with 500 2.5 %.
+"""
 
 
 def read_with_lab_tables(folder: Path | None, lab: Sequence[Path]) -> Grasps:

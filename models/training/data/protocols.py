@@ -22,7 +22,7 @@ EvalProtocol = Literal[
 ]
 PROTOCOLS: tuple[EvalProtocol, ...] = get_args(EvalProtocol)
 STANDARD = PROTOCOLS[:6]
-"""What `graspd evaluate` runs by default."""
+"""Protocols that `graspd evaluate` runs by default."""
 ABOUT: dict[EvalProtocol, str] = {
     "cv": "known objects: stratified folds of palm_down + palm_side (the paper's)",
     "unknown": "the paper's 8 objects left out of palm_down + palm_side",
@@ -45,10 +45,13 @@ DAYS = (
     ("C", (NEW_SESSION, WHOLE[1]), WHOLE[:1]),
     ("C", (NEW_SESSION, WHOLE[0]), WHOLE[1:]),
 )
-"""Of `days`: name, tables that are trained on, tables that are judged."""
+"""Streams of `days`: name, tables of the training, judged tables."""
 DAYS_FOLDS = 4
-"""Of objects in `days`, at most: with more, no table would have enough grasps of a fold's objects
-to say what a session is worth that runs for hundreds of grasps."""
+"""Most folds of objects in `days`.
+
+With more, no table would have enough grasps of a fold's objects to measure a session of hundreds of
+grasps.
+"""
 
 
 class TooFewGraspsError(ValueError):

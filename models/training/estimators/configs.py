@@ -18,7 +18,7 @@ class SvmConfig:
 
     c: float
     gamma: float | Literal["auto"]
-    """Of the kernel exp(-gamma * distance**2); auto: one over the number of features."""
+    """Gamma of the kernel exp(-gamma * distance**2); auto: 1 / number of features."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +77,10 @@ GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
         {"iterations": (400,), "learning_rate": (0.05,), **_TREES},
     ],
 }
-"""What a grid search tries, as scikit-learn's `ParameterGrid` takes it. The paper gives the grids
-of the first two; it gives none for perceptrons, and has no boosting."""
+"""Grids of the grid search, for scikit-learn's `ParameterGrid`.
+
+The paper gives the first two. It gives no grid for perceptrons, and has no boosting.
+"""
 
 
 @dataclass(frozen=True, slots=True)

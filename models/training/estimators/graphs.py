@@ -25,11 +25,11 @@ from models.training.estimators.classical import PROBABILITY_FLOOR, Boosting, Cl
 from models.training.estimators.networks import for_inference, for_margin
 
 OPSET = 18
-"""What the exporters are written for; every onnxruntime that the project allows knows it."""
+"""Operator set of the exporters; all allowed versions of onnxruntime have it."""
 ML_OPSET = 3
-"""Of the domain `ai.onnx.ml`, which has the trees."""
+"""Operator set of the domain `ai.onnx.ml`, which has the trees."""
 IR_VERSION = 10
-"""Of the file format; onnxruntime 1.18 knows it."""
+"""Version of the file format; onnxruntime 1.18 reads it."""
 MARGIN_NAME = "margin"
 
 _Steps = Sequence[tuple[str, Sequence[str], str, dict[str, Any]]]
@@ -229,7 +229,7 @@ def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
 
 
 def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
-    """What skl2onnx makes of a classifier: outputs `label` and `probabilities` (N, 2)."""
+    """Return a classifier as ONNX, with the outputs `label` and `probabilities` (N, 2)."""
     converted: onnx.ModelProto = to_onnx(
         model,
         np.zeros((1, model.n_features_in_), dtype=np.float32),

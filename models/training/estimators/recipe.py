@@ -27,7 +27,7 @@ from models.training.estimators.networks import build
 INFERENCE_BATCH = 512
 """Inputs per forward pass: bounds memory, changes nothing else."""
 KERAS_ADAM_EPSILON = 1e-8
-"""Of Keras 2.0.8, with which the published networks were trained."""
+"""Epsilon of Adam in Keras 2.0.8, which trained the published networks."""
 
 
 @contextmanager
@@ -159,7 +159,7 @@ def optimization(
 
 
 def _batches(grasps: int, recipe: AnyRecipe) -> Sequence[slice]:
-    """Where the batches of one epoch lie in the shuffled order."""
+    """Return the slices of an epoch's shuffled order, one per batch."""
     batch = min(recipe.batch, grasps)
     # A batch norm cannot be trained on a single grasp; Keras takes any other remainder.
     least = batch if isinstance(recipe, Recipe) else 2

@@ -16,7 +16,7 @@ from models.training.fitting.trained import Trained, train
 from models.training.systems.system import System
 
 FOLDS, JUDGED_FOLDS = 10, 3
-"""Of ten stratified folds, three are judged: enough to tell one point from twenty."""
+"""Number of stratified folds, and of those judged; three show a difference of a few points."""
 NUMBERS = (1, 2, 4, 8, 12)
 LOOKED_FOR_MAX = 13
 """Broken electrodes of a reading that are looked for at most: one more than the daemon repairs in a
@@ -29,7 +29,7 @@ KINDS: dict[str, Breakage] = {
     "anywhere": lambda counts, random: random.integers(200, 3500, counts.shape).astype(np.uint16),
     "500 too high": lambda counts, _: np.minimum(counts + 500, COUNT_MAX - 1).astype(np.uint16),
 }
-"""What a broken electrode reads."""
+"""Values of a broken electrode, by kind of damage."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What verdicts are worth on another day: how many slips are among what is called stable."""
+"""Figures of verdicts on another day, such as the share of slips among `stable` ones."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class VerdictFigures:
     grasps: int
     f1: float
     slips_among_stable: float | None
-    """Of what is called stable."""
+    """Share of slips among the grasps called stable; None: no such grasp."""
     slips_called_stable: float | None
-    """Of what slips."""
+    """Share of the slips that are called stable; None: no slip."""
     stable_called_slip: float | None
-    """Of what stays."""
+    """Share of the stable grasps that are called slip; None: no stable grasp."""
 
     @classmethod
     def of(cls, called_slip: Bools, slipped: Bools) -> VerdictFigures:
-        """Of verdicts (N,) and what came of them."""
+        """Return the figures of verdicts and outcomes, shape (N,) each."""
         missed, alarms = ~called_slip & slipped, called_slip & ~slipped
         return cls(
             len(slipped),

@@ -62,7 +62,7 @@ def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]
 
 
 class Day:
-    """What the daemon's `Plausibility` finds in sound readings."""
+    """Findings of the daemon's `Plausibility` in sound readings."""
 
     def __init__(self, trained: Trained) -> None:
         seen = trained.seen()
@@ -109,7 +109,7 @@ class SessionDay:
         """Inputs of the network, (features,), for the grasp that was judged last."""
 
     def look(self, counts: Numbers) -> tuple[Numbers, bool, bool]:
-        """What `Day.look` finds, of a session that may be odd."""
+        """Return the result of `Day.look`; the session may be odd."""
         mean, spread = (
             values[self._features :].reshape(counts.shape)
             for values in (self.session.mean, self.session.spread)

@@ -51,7 +51,7 @@ class Job:
     system: System
     protocol: EvalProtocol
     seed: int
-    """Of the split and, with the fold, of the training."""
+    """Seed of the split and, together with the fold, of the training."""
     fold: int
     folds: int = FOLDS
 
@@ -62,7 +62,7 @@ class Job:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def file_name(self, data: str) -> str:
-        """Of the stored result: different for every job and every data (a digest)."""
+        """Return the name of the stored result, unique for job and data. `data`: a digest."""
         readable = f"{self.system.name}.{self.protocol}.{self.seed}.{self.fold}"
         return f"{readable}.{self.key(data)[:16]}.npz"
 
@@ -89,7 +89,7 @@ class JobResult:
     """By variant: uncalibrated log-odds of slip (n,)."""
     train_grasps: int
     seconds: float
-    """Of training and judging."""
+    """Time of training and judging, s."""
     parameters: int
     """How many numbers the trained system consists of."""
     ages: dict[str, Ints] = field(default_factory=dict)

@@ -15,7 +15,7 @@ from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc
 from models.training.arrays import Bools, Floats, Ints
 
 TEMPERATURE_RANGE = (0.05, 20.0)
-"""Where a temperature is looked for; perfectly separated labels end at the low end."""
+"""Limits of a fitted temperature; perfectly separated labels end at the lower one."""
 ECE_BINS = 15
 """Bins of equal width, as in Guo et al."""
 HALVINGS = 60
@@ -54,7 +54,7 @@ class Spread:
     """A figure over folds and seeds."""
 
     mean: float
-    """Of the seeds' fold means."""
+    """Mean over the seeds of each seed's fold mean."""
     std: float
     """Population standard deviation over the folds, mean of the seeds; over the seeds where a seed
     has one fold only."""
@@ -181,10 +181,10 @@ def wilson(accuracy: float, grasps: int) -> Fraction:
 def coverage_curve(
     probability: Floats, slipped: Bools, steps: int = CURVE_STEPS
 ) -> list[CurvePoint]:
-    """Accuracy of the most confident verdicts, from nearly none to all of them.
+    """Return the accuracy of the most confident verdicts, ascending in coverage up to all.
 
-    Of slip probabilities (N,) and labels (N,), N > 0; ascending in coverage. Verdicts of the same
-    confidence stay together.
+    Slip probabilities and labels have shape (N,), N > 0. Verdicts of equal confidence stay
+    together.
     """
     points = _points(probability, slipped)
     number = len(slipped)

@@ -23,7 +23,7 @@ WORKERS_TIMEOUT_S = 60
 
 
 class ClusterError(Exception):
-    """The cluster is not there, or lost a job too often. What is finished is kept: try again."""
+    """The cluster is gone, or lost a job too often. Finished jobs are kept; try again."""
 
 
 def run_jobs(

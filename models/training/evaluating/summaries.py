@@ -1,4 +1,4 @@
-"""What a system reached in a protocol: the figures of all its jobs in one file of JSON."""
+"""Figures of a system in a protocol, from all its jobs, in one JSON file."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Variant:
     figures: dict[str, list[list[float | None]]]
     """By name: of each fold (seeds, folds)."""
     temperature: float
-    """Of all margins together; the figures' probabilities are cross-fitted."""
+    """Temperature of all margins together; probabilities of the figures are cross-fitted."""
     confusion: list[list[int]]
     """Grasps of all seeds: rows stable, slip as it was; columns as it was judged."""
     objects: dict[str, ObjectFigures]
@@ -97,9 +97,9 @@ class Variant:
     bins: list[tuple[float, float, int]]
     """Mean slip probability, share that slipped, grasps."""
     ages: list[AgeFigures]
-    """Of running variants."""
+    """Figures of running variants, by age of the session."""
     days: dict[str, DayFigures] = field(default_factory=dict)
-    """Of the protocol `days`, by group of streams."""
+    """Figures of the protocol `days`, by group of streams."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class SystemSummary:
     system: str
     description: str
     digest: str
-    """Of the system's configuration."""
+    """Digest of the system's configuration."""
     protocol: EvalProtocol
     data: str
     """Digest of the grasps."""
@@ -123,7 +123,7 @@ class SystemSummary:
     parameters: int
     """Numbers that a trained system consists of, mean over the trainings."""
     seconds: float
-    """Of all trainings, one thread each."""
+    """Time of all trainings, one thread each, s."""
     headline: str
     """The variant whose figures are quoted for the system."""
     variants: dict[str, Variant]
@@ -277,7 +277,7 @@ class _Pool:
             self.probability = p_slip(self.margins)
 
     def scores(self) -> list[Scores]:
-        """Of each fold."""
+        """Return the scores of each fold."""
         return [
             score(self.margins[inside], self._slipped[inside], self.probability[inside])
             for inside in (self._fold_of == fold for fold in np.unique(self._fold_of))

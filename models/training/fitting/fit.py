@@ -106,7 +106,7 @@ class FittedBlend(Fitted):
 
     members: tuple[FittedNetwork | FittedClassical, ...]
     factors: tuple[float, ...]
-    """What each member's margin is multiplied by."""
+    """Factor of each member's margin."""
 
     @property
     def parameters(self) -> int:
@@ -129,7 +129,7 @@ class FittedStandardised(Fitted):
 
     inner: Fitted
     mean: Floats32
-    """Of the training, in the shape of an input."""
+    """Training mean, in the shape of an input."""
     scale: Floats32
     """One over the spread in the training, in the shape of an input; 0 where nothing varied."""
 

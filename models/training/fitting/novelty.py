@@ -16,8 +16,11 @@ MARGIN_COUNTS = 100
 session, narrow enough that drifted electrodes are not: of the later session palm_45, which the
 network judges wrongly, 97 % are refused."""
 SESSION_MARGIN_COUNTS = 500
-"""The same for a session model, whose counts were mapped to the training's sensors first: drift is
-none of its business, and a young session's map is rough. 6 % of palm_45 are refused."""
+"""Margin of a session model, counts, which takes counts mapped to the training's sensors.
+
+It is wide because the mapping already follows drift, and is rough in a young session. It refuses
+6 % of palm_45.
+"""
 DISTANCE_MAX = 2.5
 """Largest root-mean-square whitened deviation still taken for seen: a held-out grasp has 0.8 at
 the median, and 1 % are above; readings made up of possible but unrelated counts all are."""
@@ -33,7 +36,7 @@ RANDOM_READINGS = 10_000
 
 
 def seen_counts(counts: Numbers, margin: int = MARGIN_COUNTS) -> SeenCounts:
-    """What counts (N, fingers, 24) look like. Raises `ValueError` for fewer than two readings."""
+    """Return the description of counts (N, fingers, 24). Raises `ValueError` for N < 2."""
     if len(counts) < 2:
         raise ValueError("two readings at least have a covariance")
     flat = counts.reshape(len(counts), -1).astype(np.float64)

@@ -30,7 +30,7 @@ class Standards:
 
     @classmethod
     def of(cls, features: Floats) -> Standards:
-        """Of features (N, M). The spread of one that does not vary is 1."""
+        """Return mean and spread of features (N, M); a constant one has spread 1."""
         return cls(features.mean(axis=0), _positive(features.std(axis=0)))
 
     def apply(self, features: Floats, clip: float) -> Floats32:
@@ -50,7 +50,7 @@ class TrainingStandards:
 
     @classmethod
     def of(cls, features: Floats, table_of: Ints) -> TrainingStandards:
-        """Of training features (N, M) and the tables (N,) that they are from."""
+        """Return the standards of training features (N, M), by their tables (N,)."""
         tables, within = {}, np.empty_like(features)
         for table in np.unique(table_of):
             inside = table_of == table
@@ -60,7 +60,7 @@ class TrainingStandards:
         return cls(tables, Standards(features.mean(axis=0), spread))
 
     def each(self, table_of: Ints) -> Standards:
-        """Of shape (N, M): each grasp's by its table (N,). Raises `KeyError` for an unknown one."""
+        """Return each grasp's standards by its table (N,), shape (N, M). Raises `KeyError`."""
         standards = [self.tables[int(table)] for table in table_of]
         return Standards(
             np.stack([one.mean for one in standards]), np.stack([one.spread for one in standards])

@@ -27,11 +27,11 @@ class SensorMapping:
     margin: int
     """Counts outside of the training range that are still taken for seen."""
     tables: TrainingStandards | None = None
-    """Of the counts (fingers * 24,) of each table; every table is mapped to `prior`."""
+    """Standards of the counts (fingers * 24,) of each table; all tables map to `prior`."""
 
     @classmethod
     def of(cls, counts: Numbers, table_of: Ints, *, session: bool) -> SensorMapping:
-        """Of training counts (N, fingers, 24) and the tables (N,) that they are from."""
+        """Return the mapping of training counts (N, fingers, 24), by their tables (N,)."""
         if not session:
             return cls(MARGIN_COUNTS)
         tables = TrainingStandards.of(counts.reshape(len(counts), -1).astype(np.float64), table_of)
@@ -62,7 +62,7 @@ class Trained:
     grasps: Grasps
     sensors: SensorMapping
     standards: TrainingStandards | None
-    """Of a session system's features."""
+    """Standards of a session system's features; None for other systems."""
 
     def margins(self, counts: Numbers, table_of: Ints) -> Floats:
         """Log-odds of slip (N,), uncalibrated, of counts (N, fingers, 24) of known tables (N,)."""
@@ -73,7 +73,7 @@ class Trained:
         return self.sensors.to_training(self.grasps.counts, self.grasps.table_of)
 
     def seen(self) -> SeenCounts:
-        """What the training counts look like, for the check of a reading's novelty."""
+        """Description of the training counts, to find readings unlike them."""
         return seen_counts(self.mapped_counts(), self.sensors.margin)
 
 

@@ -30,7 +30,7 @@ class Parity:
 
     grasps: int
     largest_difference: float
-    """Of a probability: file against trainer, before anything was folded or rounded."""
+    """Largest difference of a probability between file and trainer, before any rounding."""
     verdicts_flipped: int
 
 

@@ -101,7 +101,7 @@ def make_model(
 
 
 def _calibrator(summaries: list[SystemSummary]) -> SystemSummary:
-    """What probabilities are calibrated by: new objects, where they were measured."""
+    """Return the summary that calibrates probabilities: of new objects, if measured."""
     return summaries[min(1, len(summaries) - 1)]
 
 
@@ -123,7 +123,7 @@ def _contract(
 
 
 def _confidence(summary: SystemSummary) -> tuple[ConfidenceStep, ...]:
-    """Of few grasps the surest are too few to say how often they are right."""
+    """Return the steps with enough grasps; few grasps do not show how often they are right."""
     judged = summary.folds * summary.test_grasps
     return tuple(
         ConfidenceStep(point.confidence, point.accuracy, point.coverage)

@@ -1,4 +1,4 @@
-"""What one `graspd train` makes, and by which trainings it is measured."""
+"""Plan of one `graspd train`: the model to make, and the trainings that measure it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TrainingPlan:
     lab_files: tuple[str, ...] = ()
     """File names of the lab tables that are trained on, with their endings."""
     name: str | None = None
-    """Of the model that is made; that of the system and its lab tables unless given."""
+    """Name of the model; None: made from the system and its lab tables."""
 
     @property
     def model(self) -> str:

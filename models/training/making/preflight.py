@@ -27,7 +27,9 @@ FEWEST_STANDARD = 2
 
 def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
     """Raise `TooFewGraspsError` if a training of the plan lacks grasps of a label.
-    That of a session model also needs `FEWEST_STANDARD` of each table that it is judged by."""
+
+    A session model also needs `FEWEST_STANDARD` grasps of each table that it is judged by.
+    """
     session = isinstance(plan.system.input, SessionFeatures)
     for where, of, train, test in _trainings(plan, grasps):
         slips = int(of.slipped[train].sum())
@@ -56,7 +58,7 @@ def enough_folds(plan: TrainingPlan, grasps: Grasps) -> int | None:
 
 
 def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
-    """What a model of these grasps will not be able to do, one sentence each."""
+    """Yield the limits of a model trained on these grasps, one sentence each."""
     grasps = plan.chosen(grasps)
     objects, slips = len(set(grasps.objects)), int(grasps.slipped.sum())
     own = lab_table_names(grasps.files)

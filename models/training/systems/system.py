@@ -1,4 +1,4 @@
-"""What a system is: one way from counts to the log-odds of slip, by configuration alone."""
+"""A system: the configuration of one way from counts to the log-odds of slip."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Member:
 
     estimator: NetworkConfig | ClassicalConfig
     recipe: AnyRecipe | None = None
-    """Of a network."""
+    """Training recipe of a network; None for other estimators."""
     copies: int = 1
     """How many of it are trained, each from another seed."""
     weight: float = 1.0
-    """Of all copies together."""
+    """Weight of all copies together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,20 +64,20 @@ class PaperFigure:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """One way from counts to a margin, complete but for data and seed."""
+    """One way from counts to a margin, complete except for data and seed."""
 
     name: str
     description: str
     input: SystemInput
     estimator: Estimator
     recipe: AnyRecipe | None = None
-    """Of the network that `estimator` is; None for others."""
+    """Training recipe of the network `estimator`; None for other estimators."""
     augmentation: Augmentation | None = None
     standardise: bool = False
     """Each value of an input by its own mean and spread in the training, within the model."""
     fingers: tuple[Finger, ...] = FINGERS
     tables: tuple[str, ...] = WHOLE
-    """What the model that is kept is trained on; protocols say for themselves."""
+    """Training tables of the kept model; protocols have their own."""
     published: tuple[PaperFigure, ...] = ()
 
 
