@@ -28,8 +28,8 @@ log = logging.getLogger("graspd")
 SECTIONS: Final[tuple[str, ...]] = ("hand", "model", "gate", "session", "learn", "risk")
 """Sections of a scene that a recording has."""
 NOTHING_KNOWN: Final = (
-    "%s: begins in the middle of a run and has no state of the judge: verdicts may differ until "
-    "the hand has been open and its session is calibrated"
+    "%s: begins in the middle of a run and has no usable state of the judge: verdicts may "
+    "differ until the hand has been open and grasps again"
 )
 
 

@@ -138,14 +138,14 @@ class Runner:
             time.sleep(AWAKE_LOOK_S)
         return self._stop.received is None
 
-    def _open_sockets(self, of: scene.Scene) -> Sockets:
+    def _open_sockets(self, served: scene.Scene) -> Sockets:
         """Open the sockets of a scene; keep the open ones if they are the same."""
-        if self._sockets is not None and self._sockets.plan == plan(of):
+        if self._sockets is not None and self._sockets.plan == plan(served):
             return self._sockets
         if self._sockets is not None:
             self._sockets.close()
             self._sockets = None
-        self._sockets = Sockets(of)
+        self._sockets = Sockets(served)
         return self._sockets
 
     def _work(self, parts: Parts) -> tuple[Ended, Parts | None]:

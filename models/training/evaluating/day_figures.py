@@ -25,7 +25,7 @@ GROUPS = {name: (name,) for name in (A, B_DOWN, B_SIDE, C_DOWN, C_SIDE)} | {
 
 @dataclass(frozen=True, slots=True)
 class VerdictFigures:
-    """Figures of some verdicts as fractions, slip positive; None where nothing was called so."""
+    """Figures of verdicts as fractions; slip is positive."""
 
     grasps: int
     f1: float
@@ -54,19 +54,19 @@ class DayFigures:
     """Figures of grasps of another day."""
 
     every: VerdictFigures
-    """With those that the daemon would refuse."""
+    """Figures of all grasps, also those that the daemon would refuse."""
     judged: VerdictFigures
-    """Without them."""
+    """Figures of the grasps that the daemon would judge."""
     coverage: float
-    """Fraction that is judged."""
+    """Fraction of the grasps that would be judged."""
     refused_slipped: float | None
-    """Fraction that slipped of what is refused; None if nothing is."""
+    """Fraction of slips among the refused grasps; None: no such grasp."""
 
 
 def day_figures(
     variant: str, folds: Sequence[Sequence[JobResult]], grasps: Grasps
 ) -> dict[str, DayFigures]:
-    """By group of streams; `folds` has, for each seed, the results of `days` in their order."""
+    """Return the figures by group of streams. `folds`: results of `days` for each seed."""
     parts: dict[str, list[JobResult]] = {}
     for results in folds:
         for index, result in enumerate(results):

@@ -1,4 +1,4 @@
-"""From grasp tables to a model file and its card: measure, calibrate, train, export."""
+"""Make a model file and its card from grasp tables: measure, calibrate, train, export."""
 
 from __future__ import annotations
 
@@ -44,8 +44,10 @@ from models.training.making.plan import TrainingPlan
 from models.training.systems.system import SessionFeatures, System, configuration
 
 EXTRA_TRAININGS = 2
-"""Beside the folds: one for the repeatability, one for the model itself. The study of broken
-electrodes, three more, comes last."""
+"""Trainings beside the folds: one for repeatability, one for the model itself.
+
+The study of broken electrodes, three more, comes last.
+"""
 
 
 def make_model(
@@ -156,7 +158,7 @@ def _input(system: System, trained: Trained, summaries: list[SystemSummary]) -> 
 
 
 def _sharpness(summaries: list[SystemSummary]) -> tuple[Sharpness, ...]:
-    """How much less sure a young session is than the calibrated model, never more sure."""
+    """Return the temperatures of a young session, which is never surer than a calibrated one."""
     base = _calibrator(summaries).main.temperature
     later = next((s for s in summaries if s.protocol == "days"), None)
     if later is None:
