@@ -127,7 +127,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     ),
     LinkCause.NOT_FOUND: Trouble(
         Cause.PORT_MISSING,
-        "plug it in, or name one that there is; a Pico that is a drive has no firmware yet",
+        "plug it in, or name an existing one; a Pico that is a drive has no firmware yet",
     ),
     LinkCause.DENIED: Trouble(
         Cause.PORT_DENIED, "join the group of the port: ls -lL and the port names it"
@@ -149,7 +149,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
         Cause.SILENT, "it has said nothing yet: is it on and connected? longer: --listen 10"
     ),
     LinkCause.NO_ANSWER: Trouble(
-        Cause.SILENT, f"plug it in anew; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
+        Cause.SILENT, f"plug it in again; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
     ),
     LinkCause.TIMEOUT: Trouble(
         Cause.LINK_LOST,
@@ -187,7 +187,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     ),
     DeviceFault.CLOCK_NOT_TRUSTED: Trouble(Cause.CLOCK, CLOCK_ADVICE),
 }
-"""What is wrong with a link or a device, by what its driver says."""
+"""Cause and advice for each fault that a driver reports."""
 
 
 def device_findings(

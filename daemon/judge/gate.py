@@ -64,7 +64,7 @@ class GateMemory:
     in_contact: bool = False
     """True if all required fingers touch."""
     objections: tuple[Reason, ...] = (Reason.NO_CONTACT,)
-    """What the last reading said against settling."""
+    """Reasons of the last reading against settling."""
 
 
 class Gate:

@@ -146,7 +146,7 @@ class HandTracker:
 
     @property
     def rest(self) -> NDArray[np.float64]:
-        """Where each electrode rests, counts, shape (fingers, 24); 0 where it is not known."""
+        """Return the resting counts, shape (fingers, 24); 0: not known."""
         contact = self._contact.memory
         known = np.isfinite(contact.baseline) & contact.tared[:, np.newaxis]
         return np.where(known, contact.baseline, 0.0)

@@ -260,7 +260,7 @@ class Motion:
             np.add.reduce((sums, *means), axis=0, out=sums)
 
     def _mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
-        """Of each finger over its electrodes usable from a step on; infinite if too few are."""
+        """Return each finger's mean over electrodes usable since `begin`; infinite: too few."""
         memory, since_ns = self.memory, self.memory.times_ns.item(begin)
         if memory.all_usable_since_ns <= since_ns:
             return [total / ELECTRODES for total in values.dot(ONES).tolist()]
