@@ -172,8 +172,8 @@ class Lifts(msgspec.Struct, frozen=True, kw_only=True):
     outstanding: Count
     """Grasps whose outcome can still come."""
     unreported: Count
-    """Grasps forgotten before an outcome came. With a risk, announced ones count as slips; others are
-    in no bound."""
+    """Grasps forgotten before an outcome came. With a risk, announced ones count as slips;
+    others are in no bound."""
     announced: Count = 0
     """`lift` questions that were answered `stable`, one a grasp."""
     awaited: Count = 0

@@ -96,7 +96,9 @@ def removed_key(plan: Plan) -> Outcome:
             with clients.connect(context, "leaving") as again:
                 anew += _hears(again, QUIET_S)
         tried += 1
-    happened = f"{former} removed keys went on hearing, {anew} got in again, {lost} others were lost"
+    happened = (
+        f"{former} removed keys went on hearing, {anew} got in again, {lost} others were lost"
+    )
     return Outcome(tried, happened, held=not (former or anew or lost))
 
 
