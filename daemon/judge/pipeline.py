@@ -319,6 +319,11 @@ class Pipeline:
             return trust.review(grasp, None)
         return memory.assessment
 
+    def _is_told(self, moment: Moment) -> bool:
+        """Return True if the hand still holds a grasp whose outcome is known."""
+        over = moment.state in (GateState.IDLE, GateState.RELEASED)
+        return not over and self.lifts.is_told(GraspId(self.boot_id, moment.grasp))
+
     def _note(self, grasp: GraspId, assessment: Assessment | None, *, stable: bool) -> None:
         """Enter in the book what was said of a grasp."""
         if self.trust is None or assessment is None:
@@ -346,6 +351,8 @@ class Pipeline:
         """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
         calibrated = None if self._session is None else self._session.now.calibrated
         objections = (*unusable, *opinion.reasons)
+        if self._is_told(moment):
+            objections = (*objections, Reason.OUTCOME_TOLD)
         if calibrated is False and (self._needs_session or self.memory.needs_session):
             objections = (*objections, Reason.NOT_CALIBRATED)
         p_slip, withheld = opinion.p_slip, None
