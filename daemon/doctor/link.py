@@ -74,12 +74,12 @@ LOSSES = ("link_losses",)
 FLAPS_MIN = 3
 """Losses of a link while the doctor listens from which they are an error."""
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
-"""What a link that comes and goes may be at any one moment; its loss is the cause of each."""
+"""Causes of a link that comes and goes, at any one moment; its loss explains them all."""
 COUNTERS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
     LOSSES: Trouble(Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"),
     ("restarts",): Trouble(
-        Cause.RESTARTED, f"the board began anew: {AGAIN}, its supply and reset line"
+        Cause.RESTARTED, f"the board was reset: {AGAIN}, its supply and reset line"
     ),
     ("error_frames", "bus_off"): Trouble(
         Cause.BUS_ERRORS,

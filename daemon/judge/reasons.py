@@ -121,7 +121,7 @@ WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
 def to_act_on(reasons: Sequence[Reason]) -> list[Reason]:
     """Return the reasons that tell a person what to do.
 
-    Where the sensors cannot be read, what is said of the hand is old: closing it helps nothing.
+    If the sensors cannot be read, the state of the hand is old, and closing it does not help.
     """
     if UNREADABLE.isdisjoint(reasons):
         return list(reasons)

@@ -133,7 +133,7 @@ class Verdict:
     `decision` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
     one of those in deploy/clients/README.md. `p_slip` is the probability of slip, None when
     unknown, and rests on `outcomes` told outcomes; the network alone says `p_slip_model`. `grasp`
-    is the number of the contact episode, `age_ms` the time since the reading's last byte, ms, at least.
+    is the number of the contact episode, `age_ms` at least the time since the reading's last byte.
     `supervised`: its lift would teach, but only while a person watches. `early`: it was judged when
     nothing moved fast, but something might still slide slowly. `still_ms` is for how long the hand
     has been still, ms: from 100 on nothing moves fast, from 240 on nothing slides slowly either.
