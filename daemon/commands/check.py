@@ -270,8 +270,8 @@ def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
         f"after {after} fast motion is excluded, {soon.counts_per_s:.0f} counts/s and more, after "
         f"{again} slow slides, {sure.counts_per_s:.0f} and more (mean of the electrodes that is "
         f"seen in half of the readings; {1e9 / period_ns:.0f}/s{usual}, "
-        f"typical noise); a hand that holds may be said to move {100 * gate.false_alarms:g} % of "
-        f"the time; {judged}"
+        f"typical noise); a settled hand that holds may be said to move "
+        f"{100 * gate.false_alarms:g} % of the time; {judged}"
     )
 
 

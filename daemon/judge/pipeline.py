@@ -247,7 +247,8 @@ class Pipeline:
         judgement = self._decide(
             reading.t_ns, checked.reasons, moment, memory.opinion, assessment, counts
         )
-        if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
+        learns = self._learns and moment.steady and Reason.STALE not in judgement.reasons
+        if grasp is not None and learns:
             self._keep_to_learn(grasp, moment.grasp)
         stable = judgement.decision is Decision.STABLE
         if stable or moment.judges or moment.judged:

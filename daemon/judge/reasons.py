@@ -196,6 +196,8 @@ class Moment(NamedTuple):
     """Time for which the hand has touched and kept still, ms."""
     early: bool = False
     """True if it was judged while something might still slide slowly."""
+    steady: bool = True
+    """True if motion keeps to the strict limit: else a session learns nothing from the reading."""
     motion: dict[Finger, float | None] | None = None
     """How each finger moves, in units of its noise; None where that is not known."""
     motion_limits: dict[Finger, float] | None = None
