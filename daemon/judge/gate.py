@@ -205,7 +205,7 @@ class Gate:
 
     @property
     def _motion_limits(self) -> MotionLimits:
-        """What fingers may move now."""
+        """Limits of motion now: loose once the grasp is sure, else strict."""
         return self.motion.loose if self.memory.sure else self.motion.strict
 
     def _keeps_to(self, limits: MotionLimits) -> bool:

@@ -114,7 +114,7 @@ class FreshMedian:
 
 @dataclass(slots=True)
 class HandMemory:
-    """What the hand's parts do not remember themselves."""
+    """State of the hand that its parts do not keep themselves."""
 
     last_ns: int | None = None
     """Time of the last usable reading."""

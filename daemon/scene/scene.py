@@ -145,7 +145,7 @@ class GateSection(Section):
     contact_sigmas: Annotated[float, Field(ge=3, le=100), unit("sigma")] = ContactLimits.sigmas
     """The same limit in standard deviations of the finger's noise; both must be reached."""
     false_alarms: Annotated[float, Field(ge=0.001, le=0.3), unit()] = GateLimits.false_alarms
-    """Share of the time in which a settled hand that holds may count as moving. Until it has settled
+    """Share of the time in which a settled hand that holds may count as moving. Before it settles,
     the limit is stricter. With a smaller share, more slow slides count as still
     (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
