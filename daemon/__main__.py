@@ -1,4 +1,4 @@
-"""The process `graspd`, also as `python -m daemon`: Ctrl-C never ends in a traceback."""
+"""The process `graspd`, also `python -m daemon`. Ctrl-C never ends in a traceback."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import sys
 from types import FrameType
 
 INTERRUPTED = 130
-"""Exit code after SIGINT: 128 and the signal's number."""
+"""Exit code after SIGINT: 128 plus the number of the signal."""
 
 
 def main() -> int:
-    """Run the command line; return 130 if SIGINT comes where no command waits for it."""
+    """Run the command line; return 130 after a SIGINT that no command handles."""
     heeded = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
     try:
         if heeded:
@@ -23,7 +23,7 @@ def main() -> int:
 
             return guarded(lambda: _run(heeded))
         finally:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left is leaving
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # from here the process only leaves
     except KeyboardInterrupt:
         return INTERRUPTED
 
@@ -35,19 +35,19 @@ def _run(heeded: bool) -> int:
     from daemon.cli import parse
 
     command = parse()
-    gc.freeze()  # a search through all modules would stop the loop for 30 ms
+    gc.freeze()  # a search of all modules would stop the loop for 30 ms
     if heeded:
         signal.signal(signal.SIGINT, _interrupt_once)
     return command()
 
 
 def _leave_at_once(_number: int, _frame: FrameType | None) -> None:
-    """End the process. Modules that load may turn an exception into another; none is open yet."""
+    """End the process at once: an exception could be lost in a module that is loading."""
     os._exit(INTERRUPTED)
 
 
 def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
-    """Let the command clean up. The next SIGINT ends the process."""
+    """Let the command clean up; the next SIGINT ends the process at once."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     raise KeyboardInterrupt
 

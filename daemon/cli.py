@@ -1,8 +1,10 @@
 """The command line: `graspd COMMAND ...`.
 
-Exit codes: 0 done; 1 something failed while running: a device, the socket, the output, getting
-data, and what `doctor` finds; 2 the command line, scene, recording or model is wrong; 130 and 143
-stopped by SIGINT and SIGTERM before the work was done.
+Exit codes:
+0: done.
+1: a failure while running (device, socket, output, download), or a finding of `doctor`.
+2: the command line, scene, recording or model is wrong.
+130, 143: stopped by SIGINT or SIGTERM before the work was done.
 """
 
 from __future__ import annotations
@@ -52,26 +54,26 @@ COMMANDS = {
     "completion": ("daemon.commands.texts", "print what makes a shell complete commands"),
     "manual": ("daemon.commands.texts", "print the manual page: graspd manual | man -l -"),
 }
-"""Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
+"""Commands by name: a module with `add_arguments(parser)` and `run(args) -> int`, and help."""
 EXTRAS = {
     "export-grasps": "record",
     "train": "train",
     "evaluate": "train",
     "report": "train,report",
 }
-"""Extras without which a command cannot be run; its help needs none."""
+"""Extra that a command needs to run; its help works without."""
 LIBRARIES = ("onnxruntime", "numpy", "pyzmq", "python-can", "pyserial")
-"""Whose versions `--version` tells."""
+"""Libraries whose versions `--version` prints."""
 WRONG = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code; without what the process needs around it."""
+    """Run one command and return its exit code. `daemon.__main__` sets up the process."""
     return parse(arguments)()
 
 
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
-    """Load the named command and bind its arguments. Raises `SystemExit` if there is none."""
+    """Return the named command with its arguments. Raises `SystemExit` for a wrong line."""
     arguments = sys.argv[1:] if arguments is None else arguments
     named = next((word for word in arguments if not word.startswith("-")), None)
     parser = _parser(lambda name: name == named)
@@ -97,12 +99,12 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 
 
 def whole_parser() -> Parser:
-    """The parser of all commands, with all their arguments."""
+    """Return the parser of all commands, with all arguments."""
     return _parser(lambda _name: True)
 
 
 def _parser(is_wanted: Callable[[str], bool]) -> Parser:
-    """The parser of all commands; of those that are not wanted it knows the names alone."""
+    """Return the parser of all commands, with the arguments of those that `is_wanted`."""
     parser = Parser(
         prog="graspd",
         description="Says before a Shadow Dexterous Hand lifts whether the grasp will hold.",
@@ -119,10 +121,10 @@ def _parser(is_wanted: Callable[[str], bool]) -> Parser:
 
 
 class _Version(argparse.Action):
-    """Tells graspd's version in the first line, and of what it stands on in the second."""
+    """Print graspd's version in the first line, those of Python and libraries in the second."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        # Only where they are needed.
+        # Imported here, as only `--version` needs them.
         import platform
         from importlib.metadata import version
 

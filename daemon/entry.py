@@ -1,7 +1,7 @@
-"""Where the program `graspd` begins: it makes sure that the packages it runs are graspd's own.
+"""Start of the program `graspd`: check that the imported packages are graspd's own.
 
-In the wheel this file is the module `graspd`, a name that no other package has. `daemon`, `drivers`
-and `models` are names that other packages have too, and Python imports the first that it finds.
+In the wheel this file is the module `graspd`, a name that no other package has. Other packages too
+are called `daemon`, `drivers` or `models`, and Python imports the first one on its path.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from pathlib import Path
 
 OURS = {
     "daemon": '"""The daemon: scene, judge, publisher',
-    "drivers": '"""Everything that touches a sensor',
-    "models": '"""What the tactile image is',
+    "drivers": '"""Sensors: wire formats',
+    "models": '"""The tactile image, the networks',
 }
-"""Our packages, and how the `__init__.py` of each begins."""
+"""Packages of graspd, and the first words in the `__init__.py` of each."""
 WRONG = 2
 
 
 def main() -> int:
-    """Run the command line; 2 and one line on stderr if another package is in place of ours."""
+    """Run the command line; return 2, with a line on stderr, if `clash` finds a problem."""
     problem = clash()
     if problem is not None:
         sys.stderr.write(f"graspd: {problem}\n")
@@ -31,7 +31,7 @@ def main() -> int:
 
 
 def clash() -> str | None:
-    """Say what is in place of one of our packages and what to do; None: nothing is."""
+    """Return which foreign package hides one of `OURS` and what to do; None: no problem."""
     for name, beginning in OURS.items():
         spec = find_spec(name)
         if spec is None or spec.origin is None:

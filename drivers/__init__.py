@@ -1,1 +1,1 @@
-"""Everything that touches a sensor: wire formats, transports, the replay driver, the twins."""
+"""Sensors: wire formats, transports, drivers of devices and recordings, twins."""

@@ -1,4 +1,4 @@
-"""What every driver has in common: readings, the driver interface, exceptions, counters."""
+"""Common parts of all drivers: readings, the driver interface, exceptions, counters."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ COUNT_MAX = 4095
 
 
 def check_fingers(fingers: Sequence[str]) -> None:
-    """Raise `ValueError` unless these are one or more different `FINGERS`."""
+    """Raise `ValueError` if `fingers` is empty, or has a name twice or one not in `FINGERS`."""
     if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
         raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
 
 
 def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the sensor of a device, from 0, for each of `fingers`. Raises `ValueError`.
-    `sensors`: all fingers in the order of the device; None: `fingers`."""
+    """Return the number of each finger's sensor at the device, from 0. Raises `ValueError`.
+
+    `sensors`: all fingers in the order of the device; None: the same as `fingers`.
+    """
     check_fingers(fingers)
     if sensors is None:
         return tuple(range(len(fingers)))
@@ -53,9 +55,9 @@ class ElectrodeFault(IntFlag):
     ERROR_WORD = 8
     """The sensor answered with an error word instead of data (manual table 8)."""
     HELD = 16
-    """The value repeats an earlier sweep: nothing new was sampled."""
+    """The value repeats an earlier sweep; nothing new was sampled."""
     CUT_OFF = 32
-    """The record ends in the middle, so its values may be cut off."""
+    """The last row of a file ends without a line end; its values may be cut off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,22 +78,22 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     t_ns: int
     """Monotonic time, ns, when the last byte of the reading was received."""
     seq: int
-    """Counts up by one per reading that the sensor made; a gap is a loss."""
+    """Number of the reading; one more per reading that the sensor made. A gap is a loss."""
     counts: NDArray[np.uint16]
     """Shape (fingers, 24), raw counts 0..4095, meaningless where `faults` is not zero."""
     faults: NDArray[np.uint8]
     """Shape (fingers, 24), `ElectrodeFault` bits per electrode."""
     annotation: Annotation | None = None
     recorded_ns: int | None = None
-    """Recordings only, which may be played at any speed: time since the recording's zero, ns."""
+    """Time since the recording's zero, ns; None for live readings. Playing has any speed."""
 
     @property
     def made_ns(self) -> int:
-        """Time when the sensor made it, ns, for intervals. `t_ns` is for age."""
+        """Time for intervals between readings, ns. Use `t_ns` for the age of a reading."""
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
     def __post_init__(self) -> None:
-        """Check the shapes: another one is a bug in the driver."""
+        """Raise `ValueError` for wrong shapes, which are a bug in the driver."""
         if self.counts.ndim != 2 or self.counts.shape[1] != ELECTRODES:
             raise ValueError(f"counts have shape {self.counts.shape}, not (fingers, {ELECTRODES})")
         if self.faults.shape != self.counts.shape:
@@ -104,6 +106,7 @@ class JointReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     t_ns: int
     """Monotonic time, ns, when the last byte of the reading was received."""
     seq: int
+    """Number of the reading, one more per reading that the sender made."""
     names: tuple[str, ...]
     """Joint names without hand prefix, such as `FFJ3`."""
     position_rad: NDArray[np.float64]
@@ -127,9 +130,9 @@ class DriverCounters:
     readings: int = 0
     """Readings handed over, valid or not."""
     faulty_readings: int = 0
-    """Of these, readings with at least one electrode fault."""
+    """Readings handed over with at least one electrode fault."""
     missed_readings: int = 0
-    """Readings that the sensor made (by its sequence) and that never arrived."""
+    """Readings that never arrived, by the sensor's own sequence."""
 
     def as_dict(self) -> dict[str, int]:
         """Return all counters by name."""
@@ -137,10 +140,10 @@ class DriverCounters:
 
 
 class LinkCause(Enum):
-    """Cause of a link that is not up, for programs."""
+    """Cause of a link that is not up. Programs compare this, never the text."""
 
     UNKNOWN = auto()
-    """Not tried yet, or known from the text alone."""
+    """The link was not tried yet, or only the text tells the cause."""
     NOT_FOUND = auto()
     DENIED = auto()
     IN_USE = auto()
@@ -151,23 +154,23 @@ class LinkCause(Enum):
     """The address to listen on is not one of this computer."""
     BUS_OFF = auto()
     SILENT = auto()
-    """The port is open, and nothing has come yet."""
+    """The port is open, but no byte has arrived yet."""
     NO_ANSWER = auto()
     TIMEOUT = auto()
-    """Readings came, and then none for too long."""
+    """Readings came, then stopped for longer than the timeout."""
     DISCONNECTED = auto()
     """The device went away or was reset."""
     VERSION = auto()
     SETTINGS = auto()
-    """The device does not sample what the scene needs, or has changed what it samples."""
+    """The device samples other electrodes or rates than the scene needs, or than before."""
     SERIALS = auto()
-    """The device names other serial numbers each time."""
+    """The device gives different serial numbers each time it is asked."""
 
 
 _CAUSES: dict[int | None, LinkCause] = {
     errno.ENOENT: LinkCause.NOT_FOUND,
     errno.EACCES: LinkCause.DENIED,
-    errno.EAGAIN: LinkCause.IN_USE,  # of a lock
+    errno.EAGAIN: LinkCause.IN_USE,  # the port is locked
     errno.EBUSY: LinkCause.IN_USE,
     errno.EADDRINUSE: LinkCause.IN_USE,
     errno.ENODEV: LinkCause.NO_INTERFACE,
@@ -178,29 +181,29 @@ _CAUSES: dict[int | None, LinkCause] = {
 
 
 class DeviceFault(Enum):
-    """Faults of a device whose link is up, for programs."""
+    """Faults of a device whose link is up. Programs compare these, never the text."""
 
     OLD_FIRMWARE = auto()
     NO_SENSOR = auto()
     SENSOR_ABSENT = auto()
     SENSOR_TWICE = auto()
-    """One sensor answers in two places."""
+    """One serial number is read at two chip selects."""
     SENSOR_WORDS = auto()
-    """Words between a sensor and the device were damaged."""
+    """Words from a sensor reached the device damaged."""
     SWEEP_TOO_LONG = auto()
     CLOCK_NOT_TRUSTED = auto()
     BUS_ERROR = auto()
 
 
 class Fact(NamedTuple):
-    """One fact about a device: a text for people, and its fault."""
+    """One fact about a device: a text for people, and the fault that it shows, if any."""
 
     text: str
     fault: LinkCause | DeviceFault | None = None
 
 
 class Opened(ABC):
-    """A context manager: `with` opens it, and closes it at the end."""
+    """Base of context managers: `with` calls `open`, and `close` at the end."""
 
     @abstractmethod
     def open(self) -> None:
@@ -208,7 +211,7 @@ class Opened(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Release it."""
+        """Release the device."""
 
     def __enter__(self) -> Self:
         self.open()
@@ -219,7 +222,7 @@ class Opened(ABC):
 
 
 class Driver(Protocol):
-    """A source of readings that the service loop waits on.
+    """A source of readings for the service loop.
 
     The loop calls `read_ready` when `fileno` is readable or when `due_ns` has passed. No method
     blocks. `close` may be called more than once.
@@ -235,24 +238,29 @@ class Driver(Protocol):
 
     @property
     def exhausted(self) -> bool:
-        """True when a recording has ended. False for live links."""
+        """True when a recording has ended; always False for live links."""
 
     @property
     def live(self) -> bool:
-        """True if readings come when the sensor makes them, False for recordings."""
+        """True for a sensor, False for a recording."""
 
     @property
     def period_ns(self) -> int | None:
-        """Nominal time between tactile readings, ns, or None while it is not known."""
+        """Nominal time between tactile readings, ns; None: not known yet."""
 
     @property
     def serials(self) -> dict[str, str]:
-        """Known serial numbers of the sensors by finger, or the sender if a link has none.
-        Another number is another sensor; between the two, `read_ready` returns nothing once."""
+        """Serial numbers of the sensors by finger; links without any give the sender instead.
+
+        A new number means that the sensor was exchanged. Between the readings of two sensors,
+        `read_ready` returns nothing once. Fingers whose number is unknown are left out.
+        """
 
     def describe(self) -> dict[str, Fact]:
         """Return facts about the device by name: versions, serials, why a link is down.
-        Live links have the fact `link`, whose fault is None while it is up."""
+
+        Live links have the fact `link`; its fault is None while the link is up.
+        """
 
     def open(self) -> None:
         """Take the device. Raises `DriverError`."""
@@ -261,10 +269,10 @@ class Driver(Protocol):
         """Release everything that `open` took."""
 
     def fileno(self) -> int | None:
-        """Descriptor to wait on, or None while there is none."""
+        """Return the descriptor to wait on, or None if there is none now."""
 
     def due_ns(self) -> int | None:
-        """Monotonic time, ns, to call `read_ready` even if nothing has come, or None."""
+        """Return the monotonic time, ns, of the next call without input, or None."""
 
     def read_ready(self) -> Sequence[Reading]:
         """Return the readings that are complete now, oldest first. Raises `DriverError`."""
@@ -275,17 +283,17 @@ class DriverError(Exception):
 
 
 class LinkError(DriverError):
-    """The device does not answer or went away: try again later."""
+    """The device does not answer or went away; a later try may succeed."""
 
     def __init__(self, cause: LinkCause, text: str, endpoint: str | None = None) -> None:
-        """`cause` and `endpoint`, if the link has one, are for programs, `text` for people."""
+        """`text` is for people. `cause` and `endpoint`, the address, are for programs."""
         super().__init__(text)
         self.cause = cause
         self.endpoint = endpoint
 
     @classmethod
     def from_errno(cls, error: BaseException, text: str, endpoint: str | None = None) -> LinkError:
-        """Take the cause from the `errno` of `error`, or of the errors that led to it."""
+        """Return an error whose cause follows from the `errno` of `error` or its causes."""
         reason: BaseException | None = error
         while reason is not None:
             cause = _CAUSES.get(getattr(reason, "errno", None))
@@ -296,7 +304,7 @@ class LinkError(DriverError):
 
 
 class RecordingError(DriverError):
-    """A recording has the wrong content: give up."""
+    """A recording has the wrong content; no later try can succeed."""
 
     def __init__(
         self, path: Path, problem: str, *, line: int | None = None, column: str | None = None

@@ -19,8 +19,10 @@ E1: Final = 17
 """Channel of electrode 1; E24 is channel 40 (manual table 7)."""
 E24: Final = E1 + ELECTRODES - 1
 FORBIDDEN_COMMAND = 0xA1
-"""Channel 16 starts the streaming loop of the old protocol V1.1, which a sensor leaves only after
-five seconds of idle clock. Never sent."""
+"""Command of channel 16, never sent: it starts the streaming loop of protocol V1.1.
+
+A sensor leaves that loop only after the clock has been idle for five seconds.
+"""
 CHANNELS = (PAC, PDC, TAC, TDC, *range(E1, E24 + 1))
 
 ERROR_WORDS: dict[int, str] = {
@@ -33,9 +35,12 @@ ERROR_WORDS: dict[int, str] = {
     0xA55F: "nothing to resend",
     0xA557: "write failed",
 }
-"""Sent in place of data (tables 8 and 11, C library); 2629..2635 if parity is ignored."""
+"""Error words that a sensor sends in place of data (manual tables 8 and 11, C library).
+
+Without the check of parity they would be counts of 2629 to 2635.
+"""
 UNPLUGGED_WORDS = (0x0000, 0xFFFF)
-"""A line that nothing drives reads all zeros or all ones; both have even parity."""
+"""Words of a line that no sensor drives: all zeros or all ones, both of even parity."""
 
 SEQUENCE_ELECTRODES = tuple(range(E1, E24 + 1))
 SEQUENCE_ALL = CHANNELS
@@ -60,12 +65,15 @@ def sample_command(channel: int) -> int:
 
 
 def channel_of(command: int) -> int | None:
-    """Return the channel that a command byte samples, or None."""
+    """Return the channel that a command byte samples; None if it samples no channel."""
     return _CHANNEL_OF_COMMAND.get(command)
 
 
 def encode_word(count: int) -> int:
-    """Return `D11..D5 P  D4..D0 0 0 P` of a count, bytes of odd parity. Raises `ValueError`."""
+    """Return a count as a response word, `D11..D5 P  D4..D0 0 0 P` of odd parity.
+
+    Raises `ValueError` for a number outside 0..4095.
+    """
     if not 0 <= count <= COUNT_MAX:
         raise ValueError(f"{count} is not a 12-bit count")
     high, low = count >> 5 << 1, (count & 0x1F) << 3
@@ -77,12 +85,15 @@ def encode_word(count: int) -> int:
 def decode_words(
     words: NDArray[np.integer[Any]],
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Return counts, 0 where faulty, and `ElectrodeFault` bits of words, best `np.intp`."""
+    """Return the counts of `words`, 0 where faulty, and their `ElectrodeFault` bits.
+
+    An array of `np.intp` is fastest. The results have its shape.
+    """
     return _COUNT_OF_WORD[words], _FAULT_OF_WORD[words]
 
 
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Return count and fault of all 65536 words: a sweep takes two look-ups."""
+    """Return count and fault of all 65536 words, so that a sweep takes two look-ups."""
     counts = np.zeros(1 << 16, dtype=np.uint16)
     faults = np.full(1 << 16, int(ElectrodeFault.PARITY), dtype=np.uint8)
     for count in range(COUNT_MAX + 1):
@@ -101,7 +112,7 @@ _COUNT_OF_WORD, _FAULT_OF_WORD = _tables()
 
 
 class WordCounters(Protocol):
-    """Counters that a driver of words has."""
+    """Counters of a driver whose device sends response words."""
 
     readings: int
     faulty_readings: int
@@ -114,8 +125,10 @@ class WordCounters(Protocol):
 def make_reading(
     words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int, counters: WordCounters
 ) -> TactileReading:
-    """Return the reading of `words`, shape (fingers, 24), and count it. `marks`: faults that are
-    known already; words under `MISSING` mean nothing and are not counted."""
+    """Return the reading of `words`, shape (fingers, 24), and count it in `counters`.
+
+    `marks`: `ElectrodeFault` bits set beforehand. Words marked `MISSING` are not looked at.
+    """
     counts, faults = decode_words(words)
     if np.count_nonzero(faults) or np.count_nonzero(marks):
         absent = marks & np.uint8(ElectrodeFault.MISSING) != 0

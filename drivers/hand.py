@@ -14,7 +14,7 @@ JOINTS = frozenset(
 
 
 def joint_name(column: str) -> str | None:
-    """Return the joint of a column, or None: `rh_FFJ3` gives `FFJ3`."""
+    """Return the joint of a column (`rh_FFJ3` gives `FFJ3`); None if it names no joint."""
     if column.startswith(HAND_PREFIXES):
         column = column.partition("_")[2]
     return column if column in JOINTS else None

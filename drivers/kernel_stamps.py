@@ -1,4 +1,4 @@
-"""What the kernel tells beside a received datagram or frame: when it came, how many were lost."""
+"""Kernel stamps of a received datagram or frame: time of arrival, and number of drops."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ import struct
 from typing import Final
 
 SO_TIMESTAMPNS: Final = 35
+"""Socket option of Linux, missing in Python's `socket` (asm-generic/socket.h)."""
 SO_RXQ_OVFL: Final = 40
-"""Socket options of Linux that the socket module does not name (asm-generic/socket.h)."""
+"""Socket option of Linux, missing in Python's `socket` (asm-generic/socket.h)."""
 TIMESPEC: Final = struct.Struct("@ll")
 """Ancillary data of `SO_TIMESTAMPNS`: wall time, seconds and ns."""
 DROPS: Final = struct.Struct("@I")
-"""Ancillary data of `SO_RXQ_OVFL`: dropped since the socket was opened, wrapping at 2**32."""
+"""Ancillary data of `SO_RXQ_OVFL`: drops since the socket was opened, modulo 2**32."""
 ANCILLARY_BYTES: Final = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(DROPS.size)
-"""Room for both."""
+"""Bytes for the ancillary data of both options."""
 
 
 def read_stamps(ancillary: list[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:
-    """Return the wall time of the arrival, ns, and the sum of drops; None: not told."""
+    """Return the wall time of the arrival, ns, and the sum of drops; None if absent."""
     wall_ns = drops = None
     for level, kind, data in ancillary:
         if level != socket.SOL_SOCKET:

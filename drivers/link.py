@@ -1,4 +1,4 @@
-"""State of a link, and the schedule of its retries: a backoff with a cap."""
+"""State of a link, and its retries with a capped backoff."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from enum import StrEnum
 from drivers.base import Fact, LinkCause
 
 BACKOFF_FIRST_S = 0.05
+"""Wait after the first failure, s: a board that resets is back in a moment."""
 BACKOFF_FACTOR = 1.8
+"""Factor of the wait from one failure to the next; the seventh wait is the longest."""
 BACKOFF_MAX_S = 1.0
-"""Longest time until a device that is plugged in again is opened, s."""
+"""Longest wait, s: a device that is plugged in again is opened within this time."""
 WARNINGS_MAX = 8
-"""Most warnings of one outage, each with another reason."""
+"""Most warnings in one outage, each for another reason; the log cannot fill up."""
 
 _log = logging.getLogger(__name__)
 
@@ -23,11 +25,11 @@ class LinkState(StrEnum):
     CLOSED = "closed"
     """Not opened, or closed by its owner."""
     WAITING = "waiting"
-    """Lost or not yet found; the next try comes at `Link.retry_ns`."""
+    """Lost or not yet found; the next try is at `Link.retry_ns`."""
     GREETING = "greeting"
-    """Open, and waiting for the device to say what it is."""
+    """Open; the device has not identified itself yet."""
     UP = "up"
-    """Readings can come."""
+    """The device works; readings can arrive."""
 
 
 CLOSED, WAITING, GREETING, UP = LinkState
@@ -36,8 +38,8 @@ CLOSED, WAITING, GREETING, UP = LinkState
 class Link:
     """State and retry schedule of one link. Does no I/O; times are monotonic ns.
 
-    A failure is a warning if its reason is new in this outage, else a debug line. So a night
-    without the device does not fill the journal, and a device of the wrong version is reported.
+    A failure is logged as a warning if its reason is new in this outage, else as a debug line.
+    A night without the device does not fill the journal, and each new reason is still reported.
     """
 
     def __init__(self, name: str) -> None:
@@ -45,12 +47,13 @@ class Link:
         self.name = name
         self.state = LinkState.CLOSED
         self.retry_ns: int | None = None
-        """Time of the next try, ns, while waiting."""
+        """Monotonic time of the next try, ns; None unless the state is `WAITING`."""
         self.losses = 0
-        """Times that the link was up and was lost."""
+        """Times that the link was lost after it had been up."""
         self.reason: str | None = None
+        """Why the link is down, for people; None while it is up or untried."""
         self.cause: LinkCause | None = None
-        """Why it is not up; None while it is up or was not tried yet."""
+        """Why the link is down, for programs; None while it is up or untried."""
         self._wait_s = BACKOFF_FIRST_S
         self._warned: set[str] = set()
         self._down_since_ns = 0
@@ -60,7 +63,7 @@ class Link:
         return self.retry_ns is None or now_ns >= self.retry_ns
 
     def start(self, now_ns: int) -> None:
-        """Begin to try, at once."""
+        """Start trying; the first try is due at once."""
         self.state = LinkState.WAITING
         self.reason = self.cause = None
         self._wait_s = BACKOFF_FIRST_S
@@ -68,12 +71,12 @@ class Link:
         self._down_since_ns = self.retry_ns = now_ns
 
     def greeting(self) -> None:
-        """Note that the device was opened."""
+        """Call when the device was opened and has not answered yet."""
         self.state = LinkState.GREETING
         self.retry_ns = None
 
     def up(self, what: str, now_ns: int) -> None:
-        """Note that the device works; `what` names it in the log."""
+        """Call when the device works; `what` names it in the log."""
         down_s = (now_ns - self._down_since_ns) / 1e9
         _log.info("%s: up after %.2f s: %s", self.name, down_s, what)
         self.state = LinkState.UP
@@ -83,7 +86,7 @@ class Link:
         self._warned.clear()
 
     def failed(self, cause: LinkCause, why: str, now_ns: int) -> None:
-        """Note a failed try or a lost link, and wait, longer after each failure."""
+        """Call after a failed try or a loss; schedule the next try, later each time."""
         if self.state is LinkState.UP:
             self.losses += 1
             self._down_since_ns = now_ns
@@ -103,7 +106,7 @@ class Link:
         self.retry_ns = None
 
     def describe(self) -> dict[str, Fact]:
-        """Return the state and why it is not up, for `Driver.describe`."""
+        """Return the state, and why it is not up, as facts for `Driver.describe`."""
         cause = self.cause
         if cause is None and self.state is not UP:
             cause = LinkCause.SILENT if self.state is GREETING else LinkCause.UNKNOWN

@@ -1,4 +1,4 @@
-"""TOML that people write, read at a bounded cost."""
+"""Read TOML written by people, at a bounded cost."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import tomllib
 from typing import Any
 
 DEPTH_MAX = 8
-"""Names of a key with dots, and brackets within each other. What graspd reads has three of each;
-`tomllib` takes time and memory by the square of the first, and a stack for the second."""
+"""Most parts of a dotted key, and most nested brackets; files of graspd have three of each.
+
+`tomllib` takes time by the square of the first, and stack for the second.
+"""
 
 _TOKEN = re.compile(
     r'"{3}(?:[^"\\]|\\.|"{1,2}(?!"))*+"{0,5}|'
@@ -20,15 +22,18 @@ _TOKEN = re.compile(
     r"""[^"'\#\[\]{}.=,\n]++""",
     re.DOTALL,
 )
-"""Strings, comments, brackets, dots, and what ends a key. `tomllib` stops at an open string too."""
+"""Tokens of TOML: strings, comments, brackets, dots, and ends of keys.
+
+A string without an end is a token too; `tomllib` refuses it.
+"""
 
 
 class NestedTooDeeplyError(ValueError):
-    """The text nests more deeply than anything that graspd reads."""
+    """The text nests more than `DEPTH_MAX` levels."""
 
 
 def loads(text: str) -> dict[str, Any]:
-    """Parse TOML. Raises `NestedTooDeeplyError`, and `ValueError` for what is none."""
+    """Parse TOML. Raises `NestedTooDeeplyError`, or `ValueError` if it is not TOML."""
     depth = dots = 0
     for token in _TOKEN.finditer(text):
         match token.lastgroup:

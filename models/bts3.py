@@ -1,4 +1,4 @@
-"""The published grasp tables (BTS3). Imports nothing heavy: fetching them needs no training."""
+"""The published grasp tables (BTS3). Imports nothing heavy, so fetching them is quick."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class TableFile:
-    """One grasp table as it was published."""
+    """One published grasp table."""
 
     name: str
-    """The palm's pose; the file is `<name>.csv` in a data folder."""
+    """Pose of the palm; the file is `<name>.csv` in a data folder."""
     upstream_name: str
     """File name in `REPOSITORY`."""
     sha256: str
     rows: int
-    """Grasps, one per row."""
+    """Number of rows, one per grasp."""
 
 
 REPOSITORY = "https://github.com/3dperceptionlab/biotacsp-stability-set-v2"
@@ -49,11 +49,11 @@ TABLES = (
         2133,
     ),
 )
-"""Every published table. `palm_45` was recorded later, with drifted sensors."""
+"""All published tables; `palm_45` was recorded later, with drifted sensors."""
 
 WHOLE = ("palm_down", "palm_side")
-"""The tables that the published figures stand on: 2549 grasps of 41 objects."""
+"""Tables of the published figures: 2549 grasps of 41 objects."""
 NEW_SESSION = "palm_45"
-"""The table of another day and another palm pose."""
+"""Table of another day and another pose."""
 FINGERS: Final = ("ff", "mf", "th")
 """Fingers in the order of the columns: first, middle, thumb."""

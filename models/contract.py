@@ -1,8 +1,8 @@
-"""What a model file must say about itself, and how it is written into an ONNX file.
+"""The contract of a model: its description of itself, inside the ONNX file.
 
-The contract is one JSON object under the metadata key `graspd` of the ONNX model. The daemon runs
-no model without it: a network fed with the wrong layout, filling or finger order still answers,
-and answers nonsense.
+The contract is one JSON object under the metadata key `graspd` of the ONNX model. The daemon
+refuses a model without one, because a network that is fed with the wrong layout, filling or finger
+order still answers, but wrongly.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from models.layout import ELECTRODES
 
 METADATA_KEY = "graspd"
 CLASSES = ("stable", "slip")
-"""Order of the two probabilities that every model returns."""
+"""Classes in the order of the two probabilities that a model returns."""
 OUTPUT_NAME = "probability"
 FEATURES_PER_FINGER = ELECTRODES + 2
-"""Of a session model: 24 z-values, the finger's mean and its spread."""
+"""Features of a finger in a session model: 24 z-values, mean and spread."""
 
 Finger = Literal["ff", "mf", "rf", "lf", "th"]
-"""First, middle, ring, little finger, thumb."""
+"""Name of a finger: first, middle, ring, little, thumb."""
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=4095)]
 
 
 class ModelError(Exception):
-    """A model file is missing, broken, or says that it does not fit. Give up until it is fixed."""
+    """A model file is missing, broken or does not fit; no retry can succeed."""
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One file that a model was trained on."""
+    """A file that a model was trained on."""
 
     name: str
     sha256: str
@@ -41,10 +41,10 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Mean and deviation over folds of the recipe's error on data left out; slip is positive."""
+    """Scores on held-out data, mean and deviation over the folds; slip is positive."""
 
     protocol: str
-    """`cv`: known objects; `unknown`, `objects`: others; `session`, `days`: on other days."""
+    """`cv`: known objects; `unknown`, `objects`: new objects; `session`, `days`: other days."""
     folds: int
     f1_mean: Fraction
     f1_std: Fraction
@@ -53,23 +53,25 @@ class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the training counts look like; `models.electrodes` says what follows for a reading."""
+    """Description of the training counts, used by `models.electrodes`."""
 
     low: tuple[tuple[Count, ...], ...]
     """Smallest count of each electrode, shape (fingers, 24)."""
     high: tuple[tuple[Count, ...], ...]
     """Largest count of each electrode, shape (fingers, 24)."""
     margin: Count
-    """A count further outside of `low`..`high` than this was never seen."""
+    """Counts outside `low`..`high` that still pass as seen."""
     centre: tuple[tuple[float, ...], ...]
     """Mean of each electrode, counts, shape (fingers, 24)."""
     whitening: tuple[tuple[float, ...], ...]
-    """Rows of the lower triangle of a matrix L, 1/counts, whose product `L @ L.T` is the inverse
-    covariance of all electrodes, fingers one after the other: row i has i + 1 values."""
+    """Rows of a lower triangular matrix L, 1/counts; row i has i + 1 values.
+
+    `L @ L.T` is the inverse covariance of all electrodes, one finger after the other.
+    """
     distance_max: Annotated[float, msgspec.Meta(gt=0.0)]
-    """A reading with a larger root-mean-square whitened deviation was never seen."""
+    """Largest root-mean-square whitened deviation of a reading that counts as seen."""
     distance_min: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
-    """A reading with a smaller one was never seen either: it is the mean of all, not a grasp."""
+    """Smallest such deviation; a reading below it is the mean of all grasps, not a grasp."""
 
     def whitening_matrix(self) -> NDArray[np.float64]:
         """Return L of `whitening`, lower triangular, shape (electrodes, electrodes), 1/counts."""
@@ -80,38 +82,37 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ImageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="image"):
-    """The model takes tactile images."""
+    """Input of a model that takes tactile images."""
 
     layout: str
     fill: str
     normalisation: str
     composition: Literal["channels", "horizontal", "vertical"]
-    """How the fingers' images stand together (paper, section II-C)."""
+    """Arrangement of the fingers' images (paper, section II-C)."""
 
 
 class VectorInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="vector"):
-    """The model takes the counts, z-scored per finger over its 24 electrodes."""
+    """Input of a model that takes counts, z-scored over the 24 electrodes of each finger."""
 
 
 class CountsInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="counts"):
-    """The model takes the counts as they are: whatever is done to them is inside its graph."""
+    """Input of a model that takes raw counts and transforms them in its own graph."""
 
 
 class Sharpness(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How far a verdict may be trusted while a session is young."""
+    """Temperature of a session model's probabilities while the session is young."""
 
     grasps: Annotated[float, msgspec.Meta(ge=0.0)]
-    """Weight of the session's statistics from which on this holds, grasps."""
+    """Weight of the session's statistics, grasps, from which this temperature is used."""
     temperature: Annotated[float, msgspec.Meta(ge=1.0)]
-    """The margin (log-odds of slip) is divided by this; as measured on a session left out."""
+    """Divisor of the margin (log-odds of slip), measured on a held-out session."""
 
 
 class SessionInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="session"):
-    """The model takes features standardised by the session's own, unlabelled grasps.
+    """Input of a session model: features standardised by the session's own, unlabelled grasps.
 
-    Features, 26 per finger: first every finger's 24 z-values, then every finger's mean, then every
-    finger's spread, counts. What the session has not shown yet is filled in by the training's
-    statistics, which weigh `prior_grasps` grasps.
+    There are 26 features per finger: 24 z-values of each finger, then the mean of each finger, then
+    the spread of each finger, counts. The training's statistics count as `prior_grasps` grasps.
     """
 
     mean: tuple[float, ...]
@@ -119,54 +120,54 @@ class SessionInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag=
     spread: tuple[Annotated[float, msgspec.Meta(gt=0.0)], ...]
     """Training standard deviation of each feature, within a session."""
     clip: Annotated[float, msgspec.Meta(gt=0.0)]
-    """Standardised features are clipped to +- this."""
+    """Largest magnitude of a standardised feature; larger ones are clipped."""
     prior_grasps: Annotated[float, msgspec.Meta(gt=0.0)]
     """Weight of the training's statistics, grasps."""
     calibrated_from: Annotated[float, msgspec.Meta(ge=0.0)]
-    """Grasps' worth of statistics from which on the session counts as calibrated."""
+    """Weight of the statistics, grasps, from which the session counts as calibrated."""
     sharpness: tuple[Sharpness, ...]
-    """Ascending in `grasps`, from 0."""
+    """Temperatures, ascending in `grasps` from 0."""
 
 
 Input = ImageInput | VectorInput | CountsInput | SessionInput
-"""What a model is fed with; in JSON told apart by `type`."""
+"""Kinds of input; the JSON key `type` tells which."""
 
 
 class ConfidenceStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One point of the accuracy-coverage curve, measured on data that was left out."""
+    """One point of the accuracy-coverage curve, measured on held-out data."""
 
     confidence: Fraction
-    """Judging only where max(p_slip, 1 - p_slip) reaches this ..."""
+    """Smallest max(p_slip, 1 - p_slip) at which a grasp is judged."""
     accuracy: Fraction
-    """... this share of the verdicts was right ..."""
+    """Share of the judged grasps that were judged right."""
     coverage: Fraction
-    """... and this share of the grasps was judged."""
+    """Share of the grasps that were judged."""
 
 
 class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that must agree between a model and the program that feeds it."""
+    """Everything on which a model and the program that feeds it must agree."""
 
     version: Literal[2]
     name: str
     input: Input
     fingers: tuple[Finger, ...]
-    """Order of the fingers in the input."""
+    """Fingers in the order of the input."""
     classes: tuple[str, ...]
     seed: int
     datasets: tuple[Dataset, ...]
     measured: tuple[MeasuredError, ...]
-    """By protocol; at least one."""
+    """Scores, one for each protocol; at least one."""
     confidence: tuple[ConfidenceStep, ...]
-    """Ascending in `confidence`; empty if it was not measured."""
+    """Points ascending in `confidence`; empty if not measured."""
     seen: SeenCounts
 
     def to_json(self) -> str:
-        """Text of the `graspd` metadata entry."""
+        """Return the text of the metadata entry `graspd`."""
         return msgspec.json.encode(self).decode()
 
     @classmethod
     def from_json(cls, text: str) -> ModelContract:
-        """Parse and check a metadata entry. Raises `ModelError` naming the field."""
+        """Parse and check a metadata entry. Raises `ModelError`, which names the field."""
         try:
             contract = msgspec.json.decode(text, type=cls)
         except msgspec.DecodeError as error:
@@ -178,7 +179,7 @@ class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _check(contract: ModelContract) -> None:
-    """Raise `ModelError` for what the types alone do not say."""
+    """Raise `ModelError` for mistakes that the types do not exclude."""
     fingers, seen = contract.fingers, contract.seen
     if not fingers or len(set(fingers)) != len(fingers):
         raise ModelError(f"model contract is wrong: fingers {fingers} are not different ones")

@@ -1,10 +1,8 @@
-"""What the training's counts say of a reading: which electrodes contradict the others, what they
-should read, and whether the reading as a whole looks like anything that was seen.
+"""Compare a reading with the training: find and repair wrong electrodes, refuse new readings.
 
-The counts of all electrodes are taken for a Gaussian, with the mean and covariance of the training.
-What one electrode should read, given the others, and how far that may be off, then follows in
-closed form from the inverse covariance P: the residual is `(P d)_i / P_ii`, its standard deviation
-`1 / sqrt(P_ii)`, with d the deviations from the mean.
+All counts together are modelled as a Gaussian with the mean and covariance of the training. Let d
+be the deviations from the mean, and P the inverse covariance. The other electrodes then predict
+electrode i with the residual `(P d)_i / P_ii` and the standard deviation `1 / sqrt(P_ii)`.
 """
 
 from __future__ import annotations
@@ -18,28 +16,40 @@ from numpy.typing import NDArray
 from models.contract import SeenCounts
 
 ROUNDING = 1e-9
-"""Share of a limit within which `Electrodes.plain_square` leaves it open whether it is kept: some
-thousand times what rounding makes of a residual."""
+"""Distance from a limit, as a share of it, at which `Electrodes.plain_square` does not decide.
+
+It is about a thousand times the rounding error of a residual.
+"""
 IMPLAUSIBLE = 8.0
-"""Residual from here on, in its standard deviations. Real grasps are heavier in the tails than a
-Gaussian: 7 to 8 % of the held-out ones have an electrode beyond it. To repair it changes F1 by 0.3
-points at most; to leave four wrong ones within the range costs 3 to 40."""
+"""Residual, in its standard deviations, from which an electrode counts as broken.
+
+Real grasps have heavier tails than a Gaussian: 7 to 8 % of the held-out ones have an electrode
+beyond this limit. Repairing it changes F1 by at most 0.3 points. Leaving four wrong electrodes
+unrepaired costs 3 to 40 points.
+"""
 CONTRADICTING_MAX = 2
-"""Electrodes that may contradict the others without anything else being known against them. Of
-held-out grasps 99 % are judged with it; of readings with each electrode from another grasp none is,
-and with a limit of four a tenth would be."""
+"""Most electrodes that may contradict the others if no other fault of theirs is known.
+
+With this limit 99 % of the held-out grasps are judged, and no reading whose electrodes come from
+different grasps. With a limit of four, a tenth of those would be judged.
+"""
 LEARNED_DISTANCES = 2.0
-"""A session learns from readings up to this many times `distance_max` away. Learning only from
-those it would judge would move its mean towards them, and make the others look ever stranger."""
+"""Largest distance, in units of `distance_max`, of a reading from which a session learns.
+
+A session that learned only from readings that it judges would move its mean towards them, and
+refuse more and more of the others.
+"""
 
 CONTRADICTED_DISTANCES = 0.75
-"""Where some electrodes of a session's reading contradict the others, the others must be within
-this many times `distance_max`. Of readings with each electrode from another grasp a tenth have two
-or fewer that contradict, and 19 of 20 of these are farther; of real ones a tenth is."""
+"""Largest distance, in units of `distance_max`, of a reading with contradicting electrodes.
+
+A tenth of the readings whose electrodes come from different grasps have at most two contradicting
+electrodes. This limit refuses 19 of 20 of these, and a tenth of the real readings.
+"""
 
 
 class Electrodes:
-    """Finds and repairs broken electrodes of readings that look like the training's."""
+    """Find and repair broken electrodes of readings that look like the training's."""
 
     def __init__(self, seen: SeenCounts) -> None:
         self._centre = np.array(seen.centre).ravel()
@@ -52,17 +62,17 @@ class Electrodes:
         self._plain_limits = (1.0 - ROUNDING) * self._limits
         self._plain_finger_limits: list[float] = ((1.0 - ROUNDING) * self._finger_limits).tolist()
         self.centre = self._centre.reshape(self._shape)
-        """Mean of each electrode in the training, counts, shape (fingers, 24)."""
+        """Training mean of each electrode, counts, shape (fingers, 24)."""
         self.spread = np.sqrt(np.diag(np.linalg.inv(self._precision))).reshape(self.centre.shape)
-        """Standard deviation of each electrode in the training, counts, shape (fingers, 24)."""
+        """Training standard deviation of each electrode, counts, shape (fingers, 24)."""
 
     def implausible(
         self, values: NDArray[np.float64], broken: NDArray[np.bool_], at_most: int
     ) -> NDArray[np.bool_]:
-        """`broken` and the electrodes whose values do not fit the others', shape (fingers, 24).
+        """Return `broken` and the electrodes that do not fit the others, shape (fingers, 24).
 
-        `values` are counts (fingers, 24); those of `broken` are not looked at. The worst one goes
-        first, then the rest is looked at without it, until all fit or `at_most` are broken.
+        `values`: counts, shape (fingers, 24); those of `broken` are ignored. The worst electrode is
+        removed first and the rest checked again, until all fit or `at_most` are broken.
         """
         deviations = values.ravel() - self._centre
         if np.count_nonzero(broken):
@@ -71,21 +81,24 @@ class Electrodes:
         fit = np.abs(residuals) <= self._limits
         if np.count_nonzero(fit) == fit.size and not np.count_nonzero(broken):
             return broken
-        found = broken.ravel().copy()
+        bad = broken.ravel().copy()
         others = _Others(self._precision, residuals)
-        for electrode in np.flatnonzero(found).tolist():
+        for electrode in np.flatnonzero(bad).tolist():
             others.forget(electrode)
         for _ in range(at_most - len(others.forgotten)):
             worst = others.worst()
             if worst is None:
                 break
-            found[worst] = True
+            bad[worst] = True
             others.forget(worst)
-        return found.reshape(broken.shape)
+        return bad.reshape(broken.shape)
 
     def plain_square(self, deviations: NDArray[np.float64]) -> float | None:
-        """Return `NoveltyCheck.square` of a reading, by `deviations` from `centre`, (fingers, 24).
-        None where `implausible` finds an electrode of them or `moved_finger` says yes, or might."""
+        """Return `NoveltyCheck.square` of a reading; None if it is not plainly sound.
+
+        `deviations`: counts less `centre`, shape (fingers, 24). None means that `implausible` or
+        `moved_finger` may find something: call them.
+        """
         flat = deviations.reshape(-1)
         residuals = self._precision.dot(flat)
         if 0 in (np.abs(residuals) < self._plain_limits).tobytes():
@@ -96,10 +109,10 @@ class Electrodes:
         return float(flat.dot(residuals)) / len(flat)
 
     def moved_finger(self, values: NDArray[np.float64]) -> bool:
-        """Whether one number, added to all electrodes of a finger, made `values` what they are.
+        """Return True if all electrodes of a finger seem shifted by one offset.
 
-        Of counts (fingers, 24): that number, as the electrodes let expect it, is further from zero
-        than `IMPLAUSIBLE` of its standard deviations. No single electrode need contradict.
+        `values`: counts, shape (fingers, 24). The offset is estimated from all electrodes, and must
+        be over `IMPLAUSIBLE` standard deviations. No single electrode need contradict the others.
         """
         residuals = (self._precision @ (values.ravel() - self._centre)).reshape(self._shape)
         return not bool((np.abs(residuals.sum(axis=1)) <= self._finger_limits).all())
@@ -107,7 +120,7 @@ class Electrodes:
     def repaired(
         self, values: NDArray[np.float64], broken: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        """`values` with what the sound electrodes let expect in place of the broken ones."""
+        """Return `values` with the broken electrodes replaced by what the others predict."""
         out = broken.ravel()
         deviations = values.ravel() - self._centre
         deviations[out] = 0.0
@@ -118,14 +131,14 @@ class Electrodes:
 
 
 class _Others:
-    """Precision and residuals of the electrodes that are left when some are forgotten.
+    """Precision and residuals of the remaining electrodes after some were left out.
 
-    The inverse covariance of the others is the Schur complement. Of it only the diagonal and the
-    columns of those that go are needed: a Cholesky decomposition, one column for each.
+    The inverse covariance of the remaining ones is the Schur complement. Only its diagonal and the
+    columns of those left out are needed: a Cholesky decomposition, one column for each.
     """
 
     def __init__(self, precision: NDArray[np.float64], residuals: NDArray[np.float64]) -> None:
-        """Of all electrodes, shapes (electrodes, electrodes) and (electrodes,)."""
+        """Start with all electrodes: shapes (electrodes, electrodes) and (electrodes,)."""
         self._precision = precision
         self._residuals = residuals.copy()
         self._diagonal = np.diag(precision).copy()
@@ -133,32 +146,32 @@ class _Others:
         self.forgotten: list[int] = []
 
     def worst(self) -> int | None:
-        """The electrode that fits the others least; None if all of them fit."""
+        """Return the electrode that fits the others least; None if all fit."""
         squares = self._residuals**2 / self._diagonal
         worst = int(squares.argmax())
         return worst if squares[worst] > IMPLAUSIBLE**2 else None
 
     def forget(self, electrode: int) -> None:
-        """Leave an electrode out; whatever its value added to the others' residuals goes too."""
-        number = len(self.forgotten)
-        columns = self._columns[:number]
+        """Leave an electrode out, and remove its effect on the residuals of the others."""
+        count = len(self.forgotten)
+        columns = self._columns[:count]
         pivot = math.sqrt(self._diagonal[electrode])
         column = (self._precision[electrode] - columns[:, electrode] @ columns) / pivot
         self._residuals -= column * (self._residuals[electrode] / pivot)
         self._diagonal -= column**2
-        self._diagonal[electrode] = np.inf  # never the worst again
-        self._columns[number] = column
+        self._diagonal[electrode] = np.inf  # so that it is never the worst again
+        self._columns[count] = column
         self.forgotten.append(electrode)
 
 
 class NoveltyCheck:
-    """Tells readings that are far from all training data: for them a network's answer is noise.
+    """Find readings that are far from all training data; for them a network's answer is noise.
 
-    Two tests, each of which catches what the other lets through: every electrode must lie in its
-    range of training counts, with a margin (drifted or broken electrodes), and all together must
-    fit the training covariance (values that are each possible, but not with one another). For a
-    session model, whose counts were mapped to the training's sensors, only the second: ranges hold
-    good grasps of another day for unlike, and few that are none.
+    There are two tests, and each finds readings that the other misses. Each electrode must lie in
+    its range of training counts, with a margin; this finds drifted or broken electrodes. All
+    electrodes together must fit the training covariance; this finds values that are possible alone
+    but not together. Session models, whose counts are mapped to the training's sensors, use only
+    the second test: ranges would refuse good grasps of another day.
     """
 
     def __init__(self, seen: SeenCounts) -> None:
@@ -170,28 +183,36 @@ class NoveltyCheck:
         self._square_min, self._square_max = seen.distance_min**2, seen.distance_max**2
 
     def never_seen(self, counts: NDArray[np.generic], repaired: int = 0) -> NDArray[np.bool_]:
-        """Return shape (N,): True for each of the counts (N, fingers, 24) that was never seen.
-        Each has `repaired` electrodes that add nothing to the distance, a mean over the others."""
+        """Return True for each reading of `counts` that is unlike the training, shape (N,).
+
+        `counts`: shape (N, fingers, 24). `repaired`: number of repaired electrodes in each, which
+        are left out of the mean distance.
+        """
         values = counts.astype(np.float64)
         outside = ((values < self._low) | (values > self._high)).any(axis=(1, 2))
         squares = self._squares(values, repaired)
-        # Not (square > limit), so that a value that is not finite counts as never seen.
+        # Not `square > limit`: a value that is not finite must count as never seen.
         within = (squares <= self._square_max) & (squares >= self._square_min)
         never: NDArray[np.bool_] = outside | ~within
         return never
 
     def is_near(self, square: float, contradicted: int = 0) -> bool:
-        """Return True if a reading of this `square` fits the covariance; ranges do not matter.
-        `contradicted`: how many of its repaired electrodes contradicted the others."""
+        """Return True if a reading of this `square` fits the covariance.
+
+        `contradicted`: number of its repaired electrodes that contradicted the others.
+        """
         share = CONTRADICTED_DISTANCES if contradicted else 1.0
         return self._square_min <= square <= share**2 * self._square_max
 
     def is_learned(self, square: float) -> bool:
-        """Whether a session may take in a reading of this `square`, which was mapped by it."""
+        """Return True if a session may learn from a mapped reading of this `square`."""
         return square <= LEARNED_DISTANCES**2 * self._square_max
 
     def square(self, values: NDArray[np.float64], repaired: int = 0) -> float:
-        """Mean square whitened deviation of counts (fingers, 24); `repaired` of them count as 0."""
+        """Return the mean square whitened deviation of counts, shape (fingers, 24).
+
+        `repaired`: number of repaired electrodes, which are left out of the mean.
+        """
         deviations = (values.ravel() - self._centre) @ self._whitening
         return float(deviations @ deviations) / (self._electrodes - repaired)
 

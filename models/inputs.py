@@ -1,4 +1,4 @@
-"""From counts to what a model takes: an image, a vector, or features of a session."""
+"""Convert counts to the input of a model: an image, a vector, or features of a session."""
 
 from __future__ import annotations
 
@@ -20,34 +20,39 @@ from models.layout import ELECTRODES, LAYOUTS
 
 Floats = NDArray[np.float64]
 SPREAD_FLOOR_COUNTS = 1.0
-"""A finger whose standard deviation is below one count has no image: a z-score would magnify the
-quantisation of the converter. On real fingers the electrodes differ by 145 counts or more."""
+"""Smallest standard deviation, counts, of a finger's electrodes that a z-score can use.
+
+Below it, a z-score would magnify the converter's steps. Electrodes of a real finger differ by 145
+counts or more.
+"""
 
 
 class InputBuilder(Protocol):
-    """Makes the input of one kind of model, one reading at a time or many."""
+    """Builder of one kind of model's input, for one reading or for many."""
 
     @property
     def name(self) -> str:
-        """Of the model's input."""
+        """Name of the model's input."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one reading's input."""
+        """Shape of one reading's input."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Write the input of counts (fingers, 24) into `out`; return each finger's spread, counts.
-        A finger whose spread is below `SPREAD_FLOOR_COUNTS` must not be judged."""
+        """Write the input of `counts` (fingers, 24) into `out`; return each finger's spread.
+
+        A finger with a spread below `SPREAD_FLOOR_COUNTS` must not be judged.
+        """
 
     def build_batch(
         self, counts: NDArray[np.generic]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24)."""
+        """Return inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24)."""
 
 
-def builder(wanted: Input, fingers: int) -> InputBuilder:
-    """The builder of what a contract asks for. Raises `ModelError` for what is not known."""
-    match wanted:
+def builder(kind: Input, fingers: int) -> InputBuilder:
+    """Return the builder that a contract asks for. Raises `ModelError` for an unknown one."""
+    match kind:
         case ImageInput():
             from models.tactile_image import (  # only where it is needed
                 Composition,
@@ -59,10 +64,10 @@ def builder(wanted: Input, fingers: int) -> InputBuilder:
             try:
                 return TactileImager(
                     fingers,
-                    LAYOUTS[wanted.layout],
-                    Fill(wanted.fill),
-                    Normalisation(wanted.normalisation),
-                    Composition(wanted.composition),
+                    LAYOUTS[kind.layout],
+                    Fill(kind.fill),
+                    Normalisation(kind.normalisation),
+                    Composition(kind.composition),
                 )
             except (KeyError, ValueError) as error:
                 raise ModelError(f"asks for an image that is not known: {error}") from error
@@ -71,13 +76,13 @@ def builder(wanted: Input, fingers: int) -> InputBuilder:
         case CountsInput():
             return CountsBuilder(fingers)
         case SessionInput():
-            features = SessionBuilder(fingers, wanted.clip)
-            features.use(np.array(wanted.mean), np.array(wanted.spread))
+            features = SessionBuilder(fingers, kind.clip)
+            features.use(np.array(kind.mean), np.array(kind.spread))
             return features
 
 
 class _FlatBuilder:
-    """One reading or many, by the same arithmetic; see `InputBuilder`."""
+    """Base of builders with the same arithmetic for one reading and for many."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> Floats:
         out[...], spread = self._values(counts.astype(np.float64))
@@ -88,12 +93,12 @@ class _FlatBuilder:
         return values.astype(np.float32), spread
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
-        """Inputs (..., width) and spreads (..., fingers) of counts (..., fingers, 24)."""
+        """Return inputs (..., width) and spreads (..., fingers) of counts (..., fingers, 24)."""
         raise NotImplementedError
 
 
 class VectorBuilder(_FlatBuilder):
-    """The counts as one vector, z-scored per finger over its 24 electrodes (paper, III-D)."""
+    """Counts as one vector, z-scored over the 24 electrodes of each finger (paper, III-D)."""
 
     name = "tactile_vector"
 
@@ -106,7 +111,7 @@ class VectorBuilder(_FlatBuilder):
 
 
 class CountsBuilder(_FlatBuilder):
-    """The counts as one vector, untouched."""
+    """Raw counts as one vector."""
 
     name = "tactile_counts"
 
@@ -118,10 +123,10 @@ class CountsBuilder(_FlatBuilder):
 
 
 class SessionBuilder(_FlatBuilder):
-    """Features of a reading, standardised by what `use` was told, then clipped.
+    """Features of a reading, standardised by the values of `use`, then clipped.
 
-    The error is 6e-8 of the largest magnitude, the rounding to float32, as long as no mean is more
-    than a million times its spread.
+    The error is the rounding to float32, 6e-8 of the largest magnitude, if no mean is over a
+    million times its spread.
     """
 
     name = "session_features"
@@ -133,8 +138,10 @@ class SessionBuilder(_FlatBuilder):
         self._scale = np.ones(self.shape)
 
     def use(self, mean: Floats, spread: Floats) -> None:
-        """Standardise by these from now on, each of shape (fingers * 26,), spreads above zero.
-        The arrays must not change any more."""
+        """Set mean and spread, shape (fingers * 26,) each; spreads are above zero.
+
+        The caller must not change the arrays afterwards.
+        """
         if spread is not self._spread:
             self._scale = 1.0 / spread
         self._mean, self._spread = mean, spread
@@ -147,13 +154,15 @@ class SessionBuilder(_FlatBuilder):
 
 
 def raw_features(counts: NDArray[np.generic]) -> Floats:
-    """Features before standardising, shape (..., fingers * 26), of counts (..., fingers, 24)."""
+    """Return the raw features (..., fingers * 26) of counts (..., fingers, 24)."""
     return _features(counts.astype(np.float64))[0]
 
 
 def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what deviations are multiplied by: 1 / spread, or 0 where that must not be judged.
-    An infinite `spread` has overflowed: it becomes NaN, in place."""
+    """Return the factors of deviations: 1 / spread; 0 where the finger must not be judged.
+
+    An infinite `spread` is an overflow, and becomes NaN in place.
+    """
     if 0 not in ((spread >= SPREAD_FLOOR_COUNTS) & (spread < np.inf)).tobytes():
         return 1.0 / spread
     spread[np.isinf(spread)] = np.nan
@@ -162,11 +171,10 @@ def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _features(counts: Floats) -> tuple[Floats, Floats]:
-    """Return z-values, means and (population) spreads of each finger; and the spreads alone.
+    """Return the features of each finger (z-values, means, population spreads), and the spreads.
 
-    Z-values are zero where a finger is flat. In two passes, so that large counts that hardly differ
-    cancel before they are squared: for counts of 12 bits the error is below 1e-9 of the largest
-    magnitude, 6e-8 once it is float32.
+    Z-values of a flat finger are zero. The mean is subtracted before squaring. For counts of 12
+    bits the error is below 1e-9 of the largest magnitude, or 6e-8 as float32.
     """
     fingers = counts.shape[-2]
     features = np.empty((*counts.shape[:-2], fingers * FEATURES_PER_FINGER))

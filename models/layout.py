@@ -1,4 +1,4 @@
-"""Where the 24 electrodes of a BioTac SP stand in a tactile image (paper, section II-A)."""
+"""Places of the 24 electrodes of a BioTac SP in a tactile image (paper, section II-A)."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ D1 = _layout(
     "0 1 4 5 6 7 8 9 10 11 0 1 4 5 6 7 8 9 10 11 2 3 3 5",
     "1 2 0 1 3 0 1 4 2 1 9 8 10 9 7 10 9 6 8 9 5 4 6 5",
 )
-"""12 x 11, keeps the arrangement of the sensor. The best of the paper."""
+"""Layout of 12 x 11 pixels that keeps the sensor's arrangement; the paper's best."""
 
 D2A = _layout(
     "D2a",
     "0 1 2 2 3 3 4 4 5 5 0 1 2 2 3 3 4 4 5 5 0 1 1 2",
     "4 4 4 3 3 4 4 3 3 4 0 0 0 1 1 0 0 1 1 0 2 3 1 2",
 )
-"""6 x 5. Two tables of D2 were released; the paper does not say which one it used."""
+"""Layout of 6 x 5 pixels. Two tables of D2 were released; the paper does not say which it used."""
 
 D2B = _layout(
     "D2b",
     "0 0 2 2 3 3 4 4 5 5 0 0 2 2 3 3 4 4 5 5 0 1 1 2",
     "4 3 4 3 3 4 4 3 3 4 0 1 0 1 1 0 0 1 1 0 2 3 1 2",
 )
-"""6 x 5, the other table of D2."""
+"""Layout of 6 x 5 pixels, the other table of D2."""
 
 D3 = _layout(
     "D3",
     "0 0 1 1 2 2 2 3 3 3 0 0 1 1 2 2 2 3 3 3 0 1 1 2",
     "6 5 6 5 4 6 5 4 5 6 0 1 0 1 2 0 1 2 1 0 3 4 2 3",
 )
-"""4 x 7."""
+"""Layout of 4 x 7 pixels."""
 
 LAYOUTS = {layout.name: layout for layout in (D1, D2A, D2B, D3)}

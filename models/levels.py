@@ -1,8 +1,7 @@
-"""Levels of a tactile image for the eye: how far each electrode is below where its finger rests.
+"""Levels of a tactile image for display: how far each electrode is below its resting count.
 
-Where a finger rests is in no message, so it is learned while the gate says that nothing touches.
-Before that, and where there is no gate, levels show how the finger's electrodes differ from each
-other.
+No message has the resting counts, so they are learned while the gate says that nothing touches.
+Before that, and without a gate, levels show how a finger's electrodes differ from each other.
 """
 
 from __future__ import annotations
@@ -19,17 +18,21 @@ HEIGHT, WIDTH = D1.shape
 FULL = 100
 """Level of the strongest colour."""
 FULL_COUNTS = 1600.0
-"""Fall that has it, counts. Levels go with the square root: a touch begins at 20 counts, which is
-level 11, and real grasps press single electrodes by up to 1800."""
+"""Fall of an electrode, counts, at level `FULL`; real grasps reach 1800.
+
+Levels grow with the square root, so a touch of 20 counts has level 11.
+"""
 FULL_DEVIATIONS = 2.5
-"""The same for a finger whose rest is not known, in standard deviations of its own electrodes."""
+"""Deviation at level `FULL` while the rest is unknown, in standard deviations of the finger."""
 SHARE = 0.02
-"""Of a new reading in the rest: at 100 Hz it follows in half a second."""
+"""Weight of a new reading in the rest, which at 100 Hz follows within half a second."""
 STRAY_COUNTS = 20.0
-"""No reading counts as further from the rest than a touch begins: one may be a touch already that
-the gate has not seen yet."""
+"""Largest change, counts, that the rest learns from one reading: where a touch begins.
+
+A reading may already be a touch that the gate has not noticed yet.
+"""
 KNOWN_AFTER = 25
-"""Readings after which the mean of what came is taken for the rest."""
+"""Number of readings whose mean is the first rest."""
 
 _FILL = fill_matrix(D1, Fill.NEIGHBOUR_MEAN)[:, :ELECTRODES]
 PIXELS = [row * WIDTH + column for row, column in zip(D1.rows, D1.columns, strict=True)]
@@ -37,18 +40,18 @@ PIXELS = [row * WIDTH + column for row, column in zip(D1.rows, D1.columns, stric
 
 
 class RestCounts:
-    """Learns where the electrodes of each finger rest."""
+    """Learn the resting counts of each finger's electrodes."""
 
     def __init__(self) -> None:
         self._means: dict[str, NDArray[np.float64]] = {}
         self._readings: Counter[str] = Counter()
 
     def of(self, finger: str) -> NDArray[np.float64] | None:
-        """Return the counts of a finger at rest, shape (24,); None: not known yet."""
+        """Return the resting counts of a finger, shape (24,); None: not known yet."""
         return self._means[finger] if self._readings[finger] >= KNOWN_AFTER else None
 
     def learn(self, finger: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]) -> None:
-        """Learn from a reading of a finger that touches nothing; shapes (24,)."""
+        """Learn from a reading of a finger without contact; shapes (24,)."""
         mean = self._means.setdefault(finger, np.zeros(ELECTRODES))
         strays = counts - mean
         if self.of(finger) is not None:
@@ -62,7 +65,9 @@ def fall_of(
     counts: NDArray[np.float64], sound: NDArray[np.bool_], rest: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
     """Return how far each electrode of a finger is below `rest`, counts; all shapes (24,).
-    Without a `rest`, that is the median of the `sound` ones. The others get the median fall."""
+
+    `rest` None: the median of the `sound` electrodes. The others get the median fall.
+    """
     reference = np.median(counts[sound]) if rest is None and sound.any() else rest
     fall = np.zeros(ELECTRODES) if reference is None else reference - counts
     if sound.all():
@@ -71,8 +76,10 @@ def fall_of(
 
 
 def levels_of(fall: NDArray[np.float64], *, from_rest: bool) -> NDArray[np.int64]:
-    """Return levels (`HEIGHT` * `WIDTH`,): 0 at rest, `FULL` pressed the most, below 0 risen.
-    `fall` is what `fall_of` gives, and `from_rest` whether it knew where the finger rests."""
+    """Return levels, shape (`HEIGHT` * `WIDTH`,): 0 at rest, up to `FULL` pressed, below 0 risen.
+
+    `fall`: the result of `fall_of`. `from_rest`: True if `fall_of` had a `rest`.
+    """
     pixels = _FILL @ fall
     if from_rest:
         share = np.sign(pixels) * np.sqrt(np.abs(pixels) / FULL_COUNTS)

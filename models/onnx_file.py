@@ -1,7 +1,7 @@
-"""What an ONNX file computes with, read from its bytes: a file whose digest is not the whole of it,
-or that may take for ever, is refused before onnxruntime sees it.
+"""Check an ONNX file before onnxruntime reads it.
 
-The wire format is that of Protocol Buffers, the numbers of the fields those of onnx.proto.
+A file is refused if it needs other files, which its digest would not cover, or if it could run for
+ever. Files are Protocol Buffers; the numbers of the fields are those of onnx.proto.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from models.contract import ModelError
 
 FIELDS_MAX = 4_000_000
-"""Of a file. A forest has most: each number of its 34,000 nodes is one, 350,000 in all."""
+"""Most fields of a file; a forest of 34,000 nodes has 350,000."""
 VARINT_BYTES_MAX = 10
-"""Of 64 bits, seven in each byte."""
+"""Longest variable-length integer, bytes: 64 bits, seven in each byte."""
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-"""Kinds of fields. The other two, groups, are out of use."""
+"""Wire types of fields; the other two, groups, are out of use."""
 
 _OF_ONNX = """
     Abs Add And ArgMax ArgMin AveragePool BatchNormalization Cast CastLike Ceil Celu Clip Concat
@@ -43,18 +43,23 @@ OPERATORS = {
     "ai.onnx": frozenset(_OF_ONNX.split()),
     "ai.onnx.ml": frozenset(_OF_ML.split()),
 }
-"""What a model may compute with, by domain (the first two are one): no loops, branches, chance,
-sequences or texts, and nothing whose result has as many values as it finds."""
+"""Operators that a model may use, by domain; the first two domains are one.
+
+They exclude loops, branches, chance, sequences and texts. They also exclude operators whose result
+has a size that depends on its values.
+"""
 _SHAPED = """
     ConstantOfShape Expand Pad Range Reshape Resize Slice Split Squeeze Tile TopK Unsqueeze Upsample
     ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd
     ReduceSum ReduceSumSquare
     """
 SHAPED = frozenset(_SHAPED.split())
-"""Operators whose inputs say how large the result is. They must follow from the model alone: then
-every run takes as long as the first."""
+"""Operators whose further inputs give the size of the result.
+
+These inputs must be constants of the model, so that each run takes as long as the first.
+"""
 ALL_INPUTS = frozenset({"ConstantOfShape", "Range"})
-"""Those of which the first input says it too."""
+"""Operators of `SHAPED` whose first input also gives the size."""
 
 
 @dataclass(slots=True)
@@ -66,87 +71,89 @@ class _Node:
 
 
 def check(content: bytes) -> None:
-    """Raise `ModelError` unless a model is whole, and of operators that always come to an end."""
+    """Raise `ModelError` unless a model is complete and each of its operators surely ends."""
     _Reader(memoryview(content)).check()
 
 
 class _Reader:
-    """Reads one file, once."""
+    """Reader of one file."""
 
     def __init__(self, content: memoryview) -> None:
         self._content = content
         self._left = FIELDS_MAX
         self._nodes: list[_Node] = []
         self._fixed: set[str] = set()
-        """Names of values that are the same in every run."""
+        """Names of values that are constants of the model."""
 
     def check(self) -> None:
-        # A message may be given in several pieces: each field of that number is looked at.
-        for number, value in self._fields(self._content):
-            if number == 7:
+        # A message may come in several pieces, so each field with that number is checked.
+        for field_number, value in self._fields(self._content):
+            if field_number == 7:
                 self._read_graph(value)
-            elif number in (20, 25):
+            elif field_number in (20, 25):
                 raise ModelError("has functions or training steps of its own")
         for node in self._nodes:
             self._check_node(node)
 
     def _read_graph(self, graph: memoryview | int) -> None:
-        for number, value in self._fields(graph):
-            if number == 1:
+        for field_number, value in self._fields(graph):
+            if field_number == 1:
                 self._nodes.append(self._read_node(value))
-            elif number == 5:
+            elif field_number == 5:
                 self._fixed.add(self._read_tensor(value))
-            elif number == 15:
+            elif field_number == 15:
                 raise ModelError("has sparse weights")
 
     def _read_node(self, node: memoryview | int) -> _Node:
-        found = _Node()
-        for number, value in self._fields(node):
-            if number == 1:
-                found.inputs.append(_text(value))
-            elif number == 2:
-                found.outputs.append(_text(value))
-            elif number == 4:
-                found.operator = _text(value)
-            elif number == 5:
+        result = _Node()
+        for field_number, value in self._fields(node):
+            if field_number == 1:
+                result.inputs.append(_text(value))
+            elif field_number == 2:
+                result.outputs.append(_text(value))
+            elif field_number == 4:
+                result.operator = _text(value)
+            elif field_number == 5:
                 self._read_attribute(value)
-            elif number == 7:
-                found.domain = _text(value)
-        return found
+            elif field_number == 7:
+                result.domain = _text(value)
+        return result
 
     def _read_attribute(self, attribute: memoryview | int) -> None:
-        for number, value in self._fields(attribute):
-            if number in (5, 10):
+        for field_number, value in self._fields(attribute):
+            if field_number in (5, 10):
                 self._read_tensor(value)
-            elif number in (6, 11):
+            elif field_number in (6, 11):
                 raise ModelError("has a loop or branch: a graph within its graph")
-            elif number in (22, 23):
+            elif field_number in (22, 23):
                 raise ModelError("has sparse weights")
 
     def _read_tensor(self, tensor: memoryview | int) -> str:
-        """Its name."""
+        """Check a tensor; return its name."""
         name = ""
-        for number, value in self._fields(tensor):
-            if number == 8:
+        for field_number, value in self._fields(tensor):
+            if field_number == 8:
                 name = _text(value)
-            elif number == 13 or (number == 14 and value != 0):
+            elif field_number == 13 or (field_number == 14 and value != 0):
                 raise ModelError("has weights in another file: its digest would not be theirs")
         return name
 
     def _check_node(self, node: _Node) -> None:
-        operator, known = node.operator, [not name or name in self._fixed for name in node.inputs]
+        operator, fixed = node.operator, [not name or name in self._fixed for name in node.inputs]
         if node.domain not in OPERATORS:
             raise ModelError(f"has an operator {operator!r} of another domain, {node.domain!r}")
         if operator not in OPERATORS[node.domain]:
             raise ModelError(f"has an operator that no model may use: {operator!r}")
-        if operator in SHAPED and not all(known if operator in ALL_INPUTS else known[1:]):
-            raise ModelError(f"has a {operator} whose size depends on what is felt")
-        if operator in ("Shape", "Size") or all(known):
+        if operator in SHAPED and not all(fixed if operator in ALL_INPUTS else fixed[1:]):
+            raise ModelError(f"has a {operator} whose size depends on the counts")
+        if operator in ("Shape", "Size") or all(fixed):
             self._fixed.update(node.outputs)
 
     def _fields(self, message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
-        """Yield number and value of each field: an int, or the bytes of what is longer.
-        Raises `ModelError` for what is no message."""
+        """Yield number and value of each field: an integer, or bytes.
+
+        Raises `ModelError` if the bytes are no message.
+        """
         if isinstance(message, int):
             raise _broken("a number for a message")
         at, end = 0, len(message)
@@ -155,12 +162,12 @@ class _Reader:
             if self._left < 0:
                 raise ModelError(f"has more than {FIELDS_MAX} fields")
             tag, at = _varint(message, at)
-            number, kind = tag >> 3, tag & 7
-            if not 0 < number < 1 << 29:
-                raise _broken(f"a field of number {number}")
+            field_number, kind = tag >> 3, tag & 7
+            if not 0 < field_number < 1 << 29:
+                raise _broken(f"a field of number {field_number}")
             if kind == VARINT:
                 value, at = _varint(message, at)
-                yield number, value
+                yield field_number, value
                 continue
             if kind == BYTES:
                 size, at = _varint(message, at)
@@ -170,12 +177,12 @@ class _Reader:
                 raise _broken(f"a field of kind {kind}")
             if size > end - at:
                 raise _broken("cut off")
-            yield number, message[at : at + size]
+            yield field_number, message[at : at + size]
             at += size
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """A number of variable length, and where it ends."""
+    """Return the variable-length integer at `at`, and the place after it."""
     value = 0
     for place in range(VARINT_BYTES_MAX):
         if at + place >= len(message):

@@ -1,5 +1,7 @@
-"""Models that were added to those that ship with graspd: `graspd models add` keeps them in a folder
-of the user or, for services, of the system."""
+"""Find models by name: those of the zoo, and those that `graspd models add` has added.
+
+Added models lie in a folder of the user or, for services, of the system.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,12 @@ from models.contract import ModelError
 from models.runtime import ModelFile, read
 
 SYSTEM_FOLDER = Path("/var/lib/graspd/models")
-"""Looked into by everybody; the service's user has no other."""
+"""Folder of added models for all users; the service's user has only this one."""
 NAME_MAX = 64
 
 
 def user_folder() -> Path | None:
-    """Looked into before the system's; None for a user without a home."""
+    """Return the user's own folder of added models; None without a home."""
     try:
         return Path.home() / ".local" / "share" / "graspd" / "models"
     except RuntimeError:
@@ -27,31 +29,31 @@ def user_folder() -> Path | None:
 
 
 def folders() -> list[Path]:
-    """Where added models are looked for, in this order."""
+    """Return the folders of added models, in the order of the search."""
     return [folder for folder in (user_folder(), SYSTEM_FOLDER) if folder is not None]
 
 
 def added() -> dict[str, Path]:
-    """Files of the added models by name, sorted; what cannot be read is left out."""
-    found: dict[str, Path] = {}
+    """Return the files of the added models by name, sorted; unreadable ones are left out."""
+    models: dict[str, Path] = {}
     for folder in reversed(folders()):
-        found |= {path.stem: path for path in folder.glob("*.onnx") if is_name(path.stem)}
-    return {name: path for name, path in sorted(found.items()) if name not in zoo.names()}
+        models |= {path.stem: path for path in folder.glob("*.onnx") if is_name(path.stem)}
+    return {name: path for name, path in sorted(models.items()) if name not in zoo.names()}
 
 
 def is_name(text: str) -> bool:
-    """Whether a model may be called so: it is a file's name, and no file's path."""
+    """Return True if a model may have this name: it must be a file name, not a path."""
     whole = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", text) is not None
     return whole and len(text) <= NAME_MAX and not text.endswith(".onnx")
 
 
 def find(name: str) -> Path:
-    """Return a model's file: the zoo's, else the user's, else the system's. Raises `ModelError`."""
+    """Return a model's file, from the zoo, the user or the system. Raises `ModelError`."""
     if name in zoo.names():
         return zoo.find(name)
     for folder in folders() if is_name(name) else ():
         path = folder / f"{name}.onnx"
-        if os.path.isfile(path):  # without an error where the folder may not be read
+        if os.path.isfile(path):  # raises no error if the folder cannot be read
             return path
     others = added()
     import difflib  # only where it is needed
@@ -65,10 +67,10 @@ def find(name: str) -> Path:
 
 
 def card(path: Path, file: ModelFile | None = None) -> dict[str, Any]:
-    """The card beside a model file or, where there is none, what its contract says.
+    """Return the card beside a model file; without a card, one made of its contract.
 
-    The model is loaded as the daemon does; `file` is its content where that was read. Raises
-    `ModelError` for one that the daemon would refuse, and for the card of another file.
+    The model is loaded as by the daemon. `file`: its content, if it was read before. Raises
+    `ModelError` if the daemon would refuse the model, or if the card is of another file.
     """
     file = read(path) if file is None else file
     contract = json.loads(trial.load(path, file).contract.to_json())

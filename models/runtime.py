@@ -1,4 +1,4 @@
-"""Loading an ONNX model and running it on one reading, with nothing allocated per run."""
+"""Load an ONNX model and run it on one reading, without allocation per run."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from models.contract import METADATA_KEY, OUTPUT_NAME, ModelContract, ModelError
 from models.inputs import InputBuilder, builder
 
 MAX_MODEL_BYTES = 256 * 2**20
-"""A larger file is no model of this kind: the published CNN1 has 12 MB."""
+"""Largest model file, bytes; the published CNN1 has 12 MB."""
 WARM_UP_RUNS = 20
-"""Runs before the first verdict, so that lazy allocation and page faults are behind us."""
+"""Runs before the first verdict; they do the lazy allocation and the page faults."""
 
 
 class ModelFile:
-    """The whole content of a model file, and its SHA-256 (hexadecimal; 12 MB take 10 ms)."""
+    """Content of a model file and its SHA-256, hexadecimal; hashing 12 MB takes 10 ms."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
@@ -29,12 +29,16 @@ class ModelFile:
 
 
 class TactileModel:
-    """A loaded, warm model with its input and output bound to fixed buffers.
-    Fill `input` (float32, shape `inputs.shape`) with `inputs.build`, then call `run`."""
+    """A loaded, warm model whose input and output are fixed buffers.
+
+    Fill `input` (float32, shape `inputs.shape`) with `inputs.build`, then call `run`.
+    """
 
     def __init__(self, path: Path, tried: ModelFile | None = None) -> None:
         """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent.
-        `tried` is its content, where that has been read and checked (`models.trial`)."""
+
+        `tried`: its content, if `models.trial` has read and checked it.
+        """
         file = read(path) if tried is None else tried
         self.path = path
         self.sha256 = file.sha256
@@ -57,7 +61,7 @@ class TactileModel:
             self.run()
 
     def run(self) -> tuple[float, float]:
-        """Probabilities (stable, slip) of what is in `input`. Raises `ModelError`."""
+        """Return the probabilities (stable, slip) for `input`. Raises `ModelError`."""
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's exceptions share no narrower base
@@ -67,7 +71,7 @@ class TactileModel:
 
 
 def read(path: Path) -> ModelFile:
-    """The content of a model file. Raises `ModelError`."""
+    """Return the content of a model file. Raises `ModelError`."""
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):
@@ -82,8 +86,8 @@ def read(path: Path) -> ModelFile:
 
 
 def check_operators(path: Path, data: bytes) -> None:
-    """Raise `ModelError` unless the content is the whole model, and must come to an end."""
-    from models import onnx_file  # which no model of the zoo needs
+    """Raise `ModelError` unless the file is complete and its operators surely end."""
+    from models import onnx_file  # models of the zoo do not need it
 
     try:
         onnx_file.check(data)
@@ -92,14 +96,14 @@ def check_operators(path: Path, data: bytes) -> None:
 
 
 def single_threaded(model: bytes) -> ort.InferenceSession:
-    """A session as the daemon runs one. Raises what onnxruntime raises for no usable model."""
+    """Return a session as the daemon runs it. Raises onnxruntime's exceptions."""
     options = ort.SessionOptions()
-    # One thread, no spinning: a second thread gains nothing on a network this small, and spinning
+    # One thread, no spinning: a second thread gains nothing on a small network, and spinning
     # between readings would burn a core of the robot's PC.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Not the other format, in which nobody has looked for operators.
+    # Not ORT format: `check_operators` reads only ONNX.
     options.add_session_config_entry("session.load_model_format", "ONNX")
     options.log_severity_level = 3
     return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
@@ -127,18 +131,18 @@ def _contract(path: Path, session: ort.InferenceSession) -> tuple[ModelContract,
         raise ModelError(f"{path}: {error}") from error
 
 
-def _check_signature(path: Path, session: ort.InferenceSession, wanted: InputBuilder) -> None:
+def _check_signature(path: Path, session: ort.InferenceSession, expected: InputBuilder) -> None:
     inputs = {node.name: node for node in session.get_inputs()}
     outputs = {node.name: node for node in session.get_outputs()}
-    if set(inputs) != {wanted.name} or OUTPUT_NAME not in outputs:
+    if set(inputs) != {expected.name} or OUTPUT_NAME not in outputs:
         raise ModelError(
             f"{path}: has inputs {sorted(inputs)} and outputs {sorted(outputs)}, "
-            f"not {wanted.name} and {OUTPUT_NAME}"
+            f"not {expected.name} and {OUTPUT_NAME}"
         )
-    node = inputs[wanted.name]
-    if node.type != "tensor(float)" or tuple(node.shape[1:]) != wanted.shape:
+    node = inputs[expected.name]
+    if node.type != "tensor(float)" or tuple(node.shape[1:]) != expected.shape:
         raise ModelError(
-            f"{path}: takes {node.type} {node.shape}, its contract says {wanted.shape}"
+            f"{path}: takes {node.type} {node.shape}, its contract says {expected.shape}"
         )
     node = outputs[OUTPUT_NAME]
     if node.type != "tensor(float)" or tuple(node.shape[1:]) != (2,):

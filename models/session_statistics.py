@@ -1,7 +1,7 @@
-"""Running statistics of a session's own, unlabelled grasps: what a drifted sensor's zero is now.
+"""Running statistics of a session's own, unlabelled grasps, which follow drifting sensors.
 
 A session lasts from one exchange of a sensor to the next. Its statistics standardise the input of
-session models, so that a network trained on other days sees what it knows.
+session models, so that the network sees values like those of its training days.
 """
 
 from __future__ import annotations
@@ -15,53 +15,66 @@ import numpy as np
 from numpy.typing import NDArray
 
 HORIZON_GRASPS = 300.0
-"""Grasps after which older ones fade. Without it, 400 grasps of one object would bias
-the next thousand; with it the session forgets them, and a fresh sensor's slow drift is followed."""
+"""Largest weight of the statistics, grasps; older grasps fade.
+
+Without it, 400 grasps of one object would bias the next thousand. It also lets the statistics
+follow the slow drift of a new sensor.
+"""
 REPEAT_DISTANCE, REPEAT_IN_PRIOR = 0.05, 0.15
-"""A reading that is nearer to the last one than this (root mean square, in the session's spreads or
-in the training's) is the same grasp again: the session's own fall with every repetition. Noise of 5
-counts moves it by 0.11 of the training's at most; of 100 grasps of one object 98 differ by more."""
+"""Root-mean-square distances from the last grasp below which a reading is the same grasp again.
+
+The first is in spreads of the session, the second in spreads of the training, because the session's
+own shrink with each repetition. Noise of 5 counts gives at most 0.11 of the training's; 98 of 100
+grasps of one object differ by more than the limit.
+"""
 BALANCED_FROM = 20
-"""Grasps from which on verdicts are sound enough to tell what a session is made of."""
+"""Grasps after which verdicts are good enough to balance stable grasps and slips."""
 SHARE_GRASPS = 50.0
-"""Grasps over which the share of slips is counted."""
+"""Number of grasps over which the share of slips is counted."""
 LEAST_WEIGHT = 0.02
-"""Of a slip where nearly all are slips: so a session that began wrongly finds back."""
+"""Smallest weight of a slip; above zero, so that a session that began wrongly recovers."""
 
 SPREAD_RATIOS = (0.2, 3.0)
-"""Least and largest spread of a finger's electrodes (median) over the training's in a session of
-grasps. From twenty grasps of the published tables on it is 0.4 to 1.5, of a dead finger 0.06."""
+"""Smallest and largest median spread of a finger's electrodes, in units of the training's.
+
+After twenty grasps of the published tables it is 0.4 to 1.5; for a dead finger it is 0.06.
+"""
 AWAY_MAX = 8.0
-"""Electrodes of a session read, in the mean, at most so many of the training's spreads away from
-the training's mean (root mean square): 1.3 to 4.1 on the published days."""
+"""Largest distance of a session's mean from the training's, in the training's spreads.
+
+It is a root mean square over the electrodes; on the published days it is 1.3 to 4.1.
+"""
 AWAY_MIN, ORDER_RATIO = 1.0, 1.2
-"""Fingers are exchanged if they are further away than the first, and in another order nearer by
-more than the second: in their own they are the nearer by 1.5 to 2.6 on the published days."""
+"""Fingers count as exchanged above this distance, if another order is this factor nearer.
+
+The distance is that of `AWAY_MAX`. On the published days the right order is nearer by a factor of
+1.5 to 2.6.
+"""
 
 
 class SessionState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Statistics as they are kept between two starts of the daemon."""
+    """Statistics as kept between two starts of the daemon."""
 
     weight: Annotated[float, msgspec.Meta(ge=0.0, le=HORIZON_GRASPS)]
-    """Grasps that the sums stand for, at most `HORIZON_GRASPS`."""
+    """Weight of the sums, grasps, at most `HORIZON_GRASPS`."""
     grasps: Annotated[int, msgspec.Meta(ge=0)]
-    """Grasps seen in all."""
+    """Number of all grasps."""
     mean: tuple[float, ...]
     squares: tuple[Annotated[float, msgspec.Meta(ge=0.0)], ...]
-    """Sum of the squared deviations from the mean."""
+    """Sums of the squared deviations from the mean."""
     slip_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.5
-    """Of the latest grasps, as they were judged."""
+    """Share of slips among the latest grasps, by their verdicts."""
     last: tuple[float, ...] | None = None
-    """The grasp that was taken in last: still held, it is not taken in again."""
+    """Last grasp taken in, so that a held grasp is not taken in twice; None: none yet."""
 
 
 class SessionStatistics:
-    """Mean and spread of vectors that come one by one, by Welford's method, with a weak prior.
+    """Running mean and spread of vectors, by Welford's method, with a weak prior.
 
-    Every vector has the shape of the prior, (width,). Constant memory; numbers stay bounded however
-    many grasps come. Rounding errors fade with the grasps that made them, so mean and spread keep a
-    relative error below 1e-10 (4e-15 after a billion grasps, `graspd report stability`). The prior
-    keeps a spread above zero, even of an electrode that never moves.
+    Each vector has the shape of the prior, (width,). Memory is constant and all numbers stay
+    bounded. Rounding errors fade with old grasps, so the relative error of mean and spread stays
+    below 1e-10 (4e-15 after a billion grasps, `graspd report stability`). The prior keeps each
+    spread above zero, even of an electrode that never moves.
     """
 
     def __init__(
@@ -70,8 +83,10 @@ class SessionStatistics:
         prior_spread: NDArray[np.float64],
         prior_grasps: float = 1.0,
     ) -> None:
-        """Start from the training's statistics, which weigh `prior_grasps` grasps.
-        Raises `ValueError` unless the spreads and the weight are above zero."""
+        """Start from the training's statistics, with the weight of `prior_grasps` grasps.
+
+        Raises `ValueError` unless the spreads and the weight are above zero.
+        """
         if not (np.all(prior_spread > 0.0) and prior_grasps > 0.0):
             raise ValueError("prior spreads and weight must be above zero")
         self._prior_mean = prior_mean
@@ -81,7 +96,7 @@ class SessionStatistics:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the session: a sensor was exchanged."""
+        """Forget the session. Call when a sensor was exchanged."""
         self.grasps = 0
         self._weight = 0.0
         self._mean = np.zeros_like(self._prior_mean)
@@ -91,10 +106,10 @@ class SessionStatistics:
         self._settle()
 
     def observe(self, values: NDArray[np.float64], *, slip: bool | None = None) -> bool:
-        """Take in one grasp; False if it is the one before, still held, or is not finite.
+        """Take in one grasp; return False if it is still the last one, or not finite.
 
-        `slip` is how it was judged, None if it was not. Among many slips each weighs the less: a
-        session's mean that moved to what slips would make the next slip look stable.
+        `slip`: its verdict; None: not judged. Among many slips each weighs less, because a
+        mean that moves to the slips would make the next slip look stable.
         """
         if 0 in np.isfinite(values).tobytes() or self._is_held(values):
             return False
@@ -112,7 +127,7 @@ class SessionStatistics:
         return True
 
     def state(self) -> SessionState:
-        """What `restore` needs."""
+        """Return the state for `restore`."""
         return SessionState(
             self._weight,
             self.grasps,
@@ -123,7 +138,7 @@ class SessionStatistics:
         )
 
     def restore(self, state: SessionState) -> None:
-        """Go on from an earlier state. Raises `ValueError` if it is of another kind of vector."""
+        """Continue from an earlier state. Raises `ValueError` if it does not fit."""
         mean, squares = np.array(state.mean), np.array(state.squares)
         last = mean if state.last is None else np.array(state.last)
         if not mean.shape == squares.shape == last.shape == self._prior_mean.shape:
@@ -140,7 +155,7 @@ class SessionStatistics:
         self._settle()
 
     def _balance(self, slip: bool | None) -> float:
-        """The weight of the next grasp, after its verdict was counted."""
+        """Count the verdict of the next grasp; return the grasp's weight."""
         if self.grasps < BALANCED_FROM:
             return 1.0
         if slip is not None:
@@ -157,7 +172,7 @@ class SessionStatistics:
         return any(_mean_square(step / spread) < distance**2 for spread, distance in kinds)
 
     def _settle(self) -> None:
-        """Blend session and prior, as if the prior were `prior_grasps` grasps around its mean."""
+        """Update mean and spread, with the prior as `prior_grasps` grasps around its mean."""
         total = self._weight + self._prior_grasps
         share = self._prior_grasps / total
         self.mean: NDArray[np.float64] = share * self._prior_mean + (1.0 - share) * self._mean
@@ -174,17 +189,17 @@ def is_odd(
     *,
     enough: bool,
 ) -> bool:
-    """Whether what a session took in cannot have been grasps of these fingers.
+    """Return True if a session cannot have come from grasps of these fingers.
 
-    The sensors are far off; the fingers are exchanged; or, of `enough` grasps, a finger is dead or
-    sees noise alone. Of mean and spread of each electrode in the session, and in the training,
-    counts, shape (fingers, 24).
+    There are three cases: the sensors are far off; the fingers are exchanged; after `enough`
+    grasps a finger is dead or sees noise alone. Mean and spread of each electrode, in session and
+    training: counts, shape (fingers, 24).
     """
     ratio = np.sort(spread / training_spread, axis=1)
     middle = ratio.shape[1] // 2
     ratios = ((ratio[:, (ratio.shape[1] - 1) // 2] + ratio[:, middle]) / 2.0).tolist()  # the median
     least, most = SPREAD_RATIOS
-    # Of each finger of the session from each of the training.
+    # Distance of each finger of the session from each of the training.
     deviations = (mean[:, np.newaxis] - training_mean) / training_spread
     away = np.add.reduce(np.square(deviations), axis=2) / mean.shape[1]
     rows: list[list[float]] = away.tolist()

@@ -1,8 +1,8 @@
-"""Counts to tactile images: one definition, for training and for the daemon alike.
+"""Convert counts to tactile images, in the same way for training and for the daemon.
 
-For a fixed layout both gap fillings are linear in the counts (least contact: linear in the counts
-and their maximum), and every row of the fill matrix sums to one. So subtracting the mean commutes
-with filling, and a normalised image is one small matrix product and one division.
+For a fixed layout both ways of filling gaps are linear in the counts; least contact is linear in
+the counts and their maximum. Each row of the fill matrix sums to one, so subtracting the mean
+commutes with filling. A normalised image is one small matrix product and one division.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from models.layout import D1, ELECTRODES, Layout
 
 
 class Fill(StrEnum):
-    """What a pixel without an electrode shows (paper, section II-A)."""
+    """Value of a pixel without an electrode (paper, section II-A)."""
 
     LEAST_CONTACT = "least-contact"
     """The finger's largest count: contact lowers a count."""
@@ -26,16 +26,16 @@ class Fill(StrEnum):
 
 
 class Normalisation(StrEnum):
-    """Over what a finger's mean and (population) standard deviation are taken."""
+    """Values over which a finger's mean and population standard deviation are taken."""
 
     FILLED_IMAGE = "filled-image"
-    """All pixels of the filled image: what the authors' notebooks do."""
+    """All pixels of the filled image, as in the authors' notebooks."""
     ELECTRODES = "electrodes"
-    """The 24 electrodes: what the paper says (section II-B)."""
+    """The 24 electrodes, as in the paper (section II-B)."""
 
 
 class Composition(StrEnum):
-    """How the images of the fingers stand together (paper, section II-C)."""
+    """Arrangement of the images of the fingers (paper, section II-C)."""
 
     CHANNELS = "channels"
     """One behind the other: height x width x fingers."""
@@ -46,8 +46,10 @@ class Composition(StrEnum):
 
 
 def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
-    """Return the matrix (pixels, 25) that gives a filled image from [24 counts, their maximum].
-    Pixels are in row-major order. Each row sums to one."""
+    """Return the matrix (pixels, 25) from [24 counts, their maximum] to a filled image.
+
+    Pixels are in row-major order. Each row sums to one.
+    """
     height, width = layout.shape
     matrix = np.zeros((height, width, ELECTRODES + 1))
     filled = np.zeros((height, width), dtype=bool)
@@ -57,21 +59,21 @@ def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
     if fill is Fill.LEAST_CONTACT:
         matrix[~filled, ELECTRODES] = 1.0
     while not filled.all() and fill is Fill.NEIGHBOUR_MEAN:
-        before, known = matrix.copy(), filled.copy()
-        for row, column in np.argwhere(~known):
+        before, was_filled = matrix.copy(), filled.copy()
+        for row, column in np.argwhere(~was_filled):
             window = (slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2))
-            if known[window].any():
-                matrix[row, column] = before[window][known[window]].mean(axis=0)
+            if was_filled[window].any():
+                matrix[row, column] = before[window][was_filled[window]].mean(axis=0)
                 filled[row, column] = True
     return matrix.reshape(height * width, ELECTRODES + 1)
 
 
 class TactileImager:
-    """Builds normalised tactile images without allocating an image per reading.
+    """Build normalised tactile images without allocating an image per reading.
 
-    The arithmetic is float64 on integers below 2**12, so an image differs from the exact one by
-    less than 1e-9 before it is rounded to float32, which is 6e-8 of its largest magnitude: the
-    mean goes off each pixel before anything is squared, so nothing cancels.
+    The arithmetic is float64 on integers below 2**12, and the mean is subtracted from each pixel
+    before squaring. An image differs from the exact one by less than 1e-9, and then by rounding to
+    float32: 6e-8 of its largest magnitude.
     """
 
     name = "tactile_image"
@@ -85,7 +87,7 @@ class TactileImager:
         composition: Composition = Composition.CHANNELS,
     ) -> None:
         height, width = layout.shape
-        # The fingers' images in `shape` seen as (height, width, fingers): split, then transposed.
+        # View of the fingers' images as (height, width, fingers): split, then transposed.
         match composition:
             case Composition.CHANNELS:
                 self.shape: tuple[int, int, int] = (height, width, fingers)
@@ -106,19 +108,19 @@ class TactileImager:
         else:
             weights = np.zeros(terms)
             weights[:ELECTRODES] = 1.0 / ELECTRODES
-        # Row sums are one, so taking the weighted mean off each row centres the image.
+        # Row sums are one, so subtracting the weighted mean from each row centres the image.
         self._centre = matrix - weights
         self._spread_over_image = normalisation is Normalisation.FILLED_IMAGE
         self._counts = np.zeros((terms, fingers))
         self._pixels = np.zeros((matrix.shape[0], fingers))
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Write the image of one reading into `out` and return each finger's spread.
+        """Write the image of one reading into `out`; return each finger's spread.
 
-        `counts` has shape (fingers, 24), `out` has shape `self.shape` and is C-contiguous. The
-        result, shape (fingers,), is the standard deviation in counts; where it is below
-        `SPREAD_FLOOR_COUNTS` (or not finite) the finger's image is all zeros and must not be
-        judged. For counts of 12 bits its relative error is below 1e-9.
+        `counts`: shape (fingers, 24). `out`: shape `self.shape`, C-contiguous. The result, shape
+        (fingers,), is the standard deviation in counts. If it is below `SPREAD_FLOOR_COUNTS` or not
+        finite, the finger's image is all zeros and must not be judged. For counts of 12 bits its
+        relative error is below 1e-9.
         """
         if out.shape != self.shape or not out.flags.c_contiguous:
             raise ValueError(f"out must be C-contiguous {self.shape}, is {out.shape}")
@@ -143,7 +145,9 @@ class TactileImager:
         self, counts: NDArray[np.generic]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Return images (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24).
-        Each is made by `build`, so training sees bit for bit what the daemon sees."""
+
+        `build` makes each, so training and daemon have the same bits.
+        """
         images = np.empty((len(counts), *self.shape), dtype=np.float32)
         spreads = np.empty((len(counts), self._planes[2]))
         for index, reading in enumerate(counts):

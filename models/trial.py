@@ -1,5 +1,8 @@
-"""Loads a model as a daemon may: one that is not of the zoo, by its card's digest, is first tried
-in a process of its own, which may be slow, grow or fall. That is a second start, 0.2 s."""
+"""Load a model for a daemon, after a trial in a process of its own.
+
+A bad model may be slow, take too much memory or crash, and then only that process does. The trial
+takes 0.2 s. Models of the zoo, known by the digest in their card, need none.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +16,26 @@ from models.contract import ModelError
 from models.runtime import ModelFile, TactileModel, check_operators, read
 
 TRIAL_S = 10.0
-"""For loading and the first runs, s; a model of 12 MB takes 0.3. So long a daemon's start or a
-reload may wait."""
+"""Longest trial, s: loading and the first runs. A model of 12 MB takes 0.3.
+
+A start or reload of the daemon waits for it.
+"""
 MEMORY_MAX_BYTES = 640 << 20
-"""Of that process: the service has a gigabyte."""
+"""Most memory of the trial's process, bytes; the service has a gigabyte."""
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
-"""prctl(2)."""
+"""Option of prctl(2): a signal for this process when its parent ends."""
 _BEGIN = "import sys; sys.path[:] = sys.argv[2:]; from models.trial import main; main()"
 
 passed: deque[str] = deque(maxlen=8)
-"""Digests of models that were tried and are fine, the newest last."""
+"""Digests of models that passed their trial, the newest last."""
 
 
 def load(path: Path, file: ModelFile | None = None) -> TactileModel:
-    """Return the model at `path`, warm; `file` is its content where that was read.
-    Raises `ModelError`, also for a model that is too slow or too large."""
+    """Return the model at `path`, warm. Raises `ModelError`, also if it is too slow or large.
+
+    `file`: its content, if it was read before.
+    """
     file = read(path) if file is None else file
     if file.sha256 not in passed and not zoo.ships(path, file.sha256):
         _try(path, file.data)
@@ -37,7 +44,7 @@ def load(path: Path, file: ModelFile | None = None) -> TactileModel:
 
 
 def _try(path: Path, content: bytes) -> None:
-    import subprocess  # 10 ms that a model of the zoo does not wait for
+    import subprocess  # imported here: it takes 10 ms, and models of the zoo need no trial
 
     command = [sys.executable, "-c", _BEGIN, str(path), *sys.path]
     try:
@@ -65,7 +72,7 @@ def _try(path: Path, content: bytes) -> None:
 
 
 def main() -> None:
-    """Be the process that tries the model on stdin; prints why it is refused."""
+    """Try the model on stdin, in its own process; print why it is refused."""
     import ctypes
     import resource
     import signal

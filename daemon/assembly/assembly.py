@@ -1,4 +1,4 @@
-"""Makes the model, the judge and the drivers of a scene."""
+"""Make the model, the judge and the drivers of a scene."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ if TYPE_CHECKING:
 
 DEFAULT_MODEL = "small-session"
 RECORDED_MAX_AGE_MS = 1000.0
-"""Age limit of recorded readings, ms: generous, because a recording has no wire to be late on."""
+"""Age limit of recorded readings, ms; generous, because a recording has no link to be late on."""
 MCAP = ".mcap"
 LINK_LOGS = (".log", ".serial")
-"""Endings of candump text and of serial bytes."""
+"""File name endings of link logs: candump text and serial bytes."""
 
 Clock = Callable[[], int]
-"""Gives monotonic ns."""
+"""Clock that returns monotonic ns."""
 
 
 def model_path(scene: Scene) -> Path:
-    """Return the file of the model for the hand's fingers. Raises `ModelError`."""
+    """Return the model file for the hand's fingers. Raises `ModelError`."""
     if scene.model.path is not None:
         return scene.model.path
     name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
@@ -53,7 +53,7 @@ def model_path(scene: Scene) -> Path:
 
 
 def load_model(scene: Scene) -> TactileModel:
-    """Load the scene's model, and run it once. Raises `ModelError`."""
+    """Load the scene's model and run it once. Raises `ModelError`."""
     return trial.load(model_path(scene))
 
 
@@ -94,23 +94,23 @@ def _trust(scene: Scene, model: TactileModel) -> Trust | None:
 
 def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
     """Raise `ModelError`, with advice, if the model is not for the hand's fingers."""
-    wanted, hand = model.contract.fingers, scene.hand.fingers
-    if hand == wanted:
+    expected, hand = model.contract.fingers, scene.hand.fingers
+    if hand == expected:
         return
-    if set(hand) == set(wanted):
-        advice = f"write hand.fingers = {json.dumps(wanted)}{_and_sensors(scene)}"
+    if set(hand) == set(expected):
+        advice = f"write hand.fingers = {json.dumps(expected)}{_and_sensors(scene)}"
     elif names := zoo.judging(hand):
         advice = f"the zoo has {', '.join(names)} for these"
     else:
         advice = "the zoo has no model for these"
     raise ModelError(
-        f"{model.path}: judges the fingers {', '.join(wanted)} in this order, "
+        f"{model.path}: judges the fingers {', '.join(expected)} in this order, "
         f"the hand has {', '.join(hand)}: {advice}"
     )
 
 
 def _and_sensors(scene: Scene) -> str:
-    """Advise `tactile.sensors` if the sensors are wired in the order of the hand's fingers."""
+    """Return advice on `tactile.sensors` if sensors are wired in the order of `hand.fingers`."""
     match scene.tactile:
         case SpiTactile(sensors=None) | CanTactile(sensors=None, format="syntouch"):
             return f" and tactile.sensors = {json.dumps(scene.hand.fingers)}, as they are wired"
@@ -119,7 +119,7 @@ def _and_sensors(scene: Scene) -> str:
 
 
 def gate_mode(scene: Scene) -> GateMode:
-    """Return the gate's mode, by the recordings unless given. Raises as `build_pipeline`."""
+    """Return the gate's mode; without `gate.mode` the recordings decide. Raises `SceneError`."""
     if scene.gate.mode is not None:
         return scene.gate.mode
     if not isinstance(scene.tactile, ReplayTactile) or is_mcap(scene.tactile):
@@ -131,7 +131,7 @@ def gate_mode(scene: Scene) -> GateMode:
 
 
 def hand_limits(scene: Scene) -> HandLimits | None:
-    """Return the limits of the gate; None with mode `every`."""
+    """Return the limits of the gate; None in mode `every`."""
     mode, gate = gate_mode(scene), scene.gate
     if mode == "every":
         if gate.sweeps == 3:
@@ -187,7 +187,7 @@ def joint_limits(scene: Scene) -> JointLimits | None:
 
 
 def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:
-    """Make the drivers of this scene, not yet open, the tactile one first. Raises `SceneError`."""
+    """Make the drivers, not open yet, the tactile one first. Raises `SceneError`."""
     with _section("tactile"):
         drivers = [_tactile(scene, clock)]
     if isinstance(scene.joints, StreamJoints):
@@ -200,7 +200,7 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
 
 
 def open_driver(driver: Driver) -> None:
-    """Open a driver. Raises `LinkError` if a later try may succeed, else `SceneError`."""
+    """Open a driver. Raises `LinkError` if a retry may succeed, else `SceneError`."""
     try:
         driver.open()
     except LinkError:
@@ -224,13 +224,13 @@ def _tactile(scene: Scene, clock: Clock) -> Driver:
         case SpiTactile() as options:
             from drivers.spi.driver import SpiBridgeDriver
 
-            wanted = options.model_dump(exclude={"driver"})
-            return SpiBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
+            arguments = options.model_dump(exclude={"driver"})
+            return SpiBridgeDriver(fingers=scene.hand.fingers, clock=clock, **arguments)
         case CanTactile() as options:
             from drivers.can.driver import CanBridgeDriver
 
-            wanted = options.model_dump(exclude={"driver"})
-            return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
+            arguments = options.model_dump(exclude={"driver"})
+            return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **arguments)
         case PalmTactile() as options:
             joints = scene.joints
             calibration = joints.calibration if isinstance(joints, PalmJoints) else None

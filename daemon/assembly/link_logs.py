@@ -1,4 +1,4 @@
-"""What came over a link, judged again: its scene and its driver."""
+"""Build scene and driver that judge a link log again."""
 
 from __future__ import annotations
 
@@ -18,53 +18,53 @@ from models.runtime import TactileModel
 
 _DRIVER = {CANDUMP: "can", SERIAL: "spi"}
 _SECTIONS = ("hand", "tactile", "model", "gate", "session")
-"""Those that say how readings are judged; a link log has no joints."""
+"""Sections of a scene that change verdicts; a link log has no joints."""
 
 
 class LinkLogs:
-    """Link logs of one kind, in the order of time."""
+    """One or more link logs of one kind, in the order of time."""
 
-    def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
-        """`path` is of the scene. Raises `SceneError` for files of two kinds."""
+    def __init__(self, paths: Sequence[Path], scene_path: Path | None) -> None:
+        """`scene_path`: the scene; None: defaults. Raises `SceneError` for two kinds of files."""
         endings = {path.suffix for path in paths}
         if len(endings) > 1:
             raise SceneError(f"files of {' and '.join(sorted(endings))} are not one recording")
         self._paths = tuple(paths)
         self._ending = paths[0].suffix
-        self._scene_path = path
+        self._scene_path = scene_path
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the scene of the link. Raises `SceneError`."""
+        """Return the scene, changed by these sections. Raises `SceneError`."""
         driver = _DRIVER[self._ending]
         if self._scene_path is None:
             port = {"port": "link log"} if self._ending == SERIAL else {}
             sections: dict[str, dict[str, Any]] = {"tactile": {"driver": driver, **port}}
         else:
-            wanted = scene.load(self._scene_path)
-            if wanted.tactile.driver != driver:
+            loaded = scene.load(self._scene_path)
+            if loaded.tactile.driver != driver:
                 raise SceneError(f"{self._scene_path}: tactile.driver must be {driver}")
-            chosen = wanted.model_dump(mode="json", exclude_unset=True)
-            sections = {name: chosen[name] for name in _SECTIONS if name in chosen}
+            written = loaded.model_dump(mode="json", exclude_unset=True)
+            sections = {name: written[name] for name in _SECTIONS if name in written}
         return scene.parse(
             changed(sections, publish, model, mode), self._scene_path or Path("command line")
         )
 
-    def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Return what plays the files and judges them. Raises `SceneError`."""
+    def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
+        """Return driver and judge of the files; `speed` None: fast. Raises `SceneError`."""
         try:
-            driver = _driver(wanted, self._paths, speed)
+            driver = _driver(replayed, self._paths, speed)
         except ValueError as error:
             raise SceneError(f"[tactile] {error}") from error
         pipeline = assembly.build_pipeline(
-            wanted, model, lambda: driver.handed_over_ns, learns=wanted.session.learn
+            replayed, model, lambda: driver.handed_over_ns, learns=replayed.session.learn
         )
-        return Parts(wanted, model, pipeline, [driver])
+        return Parts(replayed, model, pipeline, [driver])
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Nothing: a link log does not know the session."""
+        """Do nothing: a link log has no session."""
 
     def tell(self, companion: Companion) -> None:
-        """Nothing: a link log has no outcomes."""
+        """Do nothing: a link log has no outcomes."""
 
 
 def changed(
@@ -73,7 +73,7 @@ def changed(
     model: dict[str, Any],
     mode: str | None,
 ) -> dict[str, dict[str, Any]]:
-    """Return sections of a scene with these instead; thresholds of the model stay."""
+    """Return `sections` with these values instead; the model's thresholds stay."""
     former = sections.get("model", {})
     if model:
         former = {key: value for key, value in former.items() if key not in ("name", "path")}
@@ -81,8 +81,8 @@ def changed(
     return {**sections, "model": former | model, "gate": gate, "publish": publish}
 
 
-def _driver(wanted: Scene, paths: Sequence[Path], speed: float | None) -> LinkLogDriver[Any]:
-    tactile, fingers = wanted.tactile, wanted.hand.fingers
+def _driver(replayed: Scene, paths: Sequence[Path], speed: float | None) -> LinkLogDriver[Any]:
+    tactile, fingers = replayed.tactile, replayed.hand.fingers
     if isinstance(tactile, SpiTactile):
         from drivers.recordings.serial_log import SerialLog
 

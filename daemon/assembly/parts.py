@@ -1,4 +1,4 @@
-"""Puts the parts of a scene together, to run it, to replay and to measure its cost."""
+"""Put the parts of a scene together: to run it, to replay it, to measure its cost."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ log = logging.getLogger("graspd")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """Drivers and judge of a scene, not open yet."""
+    """Drivers and judge of a scene. The drivers are not open yet."""
 
     scene: Scene
     model: TactileModel
     pipeline: Pipeline
     drivers: list[Driver]
-    """The tactile one first."""
+    """All drivers, the tactile one first."""
     boot_id: str | None = None
-    """Start of the daemon that judged the recording; None for this start."""
+    """Id of the daemon's start that made the recording; None: this start."""
 
     @classmethod
     def of(cls, scene: Scene, model: TactileModel) -> Parts:
@@ -46,13 +46,13 @@ class Parts:
 
 
 class Assembly:
-    """Opens the parts of one run, and what the scene wants around them, one call a part."""
+    """Open the parts of one run and everything around them, one call for each."""
 
     def __init__(self, parts: Parts, stack: ExitStack) -> None:
         self.companions: list[Companion] = []
-        """Sockets, session keeper and recorder."""
+        """Companions opened so far: sockets, session keeper, recorder."""
         self.keep: Callable[[Answer], None] = at_once
-        """Answers an outcome once it is on the disk."""
+        """Function that gives an answer once the present state is on the disk."""
         self._outputs: list[Output] = []
         self._parts = parts
         self._stack = stack
@@ -66,7 +66,7 @@ class Assembly:
         self.companions.append(sockets)
 
     def open_drivers(self) -> None:
-        """Open the drivers, and tap a link that is recorded. Raises as `open_driver`."""
+        """Open the drivers; tap the link if it is recorded. Raises as `open_driver`."""
         record, drivers = self._parts.scene.record, self._parts.drivers
         if record is not None and record.raw:
             from daemon.record.link_log import tap_of
@@ -77,8 +77,10 @@ class Assembly:
             assembly.open_driver(driver)
 
     def keep_session(self) -> bool:
-        """Watch for exchanged sensors; restore and keep the session if the scene wants it.
-        The file is saved a last time when the stack closes. Return False if none is kept."""
+        """Watch for exchanged sensors; restore and keep the session if the scene asks for it.
+
+        Return False if no session is kept. The last save is when the stack closes.
+        """
         scene, pipeline = self._parts.scene, self._parts.pipeline
         file = self._session_file()
         if file is None:
@@ -101,11 +103,11 @@ class Assembly:
         )
         self._stack.callback(keeper.save)
         self.keep = keeper.keep
-        self.companions.insert(0, keeper)  # what it answers quietens the socket that is read next
+        self.companions.insert(0, keeper)  # its answers must come before the socket is read
         return True
 
     def _session_file(self) -> SessionFile | None:
-        """Take the file of the session; None if none is kept or it cannot be had."""
+        """Return the locked session file; None if no session is kept or it cannot be locked."""
         scene, pipeline = self._parts.scene, self._parts.pipeline
         if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
             return None
@@ -118,7 +120,7 @@ class Assembly:
             return None
 
     def record(self) -> None:
-        """Record if the scene wants it, after `keep_session`. Raises `SceneError`."""
+        """Record if the scene asks for it. Call after `keep_session`. Raises `SceneError`."""
         parts = self._parts
         if parts.scene.record is None:
             return

@@ -1,4 +1,4 @@
-"""Builds the recorder of a scene."""
+"""Build the recorder of a scene."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ if TYPE_CHECKING:
 
 
 def build_recorder(
-    wanted: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
+    scene: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
 ) -> Recorder | None:
-    """Start the recorder, if wanted. Raises `SceneError` without the package `mcap`."""
-    directory = wanted.record_directory
-    if wanted.record is None or directory is None:
+    """Start the recorder; None without `[record]`. Raises `SceneError` without `mcap`."""
+    directory = scene.record_directory
+    if scene.record is None or directory is None:
         return None
     try:
         from daemon.record.files import Retention
         from daemon.record.recorder import Recorder
     except ModuleNotFoundError as error:
         raise SceneError(needs("[record]", "record", error)) from error
-    options = wanted.record
+    options = scene.record
     retention = Retention(
         directory,
-        wanted.hand.name,
+        scene.hand.name,
         boot_id,
         keep_files=options.keep_files,
         keep_bytes=round(options.keep_mb * 1e6),
@@ -45,33 +45,33 @@ def build_recorder(
     recorder = Recorder(
         retention,
         options,
-        take_header=partial(header_now, pipeline, header_of(wanted, model, boot_id)),
+        take_header=partial(header_now, pipeline, header_of(scene, model, boot_id)),
         tap=tap,
     )
     pipeline.on_exchange = recorder.exchanged
     return recorder
 
 
-def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
-    """Make the header of a run's files, without the state of judge and session."""
-    network = wanted.model.model_dump(mode="json", exclude_none=True)
-    if wanted.model.path is not None:
-        network["path"] = str(wanted.model.path.absolute())
+def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
+    """Return the header of a run's files, without the state of judge and session."""
+    network = scene.model.model_dump(mode="json", exclude_none=True)
+    if scene.model.path is not None:
+        network["path"] = str(scene.model.path.absolute())
     sections = {
-        "hand": wanted.hand.model_dump(mode="json"),
+        "hand": scene.hand.model_dump(mode="json"),
         "model": network,
         "gate": {
-            **wanted.gate.model_dump(mode="json", exclude_none=True),
-            "mode": assembly.gate_mode(wanted),
+            **scene.gate.model_dump(mode="json", exclude_none=True),
+            "mode": assembly.gate_mode(scene),
         },
-        "session": {"learn": wanted.session.learn, "required": wanted.session.required},
-        "learn": wanted.learn.model_dump(mode="json"),
+        "session": {"learn": scene.session.learn, "required": scene.session.required},
+        "learn": scene.learn.model_dump(mode="json"),
     }
-    if wanted.risk is not None:
-        sections["risk"] = wanted.risk.model_dump(mode="json")
+    if scene.risk is not None:
+        sections["risk"] = scene.risk.model_dump(mode="json")
     return RecordingHeader(
-        fingers=wanted.hand.fingers,
-        joints=assembly.joint_limits(wanted) is not None,
+        fingers=scene.hand.fingers,
+        joints=assembly.joint_limits(scene) is not None,
         boot_id=boot_id,
         scene=sections,
         model=model.contract.name,
@@ -80,7 +80,7 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
 
 
 def header_now(pipeline: Pipeline, header: RecordingHeader) -> Callable[[], RecordingHeader]:
-    """Copy the judge's state; return what encodes it in any thread."""
+    """Copy the judge's state; return a function that makes the header in any thread."""
     judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
     state = None if session is None else session.state()
     trust = None if pipeline.trust is None else pipeline.trust.state()

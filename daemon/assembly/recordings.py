@@ -1,4 +1,4 @@
-"""Builds what judges recordings again as they were judged."""
+"""Build what judges recordings again, from the state in their headers."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ from models.runtime import TactileModel
 log = logging.getLogger("graspd")
 
 SECTIONS: Final[tuple[str, ...]] = ("hand", "model", "gate", "session", "learn", "risk")
-"""Sections that a recording has."""
+"""Sections of a scene that a recording has."""
 NOTHING_KNOWN: Final = (
-    "%s: begins in the middle of a run and does not say what was known there: verdicts may differ "
-    "until the hand has been open and its grasps are known"
+    "%s: begins in the middle of a run and has no usable state of the judge: verdicts may "
+    "differ until the hand has been open and grasps again"
 )
 
 
 class RecordedRun:
-    """The recordings of one run of the daemon, in the order of time."""
+    """One or more recordings of one run of the daemon, in the order of time."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the headers; warn of missing files. Raises `RecordingError`."""
+        """Read the headers; warn if a file between them is missing. Raises `RecordingError`."""
         headers = [header_of(path) for path in paths]
         self.header = headers[0]
         self._paths = tuple(paths)
         self._companion = Companion()
         self._same_grasps = True
-        """False under another gate mode: recorded outcomes are not of its grasps."""
+        """False in another gate mode, where recorded outcomes are of other grasps."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the recorded scene, changed as asked. Raises `SceneError`."""
+        """Return the recorded scene, changed by these sections. Raises `SceneError`."""
         recorded = self.header.scene
         sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
         if sections.get("model", {}).pop("min_accuracy", None) is not None:
@@ -68,17 +68,17 @@ class RecordedRun:
         }
         return parse(changed(sections, publish, model, mode), self._paths[0])
 
-    def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Return what judges the files from their state; `speed` None: no pauses."""
+    def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
+        """Return driver and judge, in the recorded state; `speed` None: fast."""
         header = self.header
         same_model = model.sha256 == header.model_sha256
         if not same_model:
             log.warning("%s: was judged by %s, not by this model", self._paths[0], header.model)
         driver = McapReplayDriver(
-            self._paths, wanted.hand.fingers, speed=speed, axis_ns=header.axis_ns
+            self._paths, replayed.hand.fingers, speed=speed, axis_ns=header.axis_ns
         )
         pipeline = assembly.build_pipeline(
-            wanted, model, lambda: driver.handed_over_ns, learns=wanted.session.learn
+            replayed, model, lambda: driver.handed_over_ns, learns=replayed.session.learn
         )
         try:
             recall(pipeline, header.judge, same_model=same_model)
@@ -87,10 +87,10 @@ class RecordedRun:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         driver.on_event = partial(self._repeat, pipeline)
         pipeline.boot_id = header.boot_id
-        return Parts(wanted, model, pipeline, [driver], header.boot_id)
+        return Parts(replayed, model, pipeline, [driver], header.boot_id)
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Restore session and learning of the recorded model. Raises `SceneError`."""
+        """Restore the recorded session and learning. Raises `SceneError`."""
         header = self.header
         try:
             if pipeline.session is not None and header.session is not None:
@@ -103,7 +103,7 @@ class RecordedRun:
             raise SceneError(f"{self._paths[0]}: the session in it {error}") from error
 
     def tell(self, companion: Companion) -> None:
-        """Tell a companion the recorded outcomes of this run."""
+        """Pass the recorded outcomes of this run to `companion`."""
         self._companion = companion
 
     def _repeat(self, pipeline: Pipeline, event: RecordedEvent) -> None:
@@ -117,7 +117,7 @@ class RecordedRun:
             case Exchanged():
                 try:
                     pipeline.sensors_exchanged(event.session, event.learned)
-                except ValueError:  # what was known of the sensors is of another model
+                except ValueError:  # the recorded state is of another model
                     pipeline.sensors_exchanged()
             case OutcomeMessage() if self._same_grasps:
                 grasp = GraspId(event.grasp_boot_id or self.header.boot_id, event.grasp)

@@ -280,7 +280,7 @@ def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
 
 
 class OperatingPoint(NamedTuple):
-    """What one window can tell."""
+    """Figures of one window of the gate."""
 
     after_ns: int
     """Length of the window, ns."""

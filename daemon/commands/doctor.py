@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=within(LISTEN_MIN_S, LISTEN_MAX_S),
         default=LISTEN_S,
         metavar="S",
-        help="listen so long (default: 3)",
+        help="time to listen (default: 3)",
     )
     parser.add_argument("--all", action="store_true", help="a table of all electrodes too")
     parser.add_argument(

@@ -27,7 +27,7 @@ TITLES = {
     "session": "other objects, another day",
     "days": "other objects, each day by others",
 }
-"""What each protocol asks, for people."""
+"""Question of each protocol, for people."""
 SHOWN = {
     "known objects": ("cv",),
     "other objects": ("objects", "objects-whole"),
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="is_system",
         action="store_false",
         default=os.geteuid() == 0,
-        help="in ~/.local/share/graspd/models, for this user alone (default but for root)",
+        help="in ~/.local/share/graspd/models, for this user only (default, except for root)",
     )
     where.add_argument(
         "--system",
@@ -137,13 +137,13 @@ class _Data(msgspec.Struct):
 
 
 class _ShownCard(msgspec.Struct):
-    """What is shown of a card. Cards of added models may lack what has a default."""
+    """Shown fields of a card. Cards of added models may lack the fields with a default."""
 
     what: str
     contract: ModelContract
     file: _Size
     parameters: int | None = None
-    weak_points: tuple[str, ...] = ("nobody has said",)
+    weak_points: tuple[str, ...] = ("not stated",)
     data: _Data | None = None
     command: str | None = None
 

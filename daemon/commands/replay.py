@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from daemon.assembly.recordings import RecordedRun
 
 Source: TypeAlias = "_Tables | LinkLogs | RecordedRun"
-"""Plays recordings. What graspd has recorded says itself how it was judged."""
+"""Source of recorded readings. Recordings of graspd contain the scene that judged them."""
 
 NO_SILENCE_NS = 3_600_000_000_000
 """A recording has its own silences: those of this machine must not count."""
@@ -110,7 +110,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-slip-when-stable",
         type=within(0.001, 0.5),
         metavar="SHARE",
-        help="of tables and streams: say `stable` only as far as no more of these lifts slip",
+        help="for tables and streams: largest share of `stable` lifts that may slip",
     )
     parser.add_argument(
         "--warm-up",
@@ -143,7 +143,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--wait",
         type=within(0, WAIT_MAX_S),
         metavar="S",
-        help="with --publish: start when somebody has subscribed, fail after S seconds",
+        help="with --publish: wait up to S seconds for a subscriber, else fail",
     )
     parser.add_argument(
         "--json", action="store_true", help="verdict messages on stdout, summary on stderr"
@@ -219,7 +219,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
             came = sockets.wait_for_subscriber(args.wait, stop)
             if not came and stop.received is None:
                 where = f"{sockets.endpoint} within {args.wait:g} s"
-                raise PublishError(f"nobody subscribed to {where}")
+                raise PublishError(f"no subscriber of {where}")
         companions = [*around.companions, *told]
         loop = Loop(parts.drivers, pipeline, around.build_outbox(), stop, companions, timing)
         stack.callback(lambda: shown.summary(pipeline.trust))

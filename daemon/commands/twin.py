@@ -119,7 +119,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=1,
         metavar="FRAMES",
-        help="hold back and send so many at once",
+        help="collect this many frames, then send them at once",
     )
     faults.add_argument(
         "--disconnect-every",
@@ -252,4 +252,4 @@ def _serve_datagrams(
 
 
 SERVE = {"spi": _serve_spi, "can": _serve_can}
-"""What serves these kinds; the others send datagrams."""
+"""Function that serves each kind; the others send datagrams."""

@@ -43,7 +43,7 @@ class Target(NamedTuple):
     hand: str | None
     server_key: Path | None
     look: str
-    """Where a person looks when it is silent."""
+    """Place to look at if it is silent, for people."""
 
 
 class UsageError(Exception):

@@ -1,1 +1,1 @@
-"""What is wrong with hardware, computer and scene, by cause, and what to do about it."""
+"""Find what is wrong with hardware, computer and scene: the cause, and what to do."""

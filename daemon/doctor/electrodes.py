@@ -101,7 +101,7 @@ class ElectrodeStatistics:
         return np.sqrt(variance, dtype=np.float64)
 
     def findings(self) -> list[Finding]:
-        """What is wrong with the electrodes, finger by finger."""
+        """Return the findings about the electrodes, finger by finger."""
         findings: list[Finding] = []
         for finger, name in enumerate(self.fingers if self.readings else ()):
             findings += self._of(finger, name)

@@ -17,7 +17,7 @@ class Level(StrEnum):
 
 
 class Cause(StrEnum):
-    """What is at fault. Programs may rely on these names, which deploy/CONNECT.md lists."""
+    """Cause of a fault. Programs may rely on these names; deploy/CONNECT.md lists them."""
 
     PORT_MISSING = "port-missing"
     PORT_DENIED = "port-denied"
@@ -90,7 +90,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.JOINTS: frozenset({Cause.FRAMES_LOST}),
     Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
 }
-"""What follows from a cause, and is not named beside it."""
+"""Causes that follow from another one, and are not reported beside it."""
 
 
 @dataclass(frozen=True, slots=True)

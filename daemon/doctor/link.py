@@ -74,12 +74,12 @@ LOSSES = ("link_losses",)
 FLAPS_MIN = 3
 """Losses of a link while the doctor listens from which they are an error."""
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
-"""What a link that comes and goes may be at any one moment; its loss is the cause of each."""
+"""Causes of a link that comes and goes, at any one moment; its loss explains them all."""
 COUNTERS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
     LOSSES: Trouble(Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"),
     ("restarts",): Trouble(
-        Cause.RESTARTED, f"the board began anew: {AGAIN}, its supply and reset line"
+        Cause.RESTARTED, f"the board was reset: {AGAIN}, its supply and reset line"
     ),
     ("error_frames", "bus_off"): Trouble(
         Cause.BUS_ERRORS,
@@ -145,7 +145,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     ),
     LinkCause.NOT_FOUND: Trouble(
         Cause.PORT_MISSING,
-        "plug it in, or name one that there is; a Pico that is a drive has no firmware yet",
+        "plug it in, or name an existing one; a Pico that is a drive has no firmware yet",
     ),
     LinkCause.DENIED: Trouble(
         Cause.PORT_DENIED, "join the group of the port: ls -lL and the port names it"
@@ -167,7 +167,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
         Cause.SILENT, "it has said nothing yet: is it on and connected? longer: --listen 10"
     ),
     LinkCause.NO_ANSWER: Trouble(
-        Cause.SILENT, f"plug it in anew; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
+        Cause.SILENT, f"plug it in again; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
     ),
     LinkCause.TIMEOUT: Trouble(
         Cause.LINK_LOST,
@@ -205,7 +205,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     ),
     DeviceFault.CLOCK_NOT_TRUSTED: Trouble(Cause.CLOCK, CLOCK_ADVICE),
 }
-"""What is wrong with a link or a device, by what its driver says."""
+"""Cause and advice for each fault that a driver reports."""
 
 
 def device_findings(

@@ -131,7 +131,7 @@ def _denied(finding: Finding, port: str) -> Finding:
     except (OSError, KeyError):
         return finding
     if group == "root":  # not a group to join
-        advice = "install deploy/udev/70-graspd.rules, and plug it in anew"
+        advice = "install deploy/udev/70-graspd.rules, and plug it in again"
         return replace(finding, advice=advice)
     return replace(finding, advice=f"sudo usermod -aG {group} $USER, then log in again")
 

@@ -18,15 +18,15 @@ class Calibration:
     """Snapshot of a session's statistics; later grasps make the next one."""
 
     features_mean: NDArray[np.float64]
-    """Of what a session model takes, shape (fingers * 26,), before standardising."""
+    """Mean of the raw features of a session model, shape (fingers * 26,)."""
     features_spread: NDArray[np.float64]
     """Standard deviation of the same."""
     counts_mean: NDArray[np.float64]
-    """Of each electrode in this session, shape (fingers, 24)."""
+    """Mean of each electrode in this session, counts, shape (fingers, 24)."""
     counts_spread: NDArray[np.float64]
     """Standard deviation of each electrode in this session, shape (fingers, 24)."""
     training_mean: NDArray[np.float64]
-    """Of each electrode in the training, shape (fingers, 24)."""
+    """Mean of each electrode in the training, counts, shape (fingers, 24)."""
     scale: NDArray[np.float64]
     """Spread in the training over that of the session, shape (fingers, 24)."""
     calibrated: bool
@@ -34,7 +34,7 @@ class Calibration:
     odd: bool
     """Whether what came cannot have been grasps of these fingers: see `is_odd`."""
     temperature: float
-    """What the margin of a verdict must be divided by, with so few grasps."""
+    """Divisor of a verdict's margin, above 1 while the session has few grasps."""
 
     def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
         """Return counts (fingers, 24) as the training's sensors would read them."""

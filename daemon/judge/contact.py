@@ -45,7 +45,7 @@ ALONE_NS = 30_000_000_000
 SUSPECT = 0.5
 """A fall above this share of what a touch takes may be the beginning of one: not for the tare."""
 SIGMA_MIN_COUNTS = 1.5
-"""Of an electrode; counts are whole numbers, so a quiet one may show none at all."""
+"""Smallest assumed noise of an electrode, counts; a quiet one may show no noise at all."""
 SIGMA_MAX_COUNTS = 10.0
 """A finger whose median electrode wavers more is not at rest; measured 2.9 to 4.3 counts."""
 TREND_MAX_COUNTS = 5.0
@@ -187,12 +187,12 @@ class Window:
 
 @dataclass(slots=True, eq=False)
 class ContactMemory:
-    """What is known of the fingers' rest and touch; arrays of shape (fingers, 24) or (fingers,)."""
+    """State of the fingers' rest and touch; arrays have shape (fingers, 24) or (fingers,)."""
 
     window: Window
     touches: list[Touch]
     baseline: NDArray[np.float64]
-    """Where each electrode rests, counts; infinite where that is not known: nothing falls more."""
+    """Resting count of each electrode; infinite: not known yet."""
     known: list[int]
     """Electrodes of each finger whose baseline is known."""
     touching: NDArray[np.bool_]

@@ -27,7 +27,7 @@ WITHHELD: Final = {
 # Without slots, so that a default can be read from the class.
 @dataclass(frozen=True)
 class ContactLimits:
-    """What a touch is: the larger of both, for the third deepest electrode of a finger."""
+    """Limits of a touch: the third deepest electrode of a finger must reach both."""
 
     counts: float = 20.0
     """Fall below the baseline, counts. In 9.8 s of three untouched sensors it was 10 at most; from
@@ -83,7 +83,7 @@ class HandLimits:
     on_request: bool = False
     """True if a settled grasp is judged only when the controller asks."""
     sweeps: int = MEDIAN_SWEEPS
-    """What is judged: 1, the reading at hand; 3, the median of three fresh sweeps."""
+    """Sweeps that are judged: 1, the current reading; 3, the median of three fresh sweeps."""
     required: tuple[Finger, ...] | None = None
     """Fingers that must touch; all unless given."""
     contact: ContactLimits = field(default_factory=ContactLimits)
@@ -95,7 +95,7 @@ class HandLimits:
 # Without slots, so that a default can be read from the class.
 @dataclass(frozen=True)
 class Limits:
-    """What a verdict other than `unknown` must keep to."""
+    """Limits of every verdict other than `unknown`."""
 
     max_age_ns: int = 100_000_000
     """Age of the reading at the end of judging, ns."""

@@ -68,7 +68,7 @@ class GateMemory:
     in_contact: bool = False
     """True if all required fingers touch."""
     objections: tuple[Reason, ...] = (Reason.NO_CONTACT,)
-    """What the last reading said against settling."""
+    """Reasons of the last reading against settling."""
 
 
 class Gate:
@@ -205,7 +205,7 @@ class Gate:
 
     @property
     def _motion_limits(self) -> MotionLimits:
-        """What fingers may move now."""
+        """Limits of motion now: loose once the grasp is sure, else strict."""
         return self.motion.loose if self.memory.sure else self.motion.strict
 
     def _keeps_to(self, limits: MotionLimits) -> bool:

@@ -149,7 +149,7 @@ class FingerMemory:
 
 @dataclass(slots=True)
 class HandMemory:
-    """What the hand's parts do not remember themselves."""
+    """State of the hand that its parts do not keep themselves."""
 
     fingers: list[FingerMemory]
 
@@ -183,7 +183,7 @@ class HandTracker:
 
     @property
     def rest(self) -> NDArray[np.float64]:
-        """Where each electrode rests, counts, shape (fingers, 24); 0 where it is not known."""
+        """Return the resting counts, shape (fingers, 24); 0: not known."""
         contact = self._contact.memory
         known = np.isfinite(contact.baseline) & contact.tared[:, np.newaxis]
         return np.where(known, contact.baseline, 0.0)

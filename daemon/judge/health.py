@@ -23,7 +23,7 @@ REASON_OF_FAULT: dict[ElectrodeFault, Reason] = {
     ElectrodeFault.HELD: Reason.HELD,
     ElectrodeFault.CUT_OFF: Reason.CUT_OFF,
 }
-"""What the judge says of each fault that a driver can flag."""
+"""Reason for each fault that a driver can flag."""
 REPAIRABLE = int(
     ElectrodeFault.MISSING
     | ElectrodeFault.NOT_A_COUNT
@@ -36,8 +36,11 @@ BROKEN_MAX = 12
 """Electrodes of a hand that may be repaired: twelve at random, repaired, cost `cnn1` 1.2 +- 0.3
 points of F1 and `small-session` 0.6 +- 0.2, eighteen 2.1 and 1.3 (grasps not trained on, `cv`)."""
 BROKEN_FINGER_MAX = 8
-"""Of one finger: eight neighbours of the first finger, the worst place, cost 2.4 +- 0.8 and
-1.4 +- 0.5 points, twelve 4.3 and 2.8; of another finger eight cost 0.6 at most."""
+"""Most broken electrodes of one finger that are repaired.
+
+Eight neighbours of the first finger, the worst place, cost 2.4 +- 0.8 and 1.4 +- 0.5 points; twelve
+cost 4.3 and 2.8. Eight of another finger cost at most 0.6.
+"""
 UNCHANGED_MAX = 16
 """Readings in a row in which a live electrode may keep its count. Its noise is 3 to 4 counts
 (standard deviation), so it keeps it about once in ten readings, 16 times in a row never; and all
@@ -53,15 +56,17 @@ JUMPS_MAX = 2.0
 """An electrode that jumps more than twice within about ten readings has a loose contact."""
 JUMPS_FADE = 0.9
 JUMPS_FORGOTTEN = 1e-9
-"""What is left of a jump after 200 readings; less counts as none."""
+"""Remainder of a jump after 200 readings; less counts as no jump."""
 LIMITS = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
 """Above them are a count less 1 that is at a rail, a step and `JUMP_COUNTS` that is far, and a step
 that is one at all. Modulo 2**16, so that what is below zero is large."""
 SWEEPS = 128
 """Sweeps of each finger that are remembered: rings up to this length are seen at once."""
 EQUAL_MIN = 20
-"""Electrodes of 24 that are equal, or not read, in an old sweep that comes again. Of any two real
-sweeps of a finger at most 14 were equal, in 1.4 million pairs."""
+"""Fewest electrodes of 24, equal or not read, that make a sweep an old one that comes again.
+
+In 1.4 million pairs of real sweeps of a finger, at most 14 electrodes were equal.
+"""
 READ_MIN = 12
 """Electrodes of them that must have been read in both: by chance one in 14 is equal."""
 NO_COUNT = 0x8000
@@ -70,7 +75,7 @@ NO_COUNT = 0x8000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """What is wrong with a reading and its electrodes."""
+    """Findings about a reading and its electrodes."""
 
     reasons: tuple[Reason, ...]
     """Against using it at all."""
@@ -80,7 +85,7 @@ class Checked:
 
 @dataclass(slots=True, eq=False)
 class HealthMemory:
-    """What was found in the readings so far; arrays have shape (fingers, 24)."""
+    """State of the checks of earlier readings; arrays have shape (fingers, 24)."""
 
     previous: NDArray[np.uint16]
     """Counts of the last reading."""
@@ -93,7 +98,7 @@ class HealthMemory:
     has_jumped: bool
     """True if there are any."""
     faults: NDArray[np.uint8]
-    """What the driver flagged in the last reading."""
+    """Faults that the driver flagged in the last reading."""
     past: NDArray[np.uint16]
     """Shape (24, fingers, 128): sweeps of each finger; `NO_COUNT` where none was read."""
 

@@ -21,7 +21,7 @@ SOURCES_MAX = 8
 
 @dataclass(slots=True, eq=False)
 class JointMemory:
-    """What was heard of the joints, by the names of those that are sent together."""
+    """Last readings of the joints, by the names of those that are sent together."""
 
     past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]] = field(default_factory=dict)
     """Times, ns, and angles, rad, oldest first."""

@@ -43,7 +43,7 @@ class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 
 class Opinion(msgspec.Struct, frozen=True, gc=False):
-    """What the network said of a grasp, or why it was not asked."""
+    """Answer of the network for a grasp, or why it was not asked."""
 
     p_slip: float | None
     """Probability of slip by the network, softened while its session is young."""

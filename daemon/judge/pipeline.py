@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False):
-    """What was found about one reading, or about the lack of one."""
+    """Everything decided about one reading, or about its absence."""
 
     t_ns: int
     """Monotonic time, ns, of the reading's last byte."""
@@ -47,11 +47,11 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
     p_slip: float | None
     """After what outcomes have taught; None exactly when the decision is unknown."""
     moment: Moment
-    """Where in a grasp the hand was."""
+    """State of the grasp."""
     opinion: Opinion
-    """What the network said of the grasp, maybe at an earlier reading."""
+    """Answer of the network for the grasp, maybe of an earlier reading."""
     assessment: Assessment | None = None
-    """What that is worth now. None: nothing learns and no risk is set."""
+    """Worth of `opinion` now; None: without learning and without a risk."""
     supervised: bool = False
     """True if its lift, watched, would teach what is not known: ask for it."""
     session_calibrated: bool | None = None
@@ -63,7 +63,7 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(slots=True, eq=False)
 class PipelineMemory:
-    """What is known of the grasps judged so far."""
+    """State of the pipeline: the grasps judged so far."""
 
     to_learn: NDArray[np.float64]
     """Shape (fingers, 24): counts that the session is to take in; means nothing if none are."""
@@ -74,9 +74,9 @@ class PipelineMemory:
     learnt_grasp: Number = 0
     """The grasp that the session took in last, or is about to."""
     opinion: Opinion = NO_OPINION
-    """Of the current grasp."""
+    """Answer of the network for the current grasp."""
     assessment: Assessment | None = None
-    """What `opinion` was worth when it was given."""
+    """Worth of `opinion` when it was given."""
     recent: RecentVerdict = NO_RECENT_VERDICT
     needs_session: bool = False
     """True if sensors were exchanged: nothing is judged before their session is calibrated."""
@@ -123,7 +123,7 @@ class Pipeline:
         self._plausibility = Plausibility(fingers, contract.seen, electrodes)
         self._network = Network(model, limits.slip_threshold)
         self.trust = trust
-        """What outcomes have taught; None where nothing learns and no risk is set."""
+        """Learning and risk; None: without learning and without a risk."""
         self.lifts = LiftBook() if trust is None else trust.lifts
         """Which grasps were judged, and how their lifts ended."""
         self.boot_id = ""
@@ -138,13 +138,13 @@ class Pipeline:
             self.hand, self.on_request = HandTracker(fingers, hand), hand.on_request
         self.memory = PipelineMemory(np.zeros(electrodes.centre.shape))
         self._latest_ns = 0, 0
-        """Of the last reading: `t_ns` and `made_ns`."""
+        """Times `t_ns` and `made_ns` of the last reading."""
         self.on_exchange: Callable[[SessionState | None, LearnerState | None], None] | None = None
         """Called when the sensors were exchanged, with what was known of the new ones."""
 
     @property
     def session(self) -> SessionCalibration | None:
-        """What is known of today's sensors, up to the last grasp; None if no model asks."""
+        """Calibration of today's sensors up to the last grasp; None: a model without a session."""
         self.learn()
         return self._session
 

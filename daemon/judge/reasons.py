@@ -1,4 +1,4 @@
-"""What a verdict may be, why it is `unknown`, and where in a grasp the hand is.
+"""Words of a verdict: decisions, reasons for `unknown`, and states of the gate.
 
 A new reason needs a member of `Reason`, a line of `ADVICE`, a row in deploy/wire/README.md, and
 `graspd schema > deploy/wire/messages.schema.json`. The part that notices it adds it to the
@@ -16,7 +16,7 @@ from models.contract import Finger
 
 
 class Decision(StrEnum):
-    """What graspd says of a grasp."""
+    """Decision about a grasp."""
 
     STABLE = "stable"
     SLIP = "slip"
@@ -121,7 +121,7 @@ WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
 def to_act_on(reasons: Sequence[Reason]) -> list[Reason]:
     """Return the reasons that tell a person what to do.
 
-    Where the sensors cannot be read, what is said of the hand is old: closing it helps nothing.
+    If the sensors cannot be read, the state of the hand is old, and closing it does not help.
     """
     if UNREADABLE.isdisjoint(reasons):
         return list(reasons)
@@ -129,7 +129,7 @@ def to_act_on(reasons: Sequence[Reason]) -> list[Reason]:
 
 
 class GateState(StrEnum):
-    """Where in a grasp the hand is."""
+    """State of the gate: phase of the grasp."""
 
     IDLE = "idle"
     """Nothing touches."""
@@ -182,7 +182,7 @@ class GateChange:
 
 
 class Moment(NamedTuple):
-    """Where in a grasp the hand is; the defaults are those of a reading that is a grasp itself."""
+    """State of the grasp at a reading; the defaults are for a reading that is a grasp itself."""
 
     grasp: int
     """Number of the current grasp, from 1; 0 before the first."""
@@ -191,7 +191,9 @@ class Moment(NamedTuple):
     """True if the network is to judge the grasp by this reading."""
     judged: bool = True
     """True for a grasp's first judgement or the answer to a question; False for a periodic refresh.
-    Where each reading is a grasp, True for each, sound or not."""
+
+    If each reading is a grasp it is True for each, sound or not.
+    """
     in_contact: bool = True
     """True if all required fingers touch."""
     settled: bool = True

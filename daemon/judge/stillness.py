@@ -58,7 +58,7 @@ pressure of a real hold wanders as well: together they pass it in `false_alarms`
 
 Times = NDArray[np.float64]
 SlowNoise = tuple[float, list[float], list[float]]
-"""What `slow_limit` takes besides a tail."""
+"""Arguments of `slow_limit` besides a tail."""
 
 
 class Tails(NamedTuple):
@@ -82,7 +82,7 @@ class Tails(NamedTuple):
 
 
 class MotionLimits(NamedTuple):
-    """What each finger that is still moves at most, in units of its noise; do all keep to it?"""
+    """Largest motion of each still finger, in units of its noise, and if all keep to it."""
 
     fast: list[float]
     """In the short window."""
@@ -134,7 +134,7 @@ class Motion:
         """How each finger moves over the short and over the long window, in units of its noise;
         infinite where that is not known."""
         self.strict = self.loose = self._no_limits
-        """What that may be at most until a hand has settled, and from then on."""
+        """Limits of that motion before a hand has settled, and after it."""
         self.looked = False
         """True if that was worked out for the last step; else it was not wanted."""
         self.known = False
@@ -275,7 +275,7 @@ class Motion:
             np.add.reduce((sums, *means), axis=0, out=sums)
 
     def _mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
-        """Of each finger over its electrodes usable from a step on; infinite if too few are."""
+        """Return each finger's mean over electrodes usable since `begin`; infinite: too few."""
         memory, since_ns = self.memory, self.memory.times_ns.item(begin)
         if memory.all_usable_since_ns <= since_ns:
             return [total / ELECTRODES for total in values.dot(ONES).tolist()]

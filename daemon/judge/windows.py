@@ -15,7 +15,7 @@ from daemon.judge.health import Number
 from drivers.base import ELECTRODES
 
 STEP_NS = 5_000_000
-"""Of sweeps that come faster than this, the mean is remembered."""
+"""Shortest step of the window, ns; of faster sweeps the mean is kept."""
 STEP_SWEEPS_MAX = 10
 """More sweeps within a step came late, and at once: how the last ones move is not known."""
 SHORT_NS, LONG_NS = 100_000_000, 240_000_000
@@ -48,7 +48,7 @@ for _number in range(STEPS_MIN, STEPS + 1):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """What noise alone makes of windows of a number of steps; shape (steps, fingers)."""
+    """Motion that noise alone causes, by steps of the window; shape (steps, fingers)."""
 
     slope: NDArray[np.float64]
     """Mean absolute slope, counts/s, where squared times around their mean sum to 1 s**2."""
@@ -100,7 +100,7 @@ class MotionMemory:
     blocks: NDArray[np.float64]
     """Their means, shape (BLOCKS, APART, fingers), written round and round."""
     first: Number = 0
-    """Where in `steps` the oldest is."""
+    """Index of the oldest entry in `steps`."""
     number: Number = 0
     """Steps that are remembered."""
     sweeps: Number = 0

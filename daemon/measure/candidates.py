@@ -1,5 +1,7 @@
 """Candidates of the report: graspd's models, and the published code around the network `cnn1`.
-That network is not trained here: its time does not depend on its weights."""
+
+The network is not trained here, because its time does not depend on its weights.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What scenes cost: starts `footprint` for each, and puts its figures into tables."""
+"""Measure the cost of scenes: run `footprint` for each, and write tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KIB_PER_MIB = 1024
 
 
 class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one part of a scene adds to the process."""
+    """Cost that one part of a scene adds to the process."""
 
     name: str
     modules: int
@@ -42,10 +42,10 @@ class Quantiles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one scene costs. Drivers of hardware are constructed and not opened."""
+    """Cost of one scene. Drivers of hardware are made, but not opened."""
 
     parts: tuple[Part, ...]
-    """In the order of the start. What parts share is counted with the first of them."""
+    """Parts in the order of the start; shared cost counts with the first of them."""
     start: Part
     """From the start of the process to the first reading judged and reported."""
     peak_kib: int

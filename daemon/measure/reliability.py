@@ -20,7 +20,7 @@ from daemon.trust.learner import SCALE
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
 """Ends of the parts in which `p_slip` is compared with what slipped."""
 STEPS: Final = 50
-"""Of Newton's method; 10 suffice."""
+"""Steps of Newton's method; 10 suffice."""
 SLOPE_MAX: Final = 20.0
 CONFIDENT: Final = 1e-12
 """A probability nearer to 0 or 1 is taken for this one."""

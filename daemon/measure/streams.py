@@ -58,7 +58,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Life:
-    """What was said of a stream's grasps (N,), each after the outcomes of those before it."""
+    """Verdicts on a stream's grasps (N,), each after the outcomes of the grasps before it."""
 
     p_slip: NDArray[np.float64]
     """NaN: refused."""

@@ -11,7 +11,7 @@ OURS = frozenset({"daemon", "drivers", "models"})
 
 
 def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
-    """Say how to install what is missing. Raises `error` for a module of ours."""
+    """Return how to install the missing `extra`. Raises `error` for a module of graspd."""
     package = (error.name or "").partition(".")[0]
     if package in OURS:
         raise error
@@ -22,7 +22,7 @@ def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
 
 
 def installer(environment: Path) -> str:
-    """Return the command that adds packages to a virtual environment: pipx, uv or pip."""
+    """Return the command that adds packages to `environment`: pipx, uv or pip."""
     if (environment / "pipx_metadata.json").exists():
         return f"pipx runpip {shlex.quote(environment.name)} install"
     config = environment / "pyvenv.cfg"

@@ -1,4 +1,4 @@
-"""Files read without waiting and replaced in one step."""
+"""Read files without waiting; replace files in one step."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from pathlib import Path
 
 
 def read_regular(path: Path, max_bytes: int) -> bytes:
-    """Return the content of a regular file; never wait for a pipe's writer.
-    Raises `OSError`, with a reason in `strerror`, also beyond `max_bytes`."""
+    """Return the content of a regular file, without waiting for the writer of a pipe.
+
+    Raises `OSError` with a reason in `strerror`, also for more than `max_bytes`.
+    """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "not a regular file")
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
@@ -24,8 +26,10 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
 def write_atomically(
     path: Path, content: bytes, mode: int = 0o600, *, former: Path | None = None
 ) -> None:
-    """Replace the file at `path` in one step, keeping the former one at `former`.
-    Readers see a whole file, also after a power cut; it is the former one after an `OSError`."""
+    """Replace the file at `path` in one step; keep the old one at `former`, if given.
+
+    Readers always see a whole file, also after a power cut. After an `OSError` it is the old one.
+    """
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
     handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
@@ -44,7 +48,7 @@ def write_atomically(
         raise
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        # The new file is there and whole; not every file system can do more.
+        # The new file is complete; some file systems cannot sync a folder.
         with suppress(OSError):
             os.fsync(folder)
     finally:

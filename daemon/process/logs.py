@@ -1,4 +1,4 @@
-"""The log on stderr: plain for a terminal, with priorities for the journal."""
+"""The log on stderr: plain on a terminal, with priorities in the journal."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from collections.abc import Callable, Mapping
 
 LOGGERS = ("graspd", "daemon", "drivers", "models")
 SYSLOG_LEVELS = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-"""Numbers of levels in a journal prefix (sd-daemon(3)); 7 below."""
+"""Journal priority of each level (sd-daemon(3)); lower levels have 7."""
 JOURNAL_ERROR = "<3>"
-"""Prefix of an error in the journal."""
+"""Journal prefix of an error."""
 BURST = 10
-"""Messages of one kind in a window: a fault must not fill a robot's journal."""
+"""Most messages of one kind in a window; a fault must not fill the journal."""
 WINDOW_S = 60.0
 KINDS_MAX = 200
-"""Most kinds that are told apart; the code has fewer."""
+"""Most kinds of messages that are counted; the code has fewer."""
 
 
 def set_up(environment: Mapping[str, str]) -> None:
-    """Log to stderr, with priorities if `environment` says that it is the journal."""
+    """Log to stderr, with priorities if `environment` names the journal."""
     handler = logging.StreamHandler()
     plain = logging.Formatter("graspd: %(levelname)s: %(message)s")
     handler.setFormatter(JournalFormatter() if is_journal(environment) else plain)
@@ -40,33 +40,33 @@ def is_journal(environment: Mapping[str, str]) -> bool:
 
 
 class JournalFormatter(logging.Formatter):
-    """Gives each line its priority, for `journalctl -p warning`."""
+    """Formatter that gives each line its priority, for `journalctl -p warning`."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the message, each line with a prefix such as `<4>`."""
-        number = next((n for level, n in SYSLOG_LEVELS if record.levelno >= level), 7)
-        return "\n".join(f"<{number}>{line}" for line in super().format(record).splitlines())
+        """Return the message; each line has a prefix such as `<4>`."""
+        priority = next((n for level, n in SYSLOG_LEVELS if record.levelno >= level), 7)
+        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
 
 
 class RateLimit(logging.Filter):
-    """Lets a burst of each kind of message pass, then one a window."""
+    """Filter that passes a burst of each kind of message, then one per window."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._clock = clock
         self._kinds: dict[str, tuple[float, int]] = {}
-        """Start of the window, s, and how many came in it."""
+        """Start of the window, s, and number of messages in it, by kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if the message passes; the first of a window counts those that did not."""
+        """Return True to pass a message; the first of a window gives the number held back."""
         now_s, kind = self._clock(), f"{record.name} {record.msg}"
         if kind not in self._kinds and len(self._kinds) >= KINDS_MAX:
             return True
-        start_s, seen = self._kinds.get(kind, (now_s, 0))
+        start_s, count = self._kinds.get(kind, (now_s, 0))
         if now_s - start_s >= WINDOW_S:
-            held_back, start_s, seen = max(seen - BURST, 0), now_s, 0
+            held_back, start_s, count = max(count - BURST, 0), now_s, 0
             if held_back:
                 record.msg = f"{record.getMessage()} (and {held_back} more like it before)"
                 record.args = None
-        self._kinds[kind] = (start_s, seen + 1)
-        return seen < BURST
+        self._kinds[kind] = (start_s, count + 1)
+        return count < BURST

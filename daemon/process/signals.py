@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP, in a form that a selector can wait on."""
+"""SIGINT, SIGTERM and SIGHUP as a descriptor that a selector can wait on."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any, Self
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKEUPS_MAX = 4096
-"""Bytes taken out of the pipe at once: one a signal."""
+"""Most bytes of one read from the pipe; each signal is one byte."""
 
 
 class StopSignal:
-    """Keeps the signal that stops the process."""
+    """Handler that keeps the signal that stops the process."""
 
     def __init__(self, *, reloads: bool = False) -> None:
-        """With `reloads`, SIGHUP asks for a reload."""
+        """`reloads`: True if SIGHUP asks for a reload."""
         self.received: signal.Signals | None = None
         self._reload = False
         self._signals = (*STOPPING, signal.SIGHUP) if reloads else STOPPING
@@ -41,18 +41,18 @@ class StopSignal:
     def __enter__(self) -> Self:
         """Take over the signals. Only the main thread can."""
         self._former_wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        self._former = {number: signal.signal(number, self._handle) for number in self._signals}
+        self._former = {signum: signal.signal(signum, self._handle) for signum in self._signals}
         return self
 
     def __exit__(self, *_details: object) -> None:
-        for number, handler in self._former.items():
-            signal.signal(number, handler)
+        for signum, handler in self._former.items():
+            signal.signal(signum, handler)
         signal.set_wakeup_fd(self._former_wakeup)
         os.close(self._read)
         os.close(self._write)
 
-    def _handle(self, number: int, _frame: FrameType | None) -> None:
-        if number == signal.SIGHUP:
+    def _handle(self, signum: int, _frame: FrameType | None) -> None:
+        if signum == signal.SIGHUP:
             self._reload = True
         else:
-            self.received = signal.Signals(number)
+            self.received = signal.Signals(signum)

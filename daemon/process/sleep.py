@@ -1,4 +1,4 @@
-"""Sleep of the computer: the monotonic clock stands still then, and old readings look fresh."""
+"""Detect sleep of the computer, in which the monotonic clock stands and old readings look new."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from collections.abc import Callable
 from functools import partial
 
 SLEPT_NS = 50_000_000
-"""Least difference of the clocks that is a sleep, ns: the scheduler takes less."""
+"""Smallest difference of the clocks that counts as sleep, ns; the scheduler causes less."""
 LOOKS = 3
-"""Looks at the clocks at the start: the scheduler interrupts at most some."""
+"""Number of looks at the clocks at the start; the scheduler interrupts some of them."""
 
 boottime_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
-"""Time since the computer was started, ns, with its sleep (clock_gettime(2))."""
+"""Time since the computer was started, ns, sleep included (clock_gettime(2))."""
 
 
 class Sleep:
-    """Notices that the computer has slept since this object was made."""
+    """Detector of a sleep of the computer since this object was made."""
 
     def __init__(
         self,
         clock: Callable[[], int] = time.monotonic_ns,
         boot_clock: Callable[[], int] = boottime_ns,
     ) -> None:
-        """Only `boot_clock` goes on in a sleep; both give ns."""
+        """`clock`, `boot_clock`: functions that return ns; only the second runs on in a sleep."""
         self._clock = clock
         self._boot_clock = boot_clock
-        # In this order a look that the scheduler interrupts makes no sleep.
+        # In this order an interruption by the scheduler does not look like a sleep.
         self._slept_from_ns = SLEPT_NS + max(boot_clock() - clock() for _ in range(LOOKS))
 
     def has_slept(self) -> bool:

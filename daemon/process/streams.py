@@ -15,10 +15,10 @@ FAILED = 1
 
 
 def guarded(command: Callable[[], int]) -> int:
-    """Run a command whose standard output may fail, and return its exit code.
+    """Run a command whose standard output may fail; return its exit code.
 
-    0 if the reader has gone, as in `graspd replay | head`; 1 and a line on stderr if it cannot be
-    written. Characters that the encoding lacks are escaped.
+    It is 0 if the reader has closed the pipe, as in `graspd replay | head`. If writing fails, it is
+    1, with a line on stderr. Characters that the encoding lacks are escaped.
     """
     raw = _take_over()
     try:
@@ -40,7 +40,7 @@ def guarded(command: Callable[[], int]) -> int:
 
 
 class _Raw(io.FileIO):
-    """A descriptor that remembers why it could not be written."""
+    """A raw stream that keeps the error of a failed write."""
 
     failure: OSError | None = None
 
@@ -53,13 +53,13 @@ class _Raw(io.FileIO):
 
 
 def _take_over() -> _Raw:
-    """Replace `sys.stdout` and, where it is closed, `sys.stderr`."""
+    """Replace `sys.stdout`, and `sys.stderr` if it is closed."""
     former = sys.stdout
     if isinstance(former, io.TextIOWrapper):
         descriptor = former.fileno()
         encoding, at_once = former.encoding, former.line_buffering or former.write_through
     else:
-        # Closed: nothing else may get its descriptor, and writing must fail.
+        # It is closed: no other file may get its descriptor, and writing must fail.
         descriptor = os.open(os.devnull, os.O_RDONLY)
         encoding, at_once = "utf-8", False
     raw = _Raw(descriptor, "wb", closefd=False)
@@ -74,7 +74,7 @@ def _take_over() -> _Raw:
 
 
 def _discard(raw: _Raw) -> None:
-    """Discard the buffer, so that the interpreter does not try it again."""
+    """Discard the buffer, so that the interpreter does not write it again at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, raw.fileno())
     os.close(nowhere)

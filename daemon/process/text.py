@@ -1,4 +1,4 @@
-"""Text for people: made harmless for a terminal, coloured, in tables."""
+"""Text for people: escaped for terminals, coloured, in tables."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import TextIO
 from daemon.process.logs import JOURNAL_ERROR, is_journal
 
 PROGRESS_MAX = 78
-"""Characters: a wrapped line could not be taken back."""
+"""Longest progress line, characters; a wrapped line could not be erased."""
 
 
 class Colour(IntEnum):
-    """Numbers of ECMA-48, SGR."""
+    """Colours of a terminal (ECMA-48, SGR)."""
 
     BOLD = 1
     RED = 31
@@ -25,23 +25,23 @@ class Colour(IntEnum):
 
 
 def coloured(text: str, colour: Colour, stream: TextIO | None = None) -> str:
-    """Return coloured text where the stream shows it (https://no-color.org)."""
+    """Return coloured text if the stream shows colours (https://no-color.org)."""
     stream = sys.stdout if stream is None else stream
     if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
     return f"\x1b[{colour.value}m{text}\x1b[0m"
 
 
-def did_you_mean(wrong: str, known: Iterable[str]) -> str:
-    """Return advice on a mistyped word, if a known one is near."""
-    import difflib  # only where it is needed
+def did_you_mean(wrong: str, words: Iterable[str]) -> str:
+    """Return advice with the word nearest to `wrong`, which begins with "; "; "" if none is."""
+    import difflib  # imported here, as few runs need it
 
-    near = difflib.get_close_matches(wrong, list(known), n=1)
+    near = difflib.get_close_matches(wrong, list(words), n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def printable(text: str, length_max: int | None = None) -> str:
-    """Return the text with control characters escaped, cut at `length_max`."""
+    """Return the text with escaped control characters, at most `length_max` long."""
     if length_max is not None and len(text) > length_max:
         text = text[: length_max - 3] + "..."
     if text.isprintable():
@@ -55,7 +55,7 @@ def printable(text: str, length_max: int | None = None) -> str:
 
 
 def complain(problem: object) -> None:
-    """Say on stderr what is wrong."""
+    """Write a problem to stderr."""
     lines = [printable(line) for line in str(problem).split("\n")]
     if is_journal(os.environ):
         sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)
@@ -69,12 +69,12 @@ def write_json(content: object) -> None:
 
 
 def write_lines(*lines: str) -> None:
-    """Write lines to stdout. The caller makes untrusted text in them `printable`."""
+    """Write lines to stdout. Pass untrusted text through `printable` first."""
     sys.stdout.writelines(f"{line}\n" for line in lines)
 
 
 def progress(doing: str) -> None:
-    """Show on a terminal what is being done, in place of what was shown; "": nothing."""
+    """Show progress on a terminal, in place of the text before; "" erases it."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{printable(doing, PROGRESS_MAX)}")
         sys.stderr.flush()
@@ -83,7 +83,7 @@ def progress(doing: str) -> None:
 def markdown_table(
     titles: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[str] = ()
 ) -> Iterator[str]:
-    """Yield the lines of a Markdown table; columns in `right` are aligned to the right."""
+    """Yield the lines of a Markdown table; columns named in `right` are right-aligned."""
     yield f"| {' | '.join(titles)} |"
     yield f"| {' | '.join('---:' if title in right else '---' for title in titles)} |"
     for row in rows:

@@ -1,4 +1,4 @@
-"""A thread for slow jobs, so that neither a disk nor a parser holds up the loop."""
+"""A thread for slow jobs, so that neither a disk nor a parser delays the loop."""
 
 from __future__ import annotations
 
@@ -15,30 +15,32 @@ from typing import Final, Generic, TypeVar
 R = TypeVar("R")
 
 SWITCH_S: Final = 0.0005
-"""Python's switch interval from the first job on, s: the longest wait of the loop."""
+"""Python's switch interval after the first job, s: the longest wait of the loop."""
 PROCESSORS: Final = frozenset(os.sched_getaffinity(0))
-"""Processors at the start, before realtime mode pins the loop to some of them."""
+"""Processors at the start, before realtime mode restricts the loop to some of them."""
 
 log = logging.getLogger("graspd")
 
 
 class Worker(Generic[R]):
-    """Runs one job at a time in a thread of ordinary priority, on any processor.
-    The thread starts with the first job. All methods are for the loop's thread."""
+    """Run one job at a time in a thread of ordinary priority, on any processor.
+
+    The thread starts with the first job. Call all methods in the loop's thread.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._thread: threading.Thread | None = None
         self._jobs: SimpleQueue[Callable[[], R] | None]
-        """None ends the thread."""
+        """Jobs for the thread; None ends it."""
         self._results: SimpleQueue[R | Exception]
         self._ended: int
-        """Counts the results; the thread closes it."""
+        """Event descriptor, one count per result; the thread closes it."""
         self.busy = False
         """True from `submit` until the result is taken."""
 
     def submit(self, job: Callable[[], R]) -> bool:
-        """Start a job; False if the worker is busy, or the system has no thread for it."""
+        """Start a job; return False if the worker is busy or no thread can be started."""
         if self.busy or (self._thread is None and not self._start_thread()):
             return False
         self.busy = True
@@ -46,11 +48,11 @@ class Worker(Generic[R]):
         return True
 
     def filenos(self) -> list[int]:
-        """Return what becomes readable once the job has ended; empty without a job."""
+        """Return the descriptor that is readable after the job; none without a job."""
         return [self._ended] if self.busy else []
 
     def take(self, wait_s: float = 0.0) -> R | Exception | None:
-        """Return the result of the job, or what it raised; None if it has not ended in time."""
+        """Return the result of the job or its exception; None if it runs on after `wait_s`."""
         if not self.busy:
             return None
         poll = select.poll()
@@ -62,7 +64,7 @@ class Worker(Generic[R]):
         return self._results.get()
 
     def close(self, wait_s: float) -> bool:
-        """End the thread; False if its job goes on after `wait_s`."""
+        """End the thread; return False if its job runs on after `wait_s`."""
         thread, self._thread = self._thread, None
         if thread is None:
             return True
@@ -95,15 +97,15 @@ def _run(
         _be_ordinary()
         try:
             results.put(job())
-        except Exception as error:  # noqa: BLE001 - MemoryError too: the loop goes on
+        except Exception as error:  # noqa: BLE001 - also MemoryError: the loop goes on
             results.put(error)
-        del job  # with all that it holds, which may be much
+        del job  # free what the job holds, which may be large
         os.eventfd_write(ended, 1)
     os.close(ended)
 
 
 def _be_ordinary() -> None:
-    """Give up the priority and the processors of the loop, which a new thread inherits."""
+    """Give up the loop's priority and processors, which a new thread inherits."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.sched_setaffinity(0, PROCESSORS)

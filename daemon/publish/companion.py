@@ -26,7 +26,7 @@ def at_once(answer: Answer) -> None:
 
 
 class LoopEvent(Enum):
-    """What a replay must know besides the readings."""
+    """Event that a replay needs besides the readings."""
 
     ASKED = "asked"
     SKIPPED = "skipped"

@@ -71,7 +71,7 @@ class Lookout(threading.Thread):
         self._addresses: dict[tuple[int, int], str] = {}
         """By number of the monitor and descriptor of the connection."""
         self._problems: dict[int, str] = {}
-        """What was wrong with the connection that ends next, by monitor."""
+        """Problem of the connection that ends next, by monitor."""
 
     def run(self) -> None:
         poller = zmq.Poller()

@@ -51,7 +51,7 @@ class _Message(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class Verdict(_Message, frozen=True, kw_only=True):
-    """What is known of the grasp by one reading, on topic `verdict.<hand>`."""
+    """The verdict on the grasp by one reading, on topic `verdict.<hand>`."""
 
     t_mono_ns: Count
     """Monotonic time, ns, of the reading's last byte; of the start where none has come yet."""
@@ -86,13 +86,13 @@ class Verdict(_Message, frozen=True, kw_only=True):
     model_sha: str
     """First 12 hex digits of the model file's SHA-256."""
     p_slip_model: Probability | None = None
-    """What the network says without outcomes; null exactly when `p_slip` is."""
+    """`p_slip` of the network alone, without outcomes; null exactly when `p_slip` is."""
     outcomes: Count = 0
     """Outcomes since the start of the session that `p_slip` rests on."""
     supervised: bool = False
     """Lift it under supervision, whatever the verdict, and tell the outcome: it teaches."""
     risk: RiskReport | None = None
-    """What lifts of `stable` verdicts came to; null where nothing learns and no risk is set."""
+    """Outcomes of `stable` lifts so far; null: without learning and without a risk."""
     early: bool = False
     """Judged while something might still slide slowly; a surer verdict follows."""
     still_ms: Duration | None = None
@@ -101,7 +101,7 @@ class Verdict(_Message, frozen=True, kw_only=True):
     From 100 on nothing moves fast, from 240 on nothing slides; 0 while something moves.
     """
     motion: Motion | None = None
-    """Of each finger, in units of its own noise; null where it is not known, or nothing touches."""
+    """Motion of each finger, in units of its noise; null: not known, or nothing touches."""
     motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
     """Most motion of a finger that is still."""
     fingers: Annotated[dict[Finger, FingerState | None], _HAND] | None = None
@@ -126,9 +126,9 @@ class GateMessage(_Message, frozen=True, kw_only=True):
 
 
 class Tactile(_Message, frozen=True, kw_only=True):
-    """A reading as it was judged, on topic `tactile.<hand>`; comes before its verdict.
+    """A reading as judged, on topic `tactile.<hand>`; comes before its verdict.
 
-    Made only while somebody subscribes to it.
+    Sent only while a peer subscribes to it.
     """
 
     t_mono_ns: Count
@@ -149,16 +149,16 @@ class OutcomeMessage(_Message, frozen=True, kw_only=True):
     t_mono_ns: Count
     """Monotonic time, ns, when the controller told it."""
     grasp: Count
-    """Of the verdict that the lift was made by."""
+    """Number of the grasp in the verdict that permitted the lift."""
     outcome: Literal["stable", "slip"]
     object: ObjectName | None = None
-    """What was lifted; null: it was not told."""
+    """Name of the lifted object; null: not told."""
     grasp_boot_id: str | None = None
     """The earlier start under which the grasp was judged; null: this one."""
 
 
 class State(StrEnum):
-    """What the daemon is doing."""
+    """State of the daemon."""
 
     RUNNING = "running"
     SILENT = "silent"
@@ -167,15 +167,15 @@ class State(StrEnum):
 
 
 class Lifts(msgspec.Struct, frozen=True, kw_only=True):
-    """What has become of the grasps that were called `stable`, since the risk was set."""
+    """Outcomes of the `stable` grasps since the risk was set."""
 
     reported: Count
     """Lifts whose outcome was told."""
     outstanding: Count
     """Grasps whose outcome can still come."""
     unreported: Count
-    """Grasps that were forgotten before an outcome came. Of these, announced ones count as slips
-    where a risk is set; the others are in no bound."""
+    """Grasps forgotten before an outcome came. With a risk, announced ones count as slips;
+    others are in no bound."""
     announced: Count = 0
     """`lift` questions that were answered `stable`, one a grasp."""
     awaited: Count = 0
@@ -186,7 +186,7 @@ class Lifts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LearnerHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """What the learner has to go by."""
+    """State of the learner."""
 
     enabled: bool
     """`[learn] enabled`."""
@@ -223,7 +223,7 @@ class Status(_Message, frozen=True, kw_only=True):
     tared: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None
     """Fingers of which it is known where they rest; null with a null `gate`."""
     health: Annotated[dict[str, Reason], msgspec.Meta(max_length=130)] = {}
-    """What is not well now: `ff_7`, `ff`, `link`, `joints`, `model` or `session`, and why."""
+    """Current problems: `ff_7`, `ff`, `link`, `joints`, `model` or `session`, and why."""
     latency_us: dict[Literal["p50", "p99", "max"], Duration]
     """Reading to publish since start; all zero before the first verdict."""
     jitter_us: dict[Literal["p50", "p99", "max"], Duration] = {}

@@ -1,4 +1,4 @@
-"""Makes a grasp table of recorded grasps with known outcomes, as in the BioTac SP Stability Set."""
+"""Make a grasp table of recorded grasps with outcomes, as in the BioTac SP Stability Set."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ class Grasp:
     """One grasp: a row of the table."""
 
     counts: NDArray[np.uint16]
-    """Shape (fingers, 24), as judged last before the outcome."""
+    """Counts last judged before the outcome, shape (fingers, 24)."""
     slipped: bool
     object_name: str | None = None
-    """None: the controller has not told it."""
+    """Name of the object; None: the controller did not tell it."""
 
 
 @dataclass(slots=True)
 class Export:
-    """The grasps of some recordings, and how many were left out."""
+    """The grasps of some recordings, and the numbers of those left out."""
 
     fingers: tuple[str, ...] = ()
     grasps: dict[GraspId, Grasp] = field(default_factory=dict)
-    """In the order of their outcomes."""
+    """Grasps in the order of their outcomes."""
     without_outcome: int = 0
     """Judged grasps without an outcome."""
     repaired: int = 0
-    """Grasps that were judged with repaired electrodes."""
+    """Grasps judged with repaired electrodes."""
     repeated: int = 0
-    """Grasps with the counts of an earlier one, as of a recording in a loop."""
+    """Grasps with the same counts as an earlier one, such as from a replay in a loop."""
     unjoined: int = 0
     """Outcomes of grasps without judged counts."""
     cut_off: int = 0
@@ -51,7 +51,10 @@ class Export:
     """Last judged counts of each grasp."""
 
     def take(self, message: RecordedMessage) -> GraspId | None:
-        """Take a message; return the grasp of an outcome. Raises `ValueError`, `OverflowError`."""
+        """Add a message; return the grasp if it is an outcome.
+
+        Raises `ValueError` or `OverflowError` for a malformed one.
+        """
         if message.kind == Topic.JUDGED:
             judgement = decode_judged(message.payload)
             self.judged[GraspId(judgement.boot_id, judgement.grasp)] = judgement
@@ -71,7 +74,7 @@ class Export:
         return grasp
 
     def leave_out_repeats(self) -> None:
-        """Keep the first of the grasps that have the same counts, and count the others."""
+        """Keep the first of all grasps with the same counts, and count the others."""
         first: dict[bytes, GraspId] = {}
         for grasp, row in self.grasps.items():
             first.setdefault(row.counts.tobytes(), grasp)
@@ -80,8 +83,10 @@ class Export:
 
 
 def collect(paths: Sequence[Path]) -> Export:
-    """Return the grasps of recordings, given in the order of time. Raises `RecordingError` for a
-    file that is damaged, of other fingers, or without judged counts."""
+    """Return the grasps of recordings. `paths`: in the order of time.
+
+    Raises `RecordingError` for a file that is damaged, of other fingers, or without judged counts.
+    """
     export = Export()
     told: set[GraspId | None] = set()
     for path in paths:
@@ -105,7 +110,7 @@ def collect(paths: Sequence[Path]) -> Export:
 
 
 def write(out: TextIO, export: Export, object_name: str) -> None:
-    """Write the table, one row a grasp; `object_name` is for grasps without one."""
+    """Write the table, one row per grasp. `object_name`: for grasps without one."""
     writer = csv.writer(out, lineterminator="\n")
     names = [name for finger in export.fingers for name in electrode_columns(finger)]
     writer.writerow([OBJECT, SLIPPED, *names])

@@ -1,4 +1,4 @@
-"""Files of a recording: how they are named, kept and written."""
+"""Files of a recording: names, retention, writing."""
 
 from __future__ import annotations
 
@@ -12,30 +12,33 @@ from pathlib import Path
 from typing import Final
 
 MODE: Final = 0o640
-"""What a hand grasped is not for all users."""
+"""File mode of recordings; not readable for all users, as they show what a hand did."""
 _STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """Names the files of one run, and deletes the oldest of its hand."""
+    """Name the files of one run; delete the oldest files of the hand."""
 
     directory: Path
     hand: str
     boot_id: str
     keep_files: int
-    """Most recordings; link logs go with theirs."""
+    """Most recordings of the hand; a link log belongs to its recording."""
     keep_bytes: int
-    """Largest size of all files."""
+    """Largest size of all files of the hand, bytes."""
     wall_clock: Callable[[], int] = time.time_ns
 
-    def path(self, number: int, ending: str) -> Path:
-        """Return the path of file `number` of the run; names sort by time."""
+    def path(self, file: int, ending: str) -> Path:
+        """Return the path of the run's file number `file`; names sort by time."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.wall_clock() // 1_000_000_000))
-        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{number:04}{ending}"
+        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{file:04}{ending}"
 
     def make_room(self, expected_bytes: int) -> int:
-        """Delete the oldest recordings until `expected_bytes` fit; count them. Raises `OSError`."""
+        """Delete the oldest recordings until `expected_bytes` fit; return their number.
+
+        Raises `OSError`.
+        """
         self.directory.mkdir(parents=True, exist_ok=True)
         recordings = self._recordings()
         total = expected_bytes + sum(size for _, size in recordings.values())
@@ -63,7 +66,7 @@ class Retention:
 
 
 class RecordingFile:
-    """One file that is being written. All methods raise `OSError` if the disk refuses."""
+    """One file that is being written. Methods raise `OSError` if the disk fails."""
 
     def __init__(self, path: Path) -> None:
         """Create the file, which must not exist."""
@@ -75,7 +78,7 @@ class RecordingFile:
         self._stream.write(content)
 
     def flush(self) -> int:
-        """Put everything on the disk; return the file's size, bytes."""
+        """Write everything to the disk; return the size of the file, bytes."""
         self._stream.flush()
         os.fdatasync(self._stream.fileno())
         return self._stream.tell()

@@ -1,4 +1,4 @@
-"""Recorded messages without null and tables, and schemas without references, for viewers."""
+"""Recorded messages without null and nested lists, and plain schemas, for viewers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UNKNOWN: Final = "unknown"
 
 
 def flat(value: object) -> object:
-    """Return a message without null, each table as one list, row by row."""
+    """Return a message without null; each table becomes one list, row by row."""
     if isinstance(value, dict):
         return {name: _part(name, one) for name, one in value.items() if one is not None}
     if isinstance(value, list) and value and isinstance(value[0], list):
@@ -35,14 +35,14 @@ def _part(name: str, value: object) -> object:
 
 
 def table(values: object) -> object:
-    """Return recorded counts by finger, in rows of 24, as older recordings have them."""
+    """Return recorded counts as rows of 24, one per finger, as in older recordings."""
     if not isinstance(values, list) or not values or isinstance(values[0], list):
         return values
     return [values[first : first + ELECTRODES] for first in range(0, len(values), ELECTRODES)]
 
 
 def schema_of(message: type[msgspec.Struct]) -> JsonSchema:
-    """Return the schema of flat messages. Raises `TypeError` for a field no viewer can read."""
+    """Return the schema of a flat message. Raises `TypeError` for an unreadable field."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **_schema(inspect.type_info(message)),
@@ -100,7 +100,7 @@ def _object(kind: inspect.StructType) -> JsonSchema:
 
 
 def _values(kind: inspect.Type) -> list[Any]:
-    """Return the values of an enumeration or a literal, in its order."""
+    """Return the values of an enumeration or a literal, in order."""
     if isinstance(kind, inspect.EnumType):
         return [member.value for member in kind.cls]
     return list(kind.values) if isinstance(kind, inspect.LiteralType) else []

@@ -11,16 +11,16 @@ from drivers.base import FINGERS
 from models.session_statistics import SessionState
 
 _TEXTS: Final = ("boot_id", "model", "model_sha256", "judge", "trust")
-"""Fields that are texts, or bytes in base64; the others are JSON."""
+"""Fields written as text, or as base64 if they are bytes; all others are JSON."""
 _OLDER: Final = {"trust": "", "says_judged": "false"}
-"""Fields that older recordings lack."""
+"""Values of the fields that older recordings lack."""
 
 
 class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
-    """Describes the run that wrote the file. Its state lets the file be judged alone."""
+    """Description of the run, and its state, so that one file alone can be replayed."""
 
     fingers: tuple[str, ...]
-    """In the order of a reading's rows."""
+    """Fingers in the order of a reading's rows."""
     joints: bool
     """True if the hand had joint angles."""
     boot_id: str
@@ -29,22 +29,22 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
     model: str
     model_sha256: str
     file: int = 0
-    """Number within the run; skips one where the disk failed."""
+    """Number of the file in the run; one is skipped after a failure of the disk."""
     wall_minus_monotonic_ns: int = 0
-    """Log times less the daemon's monotonic times, ns."""
+    """Wall time less the daemon's monotonic time, ns."""
     judge: bytes = b""
-    """From `daemon.judge.memory.encode`; empty if not known."""
+    """State of the judge, from `daemon.judge.memory.encode`; empty: not known."""
     axis_ns: int = 0
-    """`t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
+    """Difference `t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
     session: SessionState | None = None
-    """None if the model needs none."""
+    """Statistics of the session; None for a model without a session."""
     trust: bytes = b""
-    """From `daemon.trust.trust.encode`; empty if nothing learns."""
+    """State of learning, from `daemon.trust.trust.encode`; empty without learning."""
     says_judged: bool = True
     """True if the file has `judged` messages."""
 
     def texts(self) -> dict[str, str]:
-        """Return the fields as texts, for a metadata record."""
+        """Return the fields as texts, for a metadata record of MCAP."""
         return {
             name: value if name in _TEXTS else msgspec.json.encode(value).decode()
             for name, value in msgspec.to_builtins(self).items()
@@ -52,10 +52,10 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, texts: Mapping[str, str]) -> Self:
-        """Read a header back. Raises `KeyError` or `ValueError`."""
+        """Return the header in `texts`. Raises `KeyError` or `ValueError`."""
         texts = {**_OLDER, **texts}
         fields: dict[str, Any] = {name: texts[name] for name in cls.__struct_fields__}
-        fields["session"] = fields["session"] or "null"  # as older recordings have it
+        fields["session"] = fields["session"] or "null"  # older recordings have this
         for name in fields.keys() - _TEXTS:
             fields[name] = msgspec.json.decode(fields[name])
         header = msgspec.convert(fields, cls)

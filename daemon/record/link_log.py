@@ -1,4 +1,4 @@
-"""Bytes and frames of a link, on their way into a file."""
+"""Collect bytes and frames of a link for a link log."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
 
 EARLY_MAX: Final = 1000
-"""Entries held until the recorder starts."""
+"""Most entries that are held until the recorder starts."""
 
 Sink = Callable[[tuple[object, ...], int], None]
-"""Takes an entry and its monotonic time, ns."""
+"""Function that takes an entry and its monotonic time, ns."""
 
 
 class Tap:
-    """Passes on the traffic of a link; holds it until it is connected."""
+    """Pass on the traffic of a link; hold it until `connect`."""
 
     def __init__(
         self,
@@ -26,7 +26,10 @@ class Tap:
         encode: Callable[..., bytes],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`encode` takes an entry's monotonic time and the wall clock's offset, ns; its parts."""
+        """`ending`: of the file's name. `encode`: makes the bytes of an entry.
+
+        Arguments of `encode`: monotonic time, ns, offset of the wall clock, ns, parts of the entry.
+        """
         self.ending = ending
         self.encode = encode
         self._clock = clock
@@ -34,13 +37,13 @@ class Tap:
         self._sink: Sink | None = None
 
     def connect(self, sink: Sink) -> None:
-        """Hand over what is held, and everything later at once."""
+        """Pass the held entries to `sink`, and later ones at once."""
         while self._early:
             sink(*self._early.popleft())
         self._sink = sink
 
     def take(self, *entry: object) -> None:
-        """Take CAN frames, or bytes of a serial line."""
+        """Add CAN frames, or an event and the bytes of a serial line."""
         if self._sink is None:
             self._early.append((entry, self._clock()))
         else:
@@ -48,7 +51,7 @@ class Tap:
 
 
 def tap_of(driver: Driver, section: Tactile) -> Tap | None:
-    """Return a tap on a CAN or serial link; None for others."""
+    """Return a tap on a CAN or serial link; None for other drivers."""
     if isinstance(section, CanTactile):
         from drivers.can.driver import CanBridgeDriver
         from drivers.recordings.can_log import encode_frames

@@ -1,4 +1,4 @@
-"""Serves a daemon's messages to Lichtblick and Foxglove, live. Needs the extra `foxglove`."""
+"""Serve a daemon's messages to Lichtblick and Foxglove, live. Needs the extra `foxglove`."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from daemon.record.topics import schemas
 from daemon.record.viewers import Viewer
 
 ADDRESS: Final = "127.0.0.1"
-"""Loopback alone: the server does not check who connects."""
+"""Address of the server; only loopback, because it does not check who connects."""
 BACKLOG: Final = 256
-"""Messages that may wait for a viewer; a slow one loses the oldest."""
+"""Most messages that wait for a viewer; a slow one loses the oldest."""
 IMAGES_HZ: Final = 10.0
 CHANNELS_MAX: Final = 128
-"""Most topics: those of some ten hands."""
+"""Most topics, enough for about ten hands."""
 
 
 class LiveServer:
-    """A WebSocket server for viewers, in threads of the library."""
+    """A WebSocket server for viewers; the library runs it in threads."""
 
     def __init__(self, port: int, wall_clock: Callable[[], int] = time.time_ns) -> None:
-        """Serve on a port, 0 for any free one. Raises `RuntimeError` if it is taken."""
+        """Serve on `port`; 0: any free one. Raises `RuntimeError` if it is in use."""
         self._wall_clock = wall_clock
-        # Its threads would log through Python, and wait for a thread that waits for their lock.
+        # Logging through Python, its threads could wait for one that waits for their lock.
         foxglove.set_log_level(logging.CRITICAL)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         self._viewers: dict[str, Viewer] = {}
-        """By hand."""
+        """Viewer of each hand, by name."""
         self._server = foxglove.start_server(
             name="graspd",
             host=ADDRESS,
@@ -48,7 +48,7 @@ class LiveServer:
         return int(self._server.port)
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Pass on a published message; ignore others."""
+        """Pass on a published message; ignore other topics."""
         kind, _, hand = topic.decode(errors="replace").partition(".")
         if kind not in schemas():
             return

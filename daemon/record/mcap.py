@@ -1,4 +1,4 @@
-"""Writes and reads the MCAP files of recordings. Needs the extra `record`."""
+"""Write and read the MCAP files of recordings. Needs the extra `record`."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ from drivers.base import RecordingError
 from drivers.recordings.csv_rows import open_recording
 
 METADATA: Final = "graspd"
-"""Metadata record that every file of graspd begins with."""
+"""Name of the metadata record at the start of each file of graspd."""
 RECORD_MAX_BYTES: Final = 64 << 20
-"""Largest record. One that claims more is damaged."""
+"""Largest record, bytes; a longer one is damaged."""
 CHUNK_MAX_BYTES: Final = 8 << 20
-"""Largest unpacked chunk; graspd's have 1 MB, other tools' 4 MB."""
+"""Largest unpacked chunk, bytes; graspd writes 1 MB, other tools 4 MB."""
 RATIO_MAX: Final = 100
-"""Largest unpacked size of later chunks, per packed byte; held grasps have 12, zeros 36."""
+"""Largest ratio of unpacked to packed bytes; held grasps have 12, zeros 36."""
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError),
 )
-"""Errors of the library for a damaged file; the last two come from huge lengths."""
+"""Exceptions of the library for a damaged file; huge lengths cause the last two."""
 
 
 class McapWriter(RecordingFile):
-    """Writes one MCAP file."""
+    """Writer of one MCAP file."""
 
     def __init__(self, path: Path, header: RecordingHeader) -> None:
-        """Create the file, with `header` at its beginning."""
+        """Create the file, and write `header`."""
         super().__init__(path)
         self._offset_ns = header.wall_minus_monotonic_ns
         self._writer = Writer(self._stream)
         self._channels: dict[bytes, tuple[int, Iterator[int]]] = {}
-        """By topic: number of the channel, and of its next messages."""
+        """Number of the channel and numbers of its next messages, by topic."""
         try:
             self._writer.start(profile="", library="graspd")
             self._writer.add_metadata(METADATA, header.texts())
@@ -60,7 +60,7 @@ class McapWriter(RecordingFile):
             raise
 
     def write(self, topic: bytes, payload: bytes, at_ns: int) -> None:
-        """Add a message (JSON) on `topic`, of monotonic `at_ns`."""
+        """Write a message (JSON) of `topic`. `at_ns`: its monotonic time."""
         if topic not in self._channels:
             self._channels[topic] = self._register(topic.decode()), count()
         channel, numbers = self._channels[topic]
@@ -91,31 +91,31 @@ class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     kind: str
-    """First part of its topic: a `Topic`, or an unknown one."""
+    """First part of the topic: a value of `Topic`, or unknown."""
     at_ns: int
-    """By the monotonic clock of the recording daemon, ns."""
+    """Monotonic time of the recording daemon, ns."""
     payload: bytes
-    """JSON."""
+    """Content, JSON."""
 
 
 class McapReader:
-    """Reads one file: its header at once, its messages by iterating, once.
+    """Reader of one file: the constructor reads the header, iterating the messages. Iterate once.
 
-    The iteration ends where the file is damaged, as there is no summary to look for. It raises
-    `RecordingError` for a file that unpacks to more than any recording of graspd.
+    The iteration ends where the file is damaged. It raises `RecordingError` if the file unpacks to
+    more than any recording of graspd.
     """
 
     def __init__(self, path: Path, stream: BinaryIO) -> None:
-        """`stream` is the opened file. Raises `RecordingError` if it is not graspd's."""
+        """`stream`: the opened file. Raises `RecordingError` if graspd did not write it."""
         self._path = path
         self.cut_off = False
-        """True if the file turned out to be cut off or damaged."""
+        """True if the part read so far ends in a cut or damage."""
         reader = StreamReader(
             stream, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES
         )
         self._records = reader.records
         self._spare_bytes = CHUNK_MAX_BYTES
-        """Bytes that may still be unpacked."""
+        """Number of bytes that may still be unpacked."""
         self._kinds: dict[int, str] = {}
         self.header = self._read_header()
 
@@ -147,7 +147,7 @@ class McapReader:
             self.cut_off = True
 
     def _inner_records(self) -> Iterator[McapRecord]:
-        """Yield all records, those in chunks too."""
+        """Yield all records, also those in chunks."""
         for record in self._records:
             if isinstance(record, Chunk):
                 yield from _within(self._unpacked(record))
@@ -173,7 +173,7 @@ class McapReader:
 
 
 def _within(chunk: bytes) -> Iterator[McapRecord]:
-    """Yield channels and messages of a chunk: all at once take a hundred times its memory."""
+    """Yield channels and messages of a chunk one by one; all at once take 100 times its size."""
     stream = ReadDataStream(BytesIO(chunk))
     while stream.count < len(chunk):
         kind, length = stream.read1(), stream.read8()
@@ -186,7 +186,7 @@ def _within(chunk: bytes) -> Iterator[McapRecord]:
 
 
 def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:
-    """Unpack at most `max_bytes` of a chunk; None if its window alone is too large."""
+    """Return at most `max_bytes` of an unpacked chunk; None if its window is larger."""
     unpacked = content
     if compression == "zstd":
         if zstandard.get_frame_parameters(content).window_size > CHUNK_MAX_BYTES:

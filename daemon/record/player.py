@@ -1,4 +1,4 @@
-"""Plays recordings as a driver."""
+"""Driver that plays recordings of graspd."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from drivers.recordings.player import RecordedDriver
 _log = logging.getLogger(__name__)
 
 RecordedEvent = Topic | OutcomeMessage | Exchanged
-"""One of `EVENTS`, an outcome, or an exchange of sensors."""
+"""An event of `EVENTS`, an outcome, or an exchange of sensors."""
 _Item = Reading | RecordedEvent
 
 
 @dataclass(slots=True)
 class McapCounters(DriverCounters):
-    """Counts of a replay."""
+    """Counters of a replay."""
 
     late: int = 0
-    """Readings handed over more than a period late."""
+    """Readings handed over more than one period late."""
     malformed: int = 0
-    """Broken messages, and readings of other fingers."""
+    """Malformed messages, and readings of other fingers."""
     cut_off: int = 0
     """Files that were cut off or are damaged."""
 
 
 class McapReplayDriver(RecordedDriver[_Item]):
-    """Plays the files of one run in a row, at most one reading per call of `read_ready`.
+    """Play the files of one run, at most one reading per call of `read_ready`.
 
-    `t_ns` makes a reading as old as it was when it was recorded. `recorded_ns` is its `t_ns` of
-    then less `axis_ns`. A damaged file is played up to the damage, and counted.
+    With its `t_ns` a reading is as old as it was when recorded. `recorded_ns` is the recorded
+    `t_ns` less `axis_ns`. A damaged file is played up to the damage, and counted.
     """
 
     def __init__(
@@ -57,23 +57,25 @@ class McapReplayDriver(RecordedDriver[_Item]):
         axis_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`speed` is a factor of real time; None plays as fast as possible.
-        Raises `ValueError` without files or for a speed that is not positive."""
+        """Raises `ValueError` without `paths`, or for a `speed` of 0 or less.
+
+        `speed`: factor of real time; None: as fast as possible.
+        """
         super().__init__(paths, speed, clock)
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
         self.on_event: Callable[[RecordedEvent], None] | None = None
-        """Called with each event that the judge must know of."""
+        """Called with each event that changes the judge's state."""
         self._reset()
 
     def _reset(self) -> None:
         self.counters = McapCounters()
         self.period_ns: int | None = None
-        """Shortest time between two readings so far, as played."""
+        """Shortest time between two readings as played, ns; None: not known yet."""
         self._last_ns: int | None = None
 
     def open(self) -> None:
-        """Check the header of every file, then start over. Raises `RecordingError`."""
+        """Check the header of each file, then start from the first. Raises `RecordingError`."""
         self.close()
         self._reset()
         for path in self.paths:
@@ -84,7 +86,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
         self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """Return the next reading if it is due. Events go to `on_event`."""
+        """Return the next reading if it is due; pass events to `on_event`."""
         taken = self.take()
         if taken is None:
             return ()
@@ -117,7 +119,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
                         yield message.at_ns, item
                 if recording.cut_off:
                     self.counters.cut_off += 1
-                    _log.warning("%s: ends without an end; played as far as it goes", path)
+                    _log.warning("%s: is cut off or damaged; played up to there", path)
 
     def _items_of(self, message: RecordedMessage) -> Sequence[_Item]:
         try:

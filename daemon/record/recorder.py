@@ -1,5 +1,7 @@
-"""Records readings, published messages and events in files, without delaying the loop.
-The loop appends to a bounded queue and a thread writes: a slow disk costs entries, not time."""
+"""Record readings, published messages and events in files, without delaying the loop.
+
+The loop appends to a bounded queue, and a thread writes. A slow disk costs entries, not time.
+"""
 
 from __future__ import annotations
 
@@ -35,44 +37,44 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 QUEUE_MAX: Final = 20_000
-"""Longest queue, entries: some 12 MB, a minute of readings. Later ones are dropped."""
+"""Most queued entries: 12 MB, a minute of readings. Later ones are dropped."""
 RETRY_NS: Final = 60_000_000_000
-"""Time from a failure of the disk to the next try, ns."""
+"""Time after a failure of the disk until the next try, ns."""
 ROUNDS_PER_FLUSH: Final = 10
-"""Rounds of the thread per flush: few, so that it seldom delays the loop."""
+"""Rounds of the thread in a flush interval; few, so that it rarely delays the loop."""
 FLUSH_AFTER: Final = 0.8
-"""Part of the flush interval: with a round and the writing, no entry waits longer."""
+"""Share of the flush interval after which a flush is due; a round and the writing follow."""
 CLOSE_S: Final = 0.5
-"""Longest time that `close` waits for the thread, s."""
+"""Longest wait of `close` for the thread, s."""
 
 MakeHeader = Callable[[], RecordingHeader]
-"""Encodes a state that the loop has copied; called in the thread."""
+"""Function that makes the header of a copied state; called in the thread."""
 
 LINK: Final = b""
-"""Topic of link traffic."""
+"""Topic of entries that are link traffic."""
 NEXT_FILES: Final = b"next"
-"""Topic of an entry after which new files begin; its content is a `MakeHeader`."""
+"""Topic of an entry that begins new files; its content is a `MakeHeader`."""
 
 _Entry = tuple[int, bytes, object]
-"""Monotonic ns; topic; payload, or a function that makes the message."""
+"""Monotonic time, ns, topic, and payload or a function that makes it."""
 
 
 @dataclass(slots=True, eq=False)
 class _Open:
-    """The files that are being written."""
+    """Files that are being written."""
 
     files: list[RecordingFile]
-    """Messages; then the link log, if any."""
+    """The recording, then the link log, if there is one."""
     offset_ns: int
     """Wall time less monotonic time, ns."""
     since_ns: int
-    """Start of the files, monotonic ns."""
+    """Monotonic time of the start of the files, ns."""
     unflushed: int = 0
-    """Entries that may not be on the disk yet."""
+    """Number of entries that may not be on the disk yet."""
 
 
 class Recorder(Companion):
-    """Records one run of the daemon. Its methods never block or raise."""
+    """Record one run of the daemon. Methods never block or raise."""
 
     def __init__(
         self,
@@ -86,8 +88,8 @@ class Recorder(Companion):
     ) -> None:
         """Start the thread, which creates the first file.
 
-        `take_header` copies the state for a file's header. The loop calls it here and after a
-        status: then no reading is being judged.
+        `take_header`: copies the state for a file's header. It is called here and after a status,
+        when no reading is being judged.
         """
         self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
@@ -108,7 +110,7 @@ class Recorder(Companion):
         self._flush_due_ns = clock() + self._flush_ns
         self._retry_due_ns: int | None = None
         self._awaits_turn = True
-        """True while `NEXT_FILES` is queued, or wanted by `_wants_turn`."""
+        """True while `NEXT_FILES` is queued or requested by `_wants_turn`."""
         self._wants_turn = False
         self._queue.append((clock(), NEXT_FILES, take_header()))
         self._stopping = threading.Event()
@@ -121,11 +123,11 @@ class Recorder(Companion):
         self._put(topic, payload)
 
     def wanted(self, topic: bytes) -> bool:
-        """Return True: a recording needs no subscriber."""
+        """Return True: all topics are recorded, also without a subscriber."""
         return True
 
     def on_reading(self, reading: Reading) -> None:
-        """Record joint angles; tactile readings come as messages."""
+        """Record joint angles; tactile readings are recorded as messages."""
         if isinstance(reading, JointReading):
             self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
 
@@ -136,13 +138,13 @@ class Recorder(Companion):
             self._put(self._names[Topic.JUDGED], making)
 
     def on_event(self, event: LoopEvent) -> None:
-        """Record an event, but only the first of equal ones in a row."""
+        """Record an event; of equal events in a row only the first."""
         topic = self._names[Topic(event.value)]
         if topic != self._last_topic:
             self._put(topic, EVENT)
 
     def on_status(self, status: Status) -> None:
-        """Copy the state if the thread waits for it to begin new files."""
+        """Copy the state if the thread needs it for new files."""
         if self._wants_turn:
             self._wants_turn = False
             self._queue.append((self._clock(), NEXT_FILES, self._take_header()))
@@ -159,12 +161,12 @@ class Recorder(Companion):
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """Entries `recorded`, `dropped` by a slow disk and `lost` by a failed one; files."""
+        """Number of entries recorded, dropped (slow disk) and lost (failed disk), and of files."""
         writing = int(self._open is not None)
         return {"record": {**self._counted, "dropped": self._dropped, "writing": writing}}
 
     def close(self) -> None:
-        """Write the queue and end the files, if the disk answers in time."""
+        """Write the queue and close the files, if the disk answers in time."""
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -178,14 +180,14 @@ class Recorder(Companion):
             self._flush_due_ns = 0
             self.go_round()
         except BaseException:
-            self._counted["failures"] += 1  # a mistake of ours: the status must not say `writing`
+            self._counted["failures"] += 1  # a bug of graspd: the status must not say `writing`
             log.exception("record: nothing is recorded any more")
             raise
         finally:
             self._finish()
 
     def go_round(self) -> None:
-        """Write the queue; after a failure lose it until the next try is due."""
+        """Write the queue; after a failure drop it until the next try is due."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()
         if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
@@ -201,12 +203,12 @@ class Recorder(Companion):
             self._flush(self._open, now_ns)
 
     def _ask_for_turn(self) -> None:
-        """Begin new files where the loop next copies its state."""
+        """Ask the loop to copy its state for new files."""
         if not self._awaits_turn:
             self._awaits_turn = self._wants_turn = True
 
     def _take_turn(self, make_header: MakeHeader, now_ns: int) -> None:
-        """Begin new files, except for the few entries that come after `close`."""
+        """Begin new files, unless `close` was called."""
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
@@ -245,7 +247,7 @@ class Recorder(Companion):
             self._fail(error)
 
     def _write_message(self, current: _Open, topic: bytes, content: object, at_ns: int) -> None:
-        """Write a message, and log lines and images made of it."""
+        """Write a message, and the log lines and images made from it."""
         if callable(content):
             message = msgspec.to_builtins(content())
         else:
@@ -282,9 +284,9 @@ class Recorder(Companion):
         self._counted["recorded"] += current.unflushed
 
     def _fail(self, error: OSError) -> None:
-        """Count a failure of the disk, warn of the first one, and try again later."""
+        """Count a failure of the disk, warn once, and schedule the next try."""
         current, self._open = self._open, None
-        self._number += 1  # the next file does not go on where the last one ends
+        self._number += 1  # the next file does not follow the last one
         if current is not None:
             self._counted["lost"] += current.unflushed
             for file in current.files:

@@ -24,7 +24,7 @@ from models.session_statistics import SessionState
 _ANGLES = msgspec.Meta(
     extra_json_schema={"properties": {name: {"type": "number"} for name in sorted(JOINTS)}}
 )
-"""Lets a viewer offer the joints by name."""
+"""Schema of joint angles with all names, so that a viewer can list them."""
 
 
 class Joints(msgspec.Struct, frozen=True, kw_only=True):
@@ -33,10 +33,10 @@ class Joints(msgspec.Struct, frozen=True, kw_only=True):
     v: Literal[1] = WIRE_VERSION
     seq: int
     t_mono_ns: int
-    """Of the reading's last byte, ns."""
+    """Monotonic time of the reading's last byte, ns."""
     names: tuple[str, ...]
     position_rad: Annotated[dict[str, float], _ANGLES]
-    """Valid angles, rad."""
+    """Valid angles by joint, rad."""
 
     @classmethod
     def of(cls, reading: JointReading) -> Self:
@@ -48,22 +48,22 @@ class Joints(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Judged(msgspec.Struct, frozen=True, kw_only=True):
-    """The counts by which the network judged a grasp, unless electrodes were broken."""
+    """Counts that the network judged, with the original counts of repaired electrodes."""
 
     v: Literal[1] = WIRE_VERSION
     boot_id: str
     t_mono_ns: Count
-    """Of the verdict."""
+    """Monotonic time of the verdict, ns."""
     grasp: Count
-    """Of the verdict. If it is judged again, the last message holds."""
+    """Number of the verdict's grasp. After a further judgement the last message counts."""
     counts: list[list[Count]]
-    """By finger and electrode, in the header's order, before any repair."""
+    """Counts by finger and electrode, in the header's order, before repair."""
     repaired: list[str] = []
-    """Electrodes that the verdict names as replaced."""
+    """Names of the electrodes that the verdict calls repaired."""
 
     @classmethod
     def of(cls, boot_id: str, judgement: Judgement) -> Self:
-        """Return the message for a judgement with `judged_counts`."""
+        """Return the message of a judgement that has `judged_counts`."""
         counts = judgement.judged_counts
         return cls(
             boot_id=boot_id,
@@ -75,18 +75,18 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Event(msgspec.Struct, frozen=True):
-    """Something has happened; what, the topic says."""
+    """An event; its topic tells which."""
 
 
 class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A sensor was exchanged; empty unless the new one was known."""
+    """An exchange of a sensor, with the state of the new one, if known."""
 
     session: SessionState | None = None
     learned: LearnerState | None = None
 
 
 class Topic(StrEnum):
-    """First part of a topic's name, `<kind>.<hand>`."""
+    """First part of a topic, `<kind>.<hand>`."""
 
     # Written by the outbox:
     TACTILE = "tactile"
@@ -98,13 +98,13 @@ class Topic(StrEnum):
     JOINTS = "joints"
     JUDGED = "judged"
     ASKED = "asked"
-    """A controller has asked for a judgement."""
+    """A controller asked for a judgement."""
     EXCHANGED = "exchanged"
     SKIPPED = "skipped"
-    """Readings before the next one were left out."""
+    """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
-    """A controller asked whether it may lift, and the answer was `stable`."""
-    # Made of them for viewers:
+    """A controller asked if it may lift, and the answer was `stable`."""
+    # Made from these for viewers:
     IMAGE = "image"
     LOG = "log"
 
@@ -120,7 +120,7 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
     "image": RawImage,
     "log": Log,
 }
-"""Messages by the first part of their topic."""
+"""Type of the messages by the first part of their topic."""
 EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED)
 EVENT: Final = b"{}"
 
@@ -130,7 +130,7 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """Return name and JSON Schema by topic. Viewers know those of `foxglove` by name."""
+    """Return name and JSON Schema by topic; viewers know names of `foxglove`."""
     described = {}
     for topic, message in MESSAGES.items():
         family = "foxglove" if message in (RawImage, Log) else "graspd"
@@ -147,9 +147,9 @@ def decode_judged(payload: bytes) -> Judged:
 
 
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileReading, bool]:
-    """Return the reading of a `tactile` message, of these fingers.
+    """Return the reading of a `tactile` message with `fingers`, and a bool.
 
-    The second value is True if an older recording says that a controller asked before it. Raises
+    The bool is True if an older recording says that a controller asked before the reading. Raises
     `ValueError` or `OverflowError`.
     """
     content = _decode(payload)
@@ -169,7 +169,7 @@ def joint_reading(payload: bytes) -> JointReading:
     """Return the reading of a `joints` message. Raises `ValueError`."""
     content = _decode(payload)
     angles = content.get("position_rad")
-    if isinstance(angles, list):  # as older recordings have them
+    if isinstance(angles, list):  # older recordings have these
         pairs = zip(map(str, content.get("names", "")), angles, strict=True)
         content["position_rad"] = {name: angle for name, angle in pairs if angle is not None}
     message = msgspec.convert(content, Joints)

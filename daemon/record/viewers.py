@@ -1,4 +1,4 @@
-"""Tactile images as `foxglove.RawImage`, and changes as `foxglove.Log`, for viewers."""
+"""Make tactile images (`foxglove.RawImage`) and log lines (`foxglove.Log`) for viewers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from models.levels import FULL, HEIGHT, PIXELS, WIDTH, RestCounts, fall_of, leve
 INFO: Final = 2
 WARNING: Final = 3
 SCALE: Final = 4
-"""Pixels per pixel of the tactile image, each way."""
+"""Width and height of a pixel of the tactile image, in pixels of the drawn one."""
 _COLOURS: Final = {
     -100: (59, 125, 216),
     0: (38, 44, 54),
@@ -37,7 +37,7 @@ _COLOURS: Final = {
     80: (251, 180, 26),
     100: (252, 255, 190),
 }
-"""By level: blue is risen, yellow pressed the most."""
+"""Colour by level: blue is risen, yellow is pressed most."""
 _PALETTE = np.array(
     [
         np.interp(np.arange(-FULL, FULL + 1), list(_COLOURS), channel)
@@ -45,10 +45,10 @@ _PALETTE = np.array(
     ]
 ).T.astype(np.uint8)
 _MARK = np.array((0, 220, 220), np.uint8)
-"""Of an electrode whose count is faulty."""
+"""Colour of an electrode with a faulty count."""
 
 LogLine = tuple[int, str, str]
-"""Level, name and text."""
+"""Level, name and text of a log line."""
 
 
 class Time(msgspec.Struct, frozen=True):
@@ -63,11 +63,11 @@ class Time(msgspec.Struct, frozen=True):
 
 
 class RawImage(msgspec.Struct, frozen=True, kw_only=True):
-    """A reading as `foxglove.RawImage`: how far each electrode is below where it rests.
+    """A reading as `foxglove.RawImage`: how far each electrode is below its resting count.
 
-    The fingers stand side by side in the order of the reading. The darkest grey is rest, red to
-    yellow pressed, blue risen, cyan an electrode whose count is faulty. Until it is known where a
-    finger rests, and where there is no gate, its electrodes are drawn by their own median.
+    The fingers are side by side, in the order of the reading. The darkest grey is rest, red to
+    yellow pressed, blue risen, cyan a faulty count. While the rest of a finger is unknown, and
+    without a gate, its electrodes are drawn relative to their median.
     """
 
     timestamp: Time
@@ -84,16 +84,16 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
 
     timestamp: Time
     level: Annotated[int, msgspec.Meta(ge=0, le=5)]
-    """2: information, 3: warning."""
+    """Level: 2 information, 3 warning."""
     message: str
     name: str
-    """Of what: `gate`, `verdict`, `outcome`, `health` or `state`."""
+    """Name of what changed: `gate`, `verdict`, `outcome`, `health` or `state`."""
     file: str = ""
     line: int = 0
 
 
 class Viewer:
-    """Makes log and images of the messages of one hand."""
+    """Make log lines and images from the messages of one hand."""
 
     def __init__(self, images_hz: float) -> None:
         """Draw at most `images_hz` images a second; 0 draws none."""
@@ -103,8 +103,10 @@ class Viewer:
         self._health: dict[str, Reason] = {}
 
     def of(self, kind: str, content: object, wall_ns: int) -> Iterator[tuple[str, bytes]]:
-        """Yield kind and payload of what a message comes to; nothing for a malformed one.
-        `content` is the message as JSON has it, `kind` the first part of its topic."""
+        """Yield kind and payload of each log line and image of a message; none if malformed.
+
+        `kind`: first part of the message's topic. `content`: its decoded JSON.
+        """
         if kind not in MESSAGES:
             return
         try:
@@ -119,7 +121,7 @@ class Viewer:
             yield "image", msgspec.json.encode(image)
 
     def _changes(self, message: Message) -> list[LogLine]:
-        """Return what a message changes."""
+        """Return a log line for each change in a message."""
         match message:
             case GateMessage():
                 text = f"{message.former} to {message.state} ({message.cause})"
@@ -160,7 +162,7 @@ class Viewer:
 
 
 class Painter:
-    """Draws readings by where each finger rests, which it learns."""
+    """Draw readings relative to the resting counts of each finger, which it learns."""
 
     def __init__(self, images_hz: float) -> None:
         self._period_ns = round(1e9 / images_hz) if images_hz else None

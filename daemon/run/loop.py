@@ -1,4 +1,4 @@
-"""The loop: waits for readings, has them judged and the verdicts sent, and notices silence."""
+"""The loop: wait for readings, judge them, publish verdicts, and notice silence."""
 
 from __future__ import annotations
 
@@ -38,25 +38,25 @@ from daemon.trust.lift_book import (
 from drivers.base import Driver, JointReading, Reading, TactileReading
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
-"""Time between two statuses, ns, even when nothing happens."""
+"""Time between two status messages, ns."""
 SILENCE_PERIODS: Final = 10
-"""Missing readings before silence is reported, if that takes longer than the age limit."""
+"""Number of missing readings that count as silence, if that is longer than the age limit."""
 DRAINS_MAX: Final = 8
-"""Most extra reads of the driver in one round: a flood cannot hold the loop."""
+"""Most extra reads of the driver in one round, so that a flood cannot hold the loop."""
 BLOCKED_NS: Final = 50_000
-"""A wait that takes this much longer than its processor time, ns, has put the thread to sleep."""
+"""Difference of wait and processor time, ns, from which the thread must have slept."""
 
 
 class Ended(Enum):
-    """Why the loop has ended."""
+    """Reason why the loop ended."""
 
     STOPPED = "stopped"
     EXHAUSTED = "exhausted"
-    """The recording is over."""
+    """The recording has ended."""
     RELOAD = "reload"
-    """The scene is to be read again."""
+    """A new scene is ready to run."""
     SLEPT = "slept"
-    """The computer has slept: readings from before may look fresh."""
+    """The computer has slept, so older readings may look new."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,17 +66,19 @@ class LoopTiming:
     max_age_ns: int
     """Age limit of readings, ns."""
     clock: Callable[[], int] = time.monotonic_ns
-    """Monotonic ns."""
+    """Clock that returns monotonic ns."""
     sleep: Sleep = field(default_factory=Sleep)
     rest: Callable[[float], None] = time.sleep
-    """Puts this thread to sleep, s."""
+    """Function that puts this thread to sleep, s."""
     selector: Callable[[], selectors.BaseSelector] = selectors.PollSelector
-    """Waits for descriptors in whole milliseconds, by poll(2). Unlike epoll(7), it takes a number
-    for what it is now: a driver that reopens a device mostly gets the same one."""
+    """Selector: poll(2), which waits in whole milliseconds.
+
+    A driver that reopens a device mostly gets the same descriptor, which epoll(7) would not notice.
+    """
 
 
 class Loop:
-    """Runs one hand, in one thread, until told to stop or until a recording ends."""
+    """Run one hand in one thread, until stopped or until a recording ends."""
 
     def __init__(
         self,
@@ -88,8 +90,10 @@ class Loop:
         timing: LoopTiming,
         keep: Callable[[Answer], None] = at_once,
     ) -> None:
-        """Run these open drivers, the tactile one first; the caller closes them.
-        `keep` calls its argument once all outcomes until now are on the disk."""
+        """`drivers`: open, the tactile one first; the caller closes them.
+
+        `keep`: calls its argument once all outcomes until now are on the disk.
+        """
         self._drivers = drivers
         self._tactile = drivers[0]
         self._pipeline = pipeline
@@ -116,7 +120,7 @@ class Loop:
         self._deadlines = Deadlines()
         self._joints: JointReading | None = None
         self._watched: list[int] = []
-        """Descriptors of drivers and companions that are registered with the selector."""
+        """Descriptors of drivers and companions in the selector."""
         self._state = State.RUNNING
         now_ns = self._clock()
         self._shedder = LoadShedder(now_ns, live=self._tactile.live, sleep=timing.rest)
@@ -127,8 +131,10 @@ class Loop:
         self._readings_since_status = 0
 
     def run(self) -> Ended:
-        """Run until something ends it; after `RELOAD`, continue. Raises `DriverError`.
-        Call `close` after the last call."""
+        """Run until something ends the loop. Raises `DriverError`.
+
+        After `RELOAD` it may be called again. Call `close` after the last call.
+        """
         self._watched = []
         with closing(self._new_selector()) as selector:
             selector.register(self._stop, selectors.EVENT_READ)
@@ -142,16 +148,16 @@ class Loop:
                     return Ended.SLEPT
                 self._go_round(selector)
         if self._tactile.fileno() is not None:
-            self._take_readings()  # those that had come before the signal
+            self._take_readings()  # the readings that had arrived before the signal
         return Ended.STOPPED
 
     def close(self) -> None:
-        """Send the last status, whose state is `stopping`."""
+        """Publish the last status, with the state `stopping`."""
         self._state = State.STOPPING
         self._send_status()
 
     def _go_round(self, selector: selectors.BaseSelector) -> None:
-        # Now, and not when the descriptors say so: sending quietens them.
+        # Now, without asking the descriptors: sending a message resets them.
         for before_wait in self._before_wait:
             before_wait(self)
         self._wait(selector)
@@ -171,11 +177,11 @@ class Loop:
             selector.select((due_ns - began_ns) / 1e9)
             now_ns = self._clock()
         idle_ns = now_ns - began_ns
-        if idle_ns >= BLOCKED_NS:  # else the processor time is not read, which is a system call
+        if idle_ns >= BLOCKED_NS:  # reading the processor time is a system call
             idle_ns -= time.thread_time_ns() - worked_ns
         if idle_ns >= BLOCKED_NS:
             self._shedder.waited(now_ns)
-        else:  # there was work already
+        else:  # work was waiting already
             self._shedder.yield_processor(now_ns)
 
     def _register(self, selector: selectors.BaseSelector) -> None:
@@ -199,7 +205,7 @@ class Loop:
         return due_ns
 
     def _take_readings(self) -> bool:
-        """Judge and report what the drivers have; return False if there is no tactile reading."""
+        """Judge and publish the waiting readings; return False if none is tactile."""
         readings, backlog = self._read()
         received_ns = began_ns = self._clock()
         taken = False
@@ -224,11 +230,11 @@ class Loop:
             self._shedder.record_cost(judged_ns - began_ns)
             began_ns = judged_ns
         if taken:
-            self._pipeline.learn()  # the verdicts are out: now there is time
+            self._pipeline.learn()  # the verdicts are published: now there is time
         return taken
 
     def _read(self) -> tuple[list[Reading], int]:
-        """Return what the drivers have, and how many readings of it are tactile."""
+        """Return the waiting readings, and the number of tactile ones."""
         readings: list[Reading] = []
         for driver in self._drivers:
             readings += driver.read_ready()
@@ -247,7 +253,7 @@ class Loop:
     def _after_skipped(
         self, skipped: Sequence[TactileReading], newest: TactileReading
     ) -> TactileReading:
-        """Report that readings were skipped; return `newest` as it is to be judged after them."""
+        """Report skipped readings; return `newest`, with repeats of them marked."""
         self._shedder.skip(len(skipped), self._clock())
         self._pipeline.skip()
         for on_event in self._on_event:
@@ -255,7 +261,7 @@ class Loop:
         return mark_repeats(newest, skipped[-1])
 
     def _judge(self, reading: TactileReading, received_ns: int) -> bool:
-        """Judge and report one reading; return False if the computer has slept since it came."""
+        """Judge and publish a reading; return False if the computer slept since it arrived."""
         self._outbox.tactile(reading, self._joints)
         judgement = self._pipeline.judge(reading)
         if self._sleep.has_slept():
@@ -285,7 +291,7 @@ class Loop:
         *,
         is_answer: bool = False,
     ) -> Verdict:
-        """Publish a verdict. With `is_answer`, it answers those who wait for a judgement."""
+        """Publish a verdict. `is_answer`: True if it answers waiting questions."""
         silence_ns = self._silence_ns
         self._silence_due_ns = received_ns + silence_ns
         verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
@@ -304,7 +310,7 @@ class Loop:
 
     @property
     def _silence_ns(self) -> int:
-        """Time without a reading, ns, after which silence is reported."""
+        """Return the time without a reading, ns, after which silence is reported."""
         return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
 
     def _send_status(self) -> None:
@@ -329,13 +335,13 @@ class Loop:
             on_status(status)
 
     def ask(self) -> None:
-        """Have a settled grasp judged, if that is done on request only."""
+        """Request a judgement; in mode `request` a settled grasp is judged then."""
         self._pipeline.ask()
         for on_event in self._on_event:
             on_event(LoopEvent.ASKED)
 
     def outcome(self, report: Report, answer: Answer) -> None:
-        """Learn and publish how the lift of a judged grasp has ended, and keep it on the disk."""
+        """Learn, publish and save the outcome of a judged grasp's lift; then call `answer`."""
         lifts, grasp = self._pipeline.lifts, self._judged_as(report.grasp)
         if not lifts.may_report(grasp, report.peer):
             answer(NOT_YOURS)
@@ -360,7 +366,7 @@ class Loop:
         answer(problem)
 
     def _judged_as(self, grasp: GraspId) -> GraspId:
-        """Return the name of a grasp in the book: a replay enters its grasps as recorded."""
+        """Return the id of a grasp in the book; a replay uses the recorded ids."""
         if grasp.boot_id != self._outbox.boot_id:
             return grasp
         return GraspId(self._pipeline.boot_id, grasp.grasp)

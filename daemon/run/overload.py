@@ -20,7 +20,7 @@ from drivers.base import ElectrodeFault, TactileReading
 BACKLOG_MAX_NS: Final = 10_000_000
 """Longest backlog, ns, that is judged completely; one sensor period if that is longer."""
 COST_SAMPLES: Final = 4
-"""The cost of a reading is the least of its last four times: a stall does not count."""
+"""Number of times of which the least is the cost of a reading, so that a stall does not count."""
 REPORT_AFTER_NS: Final = 3_000_000_000
 """Skipping for this long, ns, is reported as overload."""
 PAUSE_NS: Final = 1_000_000_000
@@ -32,8 +32,10 @@ YIELD_AFTER_RECORDED_NS: Final = 1_000_000_000
 """Time without a wait, ns, after which the loop yields the processor; more for recordings."""
 YIELD_SHARE: Final = 10
 YIELD_MAX_NS: Final = 5_000_000
-"""The loop yields for a tenth of the time it has worked, ns: in realtime, the kernel takes 5 % away
-otherwise (sched(7), sched_rt_runtime_us)."""
+"""Longest yield, ns. It lasts a tenth of the time worked; else a realtime thread loses 5 % anyway.
+
+See sched(7), sched_rt_runtime_us.
+"""
 
 log = logging.getLogger("graspd")
 
@@ -44,7 +46,7 @@ class LoadShedder:
     def __init__(
         self, now_ns: int, *, live: bool, sleep: Callable[[float], None] = time.sleep
     ) -> None:
-        """Skip `live` readings only. `sleep` puts this thread to sleep, s."""
+        """`live`: False never skips. `sleep`: puts this thread to sleep, s."""
         self._live = live
         self._sleep = sleep
         self._yield_after_ns = YIELD_AFTER_NS if live else YIELD_AFTER_RECORDED_NS
@@ -69,8 +71,10 @@ class LoadShedder:
         self._check_recovered(now_ns)
 
     def should_skip(self, backlog: int, age_ns: int, period_ns: int | None) -> bool:
-        """Return True if only the newest of `backlog` readings, `age_ns` old, should be judged.
-        `period_ns`: sensor period, None if not known yet."""
+        """Return True if only the newest of `backlog` readings should be judged.
+
+        `age_ns`: time since they arrived. `period_ns`: sensor period; None: not known yet.
+        """
         if backlog < 2 or not self._live:
             return False
         cost_ns = min(self._costs_ns, default=0)
@@ -97,7 +101,7 @@ class LoadShedder:
 
 
 def mark_repeats(newest: TactileReading, skipped: TactileReading) -> TactileReading:
-    """Return `newest` with the fingers HELD that only repeat `skipped`, which no judge saw."""
+    """Return `newest` with the fingers flagged HELD that only repeat the skipped reading."""
     sound = (newest.faults | skipped.faults) == 0
     differs = newest.counts != skipped.counts
     held = sound.any(axis=1) & ~(differs & sound).any(axis=1)

@@ -1,4 +1,4 @@
-"""Verdicts on standard output, for people or for programs."""
+"""Print verdicts on standard output, for people or for programs."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from daemon.trust.trust import Trust
 from drivers.base import Annotation
 
 NAME_MAX = 80
-"""Most characters of an object's name."""
+"""Most printed characters of an object's name."""
 COLOURS = {Decision.STABLE: Colour.GREEN, Decision.SLIP: Colour.RED}
 
 
 class Printer(Companion):
-    """Writes verdicts as they come, and a summary at the end."""
+    """Print verdicts when they come, and a summary at the end."""
 
     def __init__(self, *, as_json: bool) -> None:
-        """With `as_json`, write messages as they are, and the summary to stderr."""
+        """`as_json`: True prints whole messages, and the summary on stderr."""
         self._as_json = as_json
         self.result = RunSummary()
         self._start_s = time.monotonic()
         self._gate: GateState | None = None
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Write one verdict, and the outcome of its lift if the recording has it."""
+        """Print a verdict, and the recorded outcome of its lift, if there is one."""
         verdict, reading = published.verdict, published.reading
         annotation = reading.annotation if reading else None
         self.result.add(verdict, annotation.slipped if annotation else None)
@@ -39,10 +39,10 @@ class Printer(Companion):
             return
         line = published.payload.decode() if self._as_json else _line(verdict, annotation)
         sys.stdout.write(line + "\n")
-        sys.stdout.flush()  # into a pipe too: readings may come in real time
+        sys.stdout.flush()  # also into a pipe: readings may come in real time
 
     def _is_news(self, verdict: Verdict) -> bool:
-        """Return True if something changed; without a gate, each verdict is of a new grasp."""
+        """Return True if the verdict is new; without a gate each is of a new grasp."""
         if verdict.gate is None or verdict.judged or verdict.gate is not self._gate:
             self._gate = verdict.gate
             return True
@@ -52,7 +52,7 @@ class Printer(Companion):
         self.result.outcome(report.grasp.grasp, slipped=report.outcome == "slip")
 
     def summary(self, trust: Trust | None) -> None:
-        """Write the summary since the start; `trust` is what outcomes have taught."""
+        """Print the summary since the start. `trust`: what outcomes taught, if anything."""
         wall_s = time.monotonic() - self._start_s
         if self._as_json:
             sys.stdout.flush()

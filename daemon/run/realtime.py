@@ -22,27 +22,27 @@ CAP_IPC_LOCK = 14
 
 
 class RealtimeMode(Companion):
-    """Runs the process in realtime from `__enter__` to `__exit__`.
+    """Run the process in realtime from `__enter__` to `__exit__`.
 
-    Only the loop's thread gets the priority, before libzmq's threads, which copy messages. One
-    warning says what is refused.
+    Only the loop's thread gets the priority, not libzmq's threads, which copy messages. One warning
+    lists everything that the system refuses.
     """
 
-    def __init__(self, wanted: Realtime) -> None:
-        self._wanted = wanted
+    def __init__(self, options: Realtime) -> None:
+        self._options = options
         self._processors = os.sched_getaffinity(0)
         self.lacking: dict[str, str] = {}
-        """What was refused, and the right to grant."""
+        """Refused parts of realtime mode, each with advice on how to allow it."""
 
     def __enter__(self) -> Self:
-        """Take the priority for this thread, the rest for the process."""
-        wanted = self._wanted
-        if wanted.cpus is not None:
-            self._pin(set(wanted.cpus))
-        if wanted.lock_memory:
+        """Set the priority of this thread, and everything else for the process."""
+        options = self._options
+        if options.cpus is not None:
+            self._pin(set(options.cpus))
+        if options.lock_memory:
             self._lock()
-        if wanted.priority is not None:
-            self._raise(wanted.priority)
+        if options.priority is not None:
+            self._raise(options.priority)
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -75,7 +75,7 @@ class RealtimeMode(Companion):
 
     def _raise(self, priority: int) -> None:
         try:
-            # Threads that this one starts later are ordinary. Only root may take the flag back.
+            # Threads started later are ordinary. Only root may take the flag back.
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, policy, os.sched_param(priority))
         except OSError as error:
@@ -84,11 +84,11 @@ class RealtimeMode(Companion):
             )
 
     def _lock(self) -> None:
-        # With a limit, memory that is wanted later would be refused: worse than not to lock.
+        # With a limit, later allocations would fail, which is worse than unlocked memory.
         unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
         problem = "limited"
         if unlimited or _may_lock():
-            # Only what is touched: the rest of a library of 20 MB is never needed.
+            # Only used pages: most of a library of 20 MB is never used.
             if _libc().mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) == 0:
                 return
             problem = os.strerror(ctypes.get_errno())

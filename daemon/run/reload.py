@@ -1,4 +1,4 @@
-"""Prepares the scene file again while the former scene runs."""
+"""Prepare a changed scene file while the former scene runs."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ from daemon.process.worker import Worker
 from daemon.publish.companion import Companion
 
 PERIOD_NS: Final = 1_000_000_000
-"""Shortest time between the starts of two preparations, ns."""
+"""Shortest time between two preparations, ns, from start to start."""
 END_S: Final = 0.5
-"""How long `close` waits for a preparation, s."""
+"""Longest wait of `close` for a preparation, s."""
 
 
 class Reload(Companion):
-    """Stands before a `StopSignal`: the loop hears of a reload once there is a scene to run."""
+    """Wrapper of a `StopSignal` that reports a reload only when the new scene is ready."""
 
     def __init__(
         self, stop: StopSignal, prepare: Callable[[], Parts], began: Callable[[], None]
     ) -> None:
-        """`prepare` is called in a thread and may raise anything; `began` in the loop's thread."""
+        """`prepare`: called in a thread; it may raise anything.
+
+        `began`: called in the loop's thread when a preparation begins.
+        """
         self._stop = stop
         self._prepare = prepare
         self._began = began
@@ -44,11 +47,11 @@ class Reload(Companion):
         return self._worker.filenos()
 
     def due_ns(self) -> int | None:
-        """Time of the next preparation, monotonic ns, if one is requested and none runs."""
+        """Return the time of the next preparation, monotonic ns; None: none is due."""
         return self._not_before_ns if self._is_requested and not self._worker.busy else None
 
     def take_reload(self) -> bool:
-        """Return True if `take` has a result; start a preparation if one is requested and due."""
+        """Return True if `take` has a result. Start a preparation if one is due."""
         if self._stop.take_reload():
             self._is_requested = True
         if self._result is None:
@@ -61,7 +64,7 @@ class Reload(Companion):
         return False
 
     def take(self) -> Parts | Exception:
-        """Return the prepared parts, or what was raised, after `take_reload` was True."""
+        """Return the prepared parts, or the exception. Call after `take_reload` was True."""
         result, self._result = self._result, None
         if result is None:
             raise RuntimeError("nothing has been prepared")

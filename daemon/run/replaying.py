@@ -1,4 +1,4 @@
-"""Companions of a replay: one tells outcomes, one judges the same grasps in another way."""
+"""Companions of a replay: one tells outcomes, the other judges again in another way."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from models.runtime import TactileModel
 class _Lift(NamedTuple):
     report: Report
     allowed: bool
-    """True if `stable` was said, or a lift under supervision asked for."""
+    """True if the verdict was `stable`, or asked for a supervised lift."""
     over: bool
-    """True if the next reading is another grasp in any case."""
+    """True if the next reading is another grasp for certain."""
 
 
 class Controller(Companion):
-    """Tells the recorded outcome of each judged grasp before the next grasp, as a robot would."""
+    """Tell the recorded outcome of each judged grasp before the next grasp, as a robot does."""
 
     def __init__(self, *, only_lifted: bool) -> None:
-        """With `only_lifted`, tell outcomes of `stable` verdicts and supervised lifts only."""
+        """`only_lifted`: True tells outcomes of `stable` verdicts and supervised lifts only."""
         self._only_lifted = only_lifted
         self._requests: Requests | None = None
         self._lift: _Lift | None = None
@@ -37,7 +37,7 @@ class Controller(Companion):
         self._requests = requests
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Take note of a grasp; the lift of the one before it is over."""
+        """Keep the grasp of a verdict; tell the outcome of the grasp before it."""
         verdict, reading = published.verdict, published.reading
         if self._lift is not None and self._lift.report.grasp.grasp != verdict.grasp:
             self.tell()
@@ -56,7 +56,7 @@ class Controller(Companion):
         )
 
     def after_round(self) -> None:
-        """Tell the outcome if each reading is a grasp: the lift is over with it."""
+        """Tell the outcome if each reading is a grasp, whose lift is then over."""
         if self._lift is not None and self._lift.over:
             self.tell()
 
@@ -69,22 +69,22 @@ class Controller(Companion):
 
 
 def _sent(object_name: str | None) -> str | None:
-    """Return the name if an outcome may have it: tables may have any text."""
+    """Return the name if outcomes allow it, else None; tables may have any text."""
     return object_name if re.fullmatch(OBJECT_PATTERN, object_name or "") else None
 
 
 class Comparison(Companion):
-    """Judges every judged grasp once more in another way, for the summary alone."""
+    """Judge each judged grasp again in another way, only for the summary."""
 
     def __init__(self, how: str, pipeline: Pipeline, result: RunSummary) -> None:
-        """`how` is a key of `RunSummary.compared`. To `pipeline` each reading is a grasp."""
+        """`how`: key of `RunSummary.compared`. `pipeline`: takes each reading for a grasp."""
         self._how = how
         self._pipeline = pipeline
         self._result = result
         self._grasp: int | None = None
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Count what the first verdict on a grasp would have been."""
+        """Count the other way's verdict for the first verdict on a grasp."""
         verdict, reading = published.verdict, published.reading
         if reading is None:
             return
@@ -98,7 +98,7 @@ class Comparison(Companion):
 
 
 def trained_on(recordings: Sequence[Path], model: TactileModel) -> list[str]:
-    """Return the names of the recordings that a model was trained on."""
+    """Return the names of those recordings that the model was trained on."""
     digests = {dataset.sha256 for dataset in model.contract.datasets}
     names = []
     for path in recordings:

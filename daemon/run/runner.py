@@ -1,4 +1,4 @@
-"""Runs a scene file until told to stop."""
+"""Run a scene file until told to stop."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 AWAKE_RETRY_S, AWAKE_LOOK_S = 1.0, 0.1
-"""After a sleep: time between two tries to open everything, and between looks for signals, s."""
+"""After a sleep: time, s, between two tries to open everything, and between looks at signals."""
 
 
 def prepare(path: Path) -> Parts:
-    """Read a scene and load its model; rehearse in realtime. Raises as `Parts.of`."""
-    wanted = scene.load(path)
-    parts = Parts.of(wanted, assembly.load_model(wanted))
-    if wanted.realtime is not None:
+    """Read a scene and load its model; with `[realtime]` rehearse. Raises as `Parts.of`."""
+    loaded = scene.load(path)
+    parts = Parts.of(loaded, assembly.load_model(loaded))
+    if loaded.realtime is not None:
         rehearse_grasp(parts)
     return parts
 
@@ -47,23 +47,23 @@ def rehearse_grasp(parts: Parts) -> None:
     """Judge a synthetic grasp."""
     from daemon.run.rehearsal import rehearse  # only where a scene wants realtime
 
-    # With a model of its own: how a model's inputs are scaled follows who judges with it.
+    # With its own model, because judging changes the scaling of a model's inputs.
     try:
         model = assembly.load_model(parts.scene)
         rehearse(
             lambda clock: assembly.build_pipeline(parts.scene, model, clock), model.contract.seen
         )
-    except ModelError as error:  # the file has changed since; the one in memory is sound
+    except ModelError as error:  # the file has changed; the model in memory is good
         log.warning("no rehearsal: %s", error)
 
 
-def enter_realtime(wanted: scene.Scene, stack: ExitStack) -> RealtimeMode | None:
-    """Enter realtime until `stack` closes, if the scene wants it."""
-    if wanted.realtime is None:
+def enter_realtime(running: scene.Scene, stack: ExitStack) -> RealtimeMode | None:
+    """Enter realtime mode until `stack` closes; None without `[realtime]`."""
+    if running.realtime is None:
         return None
     from daemon.run.realtime import RealtimeMode  # only where a scene wants realtime
 
-    return stack.enter_context(RealtimeMode(wanted.realtime))
+    return stack.enter_context(RealtimeMode(running.realtime))
 
 
 def _controller(wanted: scene.Scene) -> Controller | None:
@@ -76,7 +76,7 @@ def _controller(wanted: scene.Scene) -> Controller | None:
 
 
 class Runner:
-    """Runs what a scene file says."""
+    """Runner of a scene file, with reloads."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class Runner:
         printer: Printer | None = None,
         manager: Systemd | None = None,
     ) -> None:
-        """`manager` started this process."""
+        """`manager`: the service manager, if it started this process."""
         self._path = path
         self._stop = stop
         self._printer = printer
@@ -95,13 +95,15 @@ class Runner:
         self._reload = Reload(stop, partial(prepare, path), self._say_reloading)
         self._running = False
         self._former: Parts | None = None
-        """What ran before a reload, until what follows it runs."""
+        """Parts of the scene before a reload, until the new scene runs."""
         self._trust: Trust | None = None
-        """What outcomes taught in the scene that ran last."""
+        """Trust of the scene that ran last."""
 
     def run(self) -> None:
-        """Run until stopped or until a recording ends. Errors of a reload are logged.
-        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`."""
+        """Run until stopped or until a recording ends. Errors of a reload are only logged.
+
+        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`.
+        """
         try:
             self._run(prepare(self._path))
         finally:
@@ -130,7 +132,7 @@ class Runner:
                 continue
             woken = ended is Ended.SLEPT
             if woken:
-                log.warning("the computer has slept: everything starts anew")
+                log.warning("the computer has slept: starting again")
             elif following is not None:
                 following.pipeline.lifts.follow(parts.pipeline.lifts)
                 parts, self._former = following, parts
@@ -147,28 +149,28 @@ class Runner:
             time.sleep(AWAKE_LOOK_S)
         return self._stop.received is None
 
-    def _open_sockets(self, wanted: scene.Scene) -> Sockets:
-        """Open the sockets of a scene; keep the open ones if it wants the same."""
-        if self._sockets is not None and self._sockets.plan == plan(wanted):
+    def _open_sockets(self, served: scene.Scene) -> Sockets:
+        """Open the sockets of a scene; keep the open ones if they are the same."""
+        if self._sockets is not None and self._sockets.plan == plan(served):
             return self._sockets
         if self._sockets is not None:
             self._sockets.close()
             self._sockets = None
-        self._sockets = Sockets(wanted)
+        self._sockets = Sockets(served)
         return self._sockets
 
     def _work(self, parts: Parts) -> tuple[Ended, Parts | None]:
-        """Run one scene until something ends it; return why, and after a reload the next scene."""
-        wanted = parts.scene
+        """Run one scene until its end; return the reason, and after a reload the next scene."""
+        running = parts.scene
         with ExitStack() as stack:
             around = Assembly(parts, stack)
-            sockets = self._open_sockets(wanted)
+            sockets = self._open_sockets(running)
             around.add_sockets(sockets)
             around.open_drivers()
             around.keep_session()
-            realtime = enter_realtime(wanted, stack)
+            realtime = enter_realtime(running, stack)
             around.record()
-            controller = _controller(wanted)
+            controller = _controller(running)
             companions = [
                 *(self._reload, self._manager, *around.companions),
                 *(self._printer, realtime, controller),
@@ -179,17 +181,17 @@ class Runner:
                 around.build_outbox(),
                 self._reload,
                 [companion for companion in companions if companion is not None],
-                LoopTiming(wanted.max_age_ns),
+                LoopTiming(running.max_age_ns),
                 around.keep,
             )
             stack.callback(loop.close)
             self._running, self._former = True, None
             self._trust = parts.pipeline.trust
-            log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-            if wanted.ask_endpoint is not None:
-                log.info("questions on %s", wanted.ask_endpoint)
+            log.info("verdict.%s on %s", running.hand.name, running.endpoint)
+            if running.ask_endpoint is not None:
+                log.info("questions on %s", running.ask_endpoint)
             if self._manager is not None:
-                self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
+                self._manager.ready(f"ready: {running.tactile.driver}, {parts.model.contract.name}")
             following: Parts | None = None
             ended = loop.run()
             while ended is Ended.RELOAD and (following := self._taken()) is None:
@@ -201,10 +203,10 @@ class Runner:
             self._manager.reloading()
 
     def _taken(self) -> Parts | None:
-        """Return the scene that was prepared; None, and an error in the log, if it is wrong."""
+        """Return the prepared scene; None, with an error in the log, if it is wrong."""
         prepared = self._reload.take()
         if isinstance(prepared, Parts):
-            log.info("%s: taken anew", self._path)
+            log.info("%s: reloaded", self._path)
             return prepared
         self._refuse(prepared)
         if self._manager is not None:
@@ -215,9 +217,9 @@ class Runner:
         said = str(error) if _is_told(error) else f"{type(error).__name__}: {error}"
         for line in said.splitlines():
             log.error("%s", line)
-        log.error("%s: not taken anew, the former scene goes on", self._path)
+        log.error("%s: not reloaded, the former scene goes on", self._path)
 
 
 def _is_told(error: Exception) -> bool:
-    """Return True if the error is not a bug of graspd: its text says what to mend."""
+    """Return True if the text of the error says what to mend; False for a bug of graspd."""
     return isinstance(error, scene.SceneError | ModelError | PublishError | DriverError)

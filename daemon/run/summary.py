@@ -15,9 +15,9 @@ from daemon.publish.outbox import LatencyHistogram
 from daemon.trust.trust import Trust
 
 WINDOW: Final = 50
-"""Length of the worst run of lifts of `stable` verdicts."""
+"""Number of `stable` lifts in a row among which the most slips are counted."""
 WAITING_MAX: Final = 1024
-"""Most grasps whose outcome can still come."""
+"""Most grasps that wait for their outcome."""
 WITHOUT_SESSION, WITHOUT_LEARNING = "without session calibration", "without learning"
 WORTH: Final = {
     "coverage": "coverage",
@@ -26,23 +26,23 @@ WORTH: Final = {
     "slips_called_stable": "slips called stable",
     "stable_called_slip": "stable called slip",
 }
-"""Texts for the figures of `Tally.worth`, in their order."""
+"""Texts of the figures of `Tally.worth`, in order."""
 
 
 class Tally:
-    """Counts verdicts and their reasons, and compares them with how the lifts ended."""
+    """Count verdicts and reasons, and compare them with the outcomes of lifts."""
 
     def __init__(self) -> None:
         self.decisions: Counter[Decision] = Counter()
         self.reasons: Counter[Reason] = Counter()
         self.confusion: Counter[tuple[bool, bool]] = Counter()
-        """(recorded slip, judged slip) of the judged grasps whose outcome was recorded."""
+        """Number of judged grasps by (recorded slip, judged slip)."""
         self.held = self.slipped = 0
-        """Lifts whose outcome is known, judged or not."""
+        """Lifts with a known outcome that held, and that slipped."""
         self._latest: deque[bool] = deque(maxlen=WINDOW)
-        """True for each of the latest lifts of `stable` verdicts that slipped."""
+        """Outcomes of the latest `stable` lifts, True: slip."""
         self.worst: int | None = None
-        """Most slips in `WINDOW` lifts of `stable` verdicts in a row; None before that many."""
+        """Most slips in `WINDOW` `stable` lifts in a row; None before `WINDOW` lifts."""
 
     @property
     def labelled(self) -> int:
@@ -50,12 +50,12 @@ class Tally:
 
     @property
     def stable(self) -> tuple[int, int]:
-        """Lifts of `stable` verdicts with a known outcome, and the slips among them."""
+        """`stable` lifts with a known outcome, and the slips among them."""
         slips = self.confusion[True, False]
         return slips + self.confusion[False, False], slips
 
     def add(self, decision: Decision, reasons: Iterable[Reason], slipped: bool | None) -> None:
-        """Count one verdict; `slipped` is None if the outcome is not known yet."""
+        """Count one verdict. `slipped`: its outcome; None: not known yet."""
         self.decisions[decision] += 1
         self.reasons.update(reasons)
         if slipped is not None:
@@ -73,7 +73,7 @@ class Tally:
                 self.worst = max(sum(self._latest), self.worst or 0)
 
     def scores(self) -> dict[str, float] | None:
-        """Return the defined scores of judged and labelled grasps; slip is positive."""
+        """Return the scores of judged grasps with outcomes; slip is positive. None: no grasp."""
         hit, miss = self.confusion[True, True], self.confusion[True, False]
         false_alarm, rest = self.confusion[False, True], self.confusion[False, False]
         total = hit + miss + false_alarm + rest
@@ -89,7 +89,7 @@ class Tally:
         )
 
     def worth(self) -> dict[str, float] | None:
-        """Return how good `stable` is, by lifts of known outcome; None without any."""
+        """Return how good `stable` is, by lifts with a known outcome; None: no lift."""
         if not self.labelled:
             return None
         (stable, slips), held = self.stable, self.confusion[False, False]
@@ -133,32 +133,34 @@ class Tally:
 
 
 def _fractions(parts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
-    """Return each part over its whole, without those whose whole is 0."""
+    """Return each part divided by its whole; a whole of 0 is left out."""
     return {name: part / whole for name, (part, whole) in parts.items() if whole}
 
 
 class RunSummary:
-    """Collects verdicts in constant memory.
-    Behind a gate a grasp counts once, by its first judgement; else each reading does."""
+    """Collect verdicts in constant memory.
+
+    With a gate each grasp counts once, by its first judgement, else each reading counts.
+    """
 
     def __init__(self) -> None:
         self.tally = Tally()
         self.compared = {WITHOUT_SESSION: Tally(), WITHOUT_LEARNING: Tally()}
-        """The same grasps judged in another way; empty unless tried."""
+        """Tallies of the same grasps judged in another way; empty if not tried."""
         self.trained_on: Sequence[str] = ()
         self._waiting: dict[int, list[tuple[Tally, Decision]]] = {}
         self.repaired = 0
-        """Verdicts made with at least one repaired electrode."""
+        """Number of verdicts with at least one repaired electrode."""
         self.latency = LatencyHistogram()
         self.readings = 0
-        """Verdicts behind a gate; 0 where each reading is a grasp."""
+        """Number of verdicts with a gate; 0 without one."""
         self.grasps = 0
         self.again = 0
-        """Further judgements of a grasp."""
+        """Number of further judgements of the same grasp."""
         self._judged_grasp: int | None = None
 
     def add(self, verdict: Verdict, slipped: bool | None) -> None:
-        """Count one verdict; `slipped` is the recorded outcome, None without one."""
+        """Count one verdict. `slipped`: its recorded outcome; None: not recorded."""
         self.latency.add(verdict.latency_us)
         if verdict.gate is not None:
             self.readings += 1
@@ -177,7 +179,7 @@ class RunSummary:
         self._add(tally, grasp, judgement.decision, judgement.reasons, slipped)
 
     def outcome(self, grasp: int, *, slipped: bool) -> None:
-        """Count the outcome of a grasp after its verdict; only the first one counts."""
+        """Count the outcome of a grasp after its verdict; only the first counts."""
         for tally, decision in self._waiting.pop(grasp, ()):
             tally.outcome(decision, slipped=slipped)
 
@@ -196,7 +198,7 @@ class RunSummary:
                 del self._waiting[next(iter(self._waiting))]
 
     def as_dict(self, wall_s: float, trust: Trust | None) -> dict[str, Any]:
-        """Return everything as JSON-ready values; `wall_s` is the time of the replay, s."""
+        """Return everything as values for JSON. `wall_s`: time of the replay, s."""
         compared = {how: tally.as_dict() for how, tally in self._compared(trust)}
         return {
             **self.tally.as_dict(),
@@ -212,7 +214,7 @@ class RunSummary:
         }
 
     def _compared(self, trust: Trust | None) -> Iterator[tuple[str, Tally]]:
-        """Yield the ways that were tried; "without learning" only if outcomes were told."""
+        """Yield the other ways that were tried; "without learning" needs outcomes."""
         for how, tally in self.compared.items():
             learned = trust is not None and bool(trust.lifts.told)
             if tally.decisions and (learned or how != WITHOUT_LEARNING):
@@ -257,7 +259,7 @@ def trained_on_line(which: str, names: Sequence[str]) -> str:
 
 
 def _learned(trust: Trust | None) -> Iterator[str]:
-    """Yield what outcomes taught and what became of the risk, for people."""
+    """Yield lines for people: what was learned from outcomes, and the risk."""
     if trust is None or not trust.lifts.told:
         return
     yield f"learned from {trust.learner.outcomes} outcomes"

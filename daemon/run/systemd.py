@@ -1,4 +1,4 @@
-"""Tells systemd that the daemon is ready, alive, reloading or stopping (sd_notify(3))."""
+"""Tell systemd that the daemon is ready, alive, reloading or stopping (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from daemon.publish.messages import Status
 log = logging.getLogger("graspd")
 
 FEEDINGS_PER_TIMEOUT = 4
-"""Feedings within the watchdog's timeout; systemd asks for two."""
+"""Number of feedings within the watchdog's timeout; systemd recommends two."""
 RELOAD_PATIENCE_US = 60_000_000
-"""Watchdog's timeout while a scene is read and its model loaded, us."""
+"""Timeout of the watchdog while a scene is read and its model loaded, us."""
 NS_PER_US = 1000
 
 
 class Systemd(Companion):
-    """Sends messages to the service manager; warns once if it does not listen."""
+    """Sender of messages to the service manager; warns once if it does not listen."""
 
     def __init__(
         self,
@@ -29,7 +29,7 @@ class Systemd(Companion):
         watchdog_us: int | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`address` is a path, or `@` and an abstract name; `watchdog_us` a timeout."""
+        """`address`: a path, or `@` and an abstract name. `watchdog_us`: timeout; None: none."""
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self._watchdog_us = watchdog_us
         self._clock = clock
@@ -41,7 +41,7 @@ class Systemd(Companion):
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Systemd | None:
-        """Return the manager that the environment names, by sd_notify(3), or None."""
+        """Return the manager named by `environment` (sd_notify(3)); None: no manager."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@"):
             return None
@@ -50,14 +50,14 @@ class Systemd(Companion):
         return cls(address, int(timeout) if mine else None)
 
     def ready(self, what: str) -> None:
-        """Say that the daemon runs; `what` is for people."""
+        """Tell systemd that the daemon runs. `what`: text for people."""
         lines = ["READY=1", f"STATUS={what}"]
         if self._watchdog_us is not None:
             lines += [f"WATCHDOG_USEC={self._watchdog_us}", "WATCHDOG=1"]
         self._send(*lines)
 
     def reloading(self) -> None:
-        """Say that the scene is read again. Until `ready` the watchdog waits longer."""
+        """Tell systemd that the scene is read again. Until `ready` the watchdog waits longer."""
         lines = ["RELOADING=1", f"MONOTONIC_USEC={self._clock() // NS_PER_US}"]
         if self._watchdog_us is not None:
             lines += [f"WATCHDOG_USEC={RELOAD_PATIENCE_US}", "WATCHDOG=1"]
@@ -71,11 +71,11 @@ class Systemd(Companion):
         self._send(f"STATUS={in_a_line(status)}")
 
     def due_ns(self) -> int | None:
-        """Time of the next feeding of the watchdog, monotonic ns; None without a watchdog."""
+        """Return the time of the next feeding, monotonic ns; None without a watchdog."""
         return None if self._watchdog_us is None else self._due_ns
 
     def after_round(self) -> None:
-        """Feed the watchdog if that is due."""
+        """Feed the watchdog if it is due."""
         if self._watchdog_us is not None and self._clock() >= self._due_ns:
             self._due_ns = self._clock() + self._period_ns
             self._send("WATCHDOG=1")

@@ -1,4 +1,4 @@
-"""The scene: one TOML file that names what the hand has, read and checked."""
+"""The scene: one TOML file that describes a hand and how to judge, read and checked."""
 
 from daemon.scene.scene import Scene, SceneError, load, parse
 

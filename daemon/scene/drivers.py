@@ -1,6 +1,6 @@
 """Sections of a scene that name a driver: `[tactile]` and `[joints]`."""
 
-# Without postponed annotations: pydantic would evaluate each of them at every start.
+# Without postponed annotations, which pydantic would evaluate at every start.
 
 import ipaddress
 from pathlib import Path
@@ -22,7 +22,7 @@ StrOrPath = TypeVar("StrOrPath", str, Path)
 
 
 def unit(symbol: str = "-") -> Any:  # noqa: ANN401 - as pydantic's `Field`
-    """Name the unit of a number in the schema; `-` where it has none."""
+    """Return the field that names a number's unit in the schema; `-`: no unit."""
     return Field(json_schema_extra={"unit": symbol})
 
 
@@ -48,11 +48,11 @@ Address = Annotated[str, AfterValidator(_ip_address)]
 FilePath = Annotated[
     Path, Field(strict=False), AfterValidator(_without_nul), AfterValidator(_beside_the_scene)
 ]
-"""A path, relative to the folder of the scene file. TOML has no paths: a string is taken."""
+"""A path, written as a string, relative to the folder of the scene file."""
 
 
 class Section(BaseModel):
-    """Base of all sections: no unknown keys, no silent conversion, nothing changes later."""
+    """Base of all sections: frozen, without unknown keys or silent conversion."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -65,24 +65,24 @@ class Section(BaseModel):
 
 
 class ReplayFaultsSection(Section):
-    """`[tactile.faults]`: break the replayed sensor on purpose, to test what listens to graspd."""
+    """`[tactile.faults]`: faults of the replayed sensor, to test a controller."""
 
     off_from: Annotated[int, Field(ge=0), unit("readings")] | None = None
-    """From this reading on nothing comes; unless given, all come."""
+    """Number of the first reading that is lost, with all after it; without it none."""
     stuck_from: Annotated[int, Field(ge=1), unit("readings")] | None = None
-    """From this reading on the counts are those of the reading before it; unless given, never."""
+    """Number of the reading from which all repeat the one before; without it none."""
     garbage_probability: Probability = 0.0
-    """Chance per reading that the counts are random 16-bit values."""
+    """Chance of a reading to have random 16-bit values as counts."""
     wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX), unit("counts")] = 0
-    """Constant offset added to the counts."""
+    """Offset added to the counts."""
     slow_every: Annotated[int, Field(ge=1), unit("readings")] = 1
-    """Only every n-th reading arrives."""
+    """Number n: only every n-th reading arrives."""
     delayed_s: Annotated[float, Field(ge=0.0, le=3600.0), unit("s")] = 0.0
-    """Readings arrive this much late."""
+    """Delay of all readings."""
     intermittent_probability: Probability = 0.0
-    """Chance that a reading is lost."""
+    """Chance of a reading to be lost."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
-    """Fingers that stuck, garbage and wrong apply to; all unless given."""
+    """Fingers with the faults stuck, garbage and wrong; without it all."""
     electrodes: (
         Annotated[
             tuple[Annotated[int, Field(ge=1, le=ELECTRODES), unit()], ...],
@@ -90,54 +90,54 @@ class ReplayFaultsSection(Section):
         ]
         | None
     ) = None
-    """Electrodes 1..24 that stuck, garbage and wrong apply to; all unless given."""
+    """Electrodes 1..24 with the faults stuck, garbage and wrong; without it all."""
     seed: Annotated[int, Field(ge=0), unit()] = 0
-    """Of the chance: the same seed breaks the same readings."""
+    """Seed of the chance; the same seed gives the same faults."""
 
 
 class ReplayTactile(Section):
     """`[tactile]` with `driver = "replay"`: recorded CSV files instead of sensors."""
 
     driver: Literal["replay"]
-    """Makes this section one of this driver."""
+    """Selects this driver."""
     recordings: Annotated[tuple[FilePath, ...], Field(min_length=1, strict=False)]
-    """Grasp tables or streams (deploy/RECORDING.md), played one after the other."""
+    """Grasp tables or streams (deploy/RECORDING.md), played in this order."""
     pace: Literal["realtime", "fast"] = "realtime"
-    """`fast`: as fast as they can be judged."""
+    """`realtime`: as recorded; `fast`: as fast as they can be judged."""
     speed: Annotated[float, Field(ge=1e-3, le=1e3), unit()] = 1.0
-    """Factor on real time: 2 plays twice as fast. Not with pace `fast`."""
+    """Factor of real time: 2 plays twice as fast. Not with pace `fast`."""
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e5), unit("1/s")] = 100.0
-    """Readings per second of a grasp table, which has no times of its own."""
+    """Readings per second of a grasp table, which has no times."""
     loop: bool = False
-    """Begin again at the end, for ever."""
+    """True: start again at the end, without end."""
     outcomes: bool = False
-    """Tell the recorded outcome of each lift that the verdict allows, as a controller would."""
+    """True: tell the recorded outcome of each lift that a verdict allows, as a controller does."""
     strict: bool = False
-    """Stop at the first value that is not a 12-bit count."""
+    """True: stop at the first value that is not a 12-bit count."""
     faults: ReplayFaultsSection = ReplayFaultsSection()
-    """`[tactile.faults]`."""
+    """Faults to inject: section `[tactile.faults]`."""
 
 
 class SpiTactile(Section):
     """`[tactile]` with `driver = "spi"`: a bridge on a serial line (deploy/bridge/PROTOCOL.md)."""
 
     driver: Literal["spi"]
-    """Makes this section one of this driver."""
+    """Selects this driver."""
     port: Name
-    """Serial port, best by its name in `/dev/serial/by-id/`, or a pyserial URL."""
+    """Serial port, best by its path in `/dev/serial/by-id/`, or a pyserial URL."""
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
     ) = None
-    """Fingers in the order of the chip selects; `hand.fingers` unless given."""
+    """Fingers in the order of the chip selects; without it `hand.fingers`."""
     baud: Annotated[int, Field(ge=115_200, le=12_000_000), unit("bit/s")] = 921_600
-    """Line rate; USB CDC ignores it."""
+    """Line rate; ports of USB CDC ignore it."""
 
 
 class CanTactile(Section):
     """`[tactile]` with `driver = "can"`: sensors behind a CAN board (deploy/can/PROTOCOL.md)."""
 
     driver: Literal["can"]
-    """Makes this section one of this driver."""
+    """Selects this driver."""
     interface: Name = "socketcan"
     """Name of a python-can interface."""
     channel: Name = "can0"
@@ -145,18 +145,18 @@ class CanTactile(Section):
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
     ) = None
-    """Fingers in the order of the board's words (`syntouch`); `hand.fingers` unless given."""
+    """Fingers in the order of the board's words (`syntouch`); without it `hand.fingers`."""
     format: Literal["syntouch", "sweep_fd"] = "syntouch"
-    """SynTouch's frame per sample, or graspd's CAN FD frame per sweep and finger."""
+    """Format: SynTouch's frame per sample, or graspd's CAN FD frame per sweep and finger."""
     arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), unit()] | None = None
-    """Of the samples, or of finger `ff` of the sweep frames. With `syntouch`, where it is not
-    documented, every frame of the right form is taken unless given."""
+    """Id of the samples, or of finger `ff` of the sweep frames. Without it, `syntouch` takes the id
+    of the first sound sample; no public document has that id."""
     sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
     """Order in which the board samples (`syntouch` only)."""
     data_length: Annotated[int, Field(ge=3, le=8), unit("bytes")] | None = None
-    """Length of a sample frame, where the board pads it."""
+    """Length of a sample frame if the board pads it."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
-    """Rate of the bus; not with socketcan, where it belongs to `ip link`."""
+    """Rate of the bus; not with socketcan, where `ip link` sets it."""
     data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000), unit("bit/s")] | None = None
     """Rate of the data phase of CAN FD; not with socketcan."""
 
@@ -165,13 +165,13 @@ class PalmTactile(Section):
     """`[tactile]` with `driver = "palm"`: status packets of the hand's palm."""
 
     driver: Literal["palm"]
-    """Makes this section one of this driver."""
+    """Selects this driver."""
     source: Name
     """`udp://ADDRESS:PORT` to listen on, or a file of packets, relative to the scene file."""
     only_from: Address | None = None
-    """IP address of the relay, if packets of no other may be heard."""
+    """IP address of the relay; without it packets from any address are taken."""
     heed_finger_bits: bool = True
-    """False for a palm that does not set the bits which say that a finger's data is valid."""
+    """False for a palm that never sets the bits of valid fingers."""
 
     @field_validator("source")
     @classmethod
@@ -182,28 +182,28 @@ class PalmTactile(Section):
 Tactile = Annotated[
     ReplayTactile | SpiTactile | CanTactile | PalmTactile, Field(discriminator="driver")
 ]
-"""Section of each tactile driver, told apart by its key `driver`."""
+"""Section of a tactile driver; its key `driver` tells which."""
 
 
 class PalmJoints(Section):
     """`[joints]` with `driver = "palm"`: Hall sensors in the palm's packets."""
 
     driver: Literal["palm"]
-    """Makes this section one of this driver."""
+    """Selects this driver."""
     calibration: FilePath
-    """The hand's calibration (TOML, as deploy/calibration/example_hand.toml)."""
+    """Calibration file of the hand (TOML, as deploy/calibration/example_hand.toml)."""
 
 
 class StreamJoints(Section):
     """`[joints]` with `driver = "stream"`: joint angles from elsewhere (deploy/wire/JOINTS.md)."""
 
     driver: Literal["stream"]
-    """Makes this section one of this driver."""
+    """Selects this driver."""
     source: Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
     """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
-    """IP address of the sender, if messages of no other may be heard."""
+    """IP address of the sender; without it messages from any address are taken."""
 
 
 Joints = Annotated[PalmJoints | StreamJoints, Field(discriminator="driver")]
-"""Section of each source of joint angles, told apart by its key `driver`."""
+"""Section of a source of joint angles; its key `driver` tells which."""

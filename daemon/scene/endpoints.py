@@ -1,4 +1,4 @@
-"""Where ZeroMQ can be bound, and who could connect there."""
+"""Check endpoints of ZeroMQ, and which computers can connect to them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ IPC_PATH_MAX_BYTES = 107
 
 
 def check_endpoint(endpoint: str) -> str:
-    """Return an endpoint that ZeroMQ can bind to. Raises `ValueError`."""
+    """Return `endpoint` if ZeroMQ can bind to it. Raises `ValueError`."""
     scheme, separator, address = endpoint.partition("://")
     if not separator or scheme not in {"ipc", "tcp"}:
         raise ValueError("must start with ipc:// or tcp://")
@@ -22,7 +22,9 @@ def check_endpoint(endpoint: str) -> str:
             raise ValueError("needs a port of 1 to 65535, as in tcp://127.0.0.1:5555")
         _ip_address(host)
     elif address.startswith("@"):
-        raise ValueError("needs a path: abstract sockets have no file mode, all may connect")
+        raise ValueError(
+            "needs a path: an abstract socket has no file mode, so any user could connect"
+        )
     elif not address or len(address.encode()) > IPC_PATH_MAX_BYTES:
         raise ValueError(f"needs a path of 1 to {IPC_PATH_MAX_BYTES} bytes after ipc://")
     elif address.startswith("*"):
@@ -31,7 +33,7 @@ def check_endpoint(endpoint: str) -> str:
 
 
 def is_private(endpoint: str) -> bool:
-    """Return True if only this computer can connect to an endpoint of `check_endpoint`."""
+    """Return True if only this computer can connect to a checked endpoint."""
     scheme, _, address = endpoint.partition("://")
     return scheme == "ipc" or _ip_address(address.rpartition(":")[0]).is_loopback
 

@@ -1,4 +1,4 @@
-"""What is wrong with a scene, in the words of the file: one line per mistake, naming the key."""
+"""Mistakes of a scene in the words of the file: one line for each, with its key."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from daemon.process.text import did_you_mean, printable
 Section = type[BaseModel]
 
 LINES_MAX = 20
-"""Most mistakes that are told: with more, the wrong file was named."""
+"""Most mistakes that are listed; with more it is probably another kind of file."""
 SHOWN_MAX = 80
-"""Characters of a key or value that are shown."""
+"""Most characters of a key or value in a line."""
 MESSAGE_MAX = 320
-"""Characters of an explanation that may have such a value in it."""
+"""Most characters of an explanation, which may contain such a value."""
 
 
 def lines_of(error: ValidationError, scene: Section, path: Path) -> list[str]:
-    """Lines for what pydantic found wrong in a scene of this class, the first twenty in full."""
+    """Return a line for each mistake that pydantic found, at most `LINES_MAX`."""
     mistakes = error.errors(include_url=False)
     inner = {mistake["loc"][:depth] for mistake in mistakes for depth in range(len(mistake["loc"]))}
-    # A wrong item also makes its list wrong; only the item is worth a line.
+    # A wrong item also makes its list wrong; only the item gets a line.
     single = [mistake for mistake in mistakes if mistake["loc"] not in inner]
     lines = [_line(path, scene, mistake) for mistake in single[:LINES_MAX]]
     if len(single) > LINES_MAX:
@@ -44,10 +44,10 @@ def _line(path: Path, scene: Section, mistake: ErrorDetails) -> str:
         return f"{path}: {key}.driver: is missing"
     if mistake["type"] == "union_tag_invalid":
         context = mistake["ctx"]
-        known, tag = context["expected_tags"].replace("'", ""), context["tag"]
+        drivers, tag = context["expected_tags"].replace("'", ""), context["tag"]
         return (
             f"{path}: {key}.driver: no driver '{printable(tag, SHOWN_MAX)}'"
-            f"{did_you_mean(tag, known.split(', ')) or f'; there are: {known}'}"
+            f"{did_you_mean(tag, drivers.split(', ')) or f'; there are: {drivers}'}"
         )
     message = mistake["msg"].removeprefix("Value error, ").replace("tuple", "list")
     message = printable(message, MESSAGE_MAX)
@@ -57,7 +57,7 @@ def _line(path: Path, scene: Section, mistake: ErrorDetails) -> str:
 
 
 def _shown(value: object) -> str:
-    """As Python would write it, cut: `repr` of a long number fails, of a deep list too."""
+    """Return a value as Python writes it, cut. `repr` fails for long numbers and deep lists."""
     try:
         return printable(repr(value), SHOWN_MAX)
     except (ValueError, RecursionError):
@@ -65,8 +65,10 @@ def _shown(value: object) -> str:
 
 
 def _place(scene: Section, location: tuple[int | str, ...]) -> tuple[list[str], Section | None]:
-    """Return the keys that lead to a location, and the section that holds the last of them.
-    The driver's name, which pydantic puts between the keys, is left out."""
+    """Return the keys that lead to a location, and the section with the last of them.
+
+    The driver's name, which pydantic puts between the keys, is left out.
+    """
     keys: list[str] = []
     section: Section | None = scene
     inside: Section | None = scene
@@ -98,7 +100,7 @@ def _tags(section: Section) -> tuple[str, ...]:
 
 
 def _suggestion(wrong: str, section: Section | None) -> str:
-    known = list(section.model_fields) if section else []
-    stem = wrong.rsplit("_", 1)[0]  # `max_age_s` for `max_age_ms`: the unit is the mistake
-    of_unit = (f"; did you mean {name}?" for name in known if name.rsplit("_", 1)[0] == stem)
-    return did_you_mean(wrong, known) or next(of_unit, f"; there are: {', '.join(known)}")
+    keys = list(section.model_fields) if section else []
+    stem = wrong.rsplit("_", 1)[0]  # for example `max_age_s` instead of `max_age_ms`
+    of_unit = (f"; did you mean {name}?" for name in keys if name.rsplit("_", 1)[0] == stem)
+    return did_you_mean(wrong, keys) or next(of_unit, f"; there are: {', '.join(keys)}")

@@ -1,4 +1,4 @@
-"""The scene explained from its own classes: JSON Schema, deploy/SCENE.md, example scenes."""
+"""Explain the scene from its own classes: JSON Schema, deploy/SCENE.md, examples."""
 
 from __future__ import annotations
 
@@ -13,34 +13,35 @@ from daemon.process.text import markdown_table
 from daemon.scene import Scene
 
 EXAMPLES = Path(__file__).parent / "examples"
-"""In the repository a link to deploy/scenes, in an installed package a copy of it."""
+"""Folder of examples: in the repository a link to deploy/scenes, installed a copy."""
 SCHEMA = "scene.schema.json"
-"""File beside the examples, which their first line names for editors."""
+"""File beside the examples; their first line names it for editors."""
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 COLUMNS = ("key", "type", "unit", "default", "range", "meaning")
 INTRODUCTION = """# The scene, key by key
 
-Made from the classes that read a scene, by `graspd scene --page`. A scene is one TOML file; only
-`[tactile]` must be there. `graspd scene --example spi > right.toml` prints one to edit, and
-`graspd check right.toml` says whether it is right, also where keys must agree with each other. An
-unknown key, or a value out of its range, is an error.
+For anybody who writes a scene. `graspd scene --page` makes this page from the classes that read it.
 
-A default `-` means that the key may be left out, and the meaning says what is then; `needed`, that
-it may not. A path is relative to the folder of the scene file.
+A scene is one TOML file; only `[tactile]` must be there. `graspd scene --example spi > right.toml`
+prints one to edit. `graspd check right.toml` finds mistakes, also keys that contradict each other.
+An unknown key, or a value out of its range, is an error.
 
-Editors that know Taplo (VS Code: Even Better TOML) complete and explain keys by the JSON Schema
+The default `-` means that the key may be left out; the meaning says what happens without it. The
+default `needed` means that it must be there. Paths are relative to the folder of the scene file.
+
+Editors with Taplo (VS Code: Even Better TOML) complete and explain keys. They use the JSON Schema
 that the first line of an example names. `graspd scene --schema > scene.schema.json` writes it for
 `#:schema ./scene.schema.json`.
 """
 
 
 def examples() -> list[str]:
-    """Names of the example scenes, sorted."""
+    """Return the names of the example scenes, sorted."""
     return sorted(path.stem for path in EXAMPLES.glob("*.toml"))
 
 
 def example(name: str) -> str:
-    """The text of an example scene, whose files are found from any folder."""
+    """Return an example scene with absolute paths, so that it works from any folder."""
     text = (EXAMPLES / f"{name}.toml").read_text()
     recordings = Path(drivers.recordings.__file__).resolve().parent
     text = text.replace("../../drivers/recordings", str(recordings))
@@ -48,7 +49,7 @@ def example(name: str) -> str:
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema of a scene: each number with its `unit`, and no null, which TOML has not."""
+    """Return the JSON Schema of a scene, with units of numbers and without null."""
     whole = Scene.model_json_schema()
     sections = whole.pop("$defs")
     for section in (whole, *sections.values()):
@@ -58,12 +59,12 @@ def schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """The schema as the file beside the examples holds it."""
+    """Return the text of the schema's file."""
     return json.dumps(schema(), indent=2) + "\n"
 
 
 def page() -> str:
-    """The text of deploy/SCENE.md: a table of the keys of each section."""
+    """Return the text of deploy/SCENE.md: a table of keys for each section."""
     tables = [INTRODUCTION]
     for section in _sections(schema()):
         title, _, about = _linked(section["description"]).partition(": ")
@@ -74,7 +75,7 @@ def page() -> str:
 
 
 def _describe(about: dict[str, Any]) -> None:
-    """Put the unit of a key into its meaning; a section has its meaning from its class."""
+    """Add the unit of a key to its meaning. A section takes the meaning of its class."""
     meaning = " ".join(about.pop("description", "").split())
     if "$ref" in about:
         about.pop("default", None)
@@ -84,13 +85,13 @@ def _describe(about: dict[str, Any]) -> None:
 
 
 def _unit(about: Mapping[str, Any]) -> str:
-    """That of a number, or of the numbers in a list; empty for what is none."""
+    """Return the unit of a number or of a list of numbers; "" for other types."""
     inner = (*about.get("anyOf", ()), about.get("items", {}))
     return about.get("unit") or next(filter(None, map(_unit, filter(None, inner))), "")
 
 
 def _plain(node: Any, sections: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    """Each section in its place, without null and without what only repeats the key."""
+    """Return a schema with each section in its place, without null and titles."""
     if isinstance(node, list):
         return [_plain(item, sections) for item in node]
     if not isinstance(node, dict):
@@ -112,7 +113,7 @@ def _plain(node: Any, sections: Mapping[str, Any]) -> Any:  # noqa: ANN401
 
 
 def _sections(of: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """All sections below one, in the order of the file."""
+    """Yield the sections below one, in the order of the file."""
     for about in of["properties"].values():
         for section in about.get("oneOf", (about,)):
             if "properties" in section:
@@ -166,10 +167,10 @@ def _range(about: Mapping[str, Any]) -> str:
 
 
 def _number(value: float) -> str:
-    """As TOML takes it too: 12_000_000."""
+    """Return a number as in TOML, such as 12_000_000."""
     return f"{int(value):_}" if value == int(value) else str(value)
 
 
 def _linked(text: str) -> str:
-    """With links, from the folder deploy, to the files there."""
+    """Return text in which names of files in deploy are links, from that folder."""
     return re.sub(r"deploy/([\w./-]+\w)", r"[\1](\1)", " ".join(text.split()))

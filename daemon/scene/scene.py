@@ -1,4 +1,4 @@
-"""The scene: one TOML file that says what this hand has and how to judge with it."""
+"""The scene: one TOML file that describes a hand, and how to judge its grasps."""
 
 # Without postponed annotations, as in `daemon.scene.drivers`.
 
@@ -35,23 +35,23 @@ from drivers import toml
 from models.contract import Finger
 
 SCENE_MAX_BYTES = 128 << 10
-"""Largest scene file: one that names a thousand recordings has 100 kB."""
+"""Largest scene file, bytes; one that names a thousand recordings has 100 kB."""
 
 STATE_DIRECTORY = Path("/var/lib/graspd")
-"""Where a service keeps its state (file-hierarchy(7))."""
+"""Folder for the state of a service (file-hierarchy(7))."""
 
 
 class SceneError(Exception):
-    """The scene file is missing or wrong; the message is one line per mistake, naming the key."""
+    """The scene is missing or wrong; the text has one line per mistake, with its key."""
 
 
 class Hand(Section):
-    """`[hand]`: which hand, and which of its fingers carry a BioTac SP."""
+    """`[hand]`: name of the hand, and its fingers with a BioTac SP."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]{1,32}$")] = "right"
-    """Part of the topics and of the default socket's name."""
+    """Name in the topics and in the default socket."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] = ("ff", "mf", "th")
-    """First, middle, ring, little finger, thumb: those with a sensor, in the order of the model."""
+    """Fingers with a sensor (first, middle, ring, little, thumb), in the order of the model."""
 
     @field_validator("fingers")
     @classmethod
@@ -62,18 +62,18 @@ class Hand(Section):
 
 
 class Model(Section):
-    """`[model]`: which network judges."""
+    """`[model]`: the network that judges, and its thresholds."""
 
     name: Name | None = None
-    """A model that ships with graspd or was added by `graspd models add`; `small-session` unless
-    name or path is given. A hand of fewer fingers gets its form for these, if there is one."""
+    """Model of the zoo, or added by `graspd models add`; without name and path `small-session`. A
+    hand with fewer fingers gets the model's form for these, if it exists."""
     path: FilePath | None = None
-    """A model file of your own, relative to the scene file."""
+    """Model file of your own, relative to the scene file."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0), unit()] = Limits.slip_threshold
-    """`p_slip` from here on is slip."""
+    """Smallest `p_slip` that is judged as slip."""
     min_confidence: Annotated[float, Field(ge=0.0, lt=1.0), unit()] = Limits.min_confidence
-    """Least confidence: `p_slip` of a slip, 1 - `p_slip` of `stable`; below it the verdict is
-    `unknown`. How many `stable` ones are right is for `[risk]`."""
+    """Smallest confidence (`p_slip` of a slip, 1 - `p_slip` of `stable`); below it the verdict is
+    `unknown`. To limit how many `stable` lifts slip, use `[risk]`."""
 
     @model_validator(mode="after")
     def _one_of_name_and_path(self) -> Self:
@@ -83,39 +83,39 @@ class Model(Section):
 
 
 class SessionSection(Section):
-    """`[session]`: where a session model keeps what it knows of today's sensors."""
+    """`[session]`: the calibration of a session model by the grasps since the last exchange."""
 
     keep: bool | None = None
-    """False: begin a new session at every start, and write nothing. Unless given, kept for live
-    sensors and not for recordings."""
+    """True: keep the session in a file; False: start a new one each time. Without it, only sessions
+    of live sensors are kept."""
     learn: bool = True
     """True: judged grasps calibrate the session."""
     required: bool = False
-    """True: verdicts are `unknown` until the session is calibrated."""
+    """True: the verdict is `unknown` until the session is calibrated."""
     file: FilePath | None = None
-    """`/var/lib/graspd/<hand>.session.json` unless given."""
+    """File of the session; without it `/var/lib/graspd/<hand>.session.json`."""
 
 
 class RiskSection(Section):
-    """`[risk]`: how many lifts of `stable` verdicts may slip, by the outcomes that were told.
+    """`[risk]`: limit of the share of slips among `stable` lifts, kept by the outcomes told.
 
-    Without it there is no such limit.
+    Without this section there is no such limit.
     """
 
     max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5), unit()] = 0.05
-    """Share of the `stable` lifts that may slip."""
+    """Largest share of the `stable` lifts that may slip."""
     warm_up: Annotated[int, Field(ge=0, le=1000), unit("outcomes")] = 50
-    """Number of outcomes in the session before which all grasps are lifted under supervision."""
+    """Number of outcomes in a session until which all grasps are lifted under supervision."""
     explore: Annotated[float, Field(ge=0.0, le=1.0), unit()] = 0.05
-    """Share of the grasps that are not `stable` to lift under supervision after that: only their
-    outcomes show that the rule is too strict."""
+    """Share of the grasps that are not `stable` to lift under supervision after that. Only their
+    outcomes can show that the rule is too strict."""
     outstanding_max: Annotated[int, Field(ge=1, le=100), unit("lifts")] = 5
-    """Number of lifts, announced by the question `lift`, whose outcome may be out at once. From
-    there on nothing is `stable`."""
+    """Most lifts, announced by the question `lift`, whose outcome is not told yet. At this number
+    no grasp is `stable`."""
 
 
 class Learn(Section):
-    """`[learn]`: what outcomes of lifts are used for."""
+    """`[learn]`: learning from the outcomes of lifts."""
 
     enabled: bool = True
     """True: outcomes change the verdicts of later grasps."""
@@ -126,139 +126,138 @@ Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0), unit("ms")]
 
 
 class GateSection(Section):
-    """`[gate]`: when a grasp is judged, and when it is refused."""
+    """`[gate]`: the conditions for judging a grasp."""
 
     mode: GateMode | None = None
-    """`settled`: judge a grasp when it has settled; `request`: when the controller asks, too;
-    `every`: each reading is a grasp of its own, in recordings only. Unless given, `every` for grasp
-    tables, else `settled`."""
+    """`settled`: judge a grasp when it has settled; `request`: when it has settled and the
+    controller asks; `every`: each reading is a grasp, in recordings only. Without it, `every` for
+    grasp tables, else `settled`."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
-    """An older reading gives `unknown`; silence for that long does, too."""
+    """Largest age of a reading. An older one, or silence for this time, gives `unknown`."""
     sweeps: Annotated[Literal[1, 3], unit("readings")] | None = None
-    """`1`: judge a single reading; `3`: each electrode's median of three. Unless given, 3; with
-    mode `every`, 1."""
+    """`1`: judge single readings; `3`: judge the median of three of each electrode. Without it 3,
+    or 1 in mode `every`."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
-    """Fingers that must touch; all of `hand.fingers` unless given."""
+    """Fingers that must touch; without it all of `hand.fingers`."""
     contact_counts: Annotated[float, Field(ge=5, le=1000), unit("counts")] = ContactLimits.counts
-    """A finger touches when three electrodes fall this far below their baseline, and
+    """A finger touches when three of its electrodes are this far below their baseline, and also
     `contact_sigmas`."""
     contact_sigmas: Annotated[float, Field(ge=3, le=100), unit("sigma")] = ContactLimits.sigmas
-    """The same in standard deviations of the finger's noise: both must be reached."""
+    """The same limit in standard deviations of the finger's noise; both must be reached."""
     false_alarms: Annotated[float, Field(ge=0.001, le=0.3), unit()] = GateLimits.false_alarms
-    """Share of the time in which a settled hand that holds may be taken for moving; until it has
-    settled the limit is stricter. A smaller share lets more slow slides pass for stillness
+    """Share of the time in which a settled hand that holds may count as moving. Before it settles,
+    the limit is stricter. With a smaller share, more slow slides count as still
     (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
-    """True: judge as soon as nothing moves fast, marked `early`, and again when nothing slides
-    slowly either."""
+    """True: judge once nothing moves fast, with the mark `early`, and again once nothing slides
+    slowly."""
     joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), unit("rad/s")] = JointLimits.rad_per_s
-    """A joint that turns faster is moving; only with `[joints]`."""
+    """Speed from which a joint counts as moving; only with `[joints]`."""
     joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0), unit("ms")] = (
         JointLimits.lost_ns / 1e6
     )
-    """Late joint angles block a verdict no longer than this; only with `[joints]`."""
+    """Longest time for which missing joint angles block a verdict; only with `[joints]`."""
     request_ms: Milliseconds = GateLimits.request_ns / 1e6
-    """A question without a judgement after this time is answered with `unknown`."""
+    """Time after which a question without a judgement is answered with `unknown`."""
     gap_ms: Milliseconds = GateLimits.gap_ns / 1e6
-    """After this long without a usable reading the grasp must settle again. More than two periods
-    of the readings."""
+    """Time without a usable reading after which a grasp must settle again. It must be more than two
+    periods of the readings."""
     change_counts: Annotated[float, Field(ge=10, le=1000), unit("counts")] = (
         GateLimits.change_counts
     )
-    """A finger whose electrodes are this far, in the mean, from where they were judged holds
-    another grasp."""
+    """Mean change of a finger's electrodes since they were judged that means another grasp."""
 
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
 FileMode = Annotated[str, Field(pattern=r"^0?[0-7]{3}$")]
-"""Mode of a socket's file, as in chmod: users who may write may connect."""
+"""Mode of a socket's file, as in chmod; users who may write may connect."""
 OTHERS = 0o007
-"""Bits of a file's mode for users who are neither its owner nor in its group."""
+"""Bits of a file's mode for users outside of its owner and group."""
 
 
 class Publish(Section):
-    """`[publish]`: where verdicts go."""
+    """`[publish]`: the socket of the verdicts."""
 
     endpoint: Endpoint | None = None
-    """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
-    addresses."""
+    """Endpoint of the socket; without it `ipc:///run/graspd/<hand>.ipc`. `tcp://` needs `[curve]`,
+    except on loopback addresses."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000), unit("messages")] = 1000
-    """Messages that wait for a slow subscriber; it loses further ones."""
+    """Most messages that wait for a slow subscriber; it loses further ones."""
     tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), unit("1/s")] = 25.0
-    """Readings published a second on `tactile.<hand>`; 0: none; at the sensor's rate or above, all.
-    Recordings always have every reading."""
+    """Rate of readings on `tactile.<hand>`; 0: none; the sensor's rate or more: all. Recordings
+    always have all readings."""
     file_mode: FileMode | None = None
-    """Mode of the file of an `ipc://` socket, as in chmod: users who may write may connect. As the
-    umask has it unless given."""
+    """Mode of the file of an `ipc://` socket, as in chmod; users who may write may connect. Without
+    it the umask decides."""
     group: Name | None = None
-    """Group of the file of an `ipc://` socket; the process's unless given."""
+    """Group of the file of an `ipc://` socket; without it that of the process."""
 
 
 class Curve(Section):
-    """`[curve]`: who may connect by `tcp://`; all peers need keys then (`graspd keys`)."""
+    """`[curve]`: keys for `tcp://`; with it all peers need keys (`graspd keys`)."""
 
     secret_key: FilePath
     """The daemon's own `.key_secret` file, of mode 0600."""
     clients: FilePath
-    """Folder with the `.key` files of peers that may connect, read again when it changes. If users
-    other than root and the daemon's may write there, no peer may connect."""
+    """Folder with the `.key` files of peers that may connect; it is read again when it changes. No
+    peer may connect while users other than root and the daemon's can write there."""
 
 
 class Ask(Section):
-    """`[ask]`: where the grasp controller asks for a verdict (deploy/wire/README.md)."""
+    """`[ask]`: the socket for questions of the grasp controller (deploy/wire/README.md)."""
 
     endpoint: Endpoint | None = None
-    """`ipc:///run/graspd/<hand>.ask.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
-    addresses."""
+    """Endpoint of the socket; without it `ipc:///run/graspd/<hand>.ask.ipc`. `tcp://` needs
+    `[curve]`, except on loopback addresses."""
     file_mode: FileMode | None = None
-    """Mode of the file of an `ipc://` socket: users who may write may ask, and tell outcomes. That
-    of `[publish]` unless given, for owner and group only."""
+    """Mode of the file of an `ipc://` socket; users who may write may ask, and tell outcomes.
+    Without it that of `[publish]`, for owner and group only."""
     group: Name | None = None
-    """Group of the file of an `ipc://` socket; that of `[publish]` unless given."""
+    """Group of the file of an `ipc://` socket; without it that of `[publish]`."""
 
 
 class Realtime(Section):
-    """`[realtime]`: run in realtime. Without it the process is an ordinary one."""
+    """`[realtime]`: run with realtime priority. Without this section it has an ordinary one."""
 
     priority: Annotated[int, Field(ge=1, le=98), unit()] | None = 50
-    """Priority under SCHED_FIFO; below that of the hand's own controller."""
+    """Priority of SCHED_FIFO; choose one below the hand's own controller."""
     cpus: (
         Annotated[tuple[Annotated[int, unit()], ...], Field(min_length=1, strict=False)] | None
     ) = None
-    """Processors to run on, numbered from 0; all unless given."""
+    """Processors to run on, numbered from 0; without it all."""
     lock_memory: bool = True
-    """Lock memory that was used (mlockall), so that no reading waits for a disk."""
+    """True: lock used memory (mlockall), so that no reading waits for a disk."""
 
 
 class Record(Section):
     """`[record]`: keep readings, verdicts and outcomes in MCAP files (extra `record`)."""
 
     directory: FilePath | None = None
-    """`/var/lib/graspd/record` unless given. Created if it is missing."""
+    """Folder of the files, created if missing; without it `/var/lib/graspd/record`."""
     flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0), unit("ms")] = 1000.0
-    """Most that a killed daemon or a power cut loses."""
+    """Longest time whose data a killed daemon or a power cut loses."""
     rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0), unit("MB")] = 256.0
-    """A file that is larger is followed by the next."""
+    """Size of a file from which the next one begins."""
     rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0), unit("minutes")] = 60.0
-    """A file that is older is followed by the next."""
+    """Age of a file from which the next one begins."""
     keep_files: Annotated[int, Field(ge=1, le=100_000), unit("files")] = 1000
-    """Most files of this hand; the oldest are removed."""
+    """Most files of this hand; the oldest are deleted."""
     keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), unit("MB")] = 4096.0
-    """Most that all files of this hand have together, the one being written included."""
+    """Largest size of all files of this hand together."""
     images_hz: Annotated[float, Field(ge=0.0, le=1000.0), unit("1/s")] = 10.0
-    """Tactile images a second, for viewers; 0 draws none. All counts are recorded anyway."""
+    """Rate of tactile images for viewers; 0: none. All counts are recorded in any case."""
     raw: bool = False
-    """True: also record the link: CAN frames as candump text, serial bytes in frames."""
+    """True: also record the link (CAN frames as candump text, serial bytes in frames)."""
 
 
 class Scene(Section):
-    """The whole file."""
+    """The whole scene file."""
 
     hand: Hand = Hand()
     tactile: Tactile
-    """Where the readings of the fingers come from; the keys depend on `driver`."""
+    """Source of the readings of the fingers; the keys depend on `driver`."""
     joints: Joints | None = None
-    """Where joint angles come from; the keys depend on `driver`. Without it none are used."""
+    """Source of joint angles; the keys depend on `driver`. Without it none are used."""
     model: Model = Model()
     session: SessionSection = SessionSection()
     learn: Learn = Learn()
@@ -318,12 +317,12 @@ class Scene(Section):
 
     @property
     def endpoint(self) -> str:
-        """Endpoint where verdicts are published."""
+        """Endpoint of the socket for verdicts."""
         return self.publish.endpoint or f"ipc:///run/graspd/{self.hand.name}.ipc"
 
     @property
     def ask_endpoint(self) -> str | None:
-        """Endpoint where questions are taken; None: peers cannot ask."""
+        """Endpoint of the socket for questions; None: peers cannot ask."""
         if self.ask is None and self.gate.mode != "request":
             return None
         endpoint = None if self.ask is None else self.ask.endpoint
@@ -331,7 +330,7 @@ class Scene(Section):
 
     @property
     def ask_file_mode(self) -> int | None:
-        """Mode of the file of the socket for questions; None: as the umask has it."""
+        """Mode of the file of the socket for questions; None: the umask decides."""
         if self.ask is not None and self.ask.file_mode is not None:
             return int(self.ask.file_mode, 8)
         mode = self.publish.file_mode
@@ -339,13 +338,13 @@ class Scene(Section):
 
     @property
     def ask_group(self) -> str | None:
-        """Group of that file; None: the process's."""
+        """Group of the file of the socket for questions; None: that of the process."""
         own = None if self.ask is None else self.ask.group
         return own or self.publish.group
 
     @property
     def session_path(self) -> Path:
-        """File of the session."""
+        """File of the session, also if none is kept."""
         return self.session.file or STATE_DIRECTORY / f"{self.hand.name}.session.json"
 
     @property
@@ -357,7 +356,7 @@ class Scene(Section):
 
     @property
     def keeps_session(self) -> bool:
-        """True if the session outlives the daemon."""
+        """True if the session is kept in a file."""
         if self.session.keep is None:
             return not isinstance(self.tactile, ReplayTactile)
         return self.session.keep
@@ -369,7 +368,7 @@ class Scene(Section):
 
 
 def load(path: Path) -> Scene:
-    """Read a scene file. Raises `SceneError`, whose text has one line per mistake."""
+    """Read and check a scene file. Raises `SceneError`."""
     try:
         text = read_regular(path, SCENE_MAX_BYTES).decode()
     except OSError as error:
@@ -380,7 +379,7 @@ def load(path: Path) -> Scene:
         data = toml.loads(text)
     except toml.NestedTooDeeplyError as error:
         raise SceneError(f"{path}: not TOML that can be read: {error}") from error
-    except ValueError as error:  # TOMLDecodeError, and Python's own limit on long numbers
+    except ValueError as error:  # TOMLDecodeError, or Python's limit on long numbers
         from daemon.scene.errors import MESSAGE_MAX
 
         raise SceneError(f"{path}: not TOML: {printable(str(error), MESSAGE_MAX)}") from error

@@ -1,4 +1,4 @@
-"""The session between two starts of the daemon, in a file that is always whole."""
+"""Keep the session between two starts of the daemon, in a file that is always complete."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from models.session_statistics import SessionState
 log = logging.getLogger("graspd")
 
 MAX_BYTES: Final = 2 << 20
-"""A session has 7 kB; what outcomes have taught, up to 330 kB."""
+"""Largest file, bytes; a session has 7 kB, learning from outcomes up to 330 kB."""
 DIGITS: Final = 12
-"""Digits of the digest of serial numbers, in a file's name."""
+"""Hexadecimal digits of the serial numbers' digest in a file name."""
 OTHERS_MAX: Final = 4
-"""Sessions of other sensors that are kept, the newest."""
+"""Most sessions of other sensors that are kept."""
 
 
 class SessionFileError(Exception):
@@ -35,30 +35,30 @@ class SessionFileError(Exception):
 
 
 class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of the file."""
+    """Content of a session file."""
 
     fingers: tuple[str, ...]
-    """In the order of the statistics."""
+    """Fingers in the order of the statistics."""
     serials: dict[str, str]
-    """By finger, where known."""
+    """Known serial numbers of the sensors, by finger."""
     saved_at: Annotated[float, msgspec.Meta(ge=0.0, le=1e11)]
-    """Wall-clock seconds since 1970, for people."""
+    """Time of saving, seconds since 1970, for people."""
     statistics: SessionState | None
-    """None if no model has needed any."""
+    """Statistics of a session model; None if no model needed any."""
     trust: bytes | None = None
-    """From `daemon.trust.trust.encode`; None if nothing learns."""
+    """State of learning, from `daemon.trust.trust.encode`; None without learning."""
     rest: tuple[Annotated[float, msgspec.Meta(ge=0.0, le=COUNT_MAX)], ...] | None = None
-    """Where the electrodes rest, finger by finger, counts; 0 where it is not known."""
+    """Resting count of each electrode, finger by finger; 0: not known."""
 
 
 class _Version1(KeptSession, frozen=True, tag_field="version", tag=1):
-    """A file of a graspd that did not learn from outcomes."""
+    """File of an older graspd, which did not learn from outcomes."""
 
 
 class _Version2(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="version", tag=2
 ):
-    """The file: what is kept, and the SHA-256 of its text."""
+    """File of this version, with the SHA-256 of its text."""
 
     sha256: str
     kept: msgspec.Raw
@@ -68,10 +68,10 @@ class SessionFile:
     """One hand's file, locked while it is open."""
 
     def __init__(self, path: Path) -> None:
-        """Take the file. Raises `SessionFileError` if it is in use or has no folder."""
+        """Lock the file. Raises `SessionFileError` if it is in use or has no folder."""
         self.path = path
         self._newest_is_whole = False
-        """Only a whole file may take the place of the former one."""
+        """True if the file is complete; only then does it replace the former one."""
         lock = path.with_name(path.name + ".lock")
         try:
             flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
@@ -87,7 +87,7 @@ class SessionFile:
             ) from error
         for written in (glob.escape(path.name), _beside_any(path)):
             for part in path.parent.glob(f"{written}.{'[0-9a-f]' * 8}"):
-                with suppress(OSError):  # a daemon was killed while it wrote this
+                with suppress(OSError):  # left by a daemon that was killed while it wrote
                     part.unlink()
 
     def close(self) -> None:
@@ -103,26 +103,26 @@ class SessionFile:
         self.close()
 
     def load(self) -> KeptSession | None:
-        """Return what is kept, as the function `load` does."""
+        """Return the kept session: see the function `load`."""
         self._newest_is_whole = False
-        found = _newest_whole(self.path)
-        if found is None:
+        newest = _newest_whole(self.path)
+        if newest is None:
             return None
-        kept, path = found
+        kept, path = newest
         self._newest_is_whole = path == self.path
         return kept
 
     def save(self, kept: KeptSession) -> None:
-        """Replace the file in one step, keeping the former one. Raises `SessionFileError`."""
+        """Replace the file in one step; keep the former one. Raises `SessionFileError`."""
         former = former_of(self.path) if self._newest_is_whole else None
         self._newest_is_whole = False
         _write(self.path, kept, former)
         self._newest_is_whole = True
 
     def put_aside(self, kept: KeptSession) -> None:
-        """Keep the session of other sensors beside the file, and the newest `OTHERS_MAX` of them.
+        """Write the session of other sensors to a file of its own beside this one.
 
-        Raises `SessionFileError`.
+        The newest `OTHERS_MAX` of these files are kept. Raises `SessionFileError`.
         """
         _write(_beside(self.path, kept.serials), kept, None)
         newest = list(others(self.path))[:OTHERS_MAX]
@@ -130,12 +130,12 @@ class SessionFile:
             self._remove(path)
 
     def remove(self) -> bool:
-        """Forget what is kept; False if nothing was. Raises `SessionFileError`."""
-        # The former one first: it must not come back where this is interrupted.
+        """Delete the session; return False if there was none. Raises `SessionFileError`."""
+        # The former file goes first: an interruption must not bring it back.
         return bool(self.remove_former() + self._remove(self.path))
 
     def remove_former(self) -> bool:
-        """Forget what was kept before, and of other sensors; False if nothing was.
+        """Delete the former session and those of other sensors; return False if none was there.
 
         Raises `SessionFileError`.
         """
@@ -153,7 +153,7 @@ class SessionFile:
 
 
 def former_of(path: Path) -> Path:
-    """Return the path of what was kept at `path` before."""
+    """Return the path of the former session of `path`."""
     return path.with_name(path.name + ".former")
 
 
@@ -164,13 +164,13 @@ def kept_now(
     trust: TrustState | None = None,
     rest: tuple[float, ...] | None = None,
 ) -> KeptSession:
-    """Return what to keep at this time."""
+    """Return the session to keep now."""
     learned = None if trust is None else encode(trust)
     return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned, rest)
 
 
 def others(path: Path) -> dict[Path, KeptSession]:
-    """Return the sessions of other sensors beside `path`, the newest first."""
+    """Return the sessions of other sensors beside `path`, newest first."""
     sessions = {}
     for each in path.parent.glob(_beside_any(path)):
         try:
@@ -190,7 +190,7 @@ def _beside(path: Path, serials: Mapping[str, str]) -> Path:
 
 
 def _beside_any(path: Path) -> str:
-    """Return a pattern; not of files that are still being written."""
+    """Return a pattern for files of other sensors; unfinished files do not match."""
     return f"{glob.escape(path.name)}.of-{'[0-9a-f]' * DIGITS}"
 
 
@@ -204,16 +204,16 @@ def _write(path: Path, kept: KeptSession, former: Path | None) -> None:
 
 
 def load(path: Path) -> KeptSession | None:
-    """Return what is kept at `path`, or what was kept before if that is damaged; None: nothing.
+    """Return the session at `path`, or the former one if that is damaged; None: no file.
 
     Raises `SessionFileError` if both are damaged.
     """
-    found = _newest_whole(path)
-    return None if found is None else found[0]
+    newest = _newest_whole(path)
+    return None if newest is None else newest[0]
 
 
 def _newest_whole(path: Path) -> tuple[KeptSession, Path] | None:
-    """Return what is kept, and the file that holds it. Raises `SessionFileError`."""
+    """Return the newest undamaged session, and its file. Raises `SessionFileError`."""
     problem: SessionFileError | None = None
     for each in (path, former_of(path)):
         try:
@@ -232,7 +232,7 @@ def _newest_whole(path: Path) -> tuple[KeptSession, Path] | None:
 
 
 def read(path: Path) -> KeptSession | None:
-    """Return what one file holds, None if there is none. Raises `SessionFileError`."""
+    """Return the session in a file; None: no file. Raises `SessionFileError`."""
     try:
         data = read_regular(path, MAX_BYTES)
     except FileNotFoundError:
@@ -240,18 +240,18 @@ def read(path: Path) -> KeptSession | None:
     except OSError as error:
         raise SessionFileError(f"{path}: cannot read the session: {error.strerror}") from error
     try:
-        found = msgspec.json.decode(data, type=_Version1 | _Version2)
-        if isinstance(found, _Version1):
-            return found
-        if hashlib.sha256(found.kept).hexdigest() != found.sha256:
+        content = msgspec.json.decode(data, type=_Version1 | _Version2)
+        if isinstance(content, _Version1):
+            return content
+        if hashlib.sha256(content.kept).hexdigest() != content.sha256:
             raise SessionFileError(f"{path}: not a session: its checksum is wrong")
-        return msgspec.json.decode(found.kept, type=KeptSession)
+        return msgspec.json.decode(content.kept, type=KeptSession)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise SessionFileError(f"{path}: not a session: {error}") from error
 
 
 def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
-    """Return the statistics of these fingers. Raises `SessionFileError` without them."""
+    """Return the statistics of `fingers`. Raises `SessionFileError` if they are missing."""
     of_fingers(kept, fingers)
     if kept.statistics is None:
         raise SessionFileError("the kept session is of a model that needs no statistics")

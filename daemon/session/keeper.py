@@ -1,4 +1,4 @@
-"""Keeps the session of a running daemon in a file; answers outcomes once they are on the disk."""
+"""Keep the session of a running daemon in a file; answer outcomes once they are on the disk."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from models.session_statistics import SessionState
 log = logging.getLogger("graspd")
 
 WAIT_S: Final = 0.4
-"""How long the end waits for the disk, s: the daemon has a second to stop."""
+"""Longest wait for the disk at the end, s; the daemon has a second to stop."""
 SAVE_PERIOD_NS: Final = 10_000_000_000
 """Time between two saves, ns, while no outcome waits."""
 WAITING_MAX: Final = 64
-"""Answers that wait for the disk; a newer one replaces the oldest."""
+"""Most answers that wait for the disk; a new one replaces the oldest."""
 BUSY: Final = "busy: too many wait for the disk, tell it again"
 UNEXPECTED: Final = "it could not be written"
 HANGS: Final = "not kept: the disk does not answer"
 
 
 class SavedState(NamedTuple):
-    """What the file holds at one moment, decoded."""
+    """Decoded content of the session file."""
 
     serials: dict[str, str]
     statistics: SessionState | None = None
@@ -54,13 +54,13 @@ class SavedState(NamedTuple):
 
     @property
     def is_empty(self) -> bool:
-        """True without a grasp and an outcome."""
+        """True if it has neither a grasp nor an outcome."""
         no_grasps = self.statistics is None or not self.statistics.grasps
         return no_grasps and (self.trust is None or not self.trust.learner.outcomes)
 
 
 class SessionKeeper(SensorWatch):
-    """Restores, saves and drops one session; a file that fails costs a warning."""
+    """Restore, save and drop one session. A failure of the file is only a warning."""
 
     def __init__(
         self,
@@ -74,10 +74,10 @@ class SessionKeeper(SensorWatch):
         read_rest: Callable[[], Rest] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Restore what `file` holds; warn, and start a new session, if it is of other fingers.
+        """Restore the session in `file`; warn, and start a new one, if it is of other fingers.
 
-        `session` is None for a model without one, `trust` where nothing learns: what the file has
-        for those stays. `on_exchange` must reset session and trust to what it is given.
+        `session`: None for a model without a session. `trust`: None without learning. The file's
+        content for a None is kept. `on_exchange`: must reset session and trust to its arguments.
         """
         self._session = session
         self._trust = trust
@@ -86,33 +86,33 @@ class SessionKeeper(SensorWatch):
         self._file = file
         self._clock = clock
         self._unused = SavedState({})
-        """What the file has and this run does not use."""
+        """Content of the file that this run does not use."""
         self._restore()
         self._others = [
             _state_of(kept) for kept in others(file.path).values() if kept.fingers == self._fingers
         ]
-        """Sessions of other sensors, the newest first."""
+        """Sessions of other sensors, newest first."""
         self._leaving: deque[SavedState] = deque(maxlen=OTHERS_MAX)
-        """Those of them that are not on the disk yet."""
+        """Sessions of other sensors that are not on the disk yet."""
         self._saved = self._now()
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._warned = False
         self._waiting: deque[Answer] = deque()
         self._in_writing = 0
-        """Answers, the first ones, that wait for the current save."""
+        """Number of the first answers, which wait for the current save."""
         self._worker: Worker[SavedState] = Worker("session")
 
     def filenos(self) -> list[int]:
         return self._worker.filenos()
 
     def before_wait(self, requests: Requests) -> None:
-        """Answer outcomes that are saved; start the next save if it is due."""
+        """Answer saved outcomes; start the next save if it is due."""
         self.wait(0.0)
         if self._waiting or self._clock() >= self._save_due_ns:
             self._start_save()
 
     def keep(self, answer: Answer) -> None:
-        """Call `answer` once the state of now is on the disk, with None, or with why it is not."""
+        """Call `answer` after the present state is saved: with None, or with the failure."""
         if len(self._waiting) == WAITING_MAX:
             self._waiting.popleft()(BUSY)
             self._in_writing = max(self._in_writing - 1, 0)
@@ -120,7 +120,7 @@ class SessionKeeper(SensorWatch):
         self._start_save()
 
     def save(self) -> None:
-        """Save for the last time, and answer all who wait, within `2 * WAIT_S`."""
+        """Save for the last time and give all answers, within `2 * WAIT_S`."""
         self.wait(WAIT_S)
         self._start_save()
         self.wait(WAIT_S)
@@ -145,7 +145,7 @@ class SessionKeeper(SensorWatch):
         self._answer(self._in_writing, f"not kept: {why}")
 
     def _start_save(self) -> None:
-        """Start a save unless one runs; the outcomes that wait now are in it."""
+        """Start a save of the present state, with all waiting outcomes, unless one runs."""
         if self._worker.busy:
             return
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
@@ -159,12 +159,12 @@ class SessionKeeper(SensorWatch):
 
     def _write(self, state: SavedState) -> SavedState:
         """Write `state` in the worker, and return it. Raises `SessionFileError`."""
-        while self._leaving:  # first, so that a session is always in one of the files
+        while self._leaving:  # first, so that one of the files always has the session
             left = self._leaving.popleft()
             try:
                 self._file.put_aside(self._kept(left))
             except SessionFileError:
-                self._leaving.appendleft(left)  # the next save tries it again
+                self._leaving.appendleft(left)  # the next save tries again
                 raise
         self._file.save(self._kept(state))
         return state
@@ -172,10 +172,10 @@ class SessionKeeper(SensorWatch):
     def _kept(self, state: SavedState) -> KeptSession:
         return kept_now(state.statistics, self._fingers, state.serials, state.trust, state.rest)
 
-    def _answer(self, number: int, why: str | None) -> None:
-        """Answer those who have waited longest."""
+    def _answer(self, count: int, why: str | None) -> None:
+        """Give the first `count` answers, with the failure `why` or None."""
         self._in_writing = 0
-        for _ in range(number):
+        for _ in range(count):
             self._waiting.popleft()(why)
 
     def _now(self) -> SavedState:
@@ -217,10 +217,10 @@ class SessionKeeper(SensorWatch):
                 self._trust.restore(learned)
                 log.info("%d outcomes restored", learned.learner.outcomes)
         except ValueError as error:
-            log.warning("%s: what was learned %s; learning begins anew", self._file.path, error)
+            log.warning("%s: what was learned %s; learning starts again", self._file.path, error)
 
     def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
-        """Begin the session of sensors with other serial numbers."""
+        """Change to the session of sensors with other serial numbers."""
         grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
         log.warning("new sensor on %s: the session%s no longer count", ", ".join(changed), grasps)
         now = serials.items()
@@ -230,12 +230,12 @@ class SessionKeeper(SensorWatch):
     def _is_known(self, rest: Rest) -> bool:
         return self._with_rest(rest) is not None
 
-    def _exchange_untold(self, number: int, rest: Rest) -> None:
-        log.warning(UNTOLD, number)
+    def _exchange_untold(self, moved: int, rest: Rest) -> None:
+        log.warning(UNTOLD, moved)
         self._begin(self._with_rest(rest))
 
     def _with_rest(self, rest: Rest) -> SavedState | None:
-        """Return the session of other sensors that rested like this."""
+        """Return the session of other sensors with this resting pattern."""
         for each in self._others:
             former = self._rest_of(each.rest)
             same_serials = each.serials == self._serials
@@ -250,7 +250,7 @@ class SessionKeeper(SensorWatch):
         return np.array(kept).reshape(shape)
 
     def _begin(self, former: SavedState | None) -> None:
-        """Put the session aside, and go on with that of the new sensors, if any."""
+        """Put the session aside; continue that of the new sensors, if there is one."""
         leaving = self._now()
         if not leaving.is_empty:
             rest = [each for each in self._others if each.serials != leaving.serials]
@@ -262,7 +262,7 @@ class SessionKeeper(SensorWatch):
         self._save_due_ns = self._clock()
 
     def _take_up(self, former: SavedState) -> bool:
-        """Go on with a session of the new sensors; False if it is of no use."""
+        """Continue a session of the new sensors; return False if it cannot be used."""
         trust = former.trust
         if trust is not None and self._trust is not None and not self._trust.fits(trust):
             trust = None
@@ -283,7 +283,7 @@ class SessionKeeper(SensorWatch):
 
 
 def _state_of(kept: KeptSession) -> SavedState:
-    """Return what a file holds, without what cannot be read."""
+    """Return the content of a file, without unreadable parts."""
     learned = None
     if kept.trust is not None:
         with contextlib.suppress(ValueError):

@@ -1,4 +1,4 @@
-"""Notices by serial numbers, or by where electrodes rest, that sensors were exchanged."""
+"""Detect exchanged sensors by their serial numbers or their resting counts."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
     from models.session_statistics import SessionState
 
 OnExchange = Callable[["SessionState | None", "LearnerState | None"], None]
-"""Takes what is known of the new sensors, or None."""
+"""Called with the states of the new sensors' session and learning; None: unknown."""
 
 UNTOLD: Final = (
     "%d fingers rest in another pattern than before: taken for other sensors, not calibrated; "
     "open the hand"
 )
 LOOK_EVERY: Final = 5
-"""Readings between two looks at the rest; a grasp takes more to settle."""
+"""Number of readings between two looks at the rest; a grasp settles more slowly."""
 
 log = logging.getLogger("graspd")
 
 
 class SensorWatch(Companion):
-    """Has the judge forget exchanged sensors, before it judges the new ones."""
+    """Make the judge forget exchanged sensors before it judges the new ones."""
 
     def __init__(
         self,
@@ -36,19 +36,19 @@ class SensorWatch(Companion):
         on_exchange: OnExchange,
         read_rest: Callable[[], Rest] | None = None,
     ) -> None:
-        """`read_rest` gives where the electrodes rest now; None: never known."""
+        """`read_rest`: returns the resting counts now; None: they are never known."""
         self._tactile = tactile
         self._on_exchange = on_exchange
         self._read_rest = read_rest
         self._serials: dict[str, str] = {}
-        """Last known, by finger."""
+        """Last known serial numbers, by finger."""
         self._rest: Rest | None = None
-        """Where the electrodes of these sensors rest, as last kept; None: not known yet."""
+        """Resting counts of these sensors when last kept; None: not known yet."""
         self._is_first_tare = True
-        """True from a start, an outage or an exchange to the tare after it."""
+        """True after a start, an outage or an exchange, until the next tare."""
         self._readings = 0
         self._looked_at = b""
-        """The rest that was compared last: it changes four times a second at most."""
+        """Last compared rest, as bytes; it changes at most four times a second."""
 
     def on_reading(self, reading: Reading) -> None:
         serials = self._tactile.serials
@@ -67,7 +67,7 @@ class SensorWatch(Companion):
             self._look_at(rest)
 
     def _look_at(self, rest: Rest) -> None:
-        """Compare where the electrodes rest with where they did."""
+        """Compare the resting counts with the kept ones."""
         tared = [bool(finger.any()) for finger in rest]
         if not any(tared):
             self._is_first_tare = True
@@ -77,7 +77,7 @@ class SensorWatch(Companion):
             self._rest = rest
         elif has_drifted(self._rest, rest):
             moved = moved_fingers(self._rest, rest)
-            # Later tares of a single finger may be of one that touches.
+            # A later tare of a single finger may be of one that touches.
             if moved and (self._is_first_tare or self._is_known(rest)):
                 self._exchange_untold(len(moved), rest)
                 self._rest = rest
@@ -86,11 +86,11 @@ class SensorWatch(Companion):
         self._is_first_tare = False
 
     def _is_known(self, _rest: Rest) -> bool:
-        """Return True if other sensors than the present ones rested like this."""
+        """Return True if this is the rest of other, known sensors."""
         return False
 
-    def _exchange_untold(self, number: int, _rest: Rest) -> None:
-        log.warning(UNTOLD, number)
+    def _exchange_untold(self, moved: int, _rest: Rest) -> None:
+        log.warning(UNTOLD, moved)
         self._on_exchange(None, None)
 
     def _exchange(self, changed: list[str], _serials: Mapping[str, str]) -> None:
@@ -99,5 +99,5 @@ class SensorWatch(Companion):
 
 
 def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Return the fingers whose sensor is known to be another one."""
+    """Return the fingers whose serial number has changed."""
     return [finger for finger in now if before.get(finger, now[finger]) != now[finger]]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 TEMPERATURE: Final = 1.5
-"""What the model's margin is divided by: networks are too sure of another day's grasps."""
+"""Divisor of the model's margin; networks are too sure of another day's grasps."""
 SCALE: Final = 1.6
 """What moderated log-odds are multiplied by, so that of the grasps with a `p_slip` of 0.1 a tenth
 slips: they are timid by this factor on days, objects and poses that no network saw. Fitted on the
@@ -38,7 +38,7 @@ Vector = NDArray[np.float64]
 
 
 class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a learner knows; arrays as float64, little-endian, row by row."""
+    """State of a learner; arrays are float64, little-endian, row by row."""
 
     outcomes: Annotated[int, msgspec.Meta(ge=0)]
     mean: bytes
@@ -125,7 +125,7 @@ class Learner:
         self.outcomes += 1
 
     def state(self) -> LearnerState:
-        """What `restore` needs."""
+        """Return the state for `restore`."""
         mean, covariance = self._mean.astype("<f8"), self._covariance.astype("<f8")
         return LearnerState(self.outcomes, mean.tobytes(), covariance.tobytes())
 

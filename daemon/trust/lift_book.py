@@ -25,7 +25,7 @@ class GraspId(NamedTuple):
     """Names a grasp for ever."""
 
     boot_id: str
-    """Of the start of the daemon that judged it."""
+    """Id of the daemon's start that judged the grasp."""
     grasp: Annotated[int, msgspec.Meta(ge=0)]
     """Its number since that start."""
 
@@ -36,13 +36,13 @@ class Report(NamedTuple):
     grasp: GraspId
     outcome: Literal["stable", "slip"]
     object_name: str | None = None
-    """What was lifted, if the peer says so."""
+    """Name of the lifted object; None: not told."""
     peer: bytes | None = None
     """Name of the peer; None: the daemon itself, when it replays a recording."""
 
 
 class OutcomeStatus(StrEnum):
-    """What became of an outcome that was told."""
+    """Result of telling an outcome."""
 
     TAKEN = "taken"
     REPEATED = "repeated"
@@ -50,7 +50,7 @@ class OutcomeStatus(StrEnum):
     CONTRADICTS = "contradicts"
     """Known already, and the opposite: refused, the first one counts."""
     UNKNOWN = "unknown"
-    """Of a grasp that was not judged or is too long ago: refused."""
+    """The grasp was not judged or is too old; the outcome is refused."""
 
 
 REFUSALS: Final = {
@@ -67,8 +67,11 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stable: bool
     """Whether it was called `stable`."""
     features: bytes | None
-    """What it was judged by, float64; `NOT_ASSESSED` where nothing was; None once the learner must
-    not learn from it, because its outcome is known or a sensor was exchanged since."""
+    """Features of the grasp, float64; `NOT_ASSESSED`: it had none.
+
+    None: the learner must not learn from it, because its outcome is known, or a sensor was
+    exchanged since.
+    """
     slipped: bool | None = None
     """None until the outcome is told."""
     announced: bool = False
@@ -81,7 +84,7 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is kept of the book between two starts of the daemon."""
+    """State of the book that is kept between two starts of the daemon."""
 
     records: Annotated[tuple[Lift, ...], msgspec.Meta(max_length=LIFTS_MAX)]
     """Oldest first."""

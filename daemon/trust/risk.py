@@ -43,7 +43,7 @@ class Permission(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RiskLimits:
-    """What the user sets."""
+    """Limits set by the user."""
 
     max_slip_when_stable: float | None = None
     """Share of the `stable` lifts that may slip, 0.001..0.5; None: no rule, all is allowed."""
@@ -68,7 +68,7 @@ class RiskLimits:
 
 
 class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What lifts of `stable` verdicts came to, for those who decide whether to lift."""
+    """Outcomes of `stable` lifts so far, for a controller that decides to lift."""
 
     target: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] | None
     """`[risk] max_slip_when_stable`; null: none is set."""
@@ -79,7 +79,7 @@ class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
     outstanding: Count
     """`stable` verdicts whose outcome can still come; each may add one slip to the bound."""
     bound: Annotated[float, msgspec.Meta(ge=0.0)] | None
-    """What `slips` cannot exceed, but for `outstanding`; null: no risk is set."""
+    """Upper bound of `slips` without `outstanding`; null: no risk is set."""
     warm_up_left: Count
     """Outcomes that are missing until the warm-up is over; 0 without a risk."""
     announced: Count = 0
@@ -115,16 +115,16 @@ class Risk:
         S <= a N + BUDGET_START + M (1 - a)     of all lifts that were told or announced
 
     1. A told `stable` lift adds a - y to the budget b, y = 1 for a slip; all else only lowers b.
-    2. So b <= BUDGET_START + a N - S, that is S <= a N + BUDGET_START - b.
+    2. Hence b <= BUDGET_START + a N - S, which is S <= a N + BUDGET_START - b.
     3. A stretch begins at b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it.
     4. `stable` is said only while b >= 1 - a. If each outcome is told before the next `stable`,
        a slip leaves b >= 0. This gives the first two bounds.
     5. Let m announced lifts be out. w = b - m (1 - a) is what is left of b if all of them slip.
-    6. An announced grasp was called `stable` at b >= 1 - a and m < M. So w >= -(M - 1) (1 - a)
+    6. An announced grasp was called `stable` at b >= 1 - a and m < M. Hence w >= -(M - 1) (1 - a)
        after its announcement.
     7. An outcome of an announced lift lowers neither w nor this minimum: a slip takes 1 - a from b
        and m by one. Caps leave b >= BUDGET_START, and m <= M.
-    8. A lift that leaves the book untold is taken for a slip. So 6 holds at every moment.
+    8. A lift that leaves the book untold is taken for a slip. Hence 6 holds at every moment.
     9. With the m lifts counted as slips, 2 is S <= a N + BUDGET_START - w: the third bound.
     10. Lifts that are told late without an announcement can leave b < 0; `bound` adds that.
 
@@ -151,7 +151,7 @@ class Risk:
 
     @property
     def bound(self) -> float | None:
-        """What `slips` cannot exceed; each lift whose outcome is out adds one. None: no rule."""
+        """Upper bound of `slips`; each lift without an outcome adds one. None: no rule."""
         alpha = self.limits.max_slip_when_stable
         if alpha is None:
             return None

@@ -1,4 +1,4 @@
-"""What a verdict is worth: the model's opinion, corrected by outcomes, under the risk that is set.
+"""The worth of a verdict: the model's opinion, corrected by outcomes, under the set risk.
 
 At each reading: `judge` a grasp that the network judged, or `review` one that it judged before;
 decide; `note` what was said. Tell each `outcome`.
@@ -20,12 +20,12 @@ from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, LiftBookStat
 from daemon.trust.risk import Permission, Risk, RiskLimits, RiskReport, RiskState
 
 MAX_BYTES: Final = 1 << 20
-"""Of a state before it is compressed: of three fingers, with every outcome still out, 240 kB."""
+"""Largest uncompressed state, bytes; three fingers with all outcomes still out take 240 kB."""
 DIGEST_BYTES: Final = 32
 
 
 class Assessment(msgspec.Struct, frozen=True):
-    """What outcomes say of one grasp, before the decision; the defaults are those of no grasp."""
+    """Assessment of a grasp by outcomes, before the decision; the defaults mean no grasp."""
 
     outcomes: int
     """Number of outcomes that `p_slip` rests on."""

@@ -27,7 +27,7 @@ class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
-    """What is drawn of one finger."""
+    """Picture of one finger."""
 
     name: str
     touches: bool | None

@@ -83,9 +83,9 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     joints: dict[str, float]
     """rad."""
     health: list[Line]
-    """What is wrong, and what to do."""
+    """Problems, and what to do about each."""
     not_well: str
-    """The same in a few words; empty if all is well, or if that is not known."""
+    """Problems in a few words; empty: no problem, or not known."""
     state: str | None
     """`running`, `silent` or `stopping`."""
     model: str | None

@@ -44,7 +44,7 @@ Row = tuple[str, str]
 
 @dataclass(frozen=True)
 class Screen:
-    """What is drawn, and where."""
+    """Lines and places on the terminal."""
 
     width: int
     """Columns."""

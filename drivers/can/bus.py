@@ -1,9 +1,9 @@
-"""One bus of python-can, drained without waiting; whatever it raises becomes a link failure.
+"""One bus of python-can, read without waiting; all its exceptions become link failures.
 
-On `socketcan` the bus's own socket is read, as python-can's `recv` costs several times a frame.
-Its stamps are wall time, which can step. They become monotonic time by the distance of the two
-clocks at the moment of reading, so that only a step between arrival and reading falsifies them.
-A frame without such a stamp came after the last moment at which the bus had nothing more to read.
+On `socketcan` the bus's socket is read directly, because python-can's `recv` is several times
+slower. Its stamps are wall time, which can step. The difference of the two clocks when a frame is
+read turns them into monotonic time, so only a step between arrival and reading makes them wrong.
+A frame without a stamp arrived after the last time at which the bus was empty.
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ from drivers.can.readings import CanCounters
 from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
 
 FRAMES_PER_DRAIN: Final = 512
-"""Frames taken at once, some 100 ms of a full bus, so that the loop gets its turn."""
+"""Most frames of one call: about 100 ms of a full bus. The loop must get its turn."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
-"""Asked of the kernel for sockets; the usual 208 KiB hold 60 ms at 4400 frames/s."""
+"""Receive buffer asked of the kernel, bytes; the usual 208 KiB hold 60 ms at 4400 frames/s."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
-"""Interfaces of python-can whose time stamps are wall time of the arrival on this host."""
+"""Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
 
 _OPTIONS: Final[dict[str, dict[str, Any]]] = {
-    # Its defaults wait: 2 s after opening, 1 ms in every read.
+    # The defaults wait: 2 s after opening, 1 ms in every read.
     "slcan": {"sleep_after_open": 0.0, "timeout": 0.0},
-    # Its default queue has no bound; this one holds some 4 s of a full bus.
+    # The default queue has no bound; this one holds about 4 s of a full bus.
     "virtual": {"rx_queue_size": 16384},
 }
 
 _PACKAGES: Final = {"serial": "pyserial"}
-"""Packages whose names are not those of their modules."""
+"""Name of the package by module, where they differ."""
 _MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module is)? not installed")
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
-    """Open a bus of python-can. Raises `LinkError`; `DriverError` if no later try can succeed."""
+    """Open a bus of python-can. Raises `LinkError`; `DriverError` if no retry can succeed."""
     if interface not in can.VALID_INTERFACES:
-        known = "socketcan, slcan, udp_multicast, virtual"
-        raise DriverError(f"python-can has no interface {interface!r}; it has {known} and others")
+        common = "socketcan, slcan, udp_multicast, virtual"
+        raise DriverError(f"python-can has no interface {interface!r}; it has {common} and others")
     where = f"cannot open {interface} {channel}"
     if interface == "socketcan":
         try:
@@ -82,7 +82,7 @@ def _what_is_missing(interface: str, error: Exception) -> str:
 
 
 class CanBus:
-    """One bus."""
+    """One bus of python-can, read without waiting."""
 
     def __init__(
         self,
@@ -92,15 +92,15 @@ class CanBus:
         clock: Callable[[], int],
         wall_clock: Callable[[], int],
     ) -> None:
-        """`options`: arguments of python-can's bus, which replace our own."""
+        """`options`: arguments of python-can's bus; they replace graspd's own."""
         self.failure: LinkError | None = None
         """Why the bus broke; None while it works."""
         self.more = False
-        """True if the last drain left frames behind."""
+        """True if the last `drain` left frames behind."""
         self.tap: Callable[[list[Stamped]], None] | None = None
-        """Called with the frames of each drain that has some."""
+        """Called with the frames of each `drain` that returns some."""
         self.counters = CanCounters()
-        """Where malformed records and the kernel's drops are counted."""
+        """Counters of malformed records and of the kernel's drops."""
         self._interface = interface
         self._channel = channel
         self._options = {**_OPTIONS.get(interface, {}), **options}
@@ -110,7 +110,7 @@ class CanBus:
         self._bus: can.BusABC | None = None
         self._socket: socket.socket | None = None
         self.descriptor: int | None = None
-        """Descriptor to wait on; None while closed, and if the interface has none."""
+        """Descriptor to wait on; None while closed, or if the interface has none."""
 
     def open(self) -> None:
         """Take the bus. Raises as `open_bus` does."""
@@ -135,14 +135,14 @@ class CanBus:
             return
         with contextlib.suppress(Exception):
             bus.shutdown()
-        # slcan's shutdown first talks to the adapter, and keeps the port if that fails.
+        # slcan's shutdown first talks to the adapter; if that fails, it leaves the port open.
         port = getattr(bus, "serialPortOrig", None)
         if port is not None:
             with contextlib.suppress(Exception):
                 port.close()
 
     def drain(self) -> list[Stamped]:
-        """Return the next frames, oldest first. Never raises: a broken bus sets `failure`."""
+        """Return the next frames, oldest first. Never raises; a broken bus sets `failure`."""
         frames: list[Stamped] = []
         self.more = False
         try:
@@ -177,7 +177,10 @@ class CanBus:
                 frames.append((frame, t_ns, t_ns))
 
     def _count_drops(self, total: int, frames: list[Stamped]) -> None:
-        """Take the kernel's running sum of 32 bits, which comes with the frame after a loss."""
+        """Count new drops. `total`: the kernel's running sum of 32 bits.
+
+        The sum rises with the frame after a loss, so `LOST` goes in front of that frame.
+        """
         dropped = (total - self._drops_seen) % (1 << 32)
         if dropped:
             now_ns = self._clock()
@@ -219,7 +222,10 @@ def _fileno(bus: can.BusABC) -> int | None:
 
 
 def _has_more(descriptor: int | None) -> bool:
-    """Return True if a descriptor is readable: slcan takes an adapter's answer for the end."""
+    """Return True if the descriptor is readable.
+
+    slcan returns no frame for an adapter's answer, although frames wait behind it.
+    """
     if descriptor is None:
         return False
     poll = select.poll()
@@ -228,7 +234,7 @@ def _has_more(descriptor: int | None) -> bool:
 
 
 def _enlarge_buffer(descriptor: int) -> None:
-    """Let the kernel keep more frames while the loop is busy, if the descriptor is a socket."""
+    """Ask the kernel for a larger buffer if the descriptor is a socket."""
     if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
         return
     with socket.socket(fileno=os.dup(descriptor)) as same, contextlib.suppress(OSError):

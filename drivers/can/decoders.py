@@ -1,4 +1,4 @@
-"""CAN frames in, readings out: one decoder per format. No I/O; what a bus brings never raises."""
+"""Decoders of CAN frames into readings, one per format. No I/O; no frame makes them raise."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from drivers.can.sweep_frames import FrameAssembler
 
 
 class SynTouchDecoder:
-    """Samples of SynTouch's board; without an id, that of the first sound sample counts."""
+    """Decoder of SynTouch's board. Without an id it takes that of the first sound sample."""
 
     def __init__(
         self,
@@ -43,12 +43,12 @@ class SynTouchDecoder:
         counters: CanCounters,
     ) -> None:
         if sequence not in SEQUENCES:
-            raise ValueError(f"sequence {sequence!r} is none of {sorted(SEQUENCES)}")
+            raise ValueError(f"sequence {sequence!r} is not one of {sorted(SEQUENCES)}")
         rows = sensor_rows(fingers, sensors)
         self._sensors = len(fingers if sensors is None else sensors)
         self._length = sample_length(self._sensors, data_length)
         self._configured_id = self.arbitration_id = arbitration_id
-        """Id of the frames that are taken; None: any id."""
+        """Id of the frames that are decoded; None: not known yet."""
         self._flags = _id_flags(arbitration_id)
         self._counters = counters
         self.sweeps = SampleAssembler(self._sensors, SEQUENCES[sequence], counters, rows)
@@ -56,8 +56,10 @@ class SynTouchDecoder:
     def push(
         self, frame: CanFrame, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
-        """Return the readings, oldest first, that a data frame completes.
-        It was received at `t_ns`, or with `until_ns` at any time between the two."""
+        """Return the readings that a data frame completes, oldest first.
+
+        It arrived at `t_ns`, or between `t_ns` and `until_ns` if that is given.
+        """
         identifier = self.arbitration_id
         if identifier is not None and (
             frame.arbitration_id != identifier or frame.flags & EXTENDED != self._flags
@@ -80,13 +82,13 @@ class SynTouchDecoder:
         return self.sweeps.push(channel, words, t_ns, until_ns)
 
     def interrupt(self) -> None:
-        """Drop the current sweep; another board may come next."""
+        """Drop the current sweep. Another board may come next."""
         self.sweeps.interrupt()
         self.arbitration_id = self._configured_id
 
 
 class SweepFrameDecoder:
-    """graspd's own frames, one per finger and sweep."""
+    """Decoder of graspd's own format: one frame per finger and sweep."""
 
     def __init__(self, fingers: Sequence[str], base_id: int, counters: CanCounters) -> None:
         self._rows = {FINGERS.index(finger): row for row, finger in enumerate(fingers)}
@@ -102,7 +104,7 @@ class SweepFrameDecoder:
     def push(
         self, frame: CanFrame, t_ns: int, _until_ns: int | None = None
     ) -> Sequence[TactileReading]:
-        """Return the readings that a data frame, received at `t_ns`, completes, oldest first."""
+        """Return the readings that a data frame of `t_ns` completes, oldest first."""
         base_id, counters = self.arbitration_id, self._counters
         finger = frame.arbitration_id - base_id
         if finger not in self._rows or frame.flags & EXTENDED != self._flags:
@@ -129,7 +131,7 @@ class SweepFrameDecoder:
         self.sweeps.interrupt()
 
     def _tick_stands(self, finger: int, sequence: int, tick_us: int) -> bool:
-        """Return True if another sweep of a finger ended at the same time: nothing was sampled."""
+        """Return True if the sweep before ended at the same tick: nothing was sampled."""
         before = self._ticks.get(finger)
         stands = before is not None and before[1] == tick_us and before[0] != sequence
         self._counters.stuck_ticks += stands
@@ -141,7 +143,7 @@ CanDecoder = SynTouchDecoder | SweepFrameDecoder
 
 
 class BoardOptions(TypedDict, total=False):
-    """What a board sends: see `make_decoder`."""
+    """Options of `make_decoder` that describe a board."""
 
     sensors: Sequence[str] | None
     format: str
@@ -160,15 +162,15 @@ def make_decoder(
     sequence: str = "interleaved",
     data_length: int | None = None,
 ) -> CanDecoder:
-    """Return the decoder of a `CanFormat`. Raises `ValueError` for arguments that do not fit it.
+    """Return the decoder of a `CanFormat`. Raises `ValueError` for options that do not fit it.
 
-    `fingers`: the rows of a reading. `arbitration_id`: of the samples, or of finger 0 (`ff`) of the
-    sweep frames, by default 0x5B0; above 0x7FF it has 29 bits. Without one, the id of the first
-    sound sample counts until the link is lost, which is for bring-up only.
+    `fingers`: the rows of a reading. `arbitration_id`: id of the samples, or of finger 0 (`ff`) of
+    the sweep frames (default 0x5B0); ids above 0x7FF have 29 bits. A decoder of samples without one
+    takes the id of the first sound sample until the link is lost; use that for bring-up only.
 
-    For `syntouch` only: `sensors`, the fingers in the order of the board's words, three at most, by
-    default `fingers`; `sequence`, a key of `drivers.biotac.SEQUENCES`; `data_length`, bytes of a
-    frame that the board pads.
+    The rest is for `syntouch`. `sensors`: the fingers in the order of the board's words, at most
+    three; None: `fingers`. `sequence`: a key of `drivers.biotac.SEQUENCES`. `data_length`: bytes of
+    a frame, if the board pads its frames.
     """
     check_fingers(fingers)
     if arbitration_id is not None and not 0 <= arbitration_id <= EXTENDED_ID_MAX:
@@ -184,19 +186,19 @@ def make_decoder(
 
 
 def _is_sound(words: bytes) -> bool:
-    """Return True if some word is a count, and every other one that of an absent sensor."""
+    """Return True if at least one word is a count and all others are of absent sensors."""
     _, faults = decode_words(np.frombuffer(words, dtype=">u2"))
     return not (faults & ~np.uint8(ElectrodeFault.MISSING)).any() and not faults.all()
 
 
 def _id_flags(identifier: int | None) -> int:
-    """Ids above 0x7FF have 29 bits, the others 11."""
+    """Return the flags of an id: `EXTENDED` above 0x7FF (29 bits), else 0 (11 bits)."""
     if identifier is None or identifier <= STANDARD_ID_MAX:
         return 0
     return EXTENDED
 
 
 def _count_reject(counters: CanCounters, reject: Reject, identifier: int | None) -> None:
-    """Count by kind; without a known id the frame may have been meant for others."""
+    """Count a refused frame by its kind; as foreign while the id is not known."""
     name = "foreign_frames" if identifier is None else reject.value
     setattr(counters, name, getattr(counters, name) + 1)

@@ -1,7 +1,7 @@
-"""BioTac SPs behind a CAN bus of any interface that python-can has.
+"""Driver of BioTac SPs on a CAN bus, by any interface of python-can.
 
 The loop waits on the descriptor of the bus. A bus without one (virtual, some vendors' libraries) is
-polled every millisecond, which costs a percent of a core.
+polled every millisecond, which costs 1 % of a core.
 """
 
 from __future__ import annotations
@@ -26,21 +26,23 @@ POLL_NS: Final = 1_000_000
 """Time between reads of a bus without a descriptor, ns."""
 REST_MARGIN_NS: Final = 1_000_000
 REST_MAX_NS: Final = 15_000_000
-"""Waking for each of a reading's many frames costs more than the frames. The loop rests until this
-margin before the reading should be complete, and at most a quarter of what the kernel's usual
-buffer holds, ns."""
+"""Longest rest, ns: a quarter of what the kernel's usual buffer holds.
+
+Waking for each frame costs more than the frame, so the loop rests until shortly before the reading
+should be complete.
+"""
 RATE_WINDOW_NS: Final = 1_000_000_000
-"""Frames per second are counted over this time, ns."""
+"""Time over which frames per second are counted, ns."""
 FD_CLOCK_HZ: Final = 80_000_000
-"""Clock from which slcan adapters with CAN FD derive their bit times (CANable 2)."""
+"""Clock of slcan adapters with CAN FD, Hz; bit times are counted in it (CANable 2)."""
 
 
 class CanBridgeDriver(Opened):
     """Readings from a CAN bus. See `deploy/can/PROTOCOL.md` for the two formats.
 
-    The constructor raises `ValueError`; `open` and `read_ready` `DriverError` only if no later
-    try can succeed. A bus that fails is closed and opened again, and its current sweep dropped. A
-    bus without a frame of ours for ten periods, 100 ms at least, is `GREETING` until one comes.
+    The constructor raises `ValueError`. `open` and `read_ready` raise `DriverError` only if no
+    retry can succeed. If the bus fails, the current sweep is dropped and the bus is reopened. After
+    ten periods (at least 100 ms) without a frame of the board, the link is `GREETING` again.
     """
 
     name = NAME
@@ -60,7 +62,9 @@ class CanBridgeDriver(Opened):
         **board: Unpack[BoardOptions],
     ) -> None:
         """`fingers` and `board`: see `drivers.can.decoders.make_decoder`.
-        `bitrate` and `data_bitrate`, bit/s: not with socketcan, where `ip link` sets them."""
+
+        `bitrate`, `data_bitrate`: bit/s; not for socketcan, where `ip link` sets them.
+        """
         self._stamped = interface in STAMPED_INTERFACES
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)
         self.stream = self._make_stream()
@@ -76,12 +80,12 @@ class CanBridgeDriver(Opened):
 
     @property
     def link_state(self) -> LinkState:
-        """`GREETING` while the bus is open and no frame of ours comes."""
+        """State of the link; `GREETING` while the bus is open without frames of the board."""
         return self.stream.link.state
 
     @property
     def frames_per_s(self) -> float:
-        """Frames of every kind per second, over the last full second."""
+        """Frames of all kinds in the last full second."""
         silent = self._clock() - self._window_start_ns > 2 * RATE_WINDOW_NS
         return 0.0 if silent else self._frames_per_s
 
@@ -113,7 +117,7 @@ class CanBridgeDriver(Opened):
         self._try_to_open()
 
     def tap(self, sink: Callable[[list[Stamped]], None]) -> None:
-        """Pass all frames that come from now on to `sink` too."""
+        """Pass all frames that arrive from now on to `sink` too."""
         self._bus.tap = sink
 
     def close(self) -> None:
@@ -121,11 +125,11 @@ class CanBridgeDriver(Opened):
         self.stream.link.close()
 
     def fileno(self) -> int | None:
-        """Descriptor to wait on; None while there is none or no reading is near."""
+        """Return the descriptor to wait on; None if there is none, or no reading is due soon."""
         return None if self._resting_until_ns is not None else self._bus.descriptor
 
     def due_ns(self) -> int | None:
-        """Time to reopen the bus, to notice silence, or to poll without a descriptor, ns."""
+        """Return the time, ns, to reopen the bus, to notice silence, or to poll."""
         link = self.stream.link
         if link.state in (CLOSED, WAITING):
             return link.retry_ns
@@ -181,7 +185,7 @@ class CanBridgeDriver(Opened):
             self._window_start_ns, self._window_frames = now_ns, 0
 
     def _rest(self, now_ns: int) -> int | None:
-        """Return the time, ns, until which the kernel may stamp and keep frames, or None."""
+        """Return the time, ns, until which frames may wait in the kernel; None: read now."""
         if not self._stamped or self._bus.more or self._bus.descriptor is None:
             return None
         expected_ns = self.stream.expected_ns
@@ -193,7 +197,7 @@ class CanBridgeDriver(Opened):
 def _bus_options(
     interface: str, frame_format: CanFormat, bitrate: int | None, data_bitrate: int | None
 ) -> dict[str, Any]:
-    """Return arguments of python-can's bus. Raises `ValueError` for those that it would drop."""
+    """Return arguments of python-can's bus. Raises `ValueError` for rates it would ignore."""
     if interface == "socketcan" and (bitrate is not None or data_bitrate is not None):
         raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
     wants_fd = frame_format is CanFormat.SWEEP_FD

@@ -1,9 +1,9 @@
-"""Meaning of a CAN frame's data: SynTouch's samples, and sweep frames of our own.
+"""The two formats of a CAN frame's data: SynTouch's samples, and graspd's sweep frames.
 
 SynTouch's board sends one classic frame per sample: the command byte, then each sensor's response
 word (`drivers.biotac`). Source: the public driver `clearpathrobotics/numatac_can_driver`
-(`numatac_can_driver.cpp`, `bt_can.h`). Arbitration id and frame length are not public, so both are
-configuration. The sweep frame is graspd's own: one CAN FD frame per finger and sweep.
+(`numatac_can_driver.cpp`, `bt_can.h`). Arbitration id and frame length are not public, so the scene
+gives them. The sweep frame is graspd's own: one CAN FD frame per finger and sweep.
 `deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc` describe both.
 
 A new format needs a member of `CanFormat`, a decoder in `decoders.make_decoder`, a name in
@@ -23,13 +23,13 @@ from drivers.biotac import channel_of, sample_command
 from drivers.can.frames import CLASSIC_DATA_MAX, FD_DATA_MAX
 
 SENSORS_MAX: Final = 3
-"""Sensors whose words fit into a classic frame behind the command byte."""
+"""Most sensors whose words fit into a classic frame behind the command byte."""
 WORD_BYTES: Final = 2
 
 SWEEP_VERSION: Final = 1
-"""Version of the sweep frame's layout; it changes with every change of meaning."""
+"""Version of the sweep frame's layout; raise it with each change of meaning."""
 SWEEP_BASE_ID: Final = 0x5B0
-"""Arbitration id of finger 0 unless the scene says otherwise; finger i has base + i."""
+"""Default arbitration id of finger 0; finger i has this id + i."""
 SWEEP_WORDS_BYTES: Final = ELECTRODES * WORD_BYTES
 _SWEEP_HEAD: Final = struct.Struct("<BBHI")
 _SWEEP_STATUS: Final = struct.Struct("<H")
@@ -39,7 +39,7 @@ _RESERVED: Final = bytes(FD_DATA_MAX - _RESERVED_AT)
 
 
 class CanFormat(StrEnum):
-    """Which of the two formats a bus carries."""
+    """Format of the frames on a bus."""
 
     SYNTOUCH = "syntouch"
     """SynTouch's board: one classic frame per sample."""
@@ -48,7 +48,7 @@ class CanFormat(StrEnum):
 
 
 class Reject(StrEnum):
-    """Why data is not of the format; the values are names of `CanCounters`."""
+    """Reason why a frame is not of the format; the values are names of `CanCounters`."""
 
     LENGTH = "wrong_length_frames"
     COMMAND = "unknown_commands"
@@ -57,15 +57,15 @@ class Reject(StrEnum):
 
 
 class SweepStatus(IntFlag):
-    """Status bits of a sweep frame. The others are reserved and zero."""
+    """Status bits of a sweep frame. All other bits are reserved and zero."""
 
     NONE = 0
     ABSENT = 1
-    """The sensor did not answer when it was last looked for: its words mean nothing."""
+    """The sensor did not answer when it was last asked; its words mean nothing."""
     REPEATED = 2
-    """The words are those of an earlier sweep: nothing new was sampled."""
+    """The words are those of an earlier sweep; nothing new was sampled."""
     OVERRUN = 4
-    """The sweep began late because the one before it took too long."""
+    """The sweep began late, because the sweep before took longer than the period."""
 
 
 _STATUS_BITS: Final = int(SweepStatus.ABSENT | SweepStatus.REPEATED | SweepStatus.OVERRUN)
@@ -75,11 +75,11 @@ class SweepFrame(msgspec.Struct, frozen=True, gc=False):
     """All electrodes of one finger, sampled in one sweep."""
 
     finger: int
-    """Place in `drivers.base.FINGERS`: 0 ff, 1 mf, 2 rf, 3 lf, 4 th."""
+    """Index in `drivers.base.FINGERS`: 0 ff, 1 mf, 2 rf, 3 lf, 4 th."""
     sequence: int
-    """Counts the device's sweeps, the same for all fingers, wraps at 65536."""
+    """Number of the device's sweep, the same for all fingers, modulo 65536."""
     tick_us: int
-    """The device's clock when the sweep ended, microseconds, wraps at 2**32."""
+    """End of the sweep by the device's clock, microseconds, modulo 2**32."""
     words: bytes
     """Response words of E1 to E24, 48 bytes, first byte on the SPI wire first."""
     status: int = 0
@@ -96,7 +96,7 @@ def encode_sample(channel: int, words: bytes) -> bytes:
 
 
 def parse_sample(data: bytes, sensors: int, length: int) -> tuple[int, bytes] | Reject:
-    """Return channel and response words in a frame of `length` bytes, `1 + 2 * sensors` used."""
+    """Return channel and response words of a frame of `length` bytes, padding included."""
     if len(data) != length:
         return Reject.LENGTH
     channel = channel_of(data[0])
@@ -106,7 +106,7 @@ def parse_sample(data: bytes, sensors: int, length: int) -> tuple[int, bytes] | 
 
 
 def parse_sweep(data: bytes) -> SweepFrame | Reject:
-    """Return the sweep frame in the data of a CAN FD frame."""
+    """Return the sweep frame in the data of a CAN FD frame, or why it is refused."""
     if len(data) != FD_DATA_MAX:
         return Reject.LENGTH
     version, finger, sequence, tick_us = _SWEEP_HEAD.unpack_from(data)
@@ -119,7 +119,7 @@ def parse_sweep(data: bytes) -> SweepFrame | Reject:
 
 
 def sample_length(sensors: int, length: int | None) -> int:
-    """Return the length of SynTouch frames. Raises `ValueError` if it cannot be `length`."""
+    """Return the length of SynTouch frames, bytes. Raises `ValueError` if `length` is wrong."""
     if sensors > SENSORS_MAX:
         raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
     used = 1 + WORD_BYTES * sensors

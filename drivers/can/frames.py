@@ -37,35 +37,35 @@ _ERROR_CLASSES: Final = {
 }
 
 
-# What kind of frame it is; none set means a classic data frame with an 11-bit id. Plain integers:
-# an IntFlag costs a microsecond per operation.
+# Flags of a frame; 0 is a classic data frame with an 11-bit id. They are plain integers, because an
+# IntFlag costs a microsecond per operation.
 EXTENDED: Final = 1
 """29-bit arbitration id."""
 REMOTE: Final = 2
-"""Asks for data, has none."""
+"""Request for data, without data."""
 ERROR: Final = 4
-"""Made by the controller: the id holds error classes."""
+"""Error frame, made by the controller: the id holds error classes."""
 FD: Final = 8
 LOST: Final = 16
-"""No frame: at this place frames were lost."""
+"""Marker instead of a frame: frames were lost here."""
 
 
 class CanFrame(msgspec.Struct, frozen=True, gc=False):
     """One frame from a bus."""
 
     arbitration_id: int
-    """Without the flag bits of Linux; for error frames the error classes."""
+    """Id without the flag bits of Linux; the error classes of an error frame."""
     data: bytes
     flags: int = 0
-    """`EXTENDED` and so on, added up."""
+    """Sum of `EXTENDED`, `REMOTE`, `ERROR`, `FD` and `LOST`."""
 
 
 Stamped = tuple[CanFrame, int, int]
-"""A frame, or `LOST`, and the monotonic times, ns, between which it arrived."""
+"""A frame or the marker `LOST`, and the two monotonic times, ns, between which it arrived."""
 
 
 def unpack_frame(raw: bytes) -> CanFrame | None:
-    """Return the frame in a `can_frame` or `canfd_frame`, or None."""
+    """Return the frame in a `can_frame` or `canfd_frame`; None if it is malformed."""
     if len(raw) == CAN_FRAME.size:
         word, length, data = CAN_FRAME.unpack(raw)
         longest, flags = CLASSIC_DATA_MAX, 0
@@ -87,12 +87,12 @@ def unpack_frame(raw: bytes) -> CanFrame | None:
 
 
 def is_bus_off(frame: CanFrame) -> bool:
-    """Return True for an error frame: the controller left the bus."""
+    """Return True if an error frame says that the controller left the bus."""
     return bool(frame.flags & ERROR and frame.arbitration_id & ERROR_BUS_OFF)
 
 
 def is_overflow(frame: CanFrame) -> bool:
-    """Return True for an error frame: the controller's receive buffer ran over."""
+    """Return True if an error frame says that the controller's receive buffer overflowed."""
     if not (frame.flags & ERROR and frame.arbitration_id & ERROR_CONTROLLER):
         return False
     return len(frame.data) > 1 and bool(frame.data[1] & CONTROLLER_RX_OVERFLOW)

@@ -1,17 +1,18 @@
-"""Samples -> one `TactileReading` per sweep; what is missing is flagged.
+"""Combine samples into one `TactileReading` per sweep; missing electrodes are flagged.
 
-The real CAN format has no counter. A sample's command byte names its channel; its sweep follows
-from its place in the known order of the sequence and from the time between samples:
+The real CAN format has no counter. A sample's command byte names its channel. Its sweep follows
+from its place in the known order of the sequence, and from the time between samples:
 
-- An electrode earlier in the order starts a new sweep, unless it is a copy of what this sweep has
-  (duplicated) or one that this sweep lacks and just passed by (reordered, up to `REORDER_MAX`).
-- A sample that comes later than its place in the order explains starts a new sweep too.
-- A sweep that is lost as a whole is found by time alone.
-- Losing an unknown number of samples ends the current sweep.
+- An electrode earlier in the order starts a new sweep. There are two exceptions: a copy of a sample
+  that this sweep has (duplicated), and a sample that this sweep has just passed by (reordered, by
+  at most `REORDER_MAX` places).
+- A sample that is later than its place in the order explains starts a new sweep too.
+- A loss of whole sweeps is found by time alone.
+- A loss of an unknown number of samples ends the current sweep.
 
-Not noticed: data damaged so that it names another valid channel. A sender that stalls within a
-sweep looks like a loss of whole sweeps; a copy more than `REORDER_MAX` electrodes late looks like a
-new sweep. No electrode is shifted or filled from memory: what a sweep did not get is `MISSING`.
+Damage that names another valid channel is not noticed. A sender that stalls within a sweep looks
+like a loss of whole sweeps. A copy that is more than `REORDER_MAX` electrodes late looks like a new
+sweep. No electrode is shifted or filled from memory; those that a sweep lacks are `MISSING`.
 """
 
 from __future__ import annotations
@@ -26,23 +27,25 @@ from drivers.biotac import E1, E24, make_reading
 from drivers.can.readings import OUTAGE_NS, CanCounters, SweepPeriod
 
 REORDER_MAX: Final = 3
-"""Most electrodes by which a sample may be late: adapters with few buffers swap neighbours."""
+"""Most places by which a sample may be late; adapters with few buffers swap neighbours."""
 NEXT_SWEEP_PERIODS: Final = 0.75
-"""A sample this much later than its place explains, in periods, is of another sweep. Samples of
-whole sweeps that are lost make it one period or more: a sweep broken without need is flagged, two
-sweeps in one reading would not be."""
+"""Delay, in periods, from which a sample belongs to another sweep.
+
+A loss of whole sweeps delays a sample by one period or more. A lower limit is the safe side: a
+sweep cut without need is flagged, two sweeps mixed in one reading would not be.
+"""
 SLOT_MIN_NS: Final = 100_000
-"""Least time between samples, ns: 103 bits at 1 Mbit/s, as of the fastest board."""
+"""Shortest time between samples, ns: 103 bits at 1 Mbit/s, as on the fastest board."""
 ARRIVAL_JITTER_NS: Final = 5_000_000
-"""A sweep that comes less than this late, ns, tells of no missed one."""
+"""Delay of a sweep, ns, up to which no sweep counts as missed."""
 EVEN_SHARE: Final = 1 / 3
-"""Largest share of a period between two samples without a lost sweep, which takes half."""
+"""Largest gap between two samples without a lost sweep, in periods; a lost one takes half."""
 
 _ALL: Final = (1 << ELECTRODES) - 1
 
 
 class SampleAssembler:
-    """Sweeps from single samples in the order of a sequence."""
+    """Combine single samples, sent in the order of a sequence, into sweeps."""
 
     def __init__(
         self,
@@ -51,8 +54,10 @@ class SampleAssembler:
         counters: CanCounters,
         rows: Sequence[int] | None = None,
     ) -> None:
-        """`sensors`: words of a sample. `rows`: the sensor, from 0, of each row of a reading.
-        `sequence`: channels in order. Raises `ValueError` unless it has E1 to E24 once each."""
+        """Raises `ValueError` if `sequence`, the channels in order, lacks an electrode.
+
+        `sensors`: number of words in a sample. `rows`: number of each row's sensor, from 0.
+        """
         electrodes = [channel for channel in sequence if E1 <= channel <= E24]
         if sorted(electrodes) != list(range(E1, E24 + 1)):
             raise ValueError("the sequence does not have every electrode exactly once")
@@ -79,14 +84,14 @@ class SampleAssembler:
     def _forget(self) -> None:
         self._synchronised = False
         self._is_steady = False
-        """True if the board has been seen to sweep without a pause."""
+        """True if the board sweeps without a pause."""
         self._previous_had = _ALL
         self._run = 0
         self._begin()
 
     @property
     def period_ns(self) -> int | None:
-        """Time between sweeps, ns, as measured; None until it is known."""
+        """Measured time between sweeps, ns; None until it is known."""
         return self._period.period_ns
 
     @property
@@ -101,10 +106,10 @@ class SampleAssembler:
     def push(
         self, channel: int, words: bytes, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
-        """Take a sample; return the readings that it completes, oldest first.
+        """Add a sample; return the readings that it completes, oldest first.
 
-        `words`: each sensor's response word, two bytes each. It came at `t_ns`, or with `until_ns`
-        at any time between the two; too wide a doubt makes it useless.
+        `words`: response word of each sensor, two bytes each. The sample arrived at `t_ns`, or
+        between `t_ns` and `until_ns` if that is given; too wide a range makes it useless.
         """
         place = self._place.get(channel)
         if place is None:
@@ -146,12 +151,12 @@ class SampleAssembler:
         return finished
 
     def interrupt(self) -> None:
-        """Drop the current sweep. Call when the link broke."""
+        """Drop the current sweep. Call after the link broke."""
         self._counters.interrupted_sweeps += not self._finished and self._have != 0
         self._forget()
 
     def _count_run(self, place: int, t_ns: int) -> None:
-        """Count samples without a gap in their order, and keep the widest time between two."""
+        """Count samples in a row without a gap, and keep the widest time between two."""
         if place != self._seen:
             follows = place == (self._seen + 1) % ELECTRODES
             self._run = self._run + 1 if follows else 1
@@ -170,7 +175,7 @@ class SampleAssembler:
         return self._synchronised
 
     def _untimed(self, place: int, t_ns: int) -> Sequence[TactileReading]:
-        """End the current sweep at a sample without a time, and learn the period."""
+        """End the current sweep at a sample whose time is unknown, and learn the period."""
         self._counters.untimed_frames += 1
         finished = self._finish()
         self._begin()
@@ -179,30 +184,30 @@ class SampleAssembler:
         return finished
 
     def _is_next_sweep(self, place: int, until_ns: int) -> bool:
-        """Return True if a sample may have come too late to be of this sweep."""
+        """Return True if a sample may be too late for the current sweep."""
         return self._last >= 0 and self._late_ns(place, until_ns) >= self._lateness_ns()
 
     def _is_early(self, place: int, until_ns: int) -> bool:
-        """Return True if a sample came too soon to be of this sweep: it is of the last one."""
+        """Return True if a sample is too early for the current sweep, so of the last one."""
         late_ns = self._late_ns(place, until_ns)
         if self._period.period_ns is None:
             return late_ns < 0
         return -late_ns >= self._lateness_ns()
 
     def _late_ns(self, place: int, until_ns: int) -> float:
-        """Return how much later than its place explains a sample came, ns; below 0 if earlier."""
+        """Return how much later than its place explains a sample is, ns; negative: earlier."""
         period_ns = self._period.period_ns
         if period_ns is None:
             return until_ns - self._t_ns - max(place - self._last, 0) * SLOT_MIN_NS
         return until_ns - (self._origin_ns + self._position[place] * period_ns)
 
     def _lateness_ns(self) -> float:
-        """Return the delay, ns, from which on a sample is of another sweep."""
+        """Return the delay, ns, from which a sample belongs to another sweep."""
         period_ns = self._period.period_ns or self._samples * SLOT_MIN_NS
         return NEXT_SWEEP_PERIODS * period_ns
 
     def _is_tail_of_previous(self, place: int) -> bool:
-        """Return True for one of the last electrodes where a sweep has just begun."""
+        """Return True if the electrode is one of the last, and a sweep has just begun."""
         return place >= ELECTRODES - REORDER_MAX and 0 <= self._last < REORDER_MAX
 
     def _holds(self, place: int, words: bytes) -> bool:
@@ -210,7 +215,7 @@ class SampleAssembler:
         return self._buffer[start : start + self._width] == words
 
     def _repeats(self, place: int, words: bytes, t_ns: int, until_ns: int) -> bool:
-        """Take a copy or a late sample, or return False: a new sweep begins."""
+        """Handle a copy or a late sample, or return False if a new sweep begins."""
         if self._last - place > REORDER_MAX or self._is_next_sweep(place, until_ns):
             return False
         if not self._have >> place & 1:
@@ -241,7 +246,7 @@ class SampleAssembler:
         self._t_ns = t_ns
 
     def _finish(self) -> Sequence[TactileReading]:
-        """Close the current sweep; return its reading, if that was not done before."""
+        """End the current sweep; return its reading, unless it was returned before."""
         if self._finished or not self._have:
             return ()
         self._finished = True
@@ -259,7 +264,7 @@ class SampleAssembler:
         return (make_reading(words, marks, self._t_ns, self._counters),)
 
     def _check_time(self) -> None:
-        """Find sweeps lost as a whole, and learn the period from two complete ends in a row."""
+        """Count lost whole sweeps; learn the period from two complete sweeps in a row."""
         period_ns = self._period.period_ns
         start_ns = self._t_ns - round(self._position[self._last] * (period_ns or 0))
         if self._previous_start_ns is not None:
@@ -275,14 +280,14 @@ class SampleAssembler:
             self._broken = True
 
     def _learn(self, end_ns: int) -> None:
-        """Learn the period from the end of a sweep and of the one before.
+        """Learn the period from the ends of this sweep and of the one before.
 
-        Samples without a gap in their order tell of a period even if the time between them broke
-        the sweep: else a period that is wrong once, and breaks every sweep, would stay. If a whole
-        sweep may be missing in the widest gap, the board must be one that always pauses there.
+        Samples without a gap in their order count even if the time between them cut the sweep.
+        Otherwise a wrong period that cuts every sweep would never be corrected. If the widest gap
+        has room for a whole sweep, only a board that always pauses there teaches the period.
         """
-        known = not self._broken or self._run > ELECTRODES
-        if known and self._previous_end_ns is not None:
+        is_usable = not self._broken or self._run > ELECTRODES
+        if is_usable and self._previous_end_ns is not None:
             gap_ns = end_ns - self._previous_end_ns
             is_even = self._widest_ns < EVEN_SHARE * gap_ns
             if is_even and not self._is_steady:

@@ -1,4 +1,4 @@
-"""What one CAN bus brings: frames in with their times, readings out. No I/O."""
+"""Decode the frames of one CAN bus, with their times, into readings. No I/O."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ NAME: Final = "can"
 SILENCE_PERIODS: Final = 10
 """Missing readings after which the link is lost."""
 SILENCE_MIN_NS: Final = 100_000_000
-"""Shortest silence that is one, ns: above what an adapter or a busy host holds back."""
+"""Shortest timeout of a reading, ns: adapters and busy hosts delay frames by less."""
 _SPECIAL: Final = ERROR | REMOTE | LOST
-"""Flags of what is no data frame."""
+"""Flags of entries that are no data frames."""
 
 
 class CanStream:
-    """Decodes one bus, and says by `link` whether a board of ours is on it.
+    """Decoder of one bus; `link` is up while the configured board sends.
 
-    The owner of the bus calls `link.greeting` when it is open, `receive` and then `watch` with what
-    comes, and `lost` when it is gone. All times are monotonic ns.
+    The owner of the bus calls `link.greeting` when the bus is open, `receive` and then `watch` for
+    the frames that arrive, and `lost` when the bus is gone. All times are monotonic ns.
     """
 
     def __init__(self, bus: str, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
-        """`bus`: its name, for people. `fingers` and `board`: see `make_decoder`."""
+        """`bus`: name of the bus in messages. `fingers` and `board`: see `make_decoder`."""
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None
-        """Last failure of the bus or error frame, for people; silence is neither."""
+        """Last failure of the bus or error frame, for people; silence does not count."""
         self._where = f"{bus}, {CanFormat(board.get('format', CanFormat.SYNTOUCH))}"
         self._accepted = 0
         self._silent_at_ns = 0
@@ -50,17 +50,17 @@ class CanStream:
 
     @property
     def period_ns(self) -> int | None:
-        """Time between readings, ns, as measured; None until it is known."""
+        """Measured time between readings, ns; None until it is known."""
         return self._decoder.sweeps.period_ns
 
     @property
     def expected_ns(self) -> int | None:
-        """Time when the next reading should be complete, if many frames make one."""
+        """Time when the next reading should be complete, ns; None: not known or not used."""
         return self._decoder.sweeps.expected_ns
 
     @property
     def silent_at_ns(self) -> int | None:
-        """Time when silence is to be noticed; None while the link is not up."""
+        """Time when the link counts as silent, ns; None while it is not up."""
         return self._silent_at_ns if self.link.state is UP else None
 
     def describe(self) -> dict[str, Fact]:
@@ -72,7 +72,7 @@ class CanStream:
         return facts
 
     def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], LinkError | None]:
-        """Return the complete readings, oldest first, and why the bus is lost, if it is."""
+        """Return the readings that are complete, oldest first, and why the bus is lost."""
         readings: list[Reading] = []
         trouble = None
         for frame, t_ns, until_ns in frames:
@@ -85,8 +85,10 @@ class CanStream:
         return readings, trouble
 
     def watch(self, now_ns: int, *, more: bool = False) -> None:
-        """Take the link up at the first frame of ours, and down after none for too long.
-        `more`: frames wait that were not taken yet, so that there is no silence."""
+        """Set the link up after the board's first frame, and down after its silence.
+
+        `more`: True if frames still wait in the bus, so that silence is not certain.
+        """
         if self.counters.accepted_frames > self._accepted:
             self._accepted = self.counters.accepted_frames
             self._silent_at_ns = now_ns + self._silence_ns()
@@ -98,13 +100,13 @@ class CanStream:
             self.link.greeting()
 
     def lost(self, error: LinkError, now_ns: int) -> None:
-        """Note that the bus broke, or could not be opened."""
+        """Call when the bus broke or could not be opened."""
         self.counters.bus_faults += 1
         self.last_error = str(error)
         self._down(error, now_ns)
 
     def interrupt(self) -> None:
-        """Drop the current sweep. Call when frames are missing from here on."""
+        """Drop the current sweep. Call when the next frames will be missing."""
         self._decoder.interrupt()
 
     def _down(self, error: LinkError, now_ns: int) -> None:

@@ -1,7 +1,7 @@
-"""Per-finger frames -> one `TactileReading` per sweep; what is missing is flagged.
+"""Combine the frames of single fingers into one `TactileReading` per sweep.
 
-Frames are of one sweep if number and tick agree and if they come within two periods: a board that
-was reset repeats both, but must be silent for that time.
+Missing fingers are flagged. Frames belong to one sweep if number and tick agree, and if they arrive
+within two periods. A board after a reset repeats both, but is silent for longer before.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from drivers.biotac import make_reading
 from drivers.can.readings import CanCounters, SweepPeriod
 
 SEQUENCE_JUMP_MAX: Final = 1000
-"""A jump by more is a restart of the counter; 1000 sweeps last ten seconds."""
+"""Largest jump of the sweep number that counts as a loss (ten seconds); more is a restart."""
 LATE_FRAMES_MAX: Final = 8
-"""Sweep counters that fall back by up to this are late frames, by more a new start."""
+"""Largest step back of the sweep number that counts as late frames; more is a restart."""
 PATIENCE_PERIODS: Final = 2
-"""After this many periods a frame is neither late nor of the present sweep."""
+"""Periods after which a frame is neither late nor of the current sweep."""
 PATIENCE_NS: Final = 100_000_000
-"""The same while the period is not known, ns."""
+"""Used instead of `PATIENCE_PERIODS` while the period is not known, ns."""
 _TICKS: Final = 1 << 32
 _HALF: Final = 1 << 31
 
 
 class FrameAssembler:
-    """Sweeps from frames that hold all electrodes of one finger and the sweep's number."""
+    """Combine frames with all electrodes of one finger and the sweep's number into sweeps."""
 
     expected_ns: int | None = None
-    """Not told: the few frames of a sweep are no reason to rest between them."""
+    """Always None: a sweep has few frames, so resting between them gains nothing."""
 
     def __init__(
         self, fingers: int, counters: CanCounters, order: Sequence[int] | None = None
     ) -> None:
-        """`order`: place of each row's frame in a sweep, by default the row."""
+        """`order`: place of each row's frame in a sweep; None: the row's own number."""
         self._order = range(fingers) if order is None else order
         self._fingers = fingers
         self._all = (1 << fingers) - 1
@@ -48,7 +48,7 @@ class FrameAssembler:
         self._synchronised = False
         self._finished_ns: int | None = None
         self._follows: int | None = None
-        """Number of the sweep after the one that was finished last, of the same start."""
+        """Number expected after the last finished sweep; None after a restart."""
         self._begin(0, 0)
 
     def _begin(self, tick_us: int, t_ns: int) -> None:
@@ -65,11 +65,11 @@ class FrameAssembler:
     def push(
         self, row: int, sequence: int, tick_us: int, words: bytes, faults: int, t_ns: int
     ) -> Sequence[TactileReading]:
-        """Take the frame of finger `row`; return the readings that it completes, oldest first.
+        """Add the frame of finger `row`; return the readings that it completes, oldest first.
 
-        `sequence`: the sweep's number, 16 bits. `tick_us`: its end by the device's clock, 32 bits.
-        `words`: 24 response words. `faults`: `ElectrodeFault` bits of all electrodes; words under
-        `MISSING` mean nothing.
+        `sequence`: number of the sweep, 16 bits. `tick_us`: its end by the device's clock, 32 bits.
+        `words`: 24 response words. `faults`: `ElectrodeFault` bits of all electrodes; with
+        `MISSING` the words are ignored.
         """
         done: Sequence[TactileReading] = ()
         if self._current is None or sequence != self._current:
@@ -82,7 +82,7 @@ class FrameAssembler:
             if (self._words[row] == np.frombuffer(words, dtype=">u2")).all():
                 self._counters.duplicate_frames += 1
                 return ()
-            # The board was reset and numbers as before: which frames are of which start is open.
+            # The board was reset and has the same numbers again, so frames may be of either start.
             self.interrupt()
             self._counters.restarts += 1
             self._follows = None
@@ -105,11 +105,11 @@ class FrameAssembler:
         return done if self._have != self._all else (*done, *self._finish())
 
     def cut(self) -> Sequence[TactileReading]:
-        """Do nothing where frames were lost: numbered frames show it by themselves."""
+        """Do nothing after a loss: the frames' numbers show it."""
         return ()
 
     def interrupt(self) -> None:
-        """Drop the current sweep. Call when the link broke."""
+        """Drop the current sweep. Call after the link broke."""
         if self._have and not self._finished:
             self._counters.interrupted_sweeps += 1
             self._counters.missed_readings += 1
@@ -121,14 +121,14 @@ class FrameAssembler:
         return PATIENCE_NS if period_ns is None else PATIENCE_PERIODS * period_ns
 
     def _is_late(self, sequence: int, tick_us: int, t_ns: int) -> bool:
-        """Return True if a frame is of a sweep just before, by number, time and tick."""
+        """Return True if a frame is of an earlier sweep, by number, time and tick."""
         if self._current is None or t_ns - self._t_ns > self._patience_ns():
             return False
         back = (self._current - sequence) % (1 << 16)
         return back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _HALF
 
     def _advance(self, sequence: int, tick_us: int, t_ns: int) -> None:
-        """Begin a sweep; count those missing, or a restart of the device."""
+        """Begin a sweep; count the missing ones, or a restart of the device."""
         if self._current is not None:
             jump = (sequence - self._current) % (1 << 16)
             backwards = (tick_us - self._tick_us) % _TICKS >= _HALF
@@ -142,7 +142,7 @@ class FrameAssembler:
         self._begin(tick_us, t_ns)
 
     def _finish(self) -> Sequence[TactileReading]:
-        """Close the current sweep; the first one must be complete."""
+        """End the current sweep; the first one must be complete."""
         if self._finished or not self._have:
             return ()
         self._finished = True

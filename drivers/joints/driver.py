@@ -7,12 +7,12 @@ from drivers.udp.driver import DatagramDriver
 
 
 class JointStreamDriver(DatagramDriver[JointStream]):
-    """Gives a `JointReading` per message."""
+    """Driver of the joint stream: one `JointReading` per message."""
 
     name = "joints"
     bytes_max = DATAGRAM_BYTES_MAX
     silence_ns = 500_000_000
-    """50 messages at 100 Hz; a sender of 10 Hz passes."""
+    """Timeout, ns: 50 messages at 100 Hz. A sender of 10 Hz passes."""
     period_ns: int | None = None
 
     def _new_stream(self) -> JointStream:

@@ -17,44 +17,44 @@ from drivers.hand import joint_name
 from drivers.udp.driver import DatagramCounters
 
 DATAGRAM_BYTES_MAX = 4096
-"""All 28 joints in full precision have about 900 bytes."""
+"""Longest message, bytes; all 28 joints in full precision take about 900."""
 ANGLE_MAX_RAD: Final = math.radians(200)
-"""J0, the sum of two joints, reaches 180 degrees. A larger value is not an angle in radians."""
+"""Largest angle, rad: J0, the sum of two joints, reaches 180 degrees. More is another unit."""
 SEQ_MAX: Final = (1 << 63) - 1
 SEQ_JUMP_MAX: Final = 1000
-"""A sender that jumps ahead by more has restarted."""
+"""Largest jump ahead of `seq` that counts as a loss; after a larger one the sender restarted."""
 OLD_MESSAGES_MAX: Final = 10
-"""Messages in a row with old but rising numbers that may be a detour; one more is a restart."""
+"""Old messages in a row, with rising numbers, that may have been delayed; one more: a restart."""
 _joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
 """Cache of 64 names: 28 joints with and without prefix, and a few unknown ones."""
 
 
 @dataclass(slots=True)
 class JointCounters(DatagramCounters):
-    """Counters of joint messages. `missed_readings` needs a sender that counts."""
+    """Counters of joint messages. `missed_readings` stays 0 if the sender sends no `seq`."""
 
     bad_messages: int = 0
-    """Datagrams that are not such a message; dropped."""
+    """Datagrams that are no joint message; dropped."""
     old_messages: int = 0
-    """Messages that came after a later one, or again; dropped."""
+    """Messages that came again or after a later one; dropped."""
     restarts: int = 0
     """Times that the sender restarted its numbers."""
     unknown_names: int = 0
-    """Joints with a name that no Shadow hand has; left out."""
+    """Names that no joint of a Shadow hand has; left out."""
     bad_angles: int = 0
     """Values that are not an angle in radians; handed over as NaN."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointMessage:
-    """One message."""
+    """One message of the joint stream."""
 
     seq: int | None
-    """Counts up by one per message, if the sender counts."""
+    """Number of the message, one more each time; None if the sender sends none."""
     t_s: float | None
-    """The sender's own time, s, from anywhere."""
+    """Sender's own time, s, with any zero; None if the sender sends none."""
     names: tuple[str, ...]
-    """Without hand prefix, in the order of the message."""
+    """Joint names without hand prefix, in the order of the message."""
     position_rad: NDArray[np.float64]
     """Shape (joints,); NaN for a value that is no angle."""
 
@@ -70,7 +70,7 @@ class JointMessage:
 
 
 class JointStream:
-    """The joint messages of one sender in, readings out. A `DatagramStream`."""
+    """Decoder of one sender's joint messages into readings. A `DatagramStream`."""
 
     sender_kind = "joint stream"
 
@@ -79,13 +79,13 @@ class JointStream:
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Take the next message for the first one."""
+        """Forget the last message; the next one counts as the first."""
         self._last: float | None = None
         self._counted = False
         self._last_old: float | None = None
 
     def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
-        """Return the reading, if a joint is known; None if the message is dropped."""
+        """Return the reading, none if no joint is known; None if the message is dropped."""
         message = self.parse(data)
         if message is None or not self.admits(message):
             return None
@@ -96,7 +96,7 @@ class JointStream:
         return [JointReading(t_ns, seq, message.names, message.position_rad)]
 
     def parse(self, data: bytes) -> JointMessage | None:
-        """Return the message of a datagram, or count it and return None."""
+        """Return the message of a datagram; None, and count it, if it is not valid."""
         try:
             message = _message(data)
         except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
@@ -119,7 +119,7 @@ class JointStream:
         return JointMessage(seq, t_s, tuple(angles), np.array(list(angles.values()), dtype=float))
 
     def admits(self, message: JointMessage) -> bool:
-        """Return True for a message newer than all before, by number or time."""
+        """Return True if the message is newer than all before, by number or time."""
         counted = message.seq is not None
         now = message.seq if counted else message.t_s
         if now is None:
@@ -151,7 +151,7 @@ class JointStream:
 
 
 def _message(data: bytes) -> tuple[int | None, float | None, Mapping[str, Any]] | None:
-    """Return number, time and joints. No message: None or `ValueError`."""
+    """Return number, time and joints. For other data, return None or raise `ValueError`."""
     if len(data) > DATAGRAM_BYTES_MAX:
         return None
     # JSON has no NaN; as text it costs only the joint that has it.
@@ -175,7 +175,7 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _finite(value: object) -> float:
-    """Return a finite number, else NaN. Truth values and text are not numbers."""
+    """Return `value` if it is a finite number, else NaN. Booleans and text are no numbers."""
     if type(value) is int:
         return float(value) if abs(value) <= SEQ_MAX else math.nan
     return value if type(value) is float and math.isfinite(value) else math.nan

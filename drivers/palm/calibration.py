@@ -1,4 +1,6 @@
-"""A hand's calibration: raw Hall values of a palm packet -> joint angles, and its checked file.
+"""A hand's calibration: convert raw Hall values of a palm packet to joint angles.
+
+A calibration file is TOML:
 
     version = 1
     hand = "378"                       # for people
@@ -10,12 +12,13 @@
     [coupled]                          # optional; without it THJ1 and THJ2 have no angle
     THJ1_THJ2 = [[2132, 2294, 0.0, -20.0], ...]   # [raw THJ1, raw THJ2, degrees, degrees]
 
-Tables are linear between their points and, without clamping, beyond them, as in Shadow's driver.
-THJ1 and THJ2 see each other's magnets: both angles come from both raw values. J0 is the sum of J1
-and J2 of a finger, which one motor moves. A joint that is left out has no angle (NaN).
+Tables are linear between their points, and go on in a straight line beyond them, as in Shadow's
+driver. The sensors of THJ1 and THJ2 see each other's magnets, so both angles come from both raw
+values. J0 of a finger is the sum of J1 and J2, which one motor moves. A joint that is left out has
+no angle (NaN).
 
-A mistake anywhere refuses the whole file, such as those of files shipped with hands: a digit too
-many, zeros for what was not measured, tables that turn back.
+One mistake refuses the whole file. Files shipped with hands have had these: a digit too many, zeros
+for joints that were not measured, tables that first rise and then fall.
 """
 
 from __future__ import annotations
@@ -47,12 +50,12 @@ HALL_SENSORS: Final = {
     "WRJ1": (23, 24),
     "WRJ2": (25,),
 }
-"""Words of `PalmPacket.sensors` by joint; the mean of two, if it has two."""
+"""Indices in `PalmPacket.sensors` of each joint; of two sensors the mean is used."""
 COUPLED = ("THJ1", "THJ2")
-"""The joints whose angles come from both raw values."""
+"""Joints whose angles come from the raw values of both."""
 SUMS: Final = {f"{finger}J0": (f"{finger}J1", f"{finger}J2") for finger in ("FF", "MF", "RF", "LF")}
 JOINTS: Final = (*HALL_SENSORS, *SUMS)
-"""All joints of a reading, in its order: 24 with sensors of their own, and the four J0."""
+"""All joints of a reading, in its order: 24 with sensors, then the four J0."""
 
 _FINGER_RANGES: Final = {0: (0, 180), 1: (0, 90), 2: (0, 90), 3: (-15, 90), 4: (-20, 20)}
 RANGE_DEG: Final[Mapping[str, tuple[int, int]]] = {
@@ -70,30 +73,30 @@ RANGE_DEG: Final[Mapping[str, tuple[int, int]]] = {
     "WRJ1": (-40, 28),
     "WRJ2": (-28, 10),
 }
-"""How far joints go, degrees (Shadow's documentation, ranges)."""
+"""Lowest and highest angle of each joint, degrees (Shadow's documentation, ranges)."""
 RANGE_MARGIN_DEG = 10
-"""An angle further than this beyond its range, degrees, shows a wrong calibration or sensor."""
+"""Degrees beyond its range from which an angle shows a wrong calibration or sensor."""
 
 VERSION = 1
 COUPLED_KEY = "THJ1_THJ2"
 FILE_BYTES_MAX = 256 * 1024
-"""A full file has 4 kB."""
+"""Largest calibration file, bytes; a full one has 4 kB."""
 POINTS_MIN, POINTS_MAX = 2, 64
-"""Points of a table; Shadow's own have 2 to 9."""
+"""Fewest and most points of a table; Shadow's own have 2 to 9."""
 COUPLED_POINTS_MIN, COUPLED_POINTS_MAX = 3, 49
-"""Points of the coupled table; Shadow's own has 25, five by five."""
+"""Fewest and most points of the coupled table; Shadow's own has 25, five by five."""
 SLOPE_MAX_DEG = 0.5
-"""Steepest segment, degrees per count of noise; usual are 0.03 to 0.1."""
+"""Steepest allowed segment, degrees per count; usual are 0.03 to 0.1."""
 
 Points = Sequence[Sequence[float]]
 """Rows of (raw, degrees), or of (raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
 
 
 class Table:
-    """One raw value -> radians."""
+    """Convert one raw value to radians."""
 
     def __init__(self, points: Points) -> None:
-        """Raises `ValueError` for fewer than two points, or two with the same raw value."""
+        """Raises `ValueError` for fewer than two points, or for equal raw values."""
         ordered = sorted(points, key=itemgetter(0))
         self._raws = [raw for raw, _ in ordered]
         self._slopes: list[float] = []
@@ -111,21 +114,21 @@ class Table:
 
 
 class CoupledTable:
-    """A pair of raw values -> a pair of radians, linear between measured pairs."""
+    """Convert two raw values to two angles, linear between measured pairs."""
 
     def __init__(self, points: Points) -> None:
-        """Raises `ValueError` if the raw pairs span no triangle."""
+        """Raises `ValueError` if all raw pairs lie on one line."""
         table = np.array(points, dtype=np.float64)
         triangles = _delaunay(table[:, :2])
         if not len(triangles):
             raise ValueError("the raw pairs do not span a triangle")
         corners = np.concatenate([table[triangles, :2], np.ones((len(triangles), 3, 1))], axis=2)
         self._to_weights = np.linalg.inv(corners)
-        """Shape (triangles, 3, 3): (raw 1, raw 2, 1) times this is the weights of the corners."""
+        """Shape (triangles, 3, 3); (raw 1, raw 2, 1) times it gives the weights of the corners."""
         self._angles_rad = np.radians(table[triangles, 2:])
 
     def angles_rad(self, raw_1: float, raw_2: float) -> tuple[float, float]:
-        """Return both angles; outside all triangles, by the nearest triangle."""
+        """Return both angles, radians; outside all triangles the nearest one is extended."""
         weights = np.array([raw_1, raw_2, 1.0]) @ self._to_weights
         nearest = int(np.argmax(weights.min(axis=1)))
         first, second = weights[nearest] @ self._angles_rad[nearest]
@@ -134,13 +137,13 @@ class CoupledTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointCalibration:
-    """Tables of one hand."""
+    """Tables of all joints of one hand."""
 
     tables: Mapping[str, Table]
     coupled: CoupledTable | None = None
 
     def angles_rad(self, sensors: Sequence[int]) -> NDArray[np.float64]:
-        """Return the angles of `JOINTS`, radians; NaN without a table or a raw value in 0..4095."""
+        """Return the angles of `JOINTS`, radians; NaN without a table or a valid raw value."""
         angles = dict.fromkeys(JOINTS, math.nan)
         for joint, table in self.tables.items():
             raw = _raw(sensors, HALL_SENSORS[joint])
@@ -163,7 +166,7 @@ _LOW_RAD, _HIGH_RAD = (
 
 
 def impossible_angles(position_rad: NDArray[np.float64]) -> int:
-    """Return how many angles of `JOINTS` are out of reach; NaN is not."""
+    """Return the number of angles of `JOINTS` that are far out of range; NaN does not count."""
     return int(((position_rad < _LOW_RAD) | (position_rad > _HIGH_RAD)).sum())
 
 
@@ -173,12 +176,14 @@ def _raw(sensors: Sequence[int], words: Sequence[int]) -> float | None:
 
 
 def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return triangles, shape (n, 3), whose circumcircle has no point inside; points: (p, 2).
-    Four points on one circle give both pairs of triangles."""
+    """Return the triangles, shape (n, 3), whose circumcircle has no point inside.
+
+    `points`: shape (p, 2). Four points on one circle give both pairs of triangles.
+    """
     triples = np.array(list(itertools.combinations(range(len(points)), 3)), dtype=np.intp)
     a, b, c = (points[triples[:, corner]] for corner in range(3))
     edges = np.stack([b - a, c - a], axis=1)
-    broad = np.abs(np.linalg.det(edges)) > 0.5  # twice the area, counts squared; 0 on one line
+    broad = np.abs(np.linalg.det(edges)) > 0.5  # twice the area; 0 on a line
     triples, a, edges = triples[broad], a[broad], edges[broad]
     # The circle's centre is as far from the first corner as from the others.
     offset = np.linalg.solve(edges, (edges**2).sum(axis=2, keepdims=True) / 2)[:, :, 0]
@@ -190,12 +195,12 @@ def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 class CalibrationError(DriverError):
-    """The file cannot be used. The message has one line per mistake."""
+    """A calibration file cannot be used. The message has one line per mistake."""
 
     def __init__(self, path: Path, problems: Sequence[str]) -> None:
         super().__init__("\n".join(f"{path}: {problem}" for problem in problems))
         self.problems = tuple(problems)
-        """Mistakes, each beginning with the name of its joint."""
+        """Mistakes; each text begins with the name of its joint."""
 
 
 def load_calibration(path: Path) -> JointCalibration:
@@ -209,7 +214,7 @@ def load_calibration(path: Path) -> JointCalibration:
         raise CalibrationError(path, [f"is longer than {FILE_BYTES_MAX} bytes"])
     try:
         return parse_calibration(toml.loads(content.decode()), path)
-    except ValueError as error:  # no UTF-8 and long numbers too
+    except ValueError as error:  # also for bytes that are not UTF-8, and for very long numbers
         raise CalibrationError(path, [f"is not TOML: {error}"]) from error
 
 
@@ -311,7 +316,7 @@ def _degree_problems(joint: str, degrees: Sequence[float]) -> Iterator[str]:
 
 
 def _curve_problems(points: Points) -> Iterator[str]:
-    """`points` are sorted by raw."""
+    """Yield the mistakes of a table whose `points` are sorted by raw value."""
     slopes = []
     for (raw, degrees), (next_raw, next_degrees) in itertools.pairwise(points):
         if raw == next_raw:
@@ -329,7 +334,7 @@ def _curve_problems(points: Points) -> Iterator[str]:
 
 
 def _steepness_problems(points: Points) -> list[str]:
-    """Return the pairs of points between which noise would move the joints."""
+    """Return the mistakes of a coupled table: segments that are too steep, and equal points."""
     problems = []
     for first, second in itertools.combinations(points, 2):
         distance = float(np.hypot(first[0] - second[0], first[1] - second[1]))

@@ -1,4 +1,4 @@
-"""The palm stream of a Shadow hand as a driver: joints and BioTacs by UDP from a relay."""
+"""Driver of a Shadow hand's palm: joints and BioTacs, by UDP from a relay."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from drivers.palm.stream import ROUND_NS, PalmStream
 from drivers.udp.driver import DatagramDriver
 
 SPARE_CYCLES: Final = 2
-"""The driver waits for packets again this many cycles before a round can end."""
+"""Cycles before the end of a round from which the driver waits for packets again."""
 
 
 class PalmDriver(DatagramDriver[PalmStream]):
-    """Gives the readings of a `PalmStream`. `open` also raises `CalibrationError`."""
+    """Driver of the readings of a `PalmStream`. `open` also raises `CalibrationError`."""
 
     name = "palm"
     bytes_max = PACKET_BYTES_MAX
@@ -37,7 +37,7 @@ class PalmDriver(DatagramDriver[PalmStream]):
     ) -> None:
         self._fingers = tuple(fingers)
         self._heed_finger_bits = heed_finger_bits
-        self._calibration: Path | None = None  # `open` is the first to read it
+        self._calibration: Path | None = None  # `open` reads it
         super().__init__(source, only_from=only_from, clock=clock)
         self._calibration = calibration
         self._attention_ns = 0
@@ -53,15 +53,15 @@ class PalmDriver(DatagramDriver[PalmStream]):
 
     @property
     def serials(self) -> dict[str, str]:
-        """The sender, for each finger: packets have no serial number."""
+        """The sender for each finger, because packets have no serial number."""
         return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
 
     def fileno(self) -> int | None:
-        """The socket, but None while no round can end: 71 wakes a second instead of 1000."""
+        """Return the socket; None while no round can end, for 71 wakes a second, not 1000."""
         return None if self._clock() < self._attention_ns else super().fileno()
 
     def due_ns(self) -> int | None:
-        """Time when a round is about to end or silence must be noticed, ns."""
+        """Return the time, ns, when a round is about to end or silence is noticed."""
         due_ns = super().due_ns()
         if self.link_state is LinkState.CLOSED or self._clock() >= self._attention_ns:
             return due_ns

@@ -1,7 +1,7 @@
-"""The palm status packet of a Shadow hand: the joint and tactile record of one millisecond.
+"""The palm status packet of a Shadow hand: joints and tactile data of one millisecond. Bytes only.
 
-Bytes only: little-endian and packed, of a length that tells which palm sent it, without checksum or
-sequence number. Source: the palm protocol headers (0220, 0230, 0240, 0250) and tactile protocol
+The packet is packed and little-endian. Its length tells the kind of palm. It has no checksum and no
+sequence number. Source: the palm protocol headers (0220, 0230, 0240, 0250) and the tactile protocol
 header published by Shadow Robot, and its driver, which reads a BioTac from the first 16 bytes of a
 finger's tactile slot on every palm.
 """
@@ -17,34 +17,34 @@ from drivers.base import ELECTRODES
 from drivers.udp.driver import DatagramCounters
 
 CYCLE_NS = 1_000_000
-"""The palm makes one packet per millisecond."""
+"""Time between two packets of a palm, ns."""
 SENSORS = 37
-"""Words of `sensors`, of which 0..25 are Hall sensors (`drivers.palm.calibration`)."""
+"""Number of words in `sensors`; 0..25 are Hall sensors (`drivers.palm.calibration`)."""
 MOTOR_BYTES: Final = 8 + 10 * 4
-"""Behind `which_motors`: two masks, and the records of the even or the odd ones of 20 motors."""
+"""Bytes behind `which_motors`: two masks, and records of the even or odd ones of 20 motors."""
 TACTILE_FINGERS = 5
-"""Tactile slots, in the order of `drivers.base.FINGERS`."""
+"""Number of tactile slots, in the order of `drivers.base.FINGERS`."""
 
 COMMAND_EMPTY: Final = 0
-"""`command` of a packet for which the palm was too late: all zeros."""
+"""`command` of a packet that the palm was too late to fill; all its bytes are zero."""
 COMMAND_SENSOR_DATA: Final = 1
 """`command` of a packet with sensor data."""
 COMMAND_MAX = 4
-"""Largest known command. 2 to 4 are service modes, in which `sensors` holds other things."""
+"""Largest known `command`. 2 to 4 are service modes, whose `sensors` are not joints."""
 
 ROUND = 14
-"""Packets until each channel of a BioTac has come once."""
+"""Packets of a round: after them each channel of a BioTac has been sent once."""
 TYPE_METADATA_FIRST: Final = 0xFFF9
 TYPE_METADATA_LAST: Final = 0xFFFF
-"""Range of types whose `tactile` holds serial numbers and versions instead of samples."""
+"""Last of the types whose `tactile` holds serial numbers and versions instead of samples."""
 
 VALID_OTHER_0, VALID_OTHER_1 = 4, 8
-"""Bits of `TactileSlot.valid`; 1 and 2 are those of the PAC words."""
+"""Bits of `TactileSlot.valid` for the two changing values; 1 and 2 are for the PAC words."""
 VALID_ALL = 0x0F
 
 
 class Channel(NamedTuple):
-    """Channel of one of a slot's two changing values; `electrode` is 0..23, or None for others."""
+    """Channel of a slot's changing value; `electrode` is 0..23, None for other channels."""
 
     name: str
     electrode: int | None
@@ -57,12 +57,12 @@ _IN_TURN = (
 CHANNELS: tuple[tuple[Channel, Channel | None], ...] = tuple(
     zip(_IN_TURN[::2], (*_IN_TURN[1::2], None), strict=True)
 )
-"""By position in the round: the channels of `other_0` and `other_1`. The last has only one."""
+"""Channels of `other_0` and `other_1` by position in the round; the last has only one."""
 _POSITIONS: Final = {2 * position + 1: position for position in range(ROUND)}
 
 
 def position_of(tactile_type: int) -> int | None:
-    """Return the position 0..13 in the round of a `tactile_type`, or None if it is no sample."""
+    """Return the position in the round, 0..13, of a `tactile_type`; None if it has no samples."""
     return _POSITIONS.get(tactile_type)
 
 
@@ -70,7 +70,7 @@ class Palm(StrEnum):
     """Kind of palm, known by the length of its packets."""
 
     PALM_0220 = "0220"
-    """220 bytes; also the 0240, which differs in what its inertial words mean."""
+    """Packets of 220 bytes; also the 0240, whose inertial words have another meaning."""
     PALM_0230 = "0230"
     PALM_0250 = "0250"
 
@@ -82,29 +82,29 @@ class TactileSlot(NamedTuple):
     pac_1: int
     other_0: int
     valid: int
-    """`VALID_...` bits. Where one is not set, the word repeats something older."""
+    """`VALID_...` bits; a word whose bit is not set repeats an older value."""
     other_1: int
 
 
 @dataclass(frozen=True, slots=True)
 class PalmPacket:
-    """What is read of one packet: neither motors nor, on a 0230, middle and proximal slots."""
+    """The fields of a packet that graspd reads; motors, middle and proximal slots are skipped."""
 
     palm: Palm
     command: int
     sensors: tuple[int, ...]
     """37 raw words, Hall sensors first."""
     which_motors: int
-    """0 even, 1 odd."""
+    """Motors in this packet: 0 the even ones, 1 the odd ones."""
     tactile_type: int
-    """Which channels `other_0` and `other_1` are: see `position_of`."""
+    """Type that tells the channels of `other_0` and `other_1`: see `position_of`."""
     tactile_valid: int
-    """Bit 0 first finger ... bit 4 thumb."""
+    """Bit i is set if slot i is valid: 0 first finger ... 4 thumb."""
     tactile: tuple[TactileSlot, ...]
-    """5 slots, in the order of `drivers.base.FINGERS`."""
+    """Five slots, in the order of `drivers.base.FINGERS`."""
 
     def to_bytes(self) -> bytes:
-        """Return the packet as the palm sends it, with zeros in the rest. Raises `ValueError`."""
+        """Return the packet as bytes; skipped fields are zero. Raises `ValueError`."""
         layout = _LAYOUTS[self.palm]
         tactile = [self.tactile_type, self.tactile_valid]
         tactile += [word for slot in self.tactile for word in slot]
@@ -129,23 +129,23 @@ class PalmCounters(DatagramCounters):
     service_packets: int = 0
     """Packets of a service mode of the palm."""
     nonsense_packets: int = 0
-    """Packets with a field that no palm sends."""
+    """Packets with a value in a field that no palm sends."""
     lost_packets: int = 0
     """Packets missing from rounds that were handed over."""
     duplicate_packets: int = 0
     """Packets that came again; the copy is dropped."""
     reordered_packets: int = 0
-    """Packets that came after their successor and in time for their round."""
+    """Packets that came after a later one, but in time for their round."""
     late_packets: int = 0
     """Packets that came when their round was over; dropped."""
     conflicting_packets: int = 0
-    """Packets for a place where another one already was; both are dropped."""
+    """Packets for a place that another packet had taken; both are dropped."""
     unsynchronised_packets: int = 0
     """Packets dropped until a round began, after opening or an outage."""
     interrupted_rounds: int = 0
     """Rounds dropped because the link broke in the middle."""
     metadata_packets: int = 0
-    """Packets whose tactile part is about the sensors themselves."""
+    """Packets whose tactile part describes the sensors: serial numbers, versions."""
     unknown_types: int = 0
     """Packets with an undocumented `tactile_type`."""
     held_values: int = 0
@@ -155,18 +155,18 @@ class PalmCounters(DatagramCounters):
     invalid_fingers: int = 0
     """Slots that the palm marked as not valid."""
     absent_fingers: int = 0
-    """Fingers of rounds without a sensor: channels that are no counts, or only zeros."""
+    """Fingers without a sensor: no counts, or only zeros. Each counts once in each round."""
     joint_readings: int = 0
     bad_angles: int = 0
-    """Angles handed over as NaN although the joint is calibrated: its raw value is no count."""
+    """Angles of calibrated joints handed over as NaN, because the raw value is no count."""
     impossible_angles: int = 0
-    """Angles handed over that are out of the joint's range by more than 10 degrees."""
+    """Angles handed over that are more than 10 degrees out of the joint's range."""
     other_palms: int = 0
-    """Packets of another kind of palm than the first since the link came up; dropped."""
+    """Packets of another kind of palm than the link began with; dropped."""
 
 
 def parse_packet(data: bytes, counters: PalmCounters) -> PalmPacket | None:
-    """Return the packet of a datagram; count and return None for one without sensor data."""
+    """Return the packet of a datagram; None, and count it, if it has no sensor data."""
     palm = PALM_OF_LENGTH.get(len(data))
     if palm is None:
         counters.bad_lengths += 1
@@ -193,7 +193,7 @@ class _Layout(NamedTuple):
 
 
 def _layout(slot_bytes: int, *, motors_first: bool, middle: str = "", after: str = "") -> _Layout:
-    """`middle` and `after` skip what stands before the tactile block, and after it."""
+    """Return the layout of a palm; `middle`, `after`: padding around the tactile block."""
     motors = f"4xh{MOTOR_BYTES}x"
     slot = f"HHHBxH{slot_bytes - 10}x"
     tactile = f"{middle}IH{slot * TACTILE_FINGERS}{after}"
@@ -207,13 +207,13 @@ _LAYOUTS: Final = {
     Palm.PALM_0250: _layout(78, motors_first=False),
 }
 CAN_RECORD_BYTES = 12
-"""Length of a CAN message that a relay may leave behind a packet: bus, length, id and data."""
+"""Bytes of a CAN message that a relay may append to a packet: bus, length, id and data."""
 PALM_OF_LENGTH: Final = {
     layout.format.size + appended: palm
     for palm, layout in _LAYOUTS.items()
     for appended in (0, CAN_RECORD_BYTES)
 }
-"""All lengths that a packet can have: 220, 416 and 530 bytes, and with the record."""
+"""Palm by length of a packet: 220, 416 and 530 bytes, each with and without the CAN message."""
 PACKET_BYTES_MAX = max(PALM_OF_LENGTH)
 
 _SLOT_WORDS = len(TactileSlot._fields)
@@ -241,6 +241,6 @@ def _unpack(palm: Palm, data: bytes) -> PalmPacket:
 
 
 def _record_is_sound(palm: Palm, data: bytes) -> bool:
-    """Return True unless an appended record has a length that no CAN message has."""
+    """Return False if an appended CAN message has an impossible length."""
     record = data[_LAYOUTS[palm].format.size :]
     return not record or record[1] <= _CAN_BYTES_MAX

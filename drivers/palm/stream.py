@@ -1,19 +1,19 @@
-"""Packets of one palm with their times in, tactile and joint readings out. No I/O.
+"""Decode the packets of one palm, with their times, into tactile and joint readings. No I/O.
 
-A packet carries two channels of each BioTac, named by its `tactile_type`. Packets have no other
-sequence, so a packet's place is its type, counted on from the furthest packet before it:
+A packet carries two channels of each BioTac; its `tactile_type` names them. Packets have no number,
+so the place of a packet is its type, counted on from the furthest packet before it:
 
-- A lost packet leaves its one or two electrodes `MISSING` in this round and moves no others. A
-  round that lacks packets is handed over when the first packet of the next round comes.
+- A lost packet leaves its one or two electrodes `MISSING` in this round, and moves no others. A
+  round that lacks packets is handed over when the first packet of the next round arrives.
 - A packet up to half a round late takes its place while its round is the current one.
 - Two different packets for one place contradict each other (a damaged `tactile_type`, or a request
-  that stands still): both are dropped and the place is `MISSING`.
+  that stands still). Both are dropped, and the place is `MISSING`.
 - Lost whole rounds are noticed by time alone, `LATE_MAX` cycles after a packet was due.
 
-Packets have no checksum; UDP's covers the way from the relay. Not noticed: damage before it that
-leaves a value in 0..4095 and its validity bit set; a damaged `tactile_type` that names the place of
-a packet lost in the same round. Two hands of one kind that share a relay's socket look like one:
-use one port per hand.
+Packets have no checksum; that of UDP covers the way from the relay. Two kinds of earlier damage are
+not noticed: a changed value in 0..4095 whose validity bit is set, and a changed `tactile_type` that
+names the place of a packet lost in the same round. Two hands of one kind that share a relay's
+socket look like one, so use one port for each hand.
 """
 
 from __future__ import annotations
@@ -56,26 +56,28 @@ if TYPE_CHECKING:
     from drivers.palm.calibration import JointCalibration
 
 ROUND_NS: Final = ROUND * CYCLE_NS
-"""Time between two samples of an electrode: 71.43 Hz."""
+"""Time between two samples of an electrode, ns (71.43 Hz)."""
 JOINT_PERIOD_NS: Final = 10_000_000
-"""100 Hz, which is enough for the position of a hand; 1000 Hz would cost processor time."""
+"""Time between joint readings, ns: 100 Hz is enough for a hand, and 1000 Hz costs more."""
 LATE_MAX: Final = 10
-"""Most cycles that a packet may be late; later, a whole round counts as lost. So after
-`ROUND - 1 + LATE_MAX` cycles of silence no packet counts for the round before."""
+"""Most cycles by which a packet may be late; after that a whole round counts as lost.
+
+After `ROUND - 1 + LATE_MAX` cycles of silence, no packet counts for the round before.
+"""
 OUTAGE_NS: Final = 2_000_000_000
-"""After a longer outage, ns, the number of rounds is unknown: it counts as one missed."""
+"""Longest outage, ns, in which missed rounds are counted; a longer one counts as one."""
 
 _COMPLETE: Final = (1 << ROUND) - 1
 _TELLING: Final = 0b11
-"""The packets with pressure and temperature, which show an absent sensor."""
+"""Bits of the packets with pressure and temperature, which show an absent sensor."""
 
 
 class PalmStream:
-    """Makes a `TactileReading` of each round of 14 packets, and a `JointReading` every 10 ms.
+    """Make a `TactileReading` of each round of 14 packets, and a `JointReading` every 10 ms.
 
-    Packets must come one a millisecond, as the palm makes them. With a relay that sends batches
-    longer than 10 ms, sound rounds are flagged or counted as missed. With one that holds packets
-    back for more than 3 ms, the loss of a whole round may go unnoticed.
+    Packets must arrive one a millisecond, as the palm makes them. If a relay sends batches longer
+    than 10 ms, sound rounds are flagged or counted as missed. If it delays packets by more than
+    3 ms, the loss of a whole round may go unnoticed.
     """
 
     period_ns: int | None = ROUND_NS
@@ -87,15 +89,16 @@ class PalmStream:
         calibration: Path | None = None,
         heed_finger_bits: bool = True,
     ) -> None:
-        """`fingers`: the rows of a reading. Raises `ValueError`, and `CalibrationError`.
+        """Raises `ValueError` for wrong fingers, and `CalibrationError`.
 
-        Joint readings need the hand's `calibration` file. Without `heed_finger_bits` the packet's
-        `tactile_valid` is ignored, as by Shadow's own driver, for a palm that does not set it.
+        `fingers`: the rows of a reading. `calibration`: the hand's file; None: no joint readings.
+        `heed_finger_bits`: False ignores `tactile_valid`, as Shadow's driver does; some palms do
+        not set it.
         """
         check_fingers(fingers)
         self.counters = PalmCounters()
         self.palm: Palm | None = None
-        """Kind of palm; None until a packet came, and after `interrupt`."""
+        """Kind of palm; None before the first packet, and after `interrupt`."""
         self._slots = tuple(FINGERS.index(finger) for finger in fingers)
         self._heed_finger_bits = heed_finger_bits
         shape = (len(fingers), ELECTRODES)
@@ -105,7 +108,7 @@ class PalmStream:
         self._known = np.zeros(shape, dtype=np.bool_)
         self._was_absent = np.zeros(len(fingers), dtype=np.bool_)
         self._place: int | None = None
-        """Furthest place so far, counted over all rounds; None until a round begins."""
+        """Furthest place so far, counted over all rounds; None before the first round."""
         self._place_t_ns: int | None = None
         self._begin(0)
         self._previous = b""
@@ -113,11 +116,11 @@ class PalmStream:
         self._joint_due_ns = 0
         self._joint_seq = 0
         if calibration is not None:
-            # Imported here: a scene without joints carries no joint code.
+            # Imported here so that a scene without joints does not load joint code.
             from drivers.palm.calibration import load_calibration
 
             self._calibration = load_calibration(calibration)
-            counts = range(SENSORS)  # any will do
+            counts = range(SENSORS)  # any valid values
             self._uncalibrated = int(np.isnan(self._calibration.angles_rad(counts)).sum())
 
     @property
@@ -126,11 +129,11 @@ class PalmStream:
 
     @property
     def cycles_to_go(self) -> int:
-        """Packets until the current round can be complete; 0 before the first round."""
+        """Fewest packets until the current round is complete; 0 before the first round."""
         return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
 
     def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
-        """Return the readings that a packet completes, or None if it is dropped."""
+        """Return the readings that a packet completes; None if the packet is dropped."""
         packet = parse_packet(data, self.counters)
         if packet is None:
             return None
@@ -154,7 +157,7 @@ class PalmStream:
         self._known[:] = False
 
     def push(self, packet: PalmPacket, t_ns: int) -> Sequence[TactileReading]:
-        """Take a packet, received at `t_ns`; return the readings that it completes."""
+        """Add a packet of `t_ns`; return the tactile readings that it completes."""
         position = position_of(packet.tactile_type)
         if position is None:
             is_metadata = TYPE_METADATA_FIRST <= packet.tactile_type <= TYPE_METADATA_LAST
@@ -212,10 +215,10 @@ class PalmStream:
     def _begin(self, at_round: int) -> None:
         self._round = at_round
         self._have = 0
-        """Bit i: position i has come, in conflict or not."""
+        """Bit i is set if a packet of position i arrived, also if it was in conflict."""
         self._finished = False
         self.packets: list[PalmPacket | None] = [None] * ROUND
-        """What has come of this round, by position."""
+        """Packets of this round by position; None: not arrived."""
         self._counts[:] = 0
         self._faults[:] = ElectrodeFault.MISSING
         self._absent = [False] * len(self._slots)
@@ -237,7 +240,7 @@ class PalmStream:
                 self._put(row, second.electrode, values.other_1, fresh=fresh)
 
     def _put(self, row: int, electrode: int | None, value: int, *, fresh: bool) -> None:
-        if electrode is None:  # pressure and temperature only tell whether there is a sensor
+        if electrode is None:  # pressure and temperature only show if a sensor is present
             self._absent[row] |= fresh and value > COUNT_MAX
         elif not fresh:
             self.counters.held_values += 1
@@ -272,7 +275,7 @@ class PalmStream:
         return TactileReading(self._t_ns, self._round, self._counts.copy(), faults)
 
     def _drop_absent_fingers(self) -> None:
-        """Flag fingers without a sensor, which show unwritten memory: no counts, or only zeros."""
+        """Flag fingers without a sensor: they show unwritten memory, no counts or only zeros."""
         silent: NDArray[np.bool_] = ((self._counts == 0) & (self._faults == 0)).all(axis=1)
         absent = np.array(self._absent)
         if self._have & _TELLING != _TELLING:
@@ -302,7 +305,7 @@ class PalmStream:
 
 
 def _step(place: int, position: int, elapsed_ns: int) -> int:
-    """Return the places from the furthest packet to this one; 0 or less for a late one."""
+    """Return the distance from the furthest packet to this one; 0 or less if it is late."""
     step = (position - place) % ROUND or ROUND
     if step > ROUND // 2 and elapsed_ns < step * CYCLE_NS // 2:
         return step - ROUND

@@ -1,8 +1,8 @@
-"""The link log of a CAN bus: frames as `candump -L` writes and `canplayer` reads them.
+"""The link log of a CAN bus: text as `candump -L` writes and `canplayer` reads it.
 
-`(1436509052.249713) can0 100#0D3A1F`: seconds, interface, id in three or eight digits, data. `##`
-and a digit of flags begin the data of CAN FD, `R` stands for that of a remote frame, and bit 29 of
-an id marks an error frame (can-utils, lib.c and linux/can.h).
+A line is `(1436509052.249713) can0 100#0D3A1F`: seconds, interface, id of three or eight digits,
+data. CAN FD has `##` and a digit of flags before its data. A remote frame has `R` instead of data.
+Bit 29 of an id marks an error frame (can-utils, lib.c and linux/can.h).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from drivers.can.stream import CanStream
 from drivers.recordings.csv_rows import open_recording
 
 LINE_MAX: Final = 256
-"""A frame of CAN FD takes 170 characters."""
+"""Longest line, characters; a frame of CAN FD takes 170."""
 NS_PER_US: Final = 1000
 
 _LINE: Final = re.compile(
@@ -43,7 +43,7 @@ _LINE: Final = re.compile(
 
 
 def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
-    """Return a line of `candump -L`. `wall_ns`: arrival, ns since 1970."""
+    """Return a frame as a line of `candump -L`. `wall_ns`: arrival, ns since 1970."""
     seconds, rest_ns = divmod(wall_ns, 1_000_000_000)
     word = frame.arbitration_id
     if frame.flags & ERROR:
@@ -57,7 +57,7 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
 
 
 def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> bytes:
-    """Return frames as lines; `offset_ns`: from their time to wall time."""
+    """Return frames as lines; `offset_ns`: wall time less their time."""
     lines = [
         line_of(frame, max(until_ns + offset_ns, 0), channel)
         for frame, _, until_ns in frames
@@ -67,37 +67,37 @@ def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> by
 
 
 def frame_of(line: str) -> tuple[int, CanFrame] | None:
-    """Return a line's time, ns since 1970, and frame, or None."""
-    found = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
-    if found is None:
+    """Return a line's time, ns since 1970, and frame; None if it is no such line."""
+    match = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
+    if match is None:
         return None
-    wall_ns = int(found[1]) * 1_000_000_000 + int(found[2]) * NS_PER_US
-    word, data = int(found[4], 16), bytes.fromhex(found[6] or "")
-    flags = FD if found[5] else 0
+    wall_ns = int(match[1]) * 1_000_000_000 + int(match[2]) * NS_PER_US
+    word, data = int(match[4], 16), bytes.fromhex(match[6] or "")
+    flags = FD if match[5] else 0
     if len(data) > (FD_DATA_MAX if flags else CLASSIC_DATA_MAX):
         return None
-    if found[7]:
+    if match[7]:
         flags |= REMOTE
-    if len(found[4]) == 3:
+    if len(match[4]) == 3:
         return (wall_ns, CanFrame(word, data, flags)) if word <= STANDARD_ID_MAX else None
     flags |= ERROR if word & ERR_FLAG else EXTENDED
     return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags)
 
 
 class CanLog:
-    """Candump text through the stream that the driver has. A `LinkLog`."""
+    """Play candump text through the driver's `CanStream`. A `LinkLog`."""
 
     def __init__(self, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
-        """Arguments: those of a `CanStream`. Raises `ValueError`."""
+        """Take the arguments of `CanStream`. Raises `ValueError`."""
         self._fingers, self._board = fingers, board
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
         with open_recording(path) as stream:
             while line := stream.readline(LINE_MAX + 1):
-                found = frame_of(line.decode("ascii", "replace"))
-                if found is not None:
-                    yield found
+                timed_frame = frame_of(line.decode("ascii", "replace"))
+                if timed_frame is not None:
+                    yield timed_frame
 
     def begin(self) -> None:
         self.stream = CanStream("link log", self._fingers, **self._board)

@@ -1,4 +1,4 @@
-"""The replay: tables and streams played as a driver like any other, in real time or fast."""
+"""Driver that plays CSV tables and streams, in real time or fast."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFault
 from drivers.recordings.player import RecordedDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
-"""Synthetic grasps, drawn by `drivers.twins.grasps.synthetic`: no hand ever made these."""
+"""Table of synthetic grasps, drawn by `drivers.twins.grasps.synthetic`."""
 DEMO_DAY = Path(__file__).parent / "demo" / "synthetic_day.csv"
-"""Synthetic grasps of sensors that drift, drawn by the same."""
+"""Table of synthetic grasps of sensors that drift, drawn by the same module."""
 DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
-"""Whole synthetic grasps, made by `drivers.twins.grasps.whole_grasps`."""
+"""Stream of whole synthetic grasps, made by `drivers.twins.grasps.whole_grasps`."""
 SHOW_RECORDING = Path(__file__).parent / "demo" / "synthetic_show.csv"
-"""Synthetic grasps that are each held for two seconds, made by the same: for people to watch."""
+"""Stream of synthetic grasps that are each held for two seconds, for people to watch."""
 IGNORED_COLUMNS_LOGGED = 10
-"""Names of ignored columns in the log line; the rest only as a number."""
+"""Most names of ignored columns in a log line."""
 
 _NS_PER_S = 1_000_000_000
 _log = logging.getLogger(__name__)
 
 
 class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
-    """Plays CSV recordings, one row per call of `read_ready` at most, several files in a row.
+    """Play one or more CSV recordings, at most one row per call of `read_ready`.
 
-    A row gives a `TactileReading` of `fingers`, in a stream with joints a `JointReading` before it.
-    With a `speed`, `t_ns` is when the row was due; else it is the time of handing over.
-    `recorded_ns` is the file's own time. A late reading is counted, never skipped.
+    A row gives a `TactileReading` of `fingers`, after a `JointReading` if the file has joints. With
+    a `speed`, `t_ns` is when the row was due, else when it is handed over. `recorded_ns` is the
+    file's own time. A late reading is counted, never skipped.
 
     `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
-    not counts, and a last row without a line end, make readings faulty, or with `strict` raise.
+    no counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
     """
 
     def __init__(
@@ -59,7 +59,10 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`speed`: factor of real time. `rate_hz`: grasps of a table per s. Raises `ValueError`."""
+        """Raises `ValueError` for a wrong number.
+
+        `speed`: factor of real time; None: fast. `rate_hz`: grasps of a table per second.
+        """
         check_fingers(fingers)
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
@@ -74,12 +77,12 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
     def _reset(self) -> None:
         self.counters = ReplayCounters()
         self.period_ns: int | None = None
-        """Nominal time between readings as played, ns; of a stream, the shortest step so far."""
+        """Time between readings as played, ns; for a stream the shortest step so far."""
         self._injector = FaultInjector(self._faults, self._fingers, self.counters)
         self._row_index = 0
 
     def open(self) -> None:
-        """Check the header of every file, then start over with the first one."""
+        """Check the header of each file, then start from the first file."""
         self.close()
         self._reset()
         ignored: dict[str, None] = {}
@@ -91,7 +94,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """The readings of one row if it is due, else none. Raises `RecordingError` for bad rows."""
+        """Return the readings of one row if it is due. Raises `RecordingError` for a bad row."""
         due = self.take()
         if due is None:
             return ()
@@ -104,7 +107,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         return self._readings(row, t_ns, at_ns)
 
     def _items(self) -> Generator[tuple[int, tuple[Row, int | None]], None, None]:
-        """All rows of all files on one time axis, with the recorded period."""
+        """Yield the rows of all files on one time axis, with the recorded period."""
         start_ns = 0
         while True:
             for path in self.paths:
@@ -115,7 +118,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
     def _items_of(
         self, path: Path, start_ns: int
     ) -> Generator[tuple[int, tuple[Row, int | None]], None, int]:
-        """The rows of one file; returns when the file after it starts."""
+        """Yield the rows of one file; return the start time of the next file."""
         at_ns, first_s = start_ns, None
         period_ns: int | None = None
         for index, row in enumerate(read_rows(path, self._fingers, strict=self._strict)):
@@ -127,7 +130,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
             else:
                 before_ns = at_ns
                 at_ns = start_ns + round((row.t_s - first_s) * _NS_PER_S)
-                if at_ns > before_ns:  # the shortest step, so that a gap is seen as a gap
+                if at_ns > before_ns:  # the shortest step, so that a gap is noticed
                     period_ns = min(at_ns - before_ns, period_ns or at_ns)
             yield at_ns, (row, period_ns)
         return at_ns + (period_ns or round(self._table_period_ns))

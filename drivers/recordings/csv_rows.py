@@ -1,7 +1,7 @@
-"""CSV recordings, read row by row, so that memory does not grow.
+"""Read CSV recordings row by row, so that memory does not grow.
 
 A grasp table has one row per grasp, as in the BioTac SP Stability Set. A stream has one row per
-sweep with a column `t` in seconds, and joint angles if they were recorded.
+sweep, with a column `t` in seconds and optional joint angles.
 """
 
 from __future__ import annotations
@@ -31,46 +31,46 @@ from drivers.base import (
 from drivers.hand import joint_name
 
 TIME = "t"
-"""Column of seconds, with any offset. A file with it is a stream, one without it a grasp table."""
+"""Column of seconds, with any zero. Files with it are streams, files without it grasp tables."""
 OBJECT = "object"
 SLIPPED = "slipped"
 LINE_BYTES_MAX = 65_536
-"""A full row has 1,200 bytes. Reading on for a line's end could take in a disk image."""
+"""Longest line, bytes; a full row has 1,200. A disk image may have no line end at all."""
 TIME_MAX_S = 1e11
-"""The year 5138. Unix time in ms, us or ns lies above it: the wrong unit, not a time in seconds."""
+"""Largest time, s (the year 5138). Unix time in ms, us or ns lies above it."""
 SHOWN_LENGTH_MAX = 40
-"""Characters of a cell that an error message shows."""
+"""Most characters of a cell in an error message."""
 
 _LABELS = {"0": False, "1": True}
-# ASCII digits only: float() alone would take `1_000`, `nan` and digits of other scripts.
+# ASCII digits only: float() also takes `1_000`, `nan` and digits of other scripts.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
-# The usual way to write each count: looking it up is ten times as fast as reading a number.
+# Counts by their usual text: a look-up is ten times as fast as parsing.
 _COUNT_OF_TEXT = {str(count): count for count in range(COUNT_MAX + 1)}
 
 
 def electrode_columns(finger: str) -> list[str]:
-    """Column names of one finger, E1 first, as the BioTac SP Stability Set writes them."""
+    """Return the columns of a finger, E1 first, named as in the BioTac SP Stability Set."""
     return [f"{finger}_biotac_{electrode}" for electrode in range(1, ELECTRODES + 1)]
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Columns of a file that are read, by name."""
+    """Names of the columns that are read from a file."""
 
     electrodes: tuple[str, ...]
-    """Finger by finger as asked for, E1..E24 each."""
+    """Electrode columns, finger by finger, E1 to E24 each."""
     joints: Mapping[str, str]
-    """Joint without hand prefix by column; empty for a table."""
+    """Joint name, without hand prefix, by column; empty for a table."""
     is_stream: bool
     has_labels: bool
     ignored: tuple[str, ...]
-    """Columns of unknown names. Those of fingers not asked for are known."""
+    """Columns of unknown names; electrodes of other fingers do not count."""
 
     @classmethod
     def of(cls, names: Sequence[str], fingers: Sequence[str]) -> Self:
-        """The columns to read for these fingers, of a header's names."""
-        known = {name for finger in FINGERS for name in electrode_columns(finger)}
-        known |= {TIME, OBJECT, SLIPPED}
+        """Return the columns to read for `fingers`. `names`: the header."""
+        own_columns = {name for finger in FINGERS for name in electrode_columns(finger)}
+        own_columns |= {TIME, OBJECT, SLIPPED}
         is_stream = TIME in names
         joints: dict[str, str] = {}
         if is_stream:
@@ -80,13 +80,13 @@ class Columns:
             joints=joints,
             is_stream=is_stream,
             has_labels=SLIPPED in names,
-            ignored=tuple(name for name in names if name not in known and name not in joints),
+            ignored=tuple(name for name in names if name not in own_columns and name not in joints),
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """One reading as the file has it."""
+    """One row of a file."""
 
     counts: NDArray[np.uint16]
     """Shape (fingers, 24)."""
@@ -94,21 +94,22 @@ class Row:
     """Shape (fingers, 24), `ElectrodeFault` bits."""
     annotation: Annotation
     t_s: float | None
-    """Streams only; never falls from row to row."""
+    """Time of the row, s, never lower than before; None for a table."""
     joint_names: tuple[str, ...]
     position_rad: NDArray[np.float64]
-    """Shape (joints,), NaN where there is no angle."""
+    """Shape (joints,), radians; NaN where the file has no angle."""
 
 
 class Recording:
-    """The rows of one file: iterate once.
+    """The rows of one file. Iterate once.
 
-    `lines`: as of `read_lines`. The constructor raises `RecordingError` for a wrong header and a
-    file without rows, iterating for a wrong row. A value that is no count only makes its electrode
-    faulty, unless `strict`.
+    `lines`: the result of `read_lines`. The constructor raises `RecordingError` for a wrong header
+    or a file without rows, and iterating raises it for a wrong row. A value that is no count makes
+    its electrode faulty; with `strict` it raises.
 
     A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
-    without a line end may be cut off in mid value: all its electrodes are faulty, its angles NaN.
+    without a line end may be cut off within a value, so all its electrodes are faulty and its
+    angles NaN.
     """
 
     def __init__(
@@ -136,7 +137,7 @@ class Recording:
             yield self._row(cells)
 
     def _cells(self, lines: Iterable[bytes]) -> Iterator[list[str]]:
-        """Cells of each line that is not blank; keeps the line number."""
+        """Yield the cells of each line that is not blank; `_line` is its number."""
         for self._line, line in enumerate(lines, 1):
             if len(line) > LINE_BYTES_MAX:
                 raise self._error(f"the line is longer than {LINE_BYTES_MAX} bytes")
@@ -152,7 +153,7 @@ class Recording:
             yield from rows
 
     def _refuse_header(self) -> None:
-        """Raise unless each column that is read is there once, and each joint under one name."""
+        """Raise if a column is missing or there twice, or a joint under two names."""
         missing = [name for name in self.columns.electrodes if name not in self._names]
         if len(missing) == 1:
             raise self._error("this column is missing", missing[0])
@@ -194,7 +195,7 @@ class Recording:
         )
 
     def _counts(self, cell_of: Mapping[str, str]) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-        """Counts and faults, shape (fingers, 24)."""
+        """Return counts and faults of a row, shape (fingers, 24) each."""
         names = self.columns.electrodes
         counts = [count_of(cell_of[name]) for name in names]
         faults = np.zeros(self._shape, dtype=np.uint8)
@@ -248,19 +249,19 @@ class Recording:
 
 
 def columns_of(path: Path, fingers: Sequence[str]) -> Columns:
-    """Return the columns of a file. Raises `RecordingError` if it is no recording of `fingers`."""
+    """Return the columns of a file. Raises `RecordingError` if it lacks `fingers`."""
     with open_recording(path) as file:
         return Recording(path, read_lines(path, file), fingers).columns
 
 
 def read_rows(path: Path, fingers: Sequence[str], *, strict: bool = False) -> Iterator[Row]:
-    """Yield the rows of a file, as a `Recording` does. Raises `RecordingError`."""
+    """Yield the rows of a file: see `Recording`. Raises `RecordingError`."""
     with open_recording(path) as file:
         yield from Recording(path, read_lines(path, file), fingers, strict=strict)
 
 
 def open_recording(path: Path) -> BinaryIO:
-    """Open a recording. Raises `RecordingError` unless it is a regular file that can be read."""
+    """Open a file. Raises `RecordingError` if it is not regular or cannot be read."""
     try:
         mode = os.stat(path).st_mode
         if stat.S_ISREG(mode):
@@ -271,7 +272,7 @@ def open_recording(path: Path) -> BinaryIO:
 
 
 def read_lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of `stream` with their ends, cut at `LINE_BYTES_MAX` + 1 bytes."""
+    """Yield the lines of `stream` with their ends, at most `LINE_BYTES_MAX` + 1 bytes each."""
     try:
         while line := stream.readline(LINE_BYTES_MAX + 1):
             yield line
@@ -280,7 +281,7 @@ def read_lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
 
 
 def count_of(cell: str) -> int | None:
-    """Return the 12-bit count that a cell holds, or None."""
+    """Return the 12-bit count in a cell; None if it holds no count."""
     count = _COUNT_OF_TEXT.get(cell)
     if count is not None:
         return count
@@ -291,7 +292,7 @@ def count_of(cell: str) -> int | None:
 
 
 def number_of(cell: str) -> float | None:
-    """Return the finite number that a cell holds, or None."""
+    """Return the finite number in a cell; None if it holds none."""
     cell = cell.strip()
     if _NUMBER.fullmatch(cell) is None:
         return None
@@ -300,7 +301,7 @@ def number_of(cell: str) -> float | None:
 
 
 def _shown(cell: str) -> str:
-    """Return a cell as an error message shows it: quoted, escaped and of bounded length."""
+    """Return a cell for an error message: quoted, escaped and shortened."""
     return repr(cell if len(cell) <= SHOWN_LENGTH_MAX else cell[:SHOWN_LENGTH_MAX] + "...")
 
 

@@ -1,4 +1,4 @@
-"""Faults that the replay injects on demand, in the words of PX4, for tests of a controller."""
+"""Faults that the replay injects on request, named as in PX4, to test a controller."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ WORD_MAX = 0xFFFF
 
 @dataclass(frozen=True, slots=True)
 class ReplayFaults:
-    """Which faults to inject; by default none. Readings are numbered from 0 over the whole run.
+    """Faults to inject; by default none. Readings are numbered from 0 over the whole run.
 
-    Names, meaning and limits are those of `[tactile.faults]` in deploy/SCENE.md, which checks them.
+    deploy/SCENE.md describes the names under `[tactile.faults]`; the scene checks the values.
     `stuck`, `wrong` and `garbage` change the counts of the chosen electrodes, in this order.
-    `off`, `slow` and `intermittent` take whole tactile readings away; joint readings still come.
-    Only `intermittent` leaves a gap in `seq`. `delayed` leaves `t_ns` at when it should have come.
+    `off`, `slow` and `intermittent` remove whole tactile readings; joint readings still come.
+    Only `intermittent` leaves a gap in `seq`. `delayed` hands over late and keeps `t_ns`.
     """
 
     off_from: int | None = None
@@ -38,18 +38,18 @@ class ReplayFaults:
 
 @dataclass(slots=True)
 class ReplayCounters(DriverCounters):
-    """What a replay counts. `missed_readings` are those that `intermittent` took away."""
+    """Counters of a replay. `missed_readings`: those that `intermittent` removed."""
 
     late: int = 0
-    """Readings handed over more than one period after they were due. None is ever skipped."""
+    """Readings handed over more than one period late; they are not skipped."""
     not_counts: int = 0
-    """Electrode values handed over that are no 12-bit count, of the file or injected."""
+    """Electrode values handed over that are no 12-bit count, injected ones included."""
     cut_off: int = 0
     """Readings handed over whose row has no line end."""
     bad_angles: int = 0
     """Joint angles handed over as NaN."""
     injected_off: int = 0
-    """Readings kept back by `off`, and so on: one per reading and fault."""
+    """Readings removed by `off`. Each fault counts once in each reading, here and below."""
     injected_stuck: int = 0
     injected_garbage: int = 0
     injected_wrong: int = 0
@@ -59,7 +59,7 @@ class ReplayCounters(DriverCounters):
 
 
 class FaultInjector:
-    """Applies `ReplayFaults` to one run. Raises `ValueError` for a finger that it lacks."""
+    """Apply `ReplayFaults` to one run. Raises `ValueError` for a finger not in the run."""
 
     def __init__(
         self, faults: ReplayFaults, fingers: Sequence[str], counters: ReplayCounters
@@ -67,7 +67,7 @@ class FaultInjector:
         self._faults = faults
         self._counters = counters
         by_chance = max(faults.garbage_probability, faults.intermittent_probability) > 0.0
-        # Where nothing is left to chance, numpy.random need not be imported: 7 MiB.
+        # Without random faults numpy.random is not imported: it takes 7 MiB.
         self._rng = np.random.default_rng(faults.seed) if by_chance else None
         self._where = _mask(faults, fingers)
         self._index = 0
@@ -75,7 +75,7 @@ class FaultInjector:
         self._held: tuple[NDArray[np.uint16], NDArray[np.uint8]] | None = None
 
     def inject(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> int | None:
-        """Spoil the next reading in place; return its sequence number, or None if it is lost."""
+        """Change the next reading in place; return its `seq`, None if it is lost."""
         faults, counters = self._faults, self._counters
         index, held = self._index, self._held
         self._index += 1
@@ -121,7 +121,7 @@ class FaultInjector:
 
 
 def _mask(faults: ReplayFaults, fingers: Sequence[str]) -> NDArray[np.bool_]:
-    """Shape (fingers, 24): the electrodes whose counts change."""
+    """Return which electrodes change, shape (fingers, 24)."""
     chosen_fingers = tuple(fingers) if faults.fingers is None else faults.fingers
     strangers = [finger for finger in chosen_fingers if finger not in fingers]
     if strangers:

@@ -1,4 +1,4 @@
-"""Link logs through the decoders of live bytes and frames, at the times at which they came."""
+"""Play link logs through the decoders of live links, at the recorded times."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from drivers.recordings.csv_rows import open_recording
 from drivers.recordings.player import RecordedDriver
 
 CANDUMP, SERIAL = ".log", ".serial"
-"""Endings of the two kinds of files that graspd writes."""
+"""File name endings of the two kinds of link log that graspd writes."""
 Record = TypeVar("Record")
 
 
 class LinkDecoder(Protocol):
-    """What makes readings of one link."""
+    """Decoder of one link's records into readings."""
 
     @property
     def counters(self) -> DriverCounters:
-        """What came, and every kind of damage."""
+        """Counters of records and of each kind of damage."""
 
     @property
     def period_ns(self) -> int | None:
@@ -29,24 +29,24 @@ class LinkDecoder(Protocol):
 
 
 class LinkLog(Protocol[Record]):
-    """One kind of file, and the decoder that its records go through."""
+    """One kind of link log, and the decoder of its records."""
 
     @property
     def stream(self) -> LinkDecoder:
-        """The one that a driver of this link has."""
+        """Decoder, the same as in a driver of this link."""
 
     def records(self, path: Path) -> Iterator[tuple[int, Record]]:
         """Yield times, ns, and records of a file; skip damage. Raises `RecordingError`."""
 
     def begin(self) -> None:
-        """Forget all that came. Raises `DriverError`."""
+        """Start with a new decoder. Raises `DriverError`."""
 
     def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:
         """Return the readings that a record of `t_ns` completes."""
 
 
 class LinkLogDriver(RecordedDriver[Record]):
-    """Plays link logs in a row, as one run; without `speed` as fast as possible."""
+    """Play one or more link logs as one run."""
 
     def __init__(
         self,
@@ -56,7 +56,10 @@ class LinkLogDriver(RecordedDriver[Record]):
         speed: float | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Nothing is opened yet. Raises `ValueError` without files or for a speed of 0 or less."""
+        """Open nothing yet. Raises `ValueError` if `paths` is empty, or `speed` not above 0.
+
+        `speed`: factor of real time; None: as fast as possible.
+        """
         super().__init__(paths, speed, clock)
         self._log = log
 
@@ -66,12 +69,12 @@ class LinkLogDriver(RecordedDriver[Record]):
 
     @property
     def period_ns(self) -> int | None:
-        """Time between readings, ns, as played."""
+        """Time between readings as played, ns; None: not known yet."""
         recorded_ns = self._log.stream.period_ns
         return None if recorded_ns is None else round(recorded_ns / (self.speed or 1.0))
 
     def open(self) -> None:
-        """Start over with the first file."""
+        """Start from the first file."""
         self.close()
         for path in self.paths:
             open_recording(path).close()
@@ -91,7 +94,7 @@ class LinkLogDriver(RecordedDriver[Record]):
                 raise RecordingError(path, f"cannot be read: {error.strerror}") from error
 
     def read_ready(self) -> Sequence[Reading]:
-        """The readings of the first record that completes any, if enough records are due."""
+        """Return the readings of the first due record that completes some."""
         while (due := self.take()) is not None:
             t_ns, record, _ = due
             if readings := self._log.feed(t_ns, record):

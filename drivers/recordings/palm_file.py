@@ -1,4 +1,4 @@
-"""A file of palm packets, one after the other without times: one came each millisecond."""
+"""Play a file of palm packets without times: the palm made one each millisecond."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from drivers.palm.stream import PalmStream
 from drivers.recordings.csv_rows import open_recording
 
 PACKETS_TRIED: Final = 64
-"""Packets by which their length is told."""
+"""Number of packets by which the packet length of a file is found."""
 SENSE_MIN: Final = 0.5
-"""Least share of these that must hold sensor data."""
+"""Smallest share of them that must hold sensor data."""
 
 
 class PalmFile:
-    """Packets through the stream that the palm's driver has. A `LinkLog`."""
+    """Play packets through the driver's `PalmStream`. A `LinkLog`."""
 
     def __init__(
         self,
@@ -29,7 +29,7 @@ class PalmFile:
         calibration: Path | None = None,
         heed_finger_bits: bool = True,
     ) -> None:
-        """As those of a `PalmStream`; `calibration` is read by `begin`. Raises `ValueError`."""
+        """Take the arguments of `PalmStream`; `begin` reads the file. Raises `ValueError`."""
         self._calibration = calibration
         self._make_stream = functools.partial(
             PalmStream, fingers, heed_finger_bits=heed_finger_bits
@@ -37,13 +37,13 @@ class PalmFile:
         self.stream = self._make_stream()
 
     def records(self, path: Path) -> Iterator[tuple[int, bytes]]:
-        """Yield times, ns since the first, and packets. Raises `RecordingError` at once."""
+        """Yield time, ns since the first, and packet. Raises `RecordingError` at once."""
         with open_recording(path) as file:
             length = _packet_bytes(path, file)
         return _packets(path, length)
 
     def begin(self) -> None:
-        """Forget all that came. Raises `CalibrationError`."""
+        """Start with a new stream. Raises `CalibrationError`."""
         self.stream = self._make_stream(calibration=self._calibration)
 
     def feed(self, t_ns: int, record: bytes) -> Sequence[Reading]:
@@ -59,7 +59,7 @@ def _packets(path: Path, length: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _packet_bytes(path: Path, file: BinaryIO) -> int:
-    """Return the length of each packet, by which most of the first ones make sense."""
+    """Return the packet length with which most of the first packets hold sensor data."""
     head = file.read(PACKETS_TRIED * max(PALM_OF_LENGTH))
     size = os.fstat(file.fileno()).st_size
     scores = {
@@ -72,7 +72,7 @@ def _packet_bytes(path: Path, file: BinaryIO) -> int:
 
 
 def _share_of_sense(head: bytes, length: int) -> float:
-    """Share of the first packets that hold sensor data, if packets have this length."""
+    """Return the share of packets in `head` that hold sensor data, with this length."""
     counters = PalmCounters()
     starts = range(0, min(len(head), PACKETS_TRIED * length) - length + 1, length)
     for start in starts:

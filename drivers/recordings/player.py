@@ -1,4 +1,4 @@
-"""What drivers that play files have in common: items read one ahead, each due at its time."""
+"""Base of drivers that play files: items are read one ahead, and each is due at its time."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Item = TypeVar("Item")
 
 
 class RecordedDriver(Opened, Generic[Item]):
-    """Base of drivers that play items of known times, ns on the recording's clock, at any speed.
+    """Base of drivers that play items of known times at any speed. Times: ns, recording's clock.
 
-    The first item begins the run when it is asked for. Reading one ahead keeps the work of reading
-    out of the age of what is read; an error waits until the items before it are taken.
+    The run begins when the first item is asked for. Items are read one ahead, so that the work of
+    reading does not add to their age. An error is raised after the items before it are taken.
     """
 
     name = "replay"
@@ -31,7 +31,10 @@ class RecordedDriver(Opened, Generic[Item]):
         *,
         delay_ns: int = 0,
     ) -> None:
-        """Without `speed`, as fast as possible; else `delay_ns` late. Raises `ValueError`."""
+        """Raises `ValueError` without `paths`, or for a `speed` of 0 or less.
+
+        `speed`: factor of real time; None: as fast as possible. `delay_ns`: lateness of each item.
+        """
         if not paths:
             raise ValueError("no recording to replay")
         if speed is not None and not speed > 0.0:
@@ -39,16 +42,16 @@ class RecordedDriver(Opened, Generic[Item]):
         self.paths = tuple(paths)
         self.speed = speed
         self.exhausted = False
-        """True when the last item has been taken, or after an error, until `start`."""
+        """True after the last item or an error, until `start`."""
         self.handed_over_ns = self._opened_ns = clock()
-        """Time of the last reading handed over: the judge's now, whatever the load."""
+        """Time when the last reading was handed over, ns; the judge's now."""
         self._clock = clock
         self._delay_ns = delay_ns
         self._playing: Generator[tuple[int, Item], None, None] | None = None
         self._next: tuple[int, Item] | None = None
         self._failure: RecordingError | None = None
         self._began: tuple[int, int] | None = None
-        """When the first item was asked for, by the clock and by the recording's."""
+        """Start of the run, ns, by the clock and by the recording; None before."""
 
     @property
     def serials(self) -> dict[str, str]:
@@ -58,11 +61,11 @@ class RecordedDriver(Opened, Generic[Item]):
         return {"recordings": Fact(", ".join(map(str, self.paths)))}
 
     def fileno(self) -> int | None:
-        """None: a file is always readable, the clock says when."""
+        """Return None: a file is always readable, so the loop waits for `due_ns`."""
         return None
 
     def start(self, items: Generator[tuple[int, Item], None, None]) -> None:
-        """Play these from the first one on."""
+        """Play `items` from the first one."""
         self.close()
         self._began = None
         self.handed_over_ns = self._opened_ns = self._clock()
@@ -70,13 +73,13 @@ class RecordedDriver(Opened, Generic[Item]):
         self._read_ahead(items)
 
     def close(self) -> None:
-        """Close the file that plays."""
+        """Close the file."""
         if self._playing is not None:
             self._playing.close()
             self._playing = None
 
     def due_ns(self) -> int | None:
-        """When the next item is due; a time in the past for at once; None if there is none."""
+        """Return when the next item is due, ns; in the past: now. None: no item."""
         if self._playing is None or self.exhausted:
             return None
         if self.speed is None or self._next is None or self._began is None:
@@ -84,12 +87,12 @@ class RecordedDriver(Opened, Generic[Item]):
         return self.played_ns(self._next[0]) + self._delay_ns
 
     def played_ns(self, at_ns: int) -> int:
-        """When an item of this time should be played, monotonic ns, without any delay."""
+        """Return when an item of `at_ns` should be played, monotonic ns, without the delay."""
         began_ns, first_ns = self._began or (self._opened_ns, at_ns)
         return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
 
     def take(self) -> tuple[int, Item, int] | None:
-        """Return a due item's time, content and lateness, ns. Raises `RecordingError`."""
+        """Return time, content and lateness, ns, of a due item. Raises `RecordingError`."""
         if self._playing is None:
             raise RuntimeError("the replay is not open")
         now_ns, item = self._clock(), self._next
@@ -107,7 +110,10 @@ class RecordedDriver(Opened, Generic[Item]):
         return *item, now_ns - due_ns
 
     def hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
-        """Return a reading of `at_ns` moved to now; `axis_ns`: the recording's zero, ns."""
+        """Return the reading `made`, complete at `at_ns`, moved to now.
+
+        `axis_ns`: zero of `recorded_ns`, on the recording's clock.
+        """
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)
         return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)

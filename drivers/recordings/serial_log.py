@@ -1,8 +1,8 @@
-"""The link log of a serial line: its bytes with their times, and what the bridge says in them.
+"""The link log of a serial line: its bytes with their times.
 
-Each record is a frame of `drivers.spi.messages`: type 1 for bytes from the device, 2 for bytes to
-it, 3 for the port having been opened; payload `t: u64` (monotonic ns) and the bytes. So a reader
-finds the next record after any damage.
+Each record is a frame of `drivers.spi.messages`, so a reader finds the next one after any damage.
+Type 1: bytes from the device. Type 2: bytes to it. Type 3: the port was opened. The payload is
+`t: u64` (monotonic ns) and the bytes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from drivers.spi.line import LineEvent
 from drivers.spi.messages import FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960
-"""Bytes of one record: a frame has 1024 at most. What came at once is cut into several."""
+"""Most bytes of one record; a frame has at most 1024. Longer pieces are cut."""
 
 CHUNK_BYTES: Final = 65_536
 
@@ -31,16 +31,16 @@ _EVENTS: Final = frozenset(event.value for event in LineEvent)
 
 @dataclass(frozen=True, slots=True)
 class SerialRecord:
-    """Bytes that went over the line at once."""
+    """Bytes of one read or write."""
 
     event: LineEvent
     t_ns: int
-    """Monotonic time, ns."""
+    """Monotonic time of the read or write, ns."""
     data: bytes
 
 
 def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
-    """The records of some bytes."""
+    """Return the records of one event on the line."""
     head = _TIME.pack(t_ns)
     starts = range(0, max(len(data), 1), PIECE_MAX_BYTES)
     return b"".join(
@@ -49,7 +49,7 @@ def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
 
 
 def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[SerialRecord]:
-    """Yield the records that some bytes of a file complete. Never raises."""
+    """Yield the records that `chunk` completes. Never raises."""
     for kind, payload in parser.feed(chunk):
         if kind in _EVENTS and len(payload) >= _TIME.size:
             (t_ns,) = _TIME.unpack_from(payload)
@@ -57,10 +57,10 @@ def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[SerialRecord]:
 
 
 class SerialLog:
-    """Serial link logs through the driver's conversation; nothing is asked. A `LinkLog`."""
+    """Play serial link logs through the driver's `Conversation`; nothing is sent. A `LinkLog`."""
 
     def __init__(self, fingers: Sequence[str], sensors: Sequence[str] | None = None) -> None:
-        """As those of a `Conversation`. Raises `ValueError`."""
+        """Take the arguments of `Conversation`. Raises `ValueError`."""
         self._fingers, self._sensors = fingers, sensors
         self.begin()
 

@@ -1,4 +1,4 @@
-"""The host's side of `deploy/bridge/PROTOCOL.md`: bytes in, readings and bytes out. No I/O."""
+"""Host side of the protocol in `deploy/bridge/PROTOCOL.md`: bytes in, readings out. No I/O."""
 
 from __future__ import annotations
 
@@ -30,31 +30,36 @@ NAME: Final = "spi"
 GREETING_NS = 500_000_000
 """Timeout of a PING at the start, ns."""
 GREETING_TRIES = 4
-"""PINGs at the start before the port is reopened, and one more if the last answer needs another
-that agrees: a board that resets when its port is opened needs a second or two."""
+"""PINGs at the start before the port is reopened; a board that resets needs a second or two.
+
+One more is sent if the serial numbers of the last answer are not confirmed yet.
+"""
 PING_PERIOD_NS = 1_000_000_000
+"""Time between PINGs, ns, after the first `PINGS_FIRST`."""
 PING_FIRST_NS = 50_000_000
+"""Time between the first PINGs, ns: short, so that the clock is known soon."""
 PINGS_FIRST = 8
-"""The first PINGs are this many and follow each other quickly, for good times from the start."""
+"""Number of PINGs that are sent at the shorter interval."""
 NONCES = 1 << 32
+"""Number of nonces: the field has 32 bits."""
 PINGS_OUT_MAX = 8
-"""PINGs that may wait for an answer; the oldest is given up."""
+"""Most PINGs that may wait for an answer; the oldest is given up."""
 PERIOD_MAX_NS = 1_000_000_000
-"""Longest period between sweeps, ns: the silence of a slower bridge would be noticed too late."""
+"""Longest accepted time between sweeps, ns. Silence of a slower bridge is noticed too late."""
 SILENCE_PERIODS = 10
 """Missing sweeps after which the link is lost."""
 SILENCE_MIN_NS = 100_000_000
-"""Shortest timeout of a sweep, ns: more than a USB adapter or a busy host holds back."""
+"""Shortest timeout of a sweep, ns: USB adapters and busy hosts delay bytes by less."""
 
 _FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 
 
 class Conversation:
-    """The protocol's state on one port, over all its reopenings. All times are monotonic ns.
+    """State of the protocol on one port, kept when the port is reopened. Times: monotonic ns.
 
-    The owner of the port calls `opened`, then `receive` with the bytes that come, then writes the
-    frames of `say` and calls `sent` right before each. While `link` is `WAITING`, the port must be
-    closed, and opened again at `link.retry_ns`. A link log passes its records instead.
+    The owner of the port calls `opened`, then `receive` with each chunk of bytes. It writes the
+    frames that `say` returns, and calls `sent` right before each. While `link` is `WAITING`, the
+    port must be closed; reopen it at `link.retry_ns`. A link log is played by the same calls.
     """
 
     def __init__(
@@ -65,19 +70,22 @@ class Conversation:
         *,
         nonce: int = 0,
     ) -> None:
-        """`fingers`: rows of a reading. `sensors`: fingers by chip select, by default the same.
-        `port`: for people. `nonce`: that of the PING before the first. Raises `ValueError`."""
+        """Raises `ValueError` for wrong fingers.
+
+        `port`: its name in messages. `fingers`: the rows of a reading. `sensors`: fingers in the
+        order of the chip selects; None: `fingers`. `nonce`: the first PING has the next one.
+        """
         self.link = Link(NAME)
         self.hello: Hello | None = None
-        """The last HELLO of a bridge that fits, None before the first."""
+        """Last HELLO of an accepted bridge; None before the first."""
         self.serials: dict[str, str] = {}
-        """Serial numbers of that HELLO by finger, without sensors that did not answer."""
+        """Serial numbers in `hello` by finger; silent sensors are left out."""
         self.status: BridgeStatus | None = None
-        """The last STATUS, None before the first."""
+        """Last STATUS; None before the first."""
         self._confirmed: tuple[str, ...] = ()
-        """Serial number of each sensor, as two HELLOs in a row have told it."""
+        """Serial numbers that two HELLOs in a row agreed on."""
         self._unconfirmed: tuple[str, ...] | None = None
-        """Serial numbers of a HELLO that told others, until the next one."""
+        """Serial numbers of the last HELLO if they differ from the confirmed ones."""
         self._sensors = sensor_rows(fingers, sensors)
         self._fingers = tuple(fingers)
         self._port = port
@@ -86,11 +94,11 @@ class Conversation:
         self._parser, self._sent = FrameParser(DIGEST, self.counters), FrameParser(DIGEST)
         self._sweeps: SweepDecoder | None = None
         self._pings: dict[int, int] = {}
-        """Send times of the PINGs that wait for an answer, by their nonce."""
+        """Time, ns, when each unanswered PING was sent, by nonce."""
 
     @property
     def period_ns(self) -> int | None:
-        """Nominal time between sweeps by the last HELLO, ns; None before the first."""
+        """Nominal time between sweeps, ns, from the last HELLO; None before the first."""
         return None if self.hello is None else self.hello.period_ns
 
     @property
@@ -100,7 +108,7 @@ class Conversation:
         return min(self._ping_due_ns, self._silent_at_ns)
 
     def describe(self) -> dict[str, Fact]:
-        """Port, link, and what the bridge last said of itself."""
+        """Return facts about port, link and bridge, for `Driver.describe`."""
         facts = {"port": Fact(self._port), **self.link.describe()}
         if self.hello is not None:
             facts |= _about(self.hello)
@@ -113,7 +121,7 @@ class Conversation:
         return facts
 
     def opened(self, now_ns: int) -> None:
-        """Begin the greeting. Call right after the port was opened."""
+        """Call right after the port was opened: starts the greeting."""
         self._parser.reset()
         self._sent.reset()
         self._sweeps = None
@@ -124,7 +132,7 @@ class Conversation:
         self.link.greeting()
 
     def lost(self, cause: LinkCause, why: str, now_ns: int) -> None:
-        """Give the link up until `opened`."""
+        """Close the link for `cause`, until the next `opened`."""
         self._sweeps = None
         self.counters.link_failures += 1
         self.counters.unanswered_pings += len(self._pings)
@@ -133,7 +141,7 @@ class Conversation:
         self.counters.link_losses = self.link.losses
 
     def say(self, now_ns: int) -> list[bytes]:
-        """Return the frames to send now. May lose the link instead, by a timeout."""
+        """Return the frames to send now. A timeout that has passed closes the link instead."""
         if self.link.state is WAITING:
             return []
         frames = [encode(Start())] if self._starts else []
@@ -158,7 +166,7 @@ class Conversation:
         return []
 
     def sent(self, data: bytes, t_ns: int) -> None:
-        """Note the time of each PING in `data`. Call right before it is written."""
+        """Record when each PING in `data` is sent. Call right before writing `data`."""
         for kind, payload in self._sent.feed(data):
             message = decode(kind, payload)
             if isinstance(message, Ping):
@@ -169,12 +177,15 @@ class Conversation:
                 self._pings_sent += 1
 
     def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
-        """Return the readings that these bytes complete, oldest first. Never raises.
-        `idle_ns`: last time before they came at which nothing was waiting to be read."""
+        """Return the readings that `chunk` completes, oldest first. Never raises.
+
+        `arrival_ns`: when the bytes were read. `idle_ns`: last earlier time at which no byte
+        waited to be read, so that all of them arrived after it.
+        """
         readings: list[Reading] = []
         for kind, payload in self._parser.feed(chunk):
             if self.link.state is WAITING:
-                break  # lost because of a frame before this one
+                break  # an earlier frame of this chunk has closed the link
             if kind == Hello.TYPE and not self._has_our_layout(payload, arrival_ns):
                 continue
             message = decode(kind, payload)
@@ -190,11 +201,11 @@ class Conversation:
         return readings
 
     def _next_ping(self) -> bytes:
-        self._nonce = (self._nonce + 1) % NONCES or 1  # 0 is that of a reset
+        self._nonce = (self._nonce + 1) % NONCES or 1  # 0 means a reset
         return encode(Ping(self._nonce))
 
     def _has_our_layout(self, payload: bytes, now_ns: int) -> bool:
-        """Return True if a HELLO has our layout, else give the link up."""
+        """Return True if a HELLO has our version and layout; else close the link."""
         layout = layout_of(payload)
         if layout is None or layout == (VERSION, DIGEST):
             return True
@@ -219,7 +230,7 @@ class Conversation:
             self.counters.bridge_tx_dropped = message.tx_dropped
             self.counters.bridge_rx_errors = message.rx_errors
         else:
-            self.counters.unknown_frames += 1  # our own words: an echo
+            self.counters.unknown_frames += 1  # an echo of our own frame
 
     def _on_hello(self, hello: Hello, arrival_ns: int) -> None:
         if hello.nonce == 0:
@@ -233,7 +244,7 @@ class Conversation:
         elif self._sweeps.hello.sampling != hello.sampling:
             self.lost(LinkCause.SETTINGS, "the bridge changed what it samples", arrival_ns)
         elif not self._is_confirmed(hello.serials):
-            # Misread or exchanged: at STOP the bridge reads them again.
+            # A serial number was misread, or a sensor exchanged: after STOP the bridge reads again.
             self.lost(LinkCause.SERIALS, "the bridge names other sensors", arrival_ns)
         if self._sweeps is not None:
             self._take(hello)
@@ -257,7 +268,7 @@ class Conversation:
             self._ping_due_ns = now_ns
 
     def _greet(self, hello: Hello, now_ns: int) -> None:
-        """Begin sweeping with a bridge that fits, once its serial numbers are confirmed."""
+        """Start the sweeps if the bridge fits the scene and its serial numbers are confirmed."""
         needed = max(self._sensors) + 1
         if hello.sensors < needed:
             why = f"has {hello.sensors} sensors, the scene needs {needed}"
@@ -319,7 +330,7 @@ def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
 
 
 def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
-    """Return SPI errors by chip select, `-` for one without a sensor."""
+    """Return the SPI errors of each chip select; `-` where no sensor answers."""
     errors = [
         count if serial else None
         for count, serial in zip(status.spi_errors, hello.serials, strict=False)

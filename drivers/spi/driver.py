@@ -1,4 +1,4 @@
-"""BioTac SPs behind a microcontroller that samples them over SPI and streams over a serial port."""
+"""Driver of the SPI bridge: a microcontroller that samples BioTac SPs and streams their words."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.spi.messages import Stop, encode
 from drivers.spi.sweeps import BridgeCounters
 
 BAUD = 921_600
-"""Carries 92 kB/s, three times the longest sequence; 115200 is too slow for any."""
+"""Bits per second: 92 kB/s, three times the longest sequence; 115200 is too slow for any."""
 POLL_NS = 2_000_000
 """Time between reads of a port without a descriptor, ns."""
 
@@ -22,10 +22,10 @@ POLL_NS = 2_000_000
 class SpiBridgeDriver(Opened):
     """Readings of the sensors behind one bridge; reconnects after every loss.
 
-    `t_ns` of a reading is when the bridge finished the sweep; `seq` continues across losses of the
-    link. Electrodes that are not sampled, and those of an absent sensor, are `MISSING`. Ports
-    without a descriptor (`rfc2217://`, `loop://`) are polled. The constructor raises `ValueError`.
-    A missing device raises nothing: `describe` tells of it.
+    `t_ns` of a reading: when the bridge finished the sweep. `seq` goes on after a loss of the link.
+    Electrodes that are not sampled, and those of an absent sensor, are `MISSING`. Ports without a
+    descriptor (`rfc2217://`, `loop://`) are polled. The constructor raises `ValueError` for wrong
+    fingers or baud. A missing device raises nothing; `describe` reports it.
     """
 
     name = NAME
@@ -73,30 +73,30 @@ class SpiBridgeDriver(Opened):
         return self.conversation.describe()
 
     def open(self) -> None:
-        """Forget everything and try the port once. Raises `DriverError` if no try can succeed."""
+        """Start afresh and try the port once. Raises `DriverError` if no try can succeed."""
         self.close()
         self.conversation = self._begin()
         self.conversation.link.start(self._clock())
         self._connect()
 
     def tap(self, sink: Callable[[LineEvent, bytes], None]) -> None:
-        """Pass all bytes that come and go from now on to `sink` too."""
+        """Pass all bytes that are read or written from now on to `sink` too."""
         self._line.tap = sink
 
     def close(self) -> None:
-        """Stop the bridge and give the port back."""
+        """Stop the bridge and release the port."""
         if self.link_state in (GREETING, UP):
-            with contextlib.suppress(LinkError):  # a bridge that is gone needs no STOP
+            with contextlib.suppress(LinkError):  # a bridge that is unplugged needs no STOP
                 self._line.write(encode(Stop()))
         self._line.close()
         self.conversation.link.close()
 
     def fileno(self) -> int | None:
-        """Descriptor of the port, or None: it is closed or must be polled."""
+        """Return the port's descriptor; None if it is closed or must be polled."""
         return self._line.descriptor
 
     def due_ns(self) -> int | None:
-        """Time of the next try, PING, timeout or poll, ns, or None while closed."""
+        """Return the time of the next try, PING, timeout or poll, ns; None while closed."""
         link = self.conversation.link
         if link.state in (CLOSED, WAITING):
             return link.retry_ns
@@ -104,7 +104,7 @@ class SpiBridgeDriver(Opened):
         return due_ns if self._line.descriptor is not None else min(due_ns, self._poll_due_ns)
 
     def read_ready(self) -> Sequence[Reading]:
-        """Return the readings of the sweeps that have arrived. No bridge makes it raise."""
+        """Return the readings that have arrived, oldest first. No fault of a bridge raises."""
         link = self.conversation.link
         if link.state is CLOSED:
             raise RuntimeError("the bridge is not open")

@@ -1,4 +1,4 @@
-"""A serial port that never blocks the loop: pyserial, with all its failures as `LinkError`."""
+"""A serial port that never blocks: pyserial, whose failures all become `LinkError`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ import serial
 from drivers.base import DriverError, LinkCause, LinkError
 
 READ_BYTES = 4096
-"""Most bytes that a terminal gives at once."""
+"""Bytes of one read: a terminal of Linux returns at most this many."""
 SHORT_BYTES = READ_BYTES // 2
-"""A terminal that gives less has no more: the kernel keeps it full while more waits."""
+"""A read of fewer bytes has emptied the terminal; the kernel keeps it full while more waits."""
 READS_MAX = 32
-"""Reads in one call: more than a kernel buffers (64 KiB), so that a flood cannot hold the loop."""
+"""Most reads in one call: twice the kernel's buffer of 64 KiB. A flood cannot hold the loop."""
 DRAIN_TRIES, DRAIN_TRY_S = 10, 0.002
-"""Waits for the last bytes to leave when a port is closed, s each."""
+"""Number and length, s, of the waits for the last bytes to leave before a port is closed."""
 WRITE_TIMEOUT_S = 0.05
-"""Longest wait for room in the port's buffer, which `select` has just reported, s."""
+"""Longest wait for room in the port's buffer, s; `select` has just reported room."""
 
 _log = logging.getLogger(__name__)
 
 
 class LineEvent(IntEnum):
-    """What happened on a line."""
+    """Kind of an event on a line, as passed to the tap and written to a link log."""
 
     RECEIVED = 1
     SENT = 2
@@ -39,27 +39,27 @@ class LineEvent(IntEnum):
 
 
 class SerialLine:
-    """One port by device name (better `/dev/serial/by-id/...`) or URL of pyserial.
+    """One port, by device name (better `/dev/serial/by-id/...`) or URL of pyserial.
 
-    `LinkError`: the device is missing or went away. Opening and closing a `socket://` or
-    `rfc2217://` port can take seconds: they are for trying things out.
+    Methods raise `LinkError` if the device is missing or went away. Use `socket://` and
+    `rfc2217://` only to try things out: opening and closing them can take seconds.
     """
 
     def __init__(self, port: str, baud: int) -> None:
         self.port = port
         self.drained = True
-        """True if the last `read` left nothing behind."""
+        """True if the last `read` took all bytes that waited."""
         self.tap: Callable[[LineEvent, bytes], None] | None = None
-        """Called with all bytes that were read, and with those that are about to be written."""
+        """Called with the bytes of each read, and before each write with its bytes."""
         self.descriptor: int | None = None
-        """Descriptor to wait on; None while closed, and for a port that must be polled."""
+        """Descriptor to wait on; None while closed, or if the port must be polled."""
         self._baud = baud
         self._serial: serial.Serial | None = None
         self._terminal: int | None = None
-        """Descriptor of a terminal, which is read without pyserial."""
+        """Descriptor if the port is a terminal; it is read without pyserial."""
 
     def open(self) -> None:
-        """Take the port exclusively. Raises `LinkError`; `DriverError` if no retry can help."""
+        """Open the port exclusively. Raises `LinkError`; `DriverError` if no retry can help."""
         self.close()
         try:
             self._serial = serial.serial_for_url(
@@ -76,7 +76,7 @@ class SerialLine:
         with contextlib.suppress(OSError, AttributeError):
             self.descriptor = self._serial.fileno()
         self._terminal = self.descriptor if type(self._serial) is serial.Serial else None
-        try:  # an FTDI adapter then passes bytes on every 1 ms, not 16
+        try:  # an FTDI adapter then sends every 1 ms, not every 16
             self._serial.set_low_latency_mode(True)
         except (OSError, ValueError, AttributeError) as error:
             _log.debug("%s: no low latency mode: %s", self.port, error)
@@ -84,7 +84,7 @@ class SerialLine:
             self.tap(LineEvent.OPENED, b"")
 
     def close(self) -> None:
-        """Release the port. May be called twice, and when the device is gone."""
+        """Release the port; does nothing if it is closed. The device may be gone."""
         port, self._serial, self.descriptor = self._serial, None, None
         if port is None:
             return
@@ -94,12 +94,12 @@ class SerialLine:
                     break
                 time.sleep(DRAIN_TRY_S)
             else:
-                port.reset_output_buffer()  # closing would wait up to 30 s for it to drain
+                port.reset_output_buffer()  # with bytes left, closing would wait up to 30 s
         except AttributeError:
             pass  # a port without a buffer of its own
         except (OSError, termios.error) as error:
             _log.debug("%s: %s", self.port, error)
-        # pyserial lets go of a socket that was reset by its peer without closing it.
+        # pyserial drops a socket that its peer has reset, but does not close it.
         held = getattr(port, "_socket", None)
         try:
             port.close()
@@ -116,7 +116,7 @@ class SerialLine:
             for _ in range(READS_MAX):
                 chunk = b"" if self._terminal is None else os.read(self._terminal, READ_BYTES)
                 self.drained = 0 < len(chunk) < SHORT_BYTES
-                if not chunk:  # pyserial also notices a terminal that went away
+                if not chunk:  # pyserial also notices that a terminal is gone
                     chunk = port.read(READ_BYTES)
                     self.drained = not chunk
                 data += chunk
@@ -157,7 +157,7 @@ class SerialLine:
 
 
 def _reason(error: Exception) -> str:
-    """Return one short line; pyserial's own repeat the port's name."""
+    """Return the error in one short line; pyserial's own texts repeat the port's name."""
     code = getattr(error, "errno", None)
     if code in (errno.EAGAIN, errno.EBUSY):
         return "another program has it open"

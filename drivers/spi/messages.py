@@ -1,7 +1,7 @@
 """Frames and messages of `deploy/bridge/PROTOCOL.md`, version 1. Bytes only.
 
-A frame is `COBS(type: u8 | payload | crc: u32) 0x00`. Encoding raises `ValueError`, decoding
-returns None, for a message that the protocol forbids: one of a wrong length or that is not sound.
+A frame is `COBS(type: u8 | payload | crc: u32) 0x00`. For a message of a wrong length, or with
+contents that the protocol forbids, encoding raises `ValueError` and decoding returns None.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from drivers.base import DriverCounters
 from drivers.biotac import FORBIDDEN_COMMAND
 
 DELIMITER: Final = b"\0"
-"""Ends a frame and occurs nowhere else, so that the next frame is found after any damage."""
+"""Byte that ends a frame and occurs in no frame, so the next one is found after any damage."""
 ENCODED_MAX_BYTES = 1024
-"""Longest encoded frame without delimiter; the largest SWEEP of version 1 takes 671."""
+"""Longest encoded frame without delimiter, bytes; the largest SWEEP of version 1 takes 671."""
 VERSION = 1
 FIRMWARE = 0x0002
-"""Firmware in `deploy/bridge` of this graspd, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
+"""Version of the firmware in `deploy/bridge`, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
 SCHEMA = """\
 graspd bridge 1
 01 HELLO   u8 version; u32 digest; u32 nonce; u64 tick; u32 tick_hz; u16 firmware; char board[16]; \
@@ -39,21 +39,24 @@ u32 spi_errors[sensors]
 83 STOP    (nothing)
 """
 DIGEST = zlib.crc32(SCHEMA.encode("ascii"))
-"""Begins the checksum of every frame but HELLO and PING, so that another layout fails it."""
+"""Start value of the checksum of all frames except HELLO and PING.
+
+A peer with another layout so fails the check, instead of being misread.
+"""
 
 SENSORS_MAX = 5
-"""Fingers of a hand, and chip selects of the largest board."""
+"""Most sensors of a bridge: one for each finger of a hand."""
 SLOTS_MAX = 64
-"""Samples per sweep; the longest sequence of the manual (table 12) has 54."""
+"""Most samples per sweep; the longest sequence of the manual (table 12) has 54."""
 TEXT_BYTES = 16
-"""Length of a board's name and of a sensor's serial number (manual table 10)."""
+"""Length of a board's name and of a sensor's serial number, bytes (manual table 10)."""
 TICK_HZ_MIN = 1_000
-"""A slower clock cannot tell sweeps apart."""
+"""Slowest accepted clock, Hz: with a slower one two sweeps could have the same tick."""
 
 UNSEEDED: Final = (0x01, 0x81)
-"""HELLO and PING, which peers with different layouts must still be able to exchange."""
+"""Types without `DIGEST`: HELLO and PING, which peers of any layout must be able to exchange."""
 _CRC_RESIDUE: Final = 0x2144DF1C
-"""CRC-32 of any bytes with their own checksum behind them, whatever it was continued from."""
+"""CRC-32 of bytes followed by their own checksum: the same for all bytes and start values."""
 _U32 = struct.Struct("<I")
 _LAYOUT = struct.Struct("<BI")
 _HELLO = struct.Struct(f"<BIIQIH{TEXT_BYTES}sIBB")
@@ -64,20 +67,23 @@ _WORD = np.dtype(">u2")
 
 @dataclass(slots=True)
 class FrameCounters(DriverCounters):
-    """Counters of a parser, among those of its driver."""
+    """Counters of a parser of frames; its driver's counters contain them."""
 
     bytes: int = 0
     frames: int = 0
     """Whole frames with the right checksum."""
     bad_cobs: int = 0
     bad_crc: int = 0
-    """Frames with a wrong checksum, or without room for one."""
+    """Frames with a wrong checksum, or too short to have one."""
     too_long: int = 0
     """Frames longer than `ENCODED_MAX_BYTES`."""
 
 
 def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
-    """Return a frame; `digest` begins its checksum unless it is `UNSEEDED`. Raises `ValueError`."""
+    """Return the frame of a payload. Raises `ValueError` if it is too long.
+
+    `kind`: type of the message. `digest`: start value of the checksum, unused for `UNSEEDED` types.
+    """
     body = bytes([kind]) + payload
     seed = 0 if kind in UNSEEDED else digest
     encoded: bytes = cobs.encode(body + _U32.pack(zlib.crc32(body, seed)))
@@ -87,17 +93,17 @@ def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
 
 
 class FrameParser:
-    """Bytes in, whole frames out. Never raises; damaged frames are counted and dropped."""
+    """Cut a stream of bytes into frames. Never raises; damaged frames are counted and dropped."""
 
     def __init__(self, digest: int = 0, counters: FrameCounters | None = None) -> None:
-        """`digest`: see `encode_frame`. Counts in `counters`, if given."""
+        """`digest`: as in `encode_frame`. `counters`: where to count; None: in new ones."""
         self.counters = counters or FrameCounters()
         self._digest = digest
         self.reset()
 
     @property
     def held_bytes(self) -> int:
-        """Bytes of an unfinished frame, at most `ENCODED_MAX_BYTES`."""
+        """Number of bytes of an unfinished frame, at most `ENCODED_MAX_BYTES`."""
         return len(self._held)
 
     def reset(self) -> None:
@@ -106,7 +112,7 @@ class FrameParser:
         self._is_overlong = False
 
     def feed(self, chunk: bytes) -> list[tuple[int, bytes]]:
-        """Return type and payload of the frames that these bytes complete, oldest first."""
+        """Return type and payload of each frame that `chunk` completes, oldest first."""
         self.counters.bytes += len(chunk)
         *ended, rest = chunk.split(DELIMITER)
         frames = []
@@ -144,19 +150,19 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Describes the bridge and its sampling; answers PING, and comes once after a reset."""
+    """Description of the bridge and its sampling; sent after a PING, and once after a reset."""
 
     TYPE: ClassVar[int] = 0x01
 
     nonce: int
-    """That of the PING that it answers, 0 after a reset."""
+    """Nonce of the answered PING; 0 after a reset."""
     tick: int
-    """The bridge's clock when it took the PING in."""
+    """Ticks of the bridge's clock when it received the PING."""
     tick_hz: int
     period_ticks: int
     """Nominal ticks from one sweep to the next."""
     serials: tuple[str, ...]
-    """Serial number by chip select, empty where no sensor answered."""
+    """Serial number at each chip select; empty where no sensor answered."""
     commands: tuple[int, ...]
     """First command byte of each slot (manual figure 13)."""
     firmware: int = 0
@@ -175,7 +181,7 @@ class Hello:
 
     @property
     def sampling(self) -> tuple[object, ...]:
-        """What must not change while the bridge sweeps."""
+        """The fields that must not change while the bridge sweeps."""
         return (self.sensors, self.commands, self.tick_hz, self.period_ticks)
 
     @property
@@ -233,19 +239,20 @@ class Hello:
 
 
 class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """Response words of one sweep over all slots and sensors."""
+    """One sweep: the response words of all slots and sensors."""
 
     TYPE: ClassVar[int] = 0x02
 
     seq: int
-    """Counts sweeps since START, from 0, wrapping at 2**32."""
+    """Number of the sweep since START, from 0, modulo 2**32."""
     tick_start: int
+    """Ticks of the bridge's clock at the first command."""
     tick_end: int
-    """The bridge's clock at the first command and after the last word."""
+    """Ticks of the bridge's clock after the last word."""
     present: int
-    """Bit i: sensor i had a serial number when it was last looked for."""
+    """Bit i is set if sensor i answered when the bridge last asked for its serial number."""
     words: NDArray[np.uint16]
-    """Shape (slots, sensors), response words of either byte order (manual figure 15)."""
+    """Response words, shape (slots, sensors), in either byte order (manual figure 15)."""
 
     def is_sound(self) -> bool:
         slots, sensors = self.words.shape
@@ -274,20 +281,20 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class BridgeStatus:
-    """The bridge's own counters since its reset; comes once a second."""
+    """The bridge's own counters since its reset, sent once a second."""
 
     TYPE: ClassVar[int] = 0x03
 
     tick: int
     sweeps: int
     overruns: int
-    """Sweeps that began late because the one before took too long."""
+    """Sweeps that began late, because the sweep before took longer than the period."""
     tx_dropped: int
-    """Frames that the host's side did not take in time."""
+    """Frames dropped because the host did not read in time."""
     rx_errors: int
     """Frames from the host that were damaged, too long or unknown."""
     spi_errors: tuple[int, ...]
-    """Words per sensor whose parity was bad, error words among them."""
+    """Words of bad parity at each chip select, error words included."""
 
     def is_sound(self) -> bool:
         return 1 <= len(self.spi_errors) <= SENSORS_MAX
@@ -311,7 +318,7 @@ class BridgeStatus:
 
 @dataclass(frozen=True)
 class _Bare:
-    """A message without payload."""
+    """Base of messages without payload."""
 
     def is_sound(self) -> bool:
         return True
@@ -325,20 +332,20 @@ class _Bare:
 
 
 class Start(_Bare):
-    """Begins sweeping with sequence number 0; ignored while sweeping."""
+    """Asks the bridge to sweep, from number 0; ignored while it sweeps."""
 
     TYPE: ClassVar[int] = 0x82
 
 
 class Stop(_Bare):
-    """Ends sweeping after the current sweep."""
+    """Asks the bridge to stop after the current sweep."""
 
     TYPE: ClassVar[int] = 0x83
 
 
 @dataclass(frozen=True)
 class Ping(_Bare):
-    """Asks for a HELLO with the same nonce."""
+    """Asks the bridge for a HELLO with the same nonce."""
 
     TYPE: ClassVar[int] = 0x81
 
@@ -378,7 +385,7 @@ def decode(kind: int, payload: bytes) -> Message | None:
 
 
 def layout_of(payload: bytes) -> tuple[int, int] | None:
-    """Return version and digest of any version's HELLO, or None if it is too short."""
+    """Return version and digest of a HELLO of any version; None if it is too short."""
     return _LAYOUT.unpack_from(payload) if len(payload) >= _LAYOUT.size else None
 
 
@@ -389,6 +396,6 @@ def _text_to_bytes(text: str) -> bytes:
 
 
 def _text(padded: bytes) -> str:
-    """Return the text; odd bytes, which a sensor may send, become `?`."""
+    """Return the text without padding; bytes that are not printable ASCII become `?`."""
     text = padded.partition(b"\0")[0].decode("ascii", errors="replace")
     return "".join(letter if letter.isprintable() and letter.isascii() else "?" for letter in text)

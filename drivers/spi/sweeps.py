@@ -1,10 +1,12 @@
-"""Sweeps of a bridge -> readings with the time at which they were made. No I/O.
+"""Convert sweeps of a bridge to readings with the time at which they were made. No I/O.
 
-A PING that is answered with a tick proves that this tick was not before the PING was sent. The
-latest of these lower bounds, carried on at the bridge's rate, makes a reading never too fresh, and
-too old by at most the shortest way there. The rate comes from a decaying linear regression that
-leaves out late PINGs, as in Klipper. Arrivals of readings play no part, so that neither batches of
-a USB adapter nor a stall of the host disturb it.
+The answer to a PING holds a tick of the bridge's clock. The tick was not before the PING was sent,
+which gives a lower bound of its time. From there, time goes on at the bridge's measured rate. The
+latest bound is used. A reading never looks too new, and looks too old by at most the shortest time
+that a PING takes to the bridge.
+
+The rate comes from a decaying linear regression that leaves out late PINGs, as in Klipper. Arrival
+times of readings are not used, so batches of a USB adapter and stalls of the host do no harm.
 """
 
 from __future__ import annotations
@@ -25,45 +27,54 @@ from drivers.spi.messages import FrameCounters, Hello, Sweep
 
 SEQ_HALF, SEQ_END = 1 << 31, 1 << 32
 SEQ_FIRST_MAX = 1_000
-"""A first sweep with a higher number shows a bridge that was sweeping before START, no loss."""
+"""Highest believed number of the first sweep after START.
+
+A higher one means that the bridge was sweeping before START; no sweep was lost then.
+"""
 RATE_TOLERANCE = 500e-6
-"""Largest error of a bridge's rate that is believed; crystals keep 100 ppm."""
+"""Largest believed error of a bridge's rate, as a share of it; crystals keep 100 ppm."""
 SLACK_MIN, SLACK_MAX = 10e-6, 200e-6
-"""Limits of the assumed error of the rate in use; at the upper one it is the nominal rate."""
+"""Limits of the assumed error of the rate, as a share of it.
+
+At the upper limit the nominal rate is used instead of the measured one.
+"""
 SLACK_SIGMAS = 6.0
-"""Assumed error of the rate, in standard errors of the regression."""
+"""Assumed error of the rate as a multiple of the regression's standard error."""
 DECAY = 1.0 / 30.0
-"""Weight of a new PING in the regression: at one per second it remembers half a minute."""
+"""Weight of a new PING in the regression: with one a second, half a minute is remembered."""
 NOISE_FIRST_NS = 1e6
-"""Standard deviation of the time that a PING takes to the bridge, until it is known, ns."""
+"""Assumed standard deviation of the time of a PING to the bridge, ns, until it is measured."""
 OUTLIER_SIGMAS = 5.0
 OUTLIER_MIN_NS = 0.5e6
 """A PING that took longer than expected by both of these is left out of the regression."""
 OUTLIERS_MAX = 5
-"""After this many in a row the regression is wrong, not they: it starts over."""
+"""After this many outliers in a row, the regression is taken for wrong and starts again."""
 BOUNDS = 16
-"""PINGs that are remembered; the best lower bound is one of them."""
+"""Number of PINGs that are kept; the best lower bound is one of them."""
 PROOF_FIRST_NS, PROOF_FACTOR, PROOF_MAX_NS = 500_000_000, 4, 8_000_000_000
-"""A clock that was wrong is trusted again when PINGs this far apart agree, ns. The first time is
-short, as it may have been reset; each further fault needs longer, as a wrong rate shows slowly."""
+"""A clock that was wrong is trusted again when PINGs this far apart, ns, agree with it.
+
+The first time is short, because a reset of the board is over at once. Each further fault
+multiplies it, up to the last value, because a wrong rate shows only slowly.
+"""
 AHEAD_TOLERANCE_NS = 1_000_000
-"""A mapped time this much later than its arrival, ns, shows a clock that does not fit its past."""
+"""Most that a mapped time may lie after the arrival, ns; more means that the clock is wrong."""
 UNKNOWN_DELAY_NS = 20_000_000
-"""Assumed delay without trusted ticks, ns: 16 ms of a USB serial adapter, 4 ms for the rest."""
+"""Assumed delay while the clock is not trusted, ns: 16 ms in a USB adapter, 4 ms elsewhere."""
 AGE_MAX_NS = 10_000_000_000
-"""No mapped time is older than this, ns: buffers hold seconds at most."""
+"""Greatest age of a mapped time, ns; buffers on the way hold a few seconds at most."""
 
 
 @dataclass(slots=True)
 class BridgeCounters(FrameCounters):
-    """Counters of frames, sweeps and the link, over all reopenings of the port."""
+    """Counters of frames, sweeps and the link; they go on when the port is reopened."""
 
     unknown_frames: int = 0
-    """Whole frames of a type that a bridge of version 1 never sends."""
+    """Whole frames of a type that no bridge of version 1 sends."""
     bad_frames: int = 0
-    """Whole frames whose content the protocol forbids or that do not fit the HELLO."""
+    """Whole frames with content that the protocol forbids, or that does not fit the HELLO."""
     duplicates: int = 0
-    """Sweeps that came twice, the second dropped."""
+    """Sweeps that came twice; the second is dropped."""
     reordered: int = 0
     """Sweeps that came after a later one; dropped, and also counted as missed."""
     stale_sweeps: int = 0
@@ -71,46 +82,46 @@ class BridgeCounters(FrameCounters):
     parity_words: int = 0
     error_words: int = 0
     unplugged_words: int = 0
-    """Words of electrodes by their fault, without those of absent sensors."""
+    """Words of a line that no sensor drives. These three leave out absent sensors."""
     absent_sensors: int = 0
-    """Sensors without serial number, one per sweep and sensor."""
+    """Sensors without a serial number; each counts once in each sweep."""
     link_losses: int = 0
     """Times that a link that was up was lost."""
     link_failures: int = 0
-    """Times that opening or greeting failed or the link was lost."""
+    """Times that opening or greeting failed, or the link was lost."""
     refused_bridges: int = 0
-    """Greetings of a bridge with another version, layout or number of sensors."""
+    """Greetings of a bridge whose version, layout or number of sensors does not fit."""
     restarts: int = 0
-    """Times that the bridge told of a reset while it was sweeping."""
+    """Resets that the bridge reported while it was sweeping."""
     unanswered_pings: int = 0
     host_tx_dropped: int = 0
-    """Frames to the bridge for which there was no room."""
+    """Frames to the bridge that were dropped because the port's buffer was full."""
     clock_faults: int = 0
     """Times that the bridge's clock stopped being trusted."""
     clock_fallbacks: int = 0
-    """Readings whose time is estimated from their arrival alone."""
+    """Readings whose time is estimated from their arrival, as the clock was not trusted."""
     bridge_overruns: int = 0
     bridge_tx_dropped: int = 0
     bridge_rx_errors: int = 0
-    """Counters of the last STATUS, which begin at the bridge's reset."""
+    """Damaged frames. These three are the bridge's own, since its reset, by the last STATUS."""
 
 
 class SweepDecoder:
-    """Sweeps in, readings out, from one START to the loss of the link."""
+    """Decoder of sweeps into readings, from one START to the loss of the link."""
 
     def __init__(self, hello: Hello, sensors: Sequence[int], counters: BridgeCounters) -> None:
-        """`hello` describes the sampling; `sensors`: the bridge's sensor, from 0, of each row."""
+        """`hello`: describes the sampling. `sensors`: number of each row's sensor, from 0."""
         self.hello = hello
         self.clock = DeviceClock(hello.tick_hz, counters)
         self.longest_ticks = 0
-        """Duration of the longest sweep, ticks."""
+        """Duration of the longest sweep so far, ticks."""
         self._sensors = tuple(sensors)
         self._counters = counters
         self._bridge_seq: int | None = None
         self._source = np.zeros((len(sensors), ELECTRODES), dtype=np.intp)
-        """Place of each electrode's word in a sweep."""
+        """Index of each electrode's word in a sweep, shape (fingers, 24)."""
         self._marks = np.full(self._source.shape, ElectrodeFault.MISSING, dtype=np.uint8)
-        """Faults of a sweep of present sensors: electrodes that are not sampled are missing."""
+        """Faults of a sweep if all sensors are present: electrodes not sampled are missing."""
         for slot, command in enumerate(hello.commands):
             channel = channel_of(command)
             if channel is not None and E1 <= channel <= E24:
@@ -118,7 +129,7 @@ class SweepDecoder:
                 self._marks[:, channel - E1] = ElectrodeFault.NONE
 
     def reading(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
-        """Return the reading of a sweep, or None for one that is not newer or does not fit."""
+        """Return the reading of a sweep; None if the sweep is old or does not fit the HELLO."""
         if sweep.words.shape != (self.hello.slots, self.hello.sensors):
             self._counters.bad_frames += 1
             return None
@@ -130,10 +141,10 @@ class SweepDecoder:
         return make_reading(words, self._marks_of(sweep), t_ns, self._counters)
 
     def _is_next(self, sweep: Sweep) -> bool:
-        """Return True for a sweep newer than all before; count the missing ones."""
+        """Return True if the sweep is newer than all before, and count the missing ones."""
         if self._bridge_seq is None:
             if sweep.tick_start < self.hello.tick:
-                self._counters.stale_sweeps += 1  # it was under way when STOP arrived
+                self._counters.stale_sweeps += 1  # the sweep was under way when STOP arrived
                 return False
             missed = sweep.seq if sweep.seq <= SEQ_FIRST_MAX else 0
         else:
@@ -160,7 +171,7 @@ class SweepDecoder:
 
 
 class _Bound(NamedTuple):
-    """An answered PING: `tick` was neither before `sent_ns` nor after `received_ns`."""
+    """An answered PING: the clock showed `tick` between `sent_ns` and `received_ns`."""
 
     tick: int
     sent_ns: int
@@ -168,17 +179,17 @@ class _Bound(NamedTuple):
 
 
 class DeviceClock:
-    """Maps the ticks of one bridge, from one reset to the next, to monotonic host time.
+    """Map the ticks of one bridge, from one reset to the next, to monotonic host time.
 
-    A mapped time is never later than the arrival and at most `AGE_MAX_NS` before it; it goes back
+    A mapped time is never later than the arrival, and at most `AGE_MAX_NS` before it. It goes back
     only when the clock stops being trusted. Ticks are not trusted before the first answered PING,
-    and when the clock stands, falls back, is ahead of its arrivals, or is wrong by more than
-    `RATE_TOLERANCE`. Then the time is `UNKNOWN_DELAY_NS` before the last time when nothing was
-    waiting to be read: rather too old than too fresh (deploy/MEASURED.md).
+    nor if the clock stands, falls back, is ahead of its arrivals, or is wrong by more than
+    `RATE_TOLERANCE`. The time is then `UNKNOWN_DELAY_NS` before the last time at which no byte
+    waited to be read. It may be too old, never too new (deploy/MEASURED.md).
     """
 
     def __init__(self, tick_hz: int, counters: BridgeCounters) -> None:
-        """`tick_hz`: nominal rate, above 0."""
+        """`tick_hz`: nominal rate, Hz, above 0."""
         self.counters = counters
         self._ns_per_tick = 1e9 / tick_hz
         self._bounds: deque[_Bound] = deque(maxlen=BOUNDS)
@@ -191,18 +202,18 @@ class DeviceClock:
 
     @property
     def trusted(self) -> bool:
-        """True if the ticks are used at present."""
+        """True if times come from the ticks now."""
         return self._best is not None
 
     @property
     def drift_ppm(self) -> float | None:
-        """Drift of the bridge's clock, ppm, positive if fast; None: not known yet."""
+        """Drift of the bridge's clock, ppm, positive if it is fast; None: not known yet."""
         drift = self._drift
         return None if drift.slack == SLACK_MAX else (1.0 / (1.0 + drift.slope) - 1.0) * 1e6
 
     @property
     def rate_limits_ppm(self) -> tuple[float, float] | None:
-        """Limits of the drift by the remembered PINGs, ppm."""
+        """Lower and upper limit of the drift, ppm, by the kept PINGs; None: not known yet."""
         least, most = -math.inf, math.inf
         for first, last in itertools.combinations(self._bounds, 2):
             if last.sent_ns > first.received_ns:
@@ -214,11 +225,11 @@ class DeviceClock:
 
     @property
     def round_trip_ns(self) -> int | None:
-        """Shortest round trip among the remembered PINGs, ns."""
+        """Shortest round trip of the kept PINGs, ns; None before the first."""
         return min((bound.received_ns - bound.sent_ns for bound in self._bounds), default=None)
 
     def round_trip(self, tick: int, sent_ns: int, received_ns: int) -> None:
-        """Take an answered PING: host time before it was sent and after the answer came."""
+        """Add an answered PING: host time before it was sent, and after its answer came."""
         bound = _Bound(tick, sent_ns, received_ns)
         if not all(self._fits(earlier, bound) for earlier in self._bounds):
             self._distrust()
@@ -232,8 +243,11 @@ class DeviceClock:
         self._best = max(self._bounds, key=lambda earlier: self._earliest_ns(earlier, tick))
 
     def host_ns(self, tick: int, arrival_ns: int, idle_ns: int) -> int:
-        """Return the host time, ns, of the `tick` of a reading that arrived at `arrival_ns`.
-        `idle_ns`: last time before it at which nothing was waiting to be read."""
+        """Return the host time, ns, of a reading's `tick`.
+
+        `arrival_ns`: when the reading arrived. `idle_ns`: last earlier time at which no byte
+        waited to be read.
+        """
         if tick <= self._last_tick:
             self._distrust()
         self._last_tick = tick
@@ -241,7 +255,7 @@ class DeviceClock:
         if mapped_ns is None:
             self.counters.clock_fallbacks += 1
             mapped_ns = min(idle_ns, arrival_ns) - UNKNOWN_DELAY_NS
-        # Made later than the reading before, so not older.
+        # The reading was made after the one before, so it is not older.
         mapped_ns = max(mapped_ns, self._last_ns, arrival_ns - AGE_MAX_NS)
         self._last_ns = min(mapped_ns, arrival_ns)
         return self._last_ns
@@ -256,13 +270,13 @@ class DeviceClock:
         return earliest_ns
 
     def _earliest_ns(self, bound: _Bound, tick: int) -> int:
-        """Return a time before which `tick` cannot have been."""
+        """Return the earliest time, ns, that `tick` can have had, by one PING."""
         drift = self._drift
         passed_ns = (tick - bound.tick) * self._ns_per_tick * (1.0 + drift.slope)
         return bound.sent_ns + round(passed_ns - drift.slack * abs(passed_ns) - self._ns_per_tick)
 
     def _fits(self, earlier: _Bound, later: _Bound) -> bool:
-        """Return True if the ticks between two PINGs fit the host's clock."""
+        """Return True if the ticks between two PINGs agree with the host's clock."""
         passed_ns = (later.tick - earlier.tick) * self._ns_per_tick
         slack_ns = abs(passed_ns) * RATE_TOLERANCE + 2.0 * self._ns_per_tick
         shortest_ns = later.sent_ns - earlier.received_ns
@@ -280,7 +294,7 @@ class DeviceClock:
 
 
 class _Drift:
-    """Drift of a bridge's clock: a decaying regression of its error over its time."""
+    """Drift of a bridge's clock, by a decaying regression of its error over its time."""
 
     def __init__(self) -> None:
         self._origin: tuple[float, int] | None = None
@@ -295,7 +309,7 @@ class _Drift:
 
     def _conclude(self) -> None:
         self.slope, self.slack = 0.0, SLACK_MAX
-        """Host ns per device ns, less one, and how wrong that may be."""
+        """Drift (host ns per device ns, less one), and its largest assumed error."""
         if self._x_variance > 0.0:
             error = math.sqrt(self._noise_variance * DECAY / (2.0 * self._x_variance))
             slope, slack = self._covariance / self._x_variance, SLACK_SIGMAS * error
@@ -303,16 +317,16 @@ class _Drift:
                 self.slope, self.slack = slope, max(slack, SLACK_MIN)
 
     def add(self, device_ns: float, sent_ns: int) -> None:
-        """Take a PING: the bridge's time at the nominal rate, and when it was sent, host ns."""
+        """Add a PING: its tick in ns of the nominal rate, and when it was sent, host ns."""
         if self._origin is None:
             self._origin = device_ns, sent_ns
-        # Differences from the first PING keep the numbers small enough for their precision.
+        # Differences from the first PING stay small enough for the precision of a float.
         x = device_ns - self._origin[0]
         y = (sent_ns - self._origin[1]) - x
         residual = y - self._y_mean - self.slope * (x - self._x_mean)
         limit = max(OUTLIER_SIGMAS * math.sqrt(self._noise_variance), OUTLIER_MIN_NS)
         if residual > limit or self._outliers >= OUTLIERS_MAX:
-            self._restart(x, y)  # no PING arrives too early: the line was made of late ones
+            self._restart(x, y)  # no PING arrives too early: the line came from late ones
             return
         if residual < -limit:
             self._outliers += 1

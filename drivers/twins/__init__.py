@@ -1,1 +1,1 @@
-"""Stand-ins for hardware and grasps that tests and demonstrations use, never the daemon."""
+"""Simulated hardware and grasps for tests and demonstrations; the daemon uses none."""

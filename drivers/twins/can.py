@@ -1,4 +1,4 @@
-"""A CAN twin: sensors that are not there, on any bus of python-can, with faults on request."""
+"""A CAN twin: simulated sensors on any bus of python-can, with faults on request."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from drivers.twins.faults import LinkFaultInjector, LinkFaults
 from drivers.twins.grasps.grasps import Counts
 
 SAMPLE_ID: Final = 0x100
-"""Arbitration id of the twin's samples: no public file says what the real board uses."""
+"""Default arbitration id of samples; that of the real board is not public."""
 OTHER_COUNTS: Final = {PAC: 2050, PDC: 2800, TAC: 2010, TDC: 2260}
-"""What the channels that are no electrodes read; an untouched hand's values."""
+"""Counts of the channels that are no electrodes, as on an untouched hand."""
 SEND_TIMEOUT_S: Final = 0.1
-"""Longest wait for a full transmit queue, s; a virtual bus is emptied by the same thread."""
+"""Longest wait for room in the transmit queue, s."""
 DOWN_S: Final = 0.2
-"""How long a broken link stays down, s."""
+"""Time that a broken link stays down, s."""
 ID_BYTES: Final = 4
-"""Bytes of the arbitration id, before the data of a frame that faults may hit."""
+"""Bytes of the arbitration id in front of the data; bit flips spare them."""
 _UNDRIVEN: Final = b"\xff\xff"
 _WORDS: Final = [encode_word(count).to_bytes(2, "big") for count in range(4096)]
 
@@ -42,8 +42,10 @@ Outgoing = tuple[int, bytes]
 
 
 class CanTwin(Opened):
-    """Sends the sweeps of `counts` in one of the two formats. The constructor raises `ValueError`.
-    `rate_hz`: sweeps/s of `serve`. `first_sweep`: number of the first sweep frame."""
+    """Send the sweeps of `counts` in one of the two formats. The constructor raises `ValueError`.
+
+    `rate_hz`: sweeps per second of `serve`. `first_sweep`: number of the first sweep frame.
+    """
 
     def __init__(
         self,
@@ -65,7 +67,7 @@ class CanTwin(Opened):
         if interface not in can.VALID_INTERFACES:
             raise ValueError(f"python-can has no interface {interface!r}")
         if sequence not in SEQUENCES:
-            raise ValueError(f"sequence {sequence!r} is none of {sorted(SEQUENCES)}")
+            raise ValueError(f"sequence {sequence!r} is not one of {sorted(SEQUENCES)}")
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
         faults.refuse("CAN", "one_byte_at_a_time")
@@ -92,10 +94,10 @@ class CanTwin(Opened):
         self._sweep = first_sweep
         self._stuck_tick_us = self._tick_us()
         self.unsent = 0
-        """Frames that the bus did not take."""
+        """Frames that the bus refused."""
 
     def open(self) -> None:
-        """Take the bus. Raises `DriverError`, also where a package is missing."""
+        """Open the bus. Raises `DriverError`, also if a package is missing."""
         self.close()
         self._bus = open_bus(self._interface, self._channel, self._options)
 
@@ -105,7 +107,7 @@ class CanTwin(Opened):
             bus.shutdown()
 
     def send_sweep(self) -> bool:
-        """Send the frames of one sweep at once. False when the counts have ended."""
+        """Send the frames of one sweep at once; return False after the last sweep."""
         frames = self.next_frames()
         for frame in frames:
             self._send(frame)
@@ -116,7 +118,7 @@ class CanTwin(Opened):
         self._put_all(self._injector.flush())
 
     def serve(self, stop: threading.Event) -> None:
-        """Send sweeps at their rate until told to stop or the counts end."""
+        """Send sweeps at `rate_hz` until `stop` is set or the counts end."""
         due_ns = self._clock()
         while not stop.is_set():
             frames = self.next_frames()
@@ -132,7 +134,7 @@ class CanTwin(Opened):
             due_ns = max(due_ns + self._period_ns, self._clock() - self._period_ns)
 
     def next_frames(self) -> list[Outgoing]:
-        """Return the next sweep's frames before link faults; none after the last."""
+        """Return the frames of the next sweep, without link faults; none after the last."""
         counts = next(self._counts, None)
         if counts is None:
             return []
@@ -142,7 +144,7 @@ class CanTwin(Opened):
         return frames
 
     def _word(self, row: int, channel: int, counts: Counts) -> bytes:
-        """Return what a finger's sensor answers, with its faults."""
+        """Return the response word of a finger's sensor, with its faults."""
         if row in self._faults.unplugged_fingers:
             return _UNDRIVEN
         if channel in OTHER_COUNTS:
@@ -173,7 +175,7 @@ class CanTwin(Opened):
         return self._clock() // 1000 % (1 << 32)
 
     def _send(self, frame: Outgoing) -> bool:
-        """Send a frame with link faults. Return False if the link broke."""
+        """Send a frame with link faults; return False if the link broke."""
         if self._injector.breaks_here():
             self.open()
             return False
@@ -186,10 +188,10 @@ class CanTwin(Opened):
             self.put((int.from_bytes(frame[:ID_BYTES]), frame[ID_BYTES:]))
 
     def put(self, outgoing: Outgoing) -> None:
-        """Put a frame on the bus, or count it in `unsent`."""
+        """Put a frame on the bus; count it in `unsent` if the bus refuses it."""
         identifier, data = outgoing
         message = can.Message(
-            timestamp=self._clock() / 1e9,  # only a bus with preserve_timestamps keeps it
+            timestamp=self._clock() / 1e9,  # only a bus with preserve_timestamps keeps this time
             arbitration_id=identifier,
             is_extended_id=identifier > STANDARD_ID_MAX,
             data=data,

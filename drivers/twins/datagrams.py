@@ -1,4 +1,4 @@
-"""Sending datagrams at a steady pace, as the twins of datagram senders do."""
+"""Send datagrams at a steady pace, for the twins of datagram senders."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from collections.abc import Iterable
 from drivers.udp.receiver import Endpoint
 
 BEHIND_MAX_NS = 100_000_000
-"""A sender that is further behind its schedule, ns, starts a new one instead of catching up."""
+"""Longest delay, ns, that a sender catches up with; after more, its schedule starts again."""
 
 
 def send_paced(
     cycles: Iterable[list[bytes]], target: Endpoint, stop: threading.Event, period_ns: int | None
 ) -> None:
-    """Send the datagrams of each cycle until told to stop; `period_ns` None: without a pause."""
+    """Send the datagrams of each cycle until `stop` is set; `period_ns` None: without a pause."""
     with socket.socket(target.family, socket.SOCK_DGRAM) as sender:
         due_ns = time.monotonic_ns()
         for datagrams in cycles:

@@ -1,4 +1,4 @@
-"""Faults that a hardware twin puts on its link on request, counted one by one."""
+"""Faults that a twin injects into its link on request; each one is counted."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class LinkFaults:
-    """Which faults a twin injects; by default none. Raises `ValueError` for a value out of range.
-    Chances are per frame. Fingers and electrodes are numbered as in a reading, from 0."""
+    """Faults that a twin injects; by default none. Raises `ValueError` for a value out of range.
+
+    Chances are per frame. Fingers and electrodes are numbered as in a reading, from 0.
+    """
 
     bit_flip_probability: float = 0.0
     """Chance that one random bit of a frame flips."""
@@ -21,17 +23,17 @@ class LinkFaults:
     reorder_probability: float = 0.0
     """Chance that a frame comes after the next one instead of before it."""
     one_byte_at_a_time: bool = False
-    """Every byte is written on its own (byte streams only)."""
+    """True to write each byte on its own; for byte streams only."""
     burst_frames: int = 1
-    """Frames are held back until there are this many, and sent at once."""
+    """Number of frames that are collected and then sent at once."""
     disconnect_every_frames: int | None = None
-    """The link breaks in the middle of every n-th frame."""
+    """Number n: the link breaks in the middle of every n-th frame. None: never."""
     wrong_version: bool = False
-    """The twin says that it speaks a later version of the protocol."""
+    """True if the twin claims a later version of the protocol."""
     dead_electrodes: tuple[tuple[int, int], ...] = ()
-    """(finger, electrode) pairs that always read 0."""
+    """Pairs (finger, electrode) that always read 0."""
     unplugged_fingers: tuple[int, ...] = ()
-    """Fingers whose line nothing drives."""
+    """Fingers whose line no sensor drives."""
     stuck_clock: bool = False
     seed: int = 0
 
@@ -46,17 +48,17 @@ class LinkFaults:
             raise ValueError("disconnect_every_frames must be at least 1")
 
     def refuse(self, link: str, *names: str) -> None:
-        """Raise `ValueError` for one of these faults, which the link cannot show."""
+        """Raise `ValueError` if a fault of `names`, which the link cannot show, is set."""
         for name in names:
             if getattr(self, name) != getattr(LinkFaults(), name):
                 raise ValueError(f"{link} cannot show the fault {name.replace('_', '-')}")
 
 
 class LinkFaultInjector:
-    """Spoils a twin's frames; `injected` counts each fault by its name."""
+    """Damage a twin's frames; `injected` counts the faults by name."""
 
     def __init__(self, faults: LinkFaults, spared_bytes: int = 0) -> None:
-        """`spared_bytes`: bytes at the front of a frame that no bit flip hits."""
+        """`spared_bytes`: bytes at the front of a frame without bit flips."""
         self.faults = faults
         self._spared_bytes = spared_bytes
         self.injected: Counter[str] = Counter()
@@ -66,8 +68,10 @@ class LinkFaultInjector:
         self._frames = 0
 
     def spoil(self, frame: bytes, *, waits: bool = True) -> list[bytes]:
-        """Return the frames to send now instead of this one.
-        A frame that does not wait is sent at once, after those held back."""
+        """Return the frames to send now, with faults.
+
+        With `waits` False, the frame is not held back: it is sent after those that were.
+        """
         faults = self.faults
         if self._happens(faults.drop_probability, "drop"):
             return []
@@ -93,7 +97,7 @@ class LinkFaultInjector:
         return burst
 
     def flush(self) -> list[bytes]:
-        """Return the frames that are held back, to be sent now."""
+        """Return the frames that were held back; send them now."""
         held = self._burst
         if self._held_back is not None:
             held.append(self._held_back)

@@ -1,4 +1,4 @@
-"""Stands in for a sender of the joint stream: joints that swing slowly."""
+"""A twin of the joint stream: joints that swing slowly."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ RATE_HZ = 100.0
 SWING_S = 4.0
 SWING_RAD = 0.2
 MIDDLE_RAD = 0.4
-"""Joints swing by `SWING_RAD` around here, each a little behind the one before."""
+"""Middle of the swing, rad; each joint is a little behind the one before."""
 
 
 class JointTwin:
-    """Sends one message per period."""
+    """Send one joint message per period."""
 
     def __init__(self, faults: LinkFaults = LinkFaults()) -> None:  # noqa: B008 (immutable)
-        """Raises `ValueError` for a fault that it lacks."""
+        """Raises `ValueError` for a fault that datagrams cannot have."""
         faults.refuse("the joint stream", "burst_frames", "one_byte_at_a_time")
         faults.refuse("the joint stream", "dead_electrodes", "unplugged_fingers")
         self._injector = LinkFaultInjector(faults)
         self.injected = self._injector.injected
 
     def messages(self) -> Iterator[JointMessage]:
-        """What is sent, before any fault, without end."""
+        """Yield the messages without faults, without end."""
         seq = 0
         while True:
             t_s = seq / RATE_HZ
@@ -45,5 +45,5 @@ class JointTwin:
             yield self._injector.spoil(message.to_bytes())
 
     def serve(self, target: str, stop: threading.Event) -> None:
-        """Send to `udp://ADDRESS:PORT` until told to stop. Raises `ValueError` for a bad target."""
+        """Send to `udp://ADDRESS:PORT` until `stop` is set. Raises `ValueError`."""
         send_paced(self.cycles(), Endpoint.parse(target), stop, round(1e9 / RATE_HZ))

@@ -1,4 +1,4 @@
-"""The palm of a Shadow hand that is not there: real packets over UDP, one per millisecond."""
+"""A twin of a Shadow hand's palm: real packets over UDP, one per millisecond."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ SENSORS_AT_REST = (
     *(1730, 1434, 3060, 1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377),
     *range(26, 37),
 )
-"""Raw sensor words of a real hand (Shadow's documentation), with noise of one count."""
+"""Raw sensor words of a real hand at rest (Shadow's documentation)."""
 HALL_WORDS = 26
-"""Of these, the ones with noise."""
+"""Number of these words that get noise of one count."""
 OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
 PAC_COUNT = 2048
 ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
-"""What a finger without a sensor shows, from a real recording; its electrodes show 0."""
+"""Words of a finger without a sensor, from a real recording; its electrodes are 0."""
 OUTAGE_CYCLES = 500
-"""A link that breaks stays silent for half a second while the palm goes on."""
+"""Cycles that a broken link is silent, half a second; the palm goes on meanwhile."""
 LATER_VERSION_BYTES = 4
-"""Packets of a later kind of palm are longer by this much."""
+"""Bytes by which packets of a later kind of palm are longer."""
 
 
 class PalmTwin:
-    """Plays counts, shape (fingers, 24) per round of 14 packets, as a palm would send them.
+    """Send counts, shape (fingers, 24) for each round of 14 packets, as a palm does.
 
-    With `stuck_clock` the palm always answers the same request. Fingers that are not in
-    `fingers` have no sensor, and say so; those unplugged by a fault do not.
+    `stuck_clock`: the palm always answers the same request. Fingers not in `fingers` have no
+    sensor, and their words show it; the words of fingers unplugged by a fault do not.
     """
 
     def __init__(
@@ -66,14 +66,14 @@ class PalmTwin:
         self._faults = faults
         self._injector = LinkFaultInjector(faults)
         self.injected = self._injector.injected
-        """Faults so far by name; `silenced`: packets made while the link was broken."""
+        """Number of faults by name; `silenced`: packets made while the link was broken."""
         self._random = np.random.default_rng(seed)
         self._dead = frozenset(faults.dead_electrodes)
         self.packets_made = 0
         """Packets that the palm made, sent or not."""
 
     def packets(self) -> Iterator[PalmPacket]:
-        """What the palm makes, before any fault of the link."""
+        """Yield the palm's packets, without faults of the link."""
         for counts in self._counts:
             for position in range(ROUND):
                 yield self._packet(0 if self._faults.stuck_clock else position, counts)
@@ -100,7 +100,7 @@ class PalmTwin:
     def serve(
         self, target: str, stop: threading.Event, *, period_ns: int | None = CYCLE_NS
     ) -> None:
-        """Send until told to stop or the counts end, without `period_ns` as fast as possible."""
+        """Send until `stop` is set or the counts end; `period_ns` None: without a pause."""
         send_paced(self.cycles(), Endpoint.parse(target), stop, period_ns)
 
     def _packet(self, position: int, counts: Counts) -> PalmPacket:

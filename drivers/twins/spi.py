@@ -1,4 +1,4 @@
-"""A bridge with BioTac SPs that are not there, on a pseudo-terminal that a driver opens by path."""
+"""A twin of the SPI bridge, on a pseudo-terminal that a driver opens by its path."""
 
 from __future__ import annotations
 
@@ -39,32 +39,32 @@ from drivers.twins.grasps.grasps import Counts
 
 TICK_HZ = 1_000_000
 SLOT_NS = 80_000
-"""One sample of three sensors at 4.4 MHz, ns (facts of manual figure 14)."""
+"""Time of one sample of three sensors at 4.4 MHz, ns (manual figure 14)."""
 NOMINAL_HZ = 100.0
-"""Rate that a twin claims when it sends as fast as the host reads."""
+"""Rate, Hz, that a twin states when it sends as fast as the host reads."""
 STATUS_PERIOD_NS = 1_000_000_000
 REPLUG_NS = 50_000_000
-"""How long a link that broke stays broken, ns."""
+"""Time that a broken link stays down, ns."""
 UNSENT_MAX_BYTES = 4096
-"""What waits for the host to read, bytes, before whole frames are dropped."""
+"""Most bytes that wait for the host; after that, whole frames are dropped."""
 READ_BYTES = 4096
 IDLE_NS = 20_000_000
-"""How long `serve` waits at most before it looks whether to stop, ns."""
+"""Longest wait of `serve`, ns, before it asks `stop` again."""
 SWEEPS_AT_ONCE = 64
-"""Sweeps in one go, so that the host is heard in between."""
+"""Most sweeps in a row; after them the host's bytes are read."""
 UNDRIVEN_WORD = 0xFFFF
 OTHER_COUNT = 2000
-"""What channels that are no electrodes read."""
+"""Count of all channels that are no electrodes."""
 
 _WORDS = np.array([encode_word(count) for count in range(4096)], dtype=np.uint16)
 
 
 class SpiTwin(Opened):
-    """The bridge's side of the protocol, one thread, driven by `run_once` or `serve`.
+    """The bridge's side of the protocol. Call `serve`, or `run_once` again and again.
 
     `path` becomes a symbolic link to a new pseudo-terminal at each `plug`, which is a reset.
-    `source`: counts of each sweep, shape (sensors, 24); after them the twin is silent but answers.
-    With `rate_hz` None sweeps come as fast as the host reads and none is dropped.
+    `source`: counts of each sweep, shape (sensors, 24); after the last the twin only answers.
+    `rate_hz` None: sweeps are sent as fast as the host reads, and no frame is dropped.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class SpiTwin(Opened):
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
-        """`tap` is called with all bytes that go to the host. Raises `ValueError`."""
+        """`tap`: called with all bytes to the host. Raises `ValueError`."""
         if rate_hz is not None and not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         counts = iter(source)
@@ -87,11 +87,11 @@ class SpiTwin(Opened):
             raise ValueError("the source has no counts")
         self.path = path
         self.sweeps = 0
-        """Sweeps made since it was last plugged in."""
+        """Sweeps made since the last `plug`."""
         self.sweeps_made = 0
-        """Sweeps made in all."""
+        """Sweeps made since the twin was made."""
         self.tx_dropped = 0
-        """Frames that the host did not take in time, in all."""
+        """Frames dropped because the host did not read, since the twin was made."""
         self.exhausted = False
         self._sensors = first.shape[0]
         self._source = itertools.chain([first], counts)
@@ -104,7 +104,7 @@ class SpiTwin(Opened):
         self._injector = LinkFaultInjector(faults)
         self.injected = self._injector.injected
         self.injected_in_sweeps: Counter[str] = Counter()
-        """Of the faults injected, those that hit sweeps."""
+        """Number of faults that hit sweeps, by name."""
         self._clock = clock
         self._tick_hz = TICK_HZ
         self._tap = tap
@@ -115,7 +115,7 @@ class SpiTwin(Opened):
         self._reset()
 
     def _reset(self) -> None:
-        """As after power comes: nothing is known, ticks begin at 0."""
+        """Set the state after power-on: ticks begin at 0."""
         now_ns = self._clock()
         self._boot_ns = now_ns
         self._started = False
@@ -137,7 +137,7 @@ class SpiTwin(Opened):
         self._replug_ns = None
 
     def plug(self) -> None:
-        """Link the path to a new pseudo-terminal, and say HELLO."""
+        """Link the path to a new pseudo-terminal, and send HELLO."""
         self.unplug()
         self._refuse_to_replace()
         self._replug_ns = None
@@ -165,7 +165,7 @@ class SpiTwin(Opened):
         )
 
     def unplug(self) -> None:
-        """Take the pseudo-terminal away."""
+        """Close the pseudo-terminal."""
         ours = None if self._slave is None else os.ttyname(self._slave)
         if self.path.is_symlink() and str(self.path.readlink()) == ours:
             self.path.unlink()
@@ -177,15 +177,15 @@ class SpiTwin(Opened):
         self._unsent_bytes = 0
 
     def pull_fingers(self, *fingers: int) -> None:
-        """Let nothing drive the lines of these fingers from now on."""
+        """Unplug the sensors of these fingers."""
         self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
 
     def fileno(self) -> int | None:
-        """Descriptor on which the host's bytes come, None while unplugged."""
+        """Return the descriptor of the host's bytes; None while unplugged."""
         return self._master
 
     def due_ns(self) -> int | None:
-        """Time of the next sweep, status or plugging in, ns."""
+        """Return the time of the next sweep, status or plugging in, ns."""
         if self._master is None:
             return self._replug_ns
         if self._sweeping() and not self._unsent:
@@ -193,7 +193,7 @@ class SpiTwin(Opened):
         return self._status_due_ns
 
     def serve(self, stop: Callable[[], bool]) -> None:
-        """Run until `stop` returns True; it is asked 50 times a second."""
+        """Run until `stop` returns True; it is called at least 50 times a second."""
         while not stop():
             due_ns = self.due_ns()
             wait_ns = IDLE_NS if due_ns is None else max(due_ns - self._clock(), 0)
@@ -267,7 +267,7 @@ class SpiTwin(Opened):
         self._send(Sweep(seq, *ticks, present, words))
 
     def _words(self, counts: Counts) -> NDArray[np.uint16]:
-        """Shape (slots, sensors), as the sensors would answer."""
+        """Return the sensors' response words, shape (slots, sensors)."""
         felt = counts.copy()
         for finger, electrode in self._faults.dead_electrodes:
             felt[finger, electrode] = 0
@@ -329,7 +329,7 @@ class SpiTwin(Opened):
         self._drain()
 
     def _write(self, data: bytes) -> None:
-        """Queue whole frames, or drop them if the host does not read."""
+        """Queue whole frames; drop them if the host does not read."""
         if self._unsent_bytes + len(data) > UNSENT_MAX_BYTES and self._unsent:
             self.tx_dropped += 1
             return

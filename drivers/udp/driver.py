@@ -1,4 +1,4 @@
-"""Base of drivers that take the datagrams of one sender over UDP."""
+"""Base of drivers that receive the UDP datagrams of one sender."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from drivers.link import Link, LinkState
 from drivers.udp.receiver import DatagramReceiver, Endpoint, Sender
 
 DRAIN_MAX = 256
-"""Most datagrams taken in one call: a flood must not keep the loop from its other work."""
+"""Most datagrams of one call, so that a flood does not keep the loop from its other work."""
 
 
 @dataclass(slots=True)
 class DatagramCounters(DriverCounters):
-    """Counters of the link, among those of its driver."""
+    """Counters of the link; a driver's own counters contain them."""
 
     foreign_datagrams: int = 0
     """Datagrams from another sender than the current one; dropped."""
     kernel_drops: int = 0
-    """Datagrams that the kernel dropped because they were not taken in time."""
+    """Datagrams that the kernel dropped because they were not read in time."""
     link_losses: int = 0
-    """Times that the link was up and fell silent or broke."""
+    """Times that the link fell silent or broke after it had been up."""
 
 
 class DatagramStream(Protocol):
-    """Datagrams of one sender in, readings out. No I/O."""
+    """Decoder of one sender's datagrams into readings. No I/O."""
 
     @property
     def counters(self) -> DatagramCounters:
-        """Counters since it was made."""
+        """Counters since the stream was made."""
 
     @property
     def sender_kind(self) -> str:
@@ -44,23 +44,23 @@ class DatagramStream(Protocol):
         """Return the readings that a datagram completes, or None if it is dropped."""
 
     def interrupt(self) -> None:
-        """The link broke: another sender may come next."""
+        """Forget the sender. Call when the link broke: another sender may come next."""
 
 
 Stream = TypeVar("Stream", bound=DatagramStream)
 
 
 class DatagramDriver(Opened, Generic[Stream]):
-    """Passes the datagrams of one sender to a stream.
+    """Pass the datagrams of one sender to a stream.
 
-    The sender of the first good datagram, by address and port, is the only one until the link is
-    lost: two hands on one port look like one. The constructor raises `ValueError`, and `open`
-    `LinkError` if it cannot listen, as the scene is wrong then. `read_ready` raises nothing.
+    The sender (address and port) of the first good datagram is the only one until the link is
+    lost, so two hands need two ports. The constructor raises `ValueError` for a wrong `source`.
+    `open` raises `LinkError` if it cannot listen. `read_ready` raises nothing.
     """
 
     name: str
     bytes_max: int
-    """Longest datagram that makes sense."""
+    """Longest valid datagram, bytes."""
     silence_ns: int
     """Time without a good datagram after which the link is lost, ns."""
     exhausted = False
@@ -73,7 +73,10 @@ class DatagramDriver(Opened, Generic[Stream]):
         only_from: str | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`source`: `udp://ADDRESS:PORT` to listen on. `only_from`: the only IP address to hear."""
+        """`source`: `udp://ADDRESS:PORT` to listen on.
+
+        `only_from`: IP address whose datagrams are taken; None: any.
+        """
         self._endpoint = Endpoint.parse(source)
         self._only_from = None if only_from is None else str(ipaddress.ip_address(only_from))
         self._clock = clock
@@ -82,7 +85,7 @@ class DatagramDriver(Opened, Generic[Stream]):
 
     @abstractmethod
     def _new_stream(self) -> Stream:
-        """Return the stream of one opening."""
+        """Return a new stream, for each `open`."""
 
     def _reset(self) -> None:
         self.stream = self._new_stream()
@@ -90,14 +93,14 @@ class DatagramDriver(Opened, Generic[Stream]):
         self._earlier_drops = 0
         self._sender: Sender | None = None
         self.sender: str | None = None
-        """Last sender, `udp://ADDRESS:PORT`; None before the first good datagram."""
+        """Last sender as `udp://ADDRESS:PORT`; None before the first good datagram."""
         self._t_ns = 0
         self._heard_from: str | None = None
         self._pauses = False
 
     @property
     def link_state(self) -> LinkState:
-        """`GREETING` while it listens and no good datagram comes."""
+        """State of the link; `GREETING` while it listens and no good datagram comes."""
         return self._link.state
 
     @property
@@ -130,7 +133,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return None if self._receiver is None else self._receiver.fileno()
 
     def due_ns(self) -> int | None:
-        """Time to reopen the socket or to notice silence, ns."""
+        """Return the time, ns, to reopen the socket or to notice silence."""
         if self._link.state is LinkState.UP:
             return self._good_t_ns + self.silence_ns
         return self._link.retry_ns
@@ -151,7 +154,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return readings
 
     def _datagrams(self) -> Iterator[tuple[bytes, int]]:
-        """Yield waiting datagrams, oldest first, with their time of arrival, ns."""
+        """Yield the waiting datagrams, oldest first, with their arrival times, ns."""
         if self._link.state is LinkState.CLOSED:
             raise RuntimeError(f"the {self.name} link is not open")
         receiver = self._receiver or self._listen_again()

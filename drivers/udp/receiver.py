@@ -1,4 +1,4 @@
-"""Receiving UDP datagrams without blocking, with their true age and the kernel's count of drops."""
+"""Receive UDP datagrams without blocking, with their age and the kernel's count of drops."""
 
 from __future__ import annotations
 
@@ -14,25 +14,27 @@ from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, 
 
 SCHEME = "udp://"
 RECEIVE_BUFFER_BYTES: Final = 128 * 1024
-"""Asked of the kernel, which doubles it: about 0.2 s of palm packets while the loop is away. What
-waits longer is too old to judge, and a full buffer drops the newest."""
+"""Receive buffer asked of the kernel, bytes; doubled by it, it holds 0.2 s of palm packets.
+
+Packets that wait longer are too old to judge, and a full buffer drops the newest.
+"""
 
 Sender = tuple[str, int]
-"""Numeric address and port."""
+"""Numeric address and port of a sender."""
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where to listen."""
+    """Address and port to listen on."""
 
     address: str
-    """Numeric; `0.0.0.0` or `::` listens on all interfaces, to anyone who can reach them."""
+    """Numeric address; `0.0.0.0` or `::` is all interfaces, so any computer may send."""
     port: int
-    """0 lets the kernel choose, for tests."""
+    """Port; 0 lets the kernel choose one, for tests."""
 
     @classmethod
     def parse(cls, source: str) -> Endpoint:
-        """From `udp://ADDRESS:PORT`. Raises `ValueError`."""
+        """Return the endpoint in `udp://ADDRESS:PORT`. Raises `ValueError`."""
         host, separator, port = source.removeprefix(SCHEME).rpartition(":")
         is_number = port.isascii() and port.isdigit() and int(port) < 1 << 16
         if not source.startswith(SCHEME) or not separator or not is_number:
@@ -56,9 +58,9 @@ class Datagram(NamedTuple):
     """One datagram."""
 
     data: bytes
-    """Cut off at one byte over the receiver's limit, so that its length says it was too long."""
+    """Content; one byte longer than the receiver's limit if the datagram was too long."""
     age_ns: int
-    """Time since the kernel received it, ns, 0 or more; wrong in the instant of a clock step."""
+    """Time since the kernel received it, ns, 0 or more; wrong if the wall clock just stepped."""
     sender: Sender
 
 
@@ -66,10 +68,10 @@ class DatagramReceiver:
     """A bound socket. The constructor raises `LinkError` if it cannot be bound."""
 
     def __init__(self, endpoint: Endpoint, bytes_max: int) -> None:
-        """`bytes_max` is the longest datagram that makes sense."""
+        """`bytes_max`: longest valid datagram, bytes."""
         self._bytes_max = bytes_max
         self.dropped = 0
-        """Datagrams that the kernel dropped because they were not taken in time."""
+        """Datagrams that the kernel dropped because they were not read in time."""
         self._socket = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         try:
             self._socket.setblocking(False)
@@ -88,7 +90,7 @@ class DatagramReceiver:
         return port
 
     def fileno(self) -> int:
-        """Readable when a datagram waits."""
+        """Return a descriptor that is readable when a datagram waits."""
         return self._socket.fileno()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Short names of array types, so that a signature can say shapes and units instead."""
+"""Short names of array types; docstrings add shapes and units."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Numbers = NDArray[np.generic]
-"""Counts of whatever type: as read (uint16) or mapped to other sensors (float64)."""
+"""Counts of any type: as read (uint16), or mapped to other sensors (float64)."""
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-"""What a model takes."""
+"""Input of a model."""
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]

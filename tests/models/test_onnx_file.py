@@ -101,7 +101,7 @@ def test_a_small_model_may_be_used() -> None:
         ("node { attribute { sparse_tensors { values { name: 'w' } } } }", "sparse weights"),
         ("} functions { name: 'Gemm'", "functions or training"),
         ("} training_info { algorithm { name: 'a' }", "functions or training"),
-        ("node { op_type: 'Reshape' input: 'x' input: 'z' }", "size depends on what is felt"),
+        ("node { op_type: 'Reshape' input: 'x' input: 'z' }", "size depends on the counts"),
     ],
 )
 def test_what_may_not_be_is_named(more: str, says: str) -> None:

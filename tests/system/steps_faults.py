@@ -189,7 +189,7 @@ def wrong_reload(lab: Lab) -> Outcome:
     pid = lab.show("can", "MainPID")
     lab.sh(f"cp {scene} /root/can.toml && sed -i 's/^max_age_ms/max_age_mss/' {scene}")
     at_s = lab.deed("systemctl reload graspd@can")
-    lab.await_journal("can", at_s, "not taken anew")
+    lab.await_journal("can", at_s, "not reloaded")
     if not any("max_age_mss" in line for line in lab.journal("can", at_s, "err")):
         raise StepError("the journal does not name the wrong key")
     lab.await_message("can", lab.now_s(), "a verdict under the old scene")

@@ -54,10 +54,10 @@ REAL_MAX = 1e12  # of a message: as a time, thirty years in ms
 MESSAGE_MAX_BYTES = 1 << 16
 OPENINGS_MAX = 100  # of lists and objects in a message, and so its depth; a verdict has ten
 QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
-# Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
+# A client that reads nothing for longer reconnects: its queue is old, and new messages are lost.
 READ_WITHIN_NS = 5_000_000_000
-# Whoever hears nothing for so long connects anew, at first and at most: who was turned away once
-# is not tried again by libzmq, and may be let in by now.
+# Shortest and longest time without a message after which a client reconnects. libzmq does not try
+# again by itself after it was turned away, but by now the client may be let in.
 QUIET_NS, QUIET_MAX_NS = 1_000_000_000, 10_000_000_000
 # The computer has slept if its clocks have moved apart by more. A sleep takes seconds, the
 # scheduler a moment between two looks at the clocks.
@@ -73,7 +73,7 @@ DRIFT_MAX_NS = 20_000_000
 # Between two questions for the daemon's clock, and after one that was not answered.
 CLOCK_EVERY_NS, CLOCK_RETRY_NS = 1_000_000_000, 10_000_000_000
 FORMER_MAX = 16  # starts of the daemon that are remembered as over
-# On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
+# On TCP: time between two signs of life, and time without one until reconnecting.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 NAME_BYTES = 16  # of a client's name, which routing ids begin with: random, the first not zero
 OBJECT_MAX = 64  # characters of an object's name
@@ -94,7 +94,7 @@ log = logging.getLogger("graspd_client")
 
 
 class Decision(str, Enum):  # noqa: UP042 - StrEnum needs Python 3.11
-    """What graspd decided about a grasp; equal to the wire's word and printed as it."""
+    """graspd's decision about a grasp; equal to the wire's word and printed like it."""
 
     UNKNOWN = "unknown"
     STABLE = "stable"
@@ -128,13 +128,13 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Risk:
-    """What lifts of `stable` verdicts came to: of `lifts` that were told, so many `slips`."""
+    """Outcomes of `stable` lifts: number of told `lifts`, and of `slips` among them."""
 
     target: float | None  # share of slips that is allowed; None: no risk is set
     lifts: int
     slips: int
     outstanding: int  # outcomes that can still come
-    bound: float | None  # of `slips`, but for one more each that is outstanding
+    bound: float | None  # of `slips`; each outstanding lift adds one
     warm_up_left: int  # outcomes until most grasps need no supervision
     announced: int = 0  # `lift` questions that were answered `stable`
     awaited: int = 0  # outcomes of these that are out; too many, and nothing is `stable`
@@ -142,19 +142,19 @@ class Risk:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is known of the grasp. True in an `if` exactly when it is stable, nobody need watch.
+    """Verdict on the grasp. True in an `if` exactly when it is stable and needs no person.
 
     `decision` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
     one of those in deploy/clients/README.md. `p_slip` is the probability of slip, None when
-    unknown, and rests on so many `outcomes`; the network alone says `p_slip_model`. `grasp` is the
-    number of the contact episode, `age_ms` the time since the reading's last byte, ms, at least.
+    unknown, and rests on `outcomes` told outcomes; the network alone says `p_slip_model`. `grasp`
+    is the number of the contact episode, `age_ms` at least the time since the reading's last byte.
     `supervised`: its lift would teach, but only while a person watches. `early`: it was judged when
     nothing moved fast, but something might still slide slowly. `still_ms` is for how long the hand
     has been still, ms: from 100 on nothing moves fast, from 240 on nothing slides slowly either.
     `motion` is how each finger moves, in units of its own noise, and None where that is not known;
     `motion_limits` what that is at most while it is still. `fingers` is what each one feels, None
-    where that is not known, and always where the reading is older than `max_age_ms`. What is not
-    known before the first message, or not told by the daemon, is None.
+    where that is not known, and always where the reading is older than `max_age_ms`. None: not
+    known before the first message, or not told by the daemon.
     """
 
     decision: Decision
@@ -188,7 +188,7 @@ class LiftAnswer:
     """Whether to lift. True in an `if` exactly when the hand may."""
 
     verdict: Verdict
-    """What it was decided by; besides its usual reasons `no-answer` and `late`."""
+    """Verdict that decided; it has `no-answer` and `late` besides the usual reasons."""
     waited_s: float
     supervised: bool = False
     """It may, but only while a person watches; never true unless such lifts were asked for."""
@@ -226,13 +226,13 @@ class OutcomeAnswer:
 
 @dataclass
 class Counts:
-    """What came since the start."""
+    """Numbers of messages since the start."""
 
     messages: int = 0  # new ones of this hand
     lost: int = 0  # gaps in `seq`, in messages
     repeats: int = 0  # messages that were known already
     malformed: int = 0  # messages that are not understood, answers too
-    restarts: int = 0  # times that the daemon was started anew
+    restarts: int = 0  # restarts of the daemon
     former: int = 0  # messages of a start that is over
 
 
@@ -272,7 +272,7 @@ class _Hand:
         """`max_age_ms` is how old a reading may be that a lift relies on, ms.
 
         With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `tell` has
-        somebody to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
+        a peer to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
         unless given, it is with `ipc://` and on loopback addresses: say False through a tunnel.
         A `stable` with a `p_slip` of `max_p_slip` or more is none: say the scene's `slip_threshold`
         if that is higher. Raises `zmq.ZMQError` for an endpoint, `TypeError` for one that is no
@@ -309,7 +309,7 @@ class _Hand:
 
     @property
     def counts(self) -> Counts:
-        """What came so far."""
+        """Numbers of messages so far."""
         return self._newest.counts
 
     @property
@@ -480,7 +480,7 @@ class _Hand:
         return new
 
     def _forget_what_is_old(self) -> None:
-        """What came or waits since before a sleep of the computer, or a long time without a look.
+        """Forget messages from before a sleep of the computer, or a long time without a look.
 
         While the computer sleeps the monotonic clock stands still: all would look fresh.
         """
@@ -527,7 +527,7 @@ class Client(_Hand):
         for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
         person watches: then what graspd wants to learn from (in the warm-up, and now and then
         after it) may be lifted too, and the answer says that it is such a lift. With `still_ms`
-        the hand must have been still for so long as well, ms, and a daemon that does not say so
+        the hand must have been still for this time as well, ms, and a daemon that does not say so
         gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
         Raises `ValueError` for a time that is none.
         """
@@ -653,7 +653,7 @@ class AsyncClient(_Hand):
 
 
 class _Message(NamedTuple):
-    """What matters of a verdict message."""
+    """Used fields of a verdict message."""
 
     verdict: Verdict  # without its age
     read_ns: int  # by the daemon's monotonic clock: when the reading's last byte came ...
@@ -662,7 +662,7 @@ class _Message(NamedTuple):
 
 
 class Newest:
-    """What the newest message says; no socket and no clock of its own."""
+    """State by the newest message, without socket and clock."""
 
     def __init__(
         self, topic: bytes, max_age_ns: int, same_computer: bool, max_p_slip: float = 0.5
@@ -673,7 +673,7 @@ class Newest:
         self._max_p_slip = max_p_slip
         self._message: _Message | None = None
         self._published_ns: int | None = None
-        """Of the message, by one's own clock: not later than then; None while that is not known."""
+        """Latest time, by the own clock, when the message was published; None: not known."""
         self._why = "no-message"
         """Why there is no message."""
         self._boot_id: str | None = None
@@ -686,7 +686,7 @@ class Newest:
         self._least_ns = 0
         """The least of these differences."""
         self._bound: tuple[int, int] | None = None
-        """What the clocks differ by at least, as the daemon told its own, and when, ns."""
+        """Least difference of the clocks, by the daemon's own, and when it was told, ns."""
 
     @property
     def silence_ns(self) -> int:
@@ -694,7 +694,7 @@ class Newest:
         return 0 if self._message is None else self._message.silence_ns
 
     def forget(self, why: str) -> None:
-        """What came is not known any more, nor how the clocks differ; repeats stay repeats."""
+        """Forget the message and the clocks' difference, but not what repeats are."""
         self._message, self._why = None, why
         self._best = self._bound = None
 
@@ -731,7 +731,7 @@ class Newest:
         return True
 
     def at(self, now_ns: int) -> Verdict:
-        """What is known at a time (own clock)."""
+        """Return the verdict at a time of the own clock."""
         message = self._message
         if message is None:
             return Verdict(Decision.UNKNOWN, (self._why,))
@@ -842,7 +842,7 @@ class _Question:
         self._still_ms = still_ms
         self._asked = self._heard = False
         self._answer: Verdict | None = None
-        """That is to be confirmed."""
+        """Answer that the newest message must confirm."""
 
     def permits(self, said: Verdict) -> bool:
         """Whether a verdict lets the hand lift."""
@@ -883,13 +883,13 @@ class _Question:
         return newest.unknown(*(newest.reasons or ("no-answer",)))
 
     def at_the_end(self, said: Verdict) -> Verdict:
-        """What was decided; if it is no lift on a message, also that nobody has answered."""
+        """Return the decision; without a lift or an answer it has `no-answer` too."""
         if self._asking is None or self._heard or said.seq is None or self.is_over(said):
             return said
         return replace(said, reasons=tuple(dict.fromkeys([*said.reasons, "no-answer"])))
 
     def _if_still(self, said: Verdict) -> Verdict:
-        """A verdict, unknown if it permits a lift before the hand has been still for so long."""
+        """Return a verdict, unknown if it permits a lift before `still_ms` of stillness."""
         if self._still_ms is None or not self.permits(said):
             return said
         still = said.still_ms is not None and said.still_ms >= self._still_ms
@@ -929,11 +929,11 @@ class _Link:
         return [each for each in sockets if each is not None]
 
     def wait(self, timeout_ms: int) -> None:
-        """Until a message or an answer waits, so long at most."""
+        """Wait until a message or an answer waits, up to `timeout_ms`."""
         zmq.zmq_poll([(each, zmq.POLLIN) for each in self.sockets], timeout_ms)
 
     def renew(self) -> None:
-        """Connect anew, and forget what waits."""
+        """Reconnect, and forget waiting messages."""
         self._socket.close(0)
         self._socket = self.connected(zmq.SUB, self._endpoint)
 
@@ -991,7 +991,7 @@ def is_same_computer(endpoint: str) -> bool:
 
 
 def _due_ns(name: str, seconds: float) -> int:
-    """When a wait of so many seconds ends. Raises `ValueError`."""
+    """Return the time when a wait of `seconds` ends, ns. Raises `ValueError`."""
     if not _is_amount(seconds):
         raise ValueError(f"{name} must be 0 or more and finite, not {seconds!r}")
     return time.monotonic_ns() + round(seconds * 1e9)
@@ -1010,7 +1010,7 @@ def _slept_ns() -> int:
 
 
 def _parsed(payload: bytes) -> dict[str, Any]:
-    """A JSON object, none of whose keys comes twice. Raises `ValueError` or `RecursionError`."""
+    """Return a JSON object without repeated keys. Raises `ValueError` or `RecursionError`."""
     openings = payload.count(b"[") + payload.count(b"{")
     if len(payload) > MESSAGE_MAX_BYTES or openings > OPENINGS_MAX:
         raise ValueError
@@ -1111,7 +1111,7 @@ def _risk(told: Any) -> Risk:  # noqa: ANN401
 
 
 def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes:
-    """What to send. Raises `ValueError`."""
+    """Return the message to send. Raises `ValueError`."""
     boot_id, grasp = _key(lifted_on)
     if not boot_id or not grasp:
         raise ValueError("nothing was lifted on a verdict that is of no grasp")
@@ -1165,7 +1165,7 @@ def _maybe(told: dict[str, Any], name: str, most: float = REAL_MAX) -> float | N
 def _number(
     told: dict[str, Any], name: str, most: float = INTEGER_MAX, kinds: tuple[type, ...] = (int,)
 ) -> Any:  # noqa: ANN401
-    """Of one of these kinds, of which bool is none, from 0 to `most`."""
+    """Return a value of one of these types (bool is none), from 0 to `most`."""
     value = told[name]
     if type(value) not in kinds or not 0 <= value <= most:
         raise ValueError

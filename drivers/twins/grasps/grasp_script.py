@@ -1,4 +1,4 @@
-"""The course of one whole grasp: when it does what, and what fingers and joints do meanwhile."""
+"""The course of one grasp: its times, and what fingers and joints do at each time."""
 
 from __future__ import annotations
 
@@ -11,41 +11,41 @@ Range = tuple[float, float]
 """Lower and upper end of a uniform distribution."""
 
 FINGER_LEAD_S = 0.05
-"""A finger is done closing at most this much before the last one, s."""
+"""Longest time, s, by which a finger stops closing before the last one."""
 CREEP_SHARE: Range = (0.05, 0.07)
-"""Share of the deviation that is still missing when closing ends: skin and fluid yield slowly."""
+"""Share of the deviation still missing when closing ends; skin and fluid yield slowly."""
 CREEP_TAU_S: Range = (0.10, 0.14)
 """Time constant of that creep, s."""
 LOAD_COUNTS: Range = (20.0, 60.0)
-"""Fall of a finger's most pressed electrode under load, counts: far less than by a grasp."""
+"""Fall of a finger's most pressed electrode under load, counts; a grasp causes far more."""
 LOAD_S = 0.15
-"""The load comes within this time, s."""
+"""Time within which the load rises, s."""
 SLIPPING_ELECTRODES = 0.5
-"""Share of the electrodes that lose contact in a slip: the object tilts away from some."""
+"""Share of the electrodes that lose contact in a slip, because the object tilts."""
 SLIP_LOSS: Range = (0.3, 0.6)
-"""Share of its deviation that such an electrode loses."""
+"""Share of the deviation that an electrode loses in a slip."""
 SLIP_STEPS = (2, 4)
-"""Sticks and slips of an object that slides; each slip is over within a sweep."""
+"""Fewest and most slips of an object that slides; each is over within a sweep."""
 SLIP_WINDOW: Range = (0.1, 0.7)
-"""When in the lift it slips, as a share of it."""
+"""Time of the slips, as a share of the lift."""
 
 JOINT_NAMES = ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
 OPEN_RAD = 0.2
 """Joint angle of an open hand, rad."""
 CLOSED_RAD: Range = (0.8, 1.0)
-"""Joint angle at the end of closing, rad: another one for each grasp and joint."""
+"""Joint angle at the end of closing, rad; drawn for each grasp and joint."""
 
 
 @dataclass(frozen=True, slots=True)
 class Durations:
-    """How long the phases last, s: each drawn between two limits."""
+    """Lengths of a grasp's phases, s; each is drawn between two limits."""
 
     first_rest_s: Range = (1.5, 2.0)
-    """Rest before the first grasp: enough sweeps to learn the resting level from."""
+    """Rest before the first grasp; long enough to learn the resting level."""
     approach_s: Range = (0.4, 0.7)
-    """Joints move and nothing is touched."""
+    """Time in which the joints move and touch nothing."""
     touch_s: Range = (0.03, 0.15)
-    """From the first finger that touches to the last: fingers of one command differ by this."""
+    """From the first touch of a finger to the last."""
     close_s: Range = (0.25, 0.5)
     """From the last touch to the end of closing."""
     settle_s: Range = (0.6, 1.0)
@@ -53,14 +53,14 @@ class Durations:
     lift_s: Range = (0.4, 0.6)
     """From the start of the lift to the release."""
     release_s: Range = (0.2, 0.3)
-    """From the first finger opening to nothing touched: faster than closing."""
+    """From the start of opening to no contact; faster than closing."""
     rest_s: Range = (0.8, 1.5)
     """From the release to the next approach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EndPoint:
-    """What a grasp feels like when it has settled, and how its lift ends."""
+    """Counts of a settled grasp, and how its lift ends."""
 
     counts: NDArray[np.uint16]
     """Shape (fingers, 24)."""
@@ -70,32 +70,32 @@ class EndPoint:
 
 @dataclass(frozen=True, slots=True)
 class Timetable:
-    """The truth about one grasp. Times in seconds since the stream's first sweep."""
+    """True times of one grasp, seconds since the stream's first sweep."""
 
     grasp: int
-    """From 1."""
+    """Number of the grasp, from 1."""
     slipped: bool
     object_name: str
     approach_s: float
-    """The joints begin to move; the grasp begins here."""
+    """Start of the grasp: the joints begin to move."""
     touched_s: tuple[float, ...]
-    """When each finger touches. Its counts begin to move here, smoothly."""
+    """Time when each finger touches; its counts begin to change smoothly."""
     closed_s: float
-    """All fingers are at the end of closing; the joints are still from here to the release."""
+    """End of closing; the joints stand still from here to the release."""
     lift_s: float
     release_s: float
-    """The hand begins to open."""
+    """Start of opening."""
     open_s: float
-    """The hand is open, nothing is touched."""
+    """End of opening: no contact."""
     end_s: float
-    """The next grasp begins."""
+    """Start of the next grasp."""
     creep_tau_s: float
     creep_counts_per_s: float
-    """Mean over all electrodes of how fast they creep at `closed_s`, counts/s."""
+    """Mean speed of creep of all electrodes at `closed_s`, counts/s."""
 
 
 class GraspScript:
-    """One grasp as functions of time: deviation of the counts, and angles of the joints."""
+    """One grasp as functions of time: deviation of the counts, angles of the joints."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class GraspScript:
         )
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return counts against the rest, (fingers, 24), at `t_s`, () or (24,)."""
+        """Return counts less the rest, shape (fingers, 24). `t_s`: shape () or (24,)."""
         timetable = self.timetable
         if t_s.max() <= min(timetable.touched_s) or t_s.min() >= timetable.open_s:
             return np.zeros_like(self._deviation)
@@ -158,7 +158,7 @@ class GraspScript:
         return deviation
 
     def position_rad(self, t_s: float) -> NDArray[np.float64]:
-        """Angles of `JOINT_NAMES` at a time, rad."""
+        """Return the angles of `JOINT_NAMES` at `t_s`, rad."""
         timetable = self.timetable
         if t_s < timetable.release_s:
             share = (t_s - timetable.approach_s) / (timetable.closed_s - timetable.approach_s)
@@ -169,14 +169,14 @@ class GraspScript:
     def _lift_changes(
         self, slipped: bool, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return load, counts, and lost share of the deviation: (fingers, 24) each."""
+        """Return load, counts, and lost share of the deviation, shape (fingers, 24) each."""
         nothing = np.zeros_like(self._deviation)
         if slipped:
             losing = rng.random(nothing.shape) < SLIPPING_ELECTRODES
             return nothing, losing * rng.uniform(*SLIP_LOSS, nothing.shape)
         deepest = np.abs(self._deviation).max(axis=1, keepdims=True)
         load = rng.uniform(*LOAD_COUNTS, deepest.shape)
-        # A finger bears no more load than it presses; one that touches nothing bears none.
+        # A finger bears at most the load that it presses with; without contact it bears none.
         scale = np.divide(load, deepest, out=np.zeros_like(deepest), where=deepest >= load)
         return scale * self._deviation, nothing
 
@@ -188,7 +188,7 @@ class GraspScript:
 def _touches(
     fingers: int, first_s: float, durations: Durations, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return when each finger touches, s; the first one at `first_s`."""
+    """Return the time, s, when each finger touches; the first is `first_s`."""
     order = rng.random(fingers)
     span_s = rng.uniform(*durations.touch_s)
     order -= order.min()
@@ -198,6 +198,6 @@ def _touches(
 
 
 def _minimum_jerk(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the way after a share of the time, 0..1 (Flash, Hogan 1985)."""
+    """Return the share of the way after a share of the time, 0..1 (Flash, Hogan 1985)."""
     share = np.minimum(np.maximum(share, 0.0), 1.0)
     return share * share * share * (10.0 + share * (6.0 * share - 15.0))

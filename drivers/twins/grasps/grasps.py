@@ -1,4 +1,4 @@
-"""Counts of a recording, for a twin to play."""
+"""Read the counts of a recording, for a twin to play."""
 
 from __future__ import annotations
 
@@ -17,8 +17,11 @@ Counts = NDArray[np.uint16]
 """Shape (fingers, 24), raw counts 0..4095."""
 
 TACTILES_COLUMN = "tactiles"
-"""Column of a Shadow hand's recording as exported from a ROS bag: its header has 43 columns, its
-rows have 38, and finger i starts at column 8 + 6 i in the order FF MF RF LF TH."""
+"""Column of a Shadow hand's recording as exported from a ROS bag.
+
+Its header has 43 columns, its rows 38. Finger i, in the order FF MF RF LF TH, starts at column
+8 + 6 i.
+"""
 _FIRST_FINGER_CELL, _CELLS_PER_FINGER, _ELECTRODES_CELL = 8, 6, 5
 
 

@@ -1,9 +1,9 @@
-"""Synthetic grasps: drawn from a small statistical model of real ones, for demos and tests.
+"""Draw synthetic grasps from a small statistical model of real ones, for demos and tests.
 
 The model describes the BioTac SP Stability Set (palm down and palm side; MIT licence,
-Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by 5763 parameters per class, against some
-92,000 counts of a class; it holds none of its grasps. A class is a mixture of three Gaussians over
-the raw counts of ff, mf, th, with the 24 largest principal axes of each.
+Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019). It has 5763 parameters per class, against
+about 92,000 counts of a class, and contains no real grasp. A class is a mixture of three Gaussians
+over the raw counts of ff, mf, th, with the 24 largest principal axes of each.
 
 `python -m drivers.twins.grasps.synthetic` writes the demo table and the demo day.
 """
@@ -30,17 +30,17 @@ DEMO_GRASPS = 200
 DAY_GRASPS = 300
 DEMO_SEED = 0
 DRIFT_ENDS = 0.6
-"""Share of a day after which its sensors stop drifting."""
+"""Share of the day after which the sensors stop drifting."""
 DRIFT_TO_STABLE = 1.2
-"""Drift of the day, as a multiple of the difference between the classes, toward stable grasps."""
+"""Drift of the day toward stable grasps, in differences between the classes."""
 DRIFT_COUNTS, DRIFT_GAIN = 60.0, 0.1
-"""Standard deviation, over the electrodes, of a further offset, and of the logarithm of a gain."""
+"""Standard deviations over the electrodes: of an offset, counts, and of a gain's logarithm."""
 OBJECT_PREFIX = "synthetic"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Component:
-    """A Gaussian with few axes. Its covariance is `axes.T @ axes` plus `spread` squared."""
+    """A Gaussian with few axes; its covariance is `axes.T @ axes` plus `spread` squared."""
 
     weight: float
     """Share of the class, 0..1."""
@@ -49,37 +49,37 @@ class Component:
     axes: NDArray[np.float64]
     """Shape (axes, 72), counts: the largest principal axes, one standard deviation long."""
     spread: NDArray[np.float64]
-    """Shape (72,), counts: standard deviation of each electrode beside the axes."""
+    """Shape (72,), counts: standard deviation of each electrode without the axes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraspClass:
-    """The grasps of one class: stable, or slip."""
+    """Model of the grasps of one class: stable or slip."""
 
     lowest: NDArray[np.float64]
-    """Shape (72,), counts: what no real grasp of the class falls below."""
+    """Shape (72,), counts: lowest counts of the class's real grasps."""
     highest: NDArray[np.float64]
     components: tuple[Component, ...]
 
 
 GraspModel = Mapping[bool, GraspClass]
-"""By label: False stable, True slip."""
+"""Model of each class by its label: False stable, True slip."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticGrasps:
-    """Grasps that `draw` made."""
+    """Grasps drawn by `draw` or `draw_day`."""
 
     counts: NDArray[np.uint16]
     """Shape (grasps, 72)."""
     slipped: NDArray[np.bool_]
     """Shape (grasps,)."""
     component: NDArray[np.int64]
-    """Shape (grasps,): the mixture component, from 0; it stands in for the object."""
+    """Shape (grasps,): mixture component, from 0, instead of an object."""
 
 
 def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
-    """Draw grasps, half of them slipping, in random order; counts within the real range."""
+    """Draw grasps in random order, half of them slips, with counts in the real range."""
     slipped = rng.permutation(np.arange(grasps) % 2 == 1)
     counts = np.zeros((grasps, COUNTS), dtype=np.uint16)
     component = np.zeros(grasps, dtype=np.int64)
@@ -90,10 +90,10 @@ def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticG
 
 
 def draw_day(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
-    """Draw grasps of sensors that drift: slips come to read as stable grasps did in the morning.
+    """Draw grasps of sensors that drift until slips look like the stable grasps of the morning.
 
-    At first the grasps are those of `draw`. Real sensors drift by hundreds of counts from month to
-    month; that it happens within a day, and in the direction that misleads, is made up.
+    The first grasps are those of `draw`. Real sensors drift by hundreds of counts from month to
+    month. Drift within one day, and in the misleading direction, is made up.
     """
     drawn = draw(model, rng, grasps)
     means = [
@@ -145,7 +145,7 @@ def main(folder: Path = DEMO_TABLE.parent) -> None:
 
 
 def _draw_one(grasp_class: GraspClass, rng: np.random.Generator) -> tuple[int, NDArray[np.uint16]]:
-    """The component and the counts, shape (72,), of one grasp."""
+    """Return component and counts, shape (72,), of one grasp."""
     weights = np.array([component.weight for component in grasp_class.components])
     index = int(np.searchsorted(weights.cumsum() / weights.sum(), rng.random(), side="right"))
     component = grasp_class.components[index]

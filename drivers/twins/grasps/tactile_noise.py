@@ -14,23 +14,25 @@ NOISE_COUNTS = 3.5
 SPIKE_PROBABILITY = 0.01
 """Chance per electrode and sweep of a downward spike; measured 0.75 to 1.22 %."""
 SPIKE_COUNTS = (25.0, 150.0)
-"""Depth of a spike, counts; upward spikes were never seen."""
+"""Depth of a spike, counts; no upward spike was recorded."""
 DRIFT_COUNTS_PER_S = 0.7
 """Warm-up drift, counts/s; measured 0.56 to 0.84, always upward."""
 WARM_UP_S = 300.0
-"""Drift stops here, s. Not measured: the recordings are shorter. 210 counts in all."""
+"""End of the drift, s, after 210 counts; assumed, because the recordings are shorter."""
 
 
 class TactileNoise(Protocol):
-    """What is added to a sweep."""
+    """Noise that is added to a sweep."""
 
     def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Noise in counts, shape (fingers, 24), of electrodes sampled at `t_s`, () or (24,)."""
+        """Return noise, counts, shape (fingers, 24). `t_s`: sample times, shape () or (24,)."""
 
 
 class MeasuredNoise:
     """Gaussian noise, downward spikes of single electrodes, and the warm-up drift.
-    At most one electrode of a finger spikes in a sweep, and never twice in a row, as recorded."""
+
+    At most one electrode of a finger spikes in a sweep, and none twice in a row, as recorded.
+    """
 
     def __init__(
         self,
@@ -38,7 +40,7 @@ class MeasuredNoise:
         rng: np.random.Generator,
         drift_max: NDArray[np.float64] | float = np.inf,
     ) -> None:
-        """`drift_max`: counts by which electrodes drift at most, shape () or (fingers, 24)."""
+        """`drift_max`: largest drift, counts, shape () or (fingers, 24)."""
         self._rng = rng
         self._drift_max = drift_max
         self._fingers = np.arange(fingers)

@@ -1,7 +1,7 @@
 """Streams of whole grasps: rest, approach, touch, close, settle, lift or slip, release.
 
-End points are rows of a grasp table or drawn; what lies between is made up, with measured noise.
-Contact lowers counts, so a believable end point lies at or below the rest; see `rest_above`.
+End points are rows of a grasp table, or drawn. The way between them is made up, with measured
+noise. Contact lowers counts, so a plausible end point is not above the rest; see `rest_above`.
 
 `python -m drivers.twins.grasps.whole_grasps` writes both demo recordings again, byte for byte.
 """
@@ -32,18 +32,18 @@ from drivers.twins.grasps.grasp_script import (
 from drivers.twins.grasps.tactile_noise import MeasuredNoise, TactileNoise
 
 RATE_HZ = 100.0
-"""Rows per second of the public recordings, and sweeps per second of an SPI bridge."""
+"""Rows per second in the public recordings; sweeps per second of an SPI bridge."""
 PALM_RATE_HZ = 1000 / 14
-"""Sweeps per second of a palm: 14 requests of a millisecond each."""
+"""Sweeps per second of a palm, which needs 14 packets of a millisecond for one."""
 ROUND_MS = 14
 PLACES_MS = 1 + np.arange(1, ELECTRODES + 1) // 2
-"""Shape (24,): when in a round an electrode is sampled, ms. PDC/TAC, TDC/E1, E2/E3, ... E24."""
+"""Time in a round when each electrode is sampled, ms: PDC/TAC, TDC/E1, E2/E3, ... E24."""
 POSITION_NOISE_RAD = 0.0003
-"""Standard deviation of a joint angle that stands still, rad."""
+"""Noise (standard deviation) of a joint that stands still, rad."""
 REST_QUANTILE = 0.98
-"""See `rest_above`."""
+"""Default quantile of `rest_above`."""
 WARM_REST_MAX = COUNT_MAX - 50
-"""No electrode drifts above this, counts: the end of the range would look like a fault."""
+"""Highest count after drift; the end of the range would look like a fault."""
 DEMO_GRASPS = 12
 DEMO_DURATIONS = Durations(
     first_rest_s=(1.2, 1.2),
@@ -52,7 +52,7 @@ DEMO_DURATIONS = Durations(
     lift_s=(0.35, 0.45),
     rest_s=(0.15, 0.25),
 )
-"""Shorter than by default, so that the demo is a small file."""
+"""Phases of the demo, shorter than the default, for a small file."""
 SHOW_GRASPS = 10
 SHOW_DURATIONS = Durations(
     first_rest_s=(1.2, 1.2),
@@ -64,18 +64,18 @@ SHOW_DURATIONS = Durations(
 """Held for two seconds, so that a person can read the verdict. In a rest of less than a second the
 gate may lose the resting level of a finger."""
 REST_DRAWS = 1000
-"""Synthetic grasps whose upper quantile is the rest of synthetic fingers."""
+"""Number of synthetic grasps whose upper quantile is the rest of synthetic fingers."""
 LOOPED_DRAWS = 200
-"""Different synthetic grasps in an endless stream."""
+"""Number of different synthetic grasps in an endless stream."""
 
 
 class Sampling(StrEnum):
-    """How values get into a row."""
+    """Way in which electrodes are sampled for a row."""
 
     FRESH = "fresh"
     """Every electrode is sampled at the time of the row."""
     HELD = "held"
-    """Rows of 100 Hz hold values of 71.43 Hz, as recorded: a pair repeats in 2 of 7 rows."""
+    """Rows of 100 Hz with values of 71.43 Hz, as recorded: 2 of 7 rows repeat a pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,21 +83,21 @@ class GraspRow:
     """One row of the stream."""
 
     t_s: float
-    """Since the first row."""
+    """Time since the first row, s."""
     counts: NDArray[np.uint16]
     """Shape (fingers, 24), raw counts."""
     joint_names: tuple[str, ...]
     position_rad: NDArray[np.float64]
     """Shape (joints,), in the order of `joint_names`."""
     grasp: int
-    """From 1, from the beginning of the approach to the end of the rest after it; 0 before."""
+    """Number of the grasp, from 1, until the next approach; 0 before the first."""
     slipped: bool | None
-    """How the lift of this grasp ends; None before the first grasp."""
+    """Label of the grasp, True slip; None before the first grasp."""
     object_name: str | None
 
 
 class WholeGrasps:
-    """A stream of grasps: the same for the same seed, and from the start at each iteration."""
+    """A stream of grasps. Each iteration starts again; one seed gives one stream."""
 
     def __init__(
         self,
@@ -111,8 +111,11 @@ class WholeGrasps:
         loop: bool = False,
         seed: int = 0,
     ) -> None:
-        """`rest`: untouched counts, shape (fingers, 24). `noise`: by default `MeasuredNoise`.
-        `loop`: play the end points without end. Raises `ValueError` for a wrong rate."""
+        """Raises `ValueError` for a wrong rate.
+
+        `rest`: untouched counts, shape (fingers, 24). `noise`: `MeasuredNoise` by default.
+        `loop`: repeat the end points without end.
+        """
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         if sampling is Sampling.HELD and rate_hz != RATE_HZ:
@@ -155,7 +158,7 @@ class WholeGrasps:
             )
 
     def timetables(self) -> Iterator[Timetable]:
-        """Yield the truth about each grasp; may be called at any time."""
+        """Yield the true times of each grasp. Call at any time."""
         return (script.timetable for script in self._scripts())
 
     def _scripts(self) -> Iterator[GraspScript]:
@@ -164,7 +167,7 @@ class WholeGrasps:
         for index in count():
             if index >= len(self._end_points) and not self._loop:
                 return
-            # A generator of its own for each grasp: what it draws does not depend on the others.
+            # Each grasp has its own generator, so it does not depend on the others.
             rng = np.random.default_rng([self._seed, 1, index + 1])
             end_point = self._end_points[index % len(self._end_points)]
             script = GraspScript(end_point, self._rest, index + 1, start_s, self._durations, rng)
@@ -176,34 +179,34 @@ class WholeGrasps:
 
 
 class Course(Protocol):
-    """What happens to the electrodes of a hand."""
+    """Deviation of a hand's electrodes over time."""
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Counts against the rest, shape (fingers, 24), as sampled at `t_s`, shape () or (24,)."""
+        """Return counts less the rest, shape (fingers, 24). `t_s`: shape () or (24,)."""
 
 
 class FreshSampler:
-    """Every electrode is sampled at the time of the row."""
+    """Sampler for `Sampling.FRESH`."""
 
     def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
-        """`rest`: counts that everything is added to, shape (fingers, 24)."""
+        """`rest`: untouched counts, shape (fingers, 24)."""
         self._rest = rest
         self._noise = noise
 
     def sample(self, course: Course, t_s: float) -> NDArray[np.uint16]:
-        """Counts of the row at `t_s`, shape (fingers, 24); rows come in order of time."""
+        """Return the counts of the row at `t_s`, shape (fingers, 24). Call in order of time."""
         return self._sweep(course, np.asarray(t_s))
 
     def _sweep(self, course: Course, t_s: NDArray[np.float64]) -> NDArray[np.uint16]:
-        """Counts, shape (fingers, 24), of electrodes sampled at `t_s`, shape () or (24,)."""
+        """Return counts, shape (fingers, 24). `t_s`: sample times, shape () or (24,)."""
         counts = self._rest + course.deviation(t_s) + self._noise.sweep(t_s)
-        # Off the rails: a count of 0 or 4095 is that of a broken electrode.
+        # Counts stay away from 0 and 4095, which would look like broken electrodes.
         readable = np.minimum(np.maximum(np.rint(counts), 1), COUNT_MAX - 1)
         return readable.astype(np.uint16)
 
 
 class HeldSampler(FreshSampler):
-    """Rows of two rounds: an electrode not yet sampled has its old value."""
+    """Sampler for `Sampling.HELD`: an electrode not sampled yet keeps its old value."""
 
     def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
         super().__init__(rest, noise)
@@ -211,7 +214,7 @@ class HeldSampler(FreshSampler):
         self._present = self._former = np.zeros(rest.shape, dtype=np.uint16)
 
     def sample(self, course: Course, t_s: float) -> NDArray[np.uint16]:
-        """See `FreshSampler`; rows are 10 ms apart."""
+        """Return the counts of the row at `t_s`; rows are 10 ms apart."""
         number, into_ms = divmod(round(t_s * 1000.0), ROUND_MS)
         if self._round is None:
             self._present = self._begin(course, number - 1)
@@ -230,7 +233,7 @@ def rest_above(
     """Return a resting level, (fingers, 24), for the grasps of a table, (grasps, fingers, 24).
 
     Contact lowers counts, and in many grasps an electrode is hardly pressed, so the rest is near
-    the upper end of what it shows. A quantile is not decided by one odd grasp, as a maximum is.
+    the highest counts. One odd grasp decides a maximum, but not a quantile.
     """
     return np.asarray(np.quantile(end_points, quantile, axis=0), dtype=np.float64)
 
@@ -244,7 +247,7 @@ def synthetic_grasps(
     loop: bool = False,
     seed: int = 0,
 ) -> WholeGrasps:
-    """Return a stream of synthetic grasps, half of them slipping. Raises `ValueError`."""
+    """Return a stream of synthetic grasps, half of them slips. Raises `ValueError`."""
     model = synthetic.read_model()
     rng = np.random.default_rng([seed, 2])
     shape = (-1, len(synthetic.FINGERS), ELECTRODES)

@@ -1,4 +1,4 @@
-"""What the commands of the training half share: arguments, messages, progress, exit codes."""
+"""Shared parts of the training commands: arguments, messages, progress, exit codes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class WrongInputError(Exception):
-    """The command line asks for what is not there, or cannot be done with these data."""
+    """The command line names something missing, or does not fit the data."""
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
@@ -32,8 +32,10 @@ def whole(low: int, high: int) -> Callable[[str], int]:
 def exit_code(
     command: str, folder: Path, work: Callable[[], None], failure: type[Exception]
 ) -> int:
-    """Do the work of a command that writes into `folder`, and say in one line why it ended.
-    Returns 0; 1 for `failure`; 2 for wrong input, data or folder; 130 for Ctrl-C."""
+    """Run `work`, which writes into `folder`; print an error in one line.
+
+    Returns 0; 1 for `failure`; 2 for wrong input, data or folder; 130 for Ctrl-C.
+    """
     try:
         work()
     except KeyboardInterrupt:
@@ -65,9 +67,10 @@ def say(command: str, text: str) -> None:
 
 @contextmanager
 def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
-    """Show on stderr, if that is a terminal, how many of `total` trainings are done.
+    """Show on stderr, if it is a terminal, how many of `total` trainings are done.
 
-    Call what it yields after each training, with the bar's next text; `first` is the first one.
+    It yields a function: call it after each training, with the bar's next text. `first`: the first
+    text.
     """
     from rich.console import Console
     from rich.progress import (

@@ -1,4 +1,4 @@
-"""What `graspd evaluate` does once its command line is read."""
+"""Run `graspd evaluate` after its command line is read."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from models.training.systems.system import BlendConfig, System, digest, with_rec
 SEEDS = 3
 """Split seeds of an evaluation unless `--seeds` says otherwise."""
 QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 400, 2, 1
-"""Of `--quick`: enough to see that everything runs. The figures mean nothing."""
+"""Grasps, folds and epochs of `--quick`: enough to see that all runs; figures mean nothing."""
 
 
 def evaluate(args: argparse.Namespace) -> None:
@@ -98,7 +98,7 @@ def _systems(names: Sequence[str], *, grid: bool) -> list[System]:
         return systems
     with_grid = [system for system in systems if grid_of(system)]
     if not with_grid:
-        raise WrongInputError("none of these systems has a grid")
+        raise WrongInputError("these systems have no grid")
     return with_grid
 
 

@@ -1,4 +1,4 @@
-"""More tactile images from few: flips and small rotations, as published (paper, section III-E)."""
+"""Augment tactile images by flips and small rotations, as published (paper, section III-E)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from models.training.arrays import Bools, Floats32
 
 COPIES = 4
-"""What is left of each grasp: itself, flipped both ways, rotated."""
+"""Copies of each grasp: itself, flipped both ways, rotated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +23,10 @@ class Augmentation:
 def augment(
     images: Floats32, slipped: Bools, augmentation: Augmentation, seed: int
 ) -> tuple[Floats32, Bools]:
-    """Images (N, height, width, fingers) and labels (N,) to (4 N, ...) and (4 N,).
+    """Return four times the images (N, height, width, fingers) and labels (N,).
 
-    In this order: as they are, flipped left-right, flipped up-down, rotated. A rotated image keeps
-    its size; what comes in from outside repeats the nearest edge. Raises `ValueError` if these are
-    no images.
+    The order is: unchanged, flipped left-right, flipped up-down, rotated. A rotated image keeps its
+    size, and pixels from outside repeat the nearest edge. Raises `ValueError` if `images` are none.
     """
     if images.ndim != 4:
         raise ValueError(f"only images can be flipped and rotated, not inputs {images.shape[1:]}")

@@ -9,19 +9,21 @@ from models.bts3 import TABLES
 from models.training.data.datasets import DatasetError, Grasps, concatenate, read_all, read_table
 
 FEWEST_GRASPS = 20
-"""Of one lab table: the number from which the daemon takes a session for calibrated."""
+"""Fewest grasps of a lab table; from this number a session counts as calibrated."""
 ENOUGH_GRASPS = 200
-"""Of lab tables without the published ones. The daemon refuses readings that are unlike all of the
-training: of other grasps of palm_45, 98 % by 20 of its grasps, 20 % by 100, 6 % by 200, 2.5 % by
-500."""
+"""Fewest grasps of lab tables without the published ones.
+
+The daemon refuses readings that are unlike the training. With 20 grasps of palm_45 in the training
+it refuses 98 % of the others; with 100 grasps 20 %, with 200 6 %, with 500 2.5 %.
+"""
 
 
 def read_with_lab_tables(folder: Path | None, lab: Sequence[Path]) -> Grasps:
-    """The published tables of `folder`, if it is given, and after them each lab table.
+    """Return the published tables of `folder`, if given, then each lab table.
 
-    Raises `DatasetError` for a file that is no grasp table, and for a lab table that has the name
-    of another, repeats a grasp, has grasps of one label only or fewer than `FEWEST_GRASPS`;
-    `ValueError` if there is neither a folder nor a lab table.
+    Raises `DatasetError` for a file that is no grasp table. A lab table is also refused if it has
+    the name of another, repeats a grasp, has only one label, or under `FEWEST_GRASPS` grasps.
+    Raises `ValueError` if there is neither a folder nor a lab table.
     """
     parts = [] if folder is None else [read_all(folder)]
     paths: dict[str, Path] = {}
@@ -55,7 +57,7 @@ def _read_lab_table(path: Path) -> Grasps:
 
 
 def _check_once(grasps: Grasps, lab: dict[str, Path]) -> None:
-    """A grasp that is there twice would be trained on and judged by: figures too good."""
+    """Raise `DatasetError` if a grasp is there twice: training and test would share it."""
     first: dict[bytes, str] = {}
     for table, counts in zip(grasps.table_of.tolist(), grasps.counts, strict=True):
         name, key = grasps.files[table].name, counts.tobytes()

@@ -1,7 +1,7 @@
-"""Evaluation protocols: which grasps are trained on and which are judged.
+"""Evaluation protocols: the grasps for training, and the grasps that are judged.
 
-`cv`, `objects` and `objects-whole` take lab tables (those that are not published) in addition; of
-data without any published table, these alone.
+`cv`, `objects` and `objects-whole` also take lab tables, which are not published. Without any
+published table they take lab tables only.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ EvalProtocol = Literal[
 ]
 PROTOCOLS: tuple[EvalProtocol, ...] = get_args(EvalProtocol)
 STANDARD = PROTOCOLS[:6]
-"""What `graspd evaluate` runs by default."""
+"""Protocols that `graspd evaluate` runs by default."""
 ABOUT: dict[EvalProtocol, str] = {
     "cv": "known objects: stratified folds of palm_down + palm_side (the paper's)",
     "unknown": "the paper's 8 objects left out of palm_down + palm_side",
@@ -45,37 +45,46 @@ DAYS = (
     ("C", (NEW_SESSION, WHOLE[1]), WHOLE[:1]),
     ("C", (NEW_SESSION, WHOLE[0]), WHOLE[1:]),
 )
-"""Of `days`: name, tables that are trained on, tables that are judged."""
+"""Streams of `days`: name, tables of the training, judged tables."""
 DAYS_FOLDS = 4
-"""Of objects in `days`, at most: with more, no table would have enough grasps of a fold's objects
-to say what a session is worth that runs for hundreds of grasps."""
+"""Most folds of objects in `days`.
+
+With more, no table would have enough grasps of a fold's objects to measure a session of hundreds of
+grasps.
+"""
 
 
 class TooFewGraspsError(ValueError):
-    """The data cannot be cut into that many folds: take fewer folds or more data."""
+    """The data is too small for these folds: take fewer folds, or more data."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
-    """One training and the grasps that it is judged by: row indices of `Grasps`, ascending."""
+    """Grasps of a training, and those that it is judged by: row indices, ascending."""
 
     name: str
     train: Ints
     test: Ints
     calibration: Ints | None = None
-    """In `session`: grasps of the test's session but of other objects. They may calibrate the
-    session; their labels are not used. In `days` a session starts from nothing, in each table."""
+    """Grasps that may calibrate the session in `session`, without their labels.
+
+    They are of the test's session, but of other objects. In `days` each table starts a new session.
+    """
 
 
 def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
-    """Return the splits of a protocol; `unknown` has one whatever `seed` and `folds` are.
-    Raises `TooFewGraspsError` if the data lack a table, objects or grasps that it needs."""
+    """Return the splits of a protocol; `unknown` always has one.
+
+    Raises `TooFewGraspsError` if the data lack a table, objects or grasps.
+    """
     return _MAKERS[protocol](grasps, seed, folds)
 
 
 def folds_of(slipped: Bools, folds: int, seed: int) -> Ints:
     """Return the fold of each grasp, shape (N,): stratified, shuffled with the seed.
-    Raises `TooFewGraspsError` if a class has fewer grasps than there are folds."""
+
+    Raises `TooFewGraspsError` if a class has fewer grasps than folds.
+    """
     from sklearn.model_selection import StratifiedKFold
 
     fewest = min(int(slipped.sum()), int((~slipped).sum()))
@@ -91,13 +100,15 @@ def folds_of(slipped: Bools, folds: int, seed: int) -> Ints:
 
 
 def fold_seed(seed: int, fold: int) -> int:
-    """Return the seed of the training of a fold: another one for each fold and split seed."""
+    """Return the seed of a fold's training, different for each fold and split seed."""
     return int(np.random.SeedSequence([seed, fold]).generate_state(1)[0])
 
 
 def object_folds(objects: Sequence[str], folds: int, seed: int) -> Ints:
-    """Return the fold of each grasp, shape (N,): all grasps of an object are in one fold.
-    Raises `TooFewGraspsError` if there are fewer objects than folds."""
+    """Return the fold of each grasp, shape (N,); all grasps of an object share a fold.
+
+    Raises `TooFewGraspsError` if there are fewer objects than folds.
+    """
     names = sorted(set(objects))
     if len(names) < folds:
         raise TooFewGraspsError(f"{folds} folds need {folds} objects, there are {len(names)}")
@@ -127,7 +138,7 @@ def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
 
 
 def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """The same groups of objects leave both days: trained without, tested on the later day."""
+    """Return splits that leave groups of objects out of both days, and test on the later."""
     whole, later = _rows(grasps, *WHOLE), _rows(grasps, NEW_SESSION)
     fold_of = _object_folds(grasps, np.concatenate((whole, later)), folds, seed)
     of_whole, of_later = fold_of[: len(whole)], fold_of[len(whole) :]
@@ -171,7 +182,7 @@ _MAKERS: dict[EvalProtocol, Callable[[Grasps, int, int], list[Split]]] = {
 
 
 def _rows(grasps: Grasps, *tables: str, with_lab: bool = False) -> Ints:
-    """Indices of the grasps of these tables, all of which must be there, and of lab tables."""
+    """Return the indices of the grasps of these tables, which must exist, and lab tables."""
     names = [file.name for file in grasps.files]
     if with_lab:
         lab = lab_table_names(grasps.files)

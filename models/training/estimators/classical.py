@@ -1,4 +1,4 @@
-"""Classifiers of scikit-learn on vectors and features, and the grids to choose from."""
+"""Classifiers of scikit-learn on vectors and features."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from models.training.estimators.configs import (
 )
 
 PROBABILITY_FLOOR = 1e-3
-"""A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
+"""Distance of a forest's probability from 0 and 1, where its log-odds are infinite."""
 INTERRUPTED = "Training interrupted"
-"""How scikit-learn's warning begins that Ctrl-C has ended the training of a perceptron."""
+"""Start of scikit-learn's warning that Ctrl-C ended the training of a perceptron."""
 
 
 class Boosting(HistGradientBoostingClassifier):  # type: ignore[misc]  # scikit-learn has no types
-    """Gradient boosting that shows what it consists of."""
+    """Gradient boosting with access to its trees."""
 
     @property
     def trees(self) -> list[NDArray[np.void]]:
@@ -51,7 +51,9 @@ def fit_classical(
     config: ClassicalConfig, inputs: Floats32, slipped: Bools, seed: int
 ) -> ClassicalModel:
     """Fit a classifier to inputs (N, M) and labels (N,), on one thread.
-    Raises `ValueError` if the inputs are no vectors or a class is missing."""
+
+    Raises `ValueError` if the inputs are no vectors or a class is missing.
+    """
     if inputs.ndim != 2:
         raise ValueError(f"takes vectors, not inputs {inputs.shape[1:]}")
     if len(np.unique(slipped)) != 2:
@@ -63,7 +65,7 @@ def fit_classical(
 
 
 def classical_margins(model: ClassicalModel, inputs: Floats32) -> Floats:
-    """Log-odds of slip (N,), up to a temperature, of inputs (N, M)."""
+    """Return the log-odds of slip (N,), up to a temperature, of inputs (N, M)."""
     if not len(inputs):
         return np.empty(0)
     with _one_thread():
@@ -80,7 +82,7 @@ def classical_margins(model: ClassicalModel, inputs: Floats32) -> Floats:
 
 
 def classical_size(model: ClassicalModel) -> int:
-    """How many numbers the fitted model consists of: weights, support vectors, or tree nodes."""
+    """Return the number of weights, support vectors' values or tree nodes of a model."""
     match model:
         case SVC():
             return int(model.support_vectors_.size + model.dual_coef_.size + 1)
@@ -123,7 +125,7 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
 
 
 def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:
-    """The output layer before its logistic function, which would lose the large ones."""
+    """Return the output before its logistic function, which would lose large margins."""
     values = inputs.astype(np.float64)
     for weights, bias in zip(model.coefs_[:-1], model.intercepts_[:-1], strict=True):
         values = np.maximum(values @ weights + bias, 0.0)
@@ -133,7 +135,7 @@ def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Sums over more threads round differently."""
+    """Limit libraries to one thread, because sums over more threads round differently."""
     with threadpool_limits(1), warnings.catch_warnings():
         # A perceptron's number of epochs is a setting here, not a failure to converge.
         warnings.filterwarnings("ignore", category=ConvergenceWarning)

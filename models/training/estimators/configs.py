@@ -1,5 +1,7 @@
 """Settings of classifiers, networks and their training.
-No library of the training is imported here, so that help and completion know every system."""
+
+No library of the training is imported here, so that help and completion list every system.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 THREADS = 1
-"""Threads of a training. Fixed, because sums over more threads round differently; one, because two
-that share busy cores wait for each other, and many trainings at once use a machine better."""
+"""Threads of a training. The number is fixed, because sums over more threads round differently.
+
+It is one, because threads on busy cores wait for each other. Parallel trainings are faster.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +22,7 @@ class SvmConfig:
 
     c: float
     gamma: float | Literal["auto"]
-    """Of the kernel exp(-gamma * distance**2); auto: one over the number of features."""
+    """Gamma of the kernel exp(-gamma * distance**2); auto: 1 / number of features."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +31,7 @@ class ForestConfig:
 
     trees: int
     depth: int | None
-    """Largest depth of a tree; None: until its leaves are pure."""
+    """Largest depth of a tree; None: grow until the leaves are pure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +41,7 @@ class MlpConfig:
     hidden: tuple[int, ...]
     """Units of each hidden layer."""
     alpha: float = 1e-4
-    """L2 term."""
+    """Weight of the L2 term."""
     learning_rate: float = 1e-3
     epochs: int = 100
 
@@ -77,8 +81,10 @@ GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
         {"iterations": (400,), "learning_rate": (0.05,), **_TREES},
     ],
 }
-"""What a grid search tries, as scikit-learn's `ParameterGrid` takes it. The paper gives the grids
-of the first two; it gives none for perceptrons, and has no boosting."""
+"""Grids of the grid search, for scikit-learn's `ParameterGrid`.
+
+The paper gives the first two. It gives no grid for perceptrons, and has no boosting.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +114,7 @@ class NetworkConfig:
     dropout: float = 0.0
     """Fraction of values left out in training, before and after the hidden layer."""
     batch_norm: bool = True
-    """After each convolution and after the hidden layer; a convolution then needs no bias."""
+    """True: batch norm after each convolution and the hidden layer; convolutions lose bias."""
 
 
 CNN0 = NetworkConfig(filters=32, hidden=128)
@@ -120,10 +126,10 @@ CNN3 = NetworkConfig(filters=32, hidden=1024, pool=True, second=SecondConvolutio
 
 @dataclass(frozen=True, slots=True)
 class DayShift:
-    """How far the features of one day differ from those of another, beyond their standardising.
+    """Assumed difference of the features of two days after standardising.
 
-    Measured by what helped networks on days that they were not trained on; twice as much helps
-    networks of a single training day more, and costs the others.
+    The values are those that helped networks on new days. Twice as much helps networks of a single
+    training day more, but costs the others.
     """
 
     gain: float = 0.3
@@ -131,7 +137,7 @@ class DayShift:
     finger_gain: float = 0.3
     """All 24 z-values of a finger are multiplied by the same `exp(finger_gain * e)`."""
     offset: float = 0.7
-    """Standard deviation of what is added to each finger's mean and to its spread."""
+    """Standard deviation of the offsets added to each finger's mean and spread."""
 
 
 DAY_SHIFT = DayShift()
@@ -154,7 +160,7 @@ class Recipe:
     """Decoupled (times the learning rate in each step), on convolution and dense weights only;
     stands for the paper's L2 term."""
     label_smoothing: float = 0.0
-    """This much of each target is shared out evenly among both classes."""
+    """Part of each target that is shared evenly among both classes."""
     input_noise: float = 0.0
     """Standard deviation of the noise added to each input, in the input's own (z-score) units."""
     norm_momentum: float = 0.1
@@ -164,7 +170,7 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class SessionRecipe(Recipe):
-    """For session features: each batch is seen as it might have been on other days."""
+    """Recipe for session features: each batch is varied as on other days."""
 
     epochs: int = 40
     weight_decay: float = 1.0
@@ -187,7 +193,7 @@ class PublishedRecipe:
     label_smoothing: float = 0.0
     input_noise: float = 0.0
     norm_momentum: float = 0.01
-    """Keras writes it 0.99: the weight of what was."""
+    """Weight of a new batch in the running statistics; Keras writes 0.99, the old weight."""
     threads: int = THREADS
 
 

@@ -1,4 +1,4 @@
-"""ONNX graphs of what was trained: from an input (N, *shape) to `margin` or `probability`."""
+"""Make ONNX graphs of trained estimators: input (N, *shape), output margin or probability."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from models.training.estimators.classical import PROBABILITY_FLOOR, Boosting, Cl
 from models.training.estimators.networks import for_inference, for_margin
 
 OPSET = 18
-"""What the exporters are written for; every onnxruntime that the project allows knows it."""
+"""Operator set of the exporters; all allowed versions of onnxruntime have it."""
 ML_OPSET = 3
-"""Of the domain `ai.onnx.ml`, which has the trees."""
+"""Operator set of the domain `ai.onnx.ml`, which has the trees."""
 IR_VERSION = 10
-"""Of the file format; onnxruntime 1.18 knows it."""
+"""Version of the file format; onnxruntime 1.18 reads it."""
 MARGIN_NAME = "margin"
 
 _Steps = Sequence[tuple[str, Sequence[str], str, dict[str, Any]]]
@@ -39,19 +39,19 @@ _Steps = Sequence[tuple[str, Sequence[str], str, dict[str, Any]]]
 def network_probability(
     network: nn.Sequential, shape: Sequence[int], temperature: float, input_name: str
 ) -> onnx.ModelProto:
-    """`softmax(logits / temperature)` (N, 2) of a network."""
+    """Return the graph `softmax(logits / temperature)`, (N, 2), of a network."""
     return _from_torch(for_inference(network, temperature), shape, input_name, OUTPUT_NAME)
 
 
 def network_margin(
     network: nn.Sequential, shape: Sequence[int], input_name: str
 ) -> onnx.ModelProto:
-    """Log-odds of slip (N, 1) of a network."""
+    """Return the graph of a network's log-odds of slip, (N, 1)."""
     return _from_torch(for_margin(network), shape, input_name, MARGIN_NAME)
 
 
 def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
-    """Log-odds of slip (N, 1) of a classifier on vectors."""
+    """Return the graph of a classifier's log-odds of slip, (N, 1)."""
     graph_of: dict[type[ClassicalModel], Callable[[Any, str], onnx.ModelProto]] = {
         SVC: _svm,
         Boosting: _boosting,
@@ -82,7 +82,7 @@ def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> 
 
 
 def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelProto:
-    """The graph continued to `probability` (N, 2): stable, slip; sigmoid(margin / temperature)."""
+    """Return the graph with `probability` (N, 2) of stable and slip: sigmoid(margin / T)."""
     # softmax(-m / 2T, m / 2T) is 1 - sigmoid(m / T), sigmoid(m / T).
     share = np.array([[-0.5, 0.5]]) / temperature
     nodes = [
@@ -120,8 +120,10 @@ def _feed(graph: onnx.GraphProto, former: str, name: str) -> None:
 
 
 def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
-    """In double precision: ONNX's own SVMClassifier sums up in float32, and with large C its
-    margins are off by more than a hundredth."""
+    """Return the graph of a support vector machine in double precision.
+
+    ONNX's own SVMClassifier sums in float32; with large C its margins are wrong by over 0.01.
+    """
     vectors = model.support_vectors_
     features = vectors.shape[1]
     gamma = 1.0 / features if model.gamma == "auto" else float(model.gamma)
@@ -154,7 +156,7 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
 
 
 def _boosting(model: Boosting, input_name: str) -> onnx.ModelProto:
-    """As one TreeEnsembleRegressor; skl2onnx 1.20 cannot write these trees with onnx 1.23."""
+    """Return one TreeEnsembleRegressor; skl2onnx 1.20 cannot write it with onnx 1.23."""
     trees = model.trees
     of_tree = np.repeat(np.arange(len(trees)), [len(tree) for tree in trees])
     of_node = np.concatenate([np.arange(len(tree)) for tree in trees])
@@ -184,13 +186,13 @@ def _boosting(model: Boosting, input_name: str) -> onnx.ModelProto:
 
 
 def _float32_below(thresholds: Floats) -> Floats32:
-    """The largest float32 not above: a float32 is below it exactly if below the threshold."""
+    """Return the largest float32 not above each threshold, so that comparisons agree."""
     nearest = thresholds.astype(np.float32)
     return np.where(nearest > thresholds, np.nextafter(nearest, np.float32(-np.inf)), nearest)
 
 
 def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
-    """The trees add up votes, not their shares: shares of 1/199 would round differently."""
+    """Return a graph whose trees add votes; shares of 1/199 would round differently."""
     (trees,) = _from_sklearn(model, input_name).graph.node
     number = len(model.estimators_)
     (weights,) = (part for part in trees.attribute if part.name == "class_weights")
@@ -217,7 +219,7 @@ def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
 
 
 def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
-    """Up to the last layer, whose logistic function would lose large margins in float32."""
+    """Return the graph up to the last logistic function, which loses large margins."""
     graph = _from_sklearn(model, input_name).graph
     kinds = [node.op_type for node in graph.node]
     nodes = list(graph.node[: kinds.index("Sigmoid")])
@@ -229,7 +231,7 @@ def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
 
 
 def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
-    """What skl2onnx makes of a classifier: outputs `label` and `probabilities` (N, 2)."""
+    """Return a classifier as ONNX, with the outputs `label` and `probabilities` (N, 2)."""
     converted: onnx.ModelProto = to_onnx(
         model,
         np.zeros((1, model.n_features_in_), dtype=np.float32),
@@ -266,7 +268,7 @@ def _from_torch(
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """Hold back deprecations and a logger's warnings: no user could act on the exporter's."""
+    """Hide the exporter's deprecations and warnings, on which no user can act."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -280,7 +282,7 @@ def _quiet(name: str) -> Iterator[None]:
 
 
 def _strip(model: onnx.ModelProto) -> None:
-    """Take out what tells of the machine: stack traces with paths, in each part's metadata."""
+    """Remove stack traces with paths of this machine from all metadata."""
     graph = model.graph
     parts = (graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output)
     for part in (model, *parts):

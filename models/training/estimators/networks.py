@@ -1,4 +1,4 @@
-"""The networks of the paper, and narrower ones, as PyTorch modules made from a configuration."""
+"""Make PyTorch modules from configurations: networks of the paper, and narrower ones."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ NORM_EPSILON = 1e-3
 
 
 class ChannelsFirst(nn.Module):
-    """Images (N, height, width, fingers), as the daemon builds them, to (N, fingers, ...)."""
+    """Layer from images (N, height, width, fingers), as in the daemon, to (N, fingers, ...)."""
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         return images.permute(0, 3, 1, 2)
 
 
 class FeatureImages(nn.Module):
-    """Electrodes (N, fingers * 24) to D1 images (N, fingers, 12, 11), gaps filled with means."""
+    """Layer from electrodes (N, fingers * 24) to D1 images (N, fingers, 12, 11)."""
 
     fill: torch.Tensor
 
@@ -48,7 +48,7 @@ class FeatureImages(nn.Module):
 
 
 class Beside(nn.Module):
-    """Puts the first features through layers and lays the rest beside the result."""
+    """Module that passes the first features through layers and appends the rest."""
 
     def __init__(self, look: nn.Sequential, first: int) -> None:
         super().__init__()
@@ -62,9 +62,9 @@ class Beside(nn.Module):
 
 
 def build(config: NetworkConfig, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Sequential:
-    """A network with fresh weights from torch's global random state.
+    """Return a network with new weights from torch's global random state.
 
-    Takes float32 inputs (N, *shape), images or features, returns logits (N, 2) in the order
+    It takes float32 inputs (N, *shape), images or features, and returns logits (N, 2) in the order
     (stable, slip). Weights are Glorot-uniform and biases zero, as Keras starts them. Raises
     `ValueError` if the network does not fit the shape.
     """
@@ -85,15 +85,15 @@ def build(config: NetworkConfig, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Seque
 
 
 def parameter_count(network: nn.Module) -> int:
-    """Number of trained parameters."""
+    """Return the number of trained parameters."""
     return sum(parameter.numel() for parameter in network.parameters())
 
 
 def for_inference(network: nn.Sequential, temperature: float) -> nn.Sequential:
-    """A copy that returns calibrated probabilities (N, 2), with nothing left to compute twice.
+    """Return a copy that gives calibrated probabilities (N, 2).
 
-    Batch norm goes into the layer before it, the temperature into the last layer: a linear layer
-    divided by T gives `softmax(logits / T)`.
+    Batch norm is folded into the layer before it, and the temperature into the last layer. A linear
+    layer divided by T gives `softmax(logits / T)`.
     """
     layers = _folded(copy.deepcopy(network).eval())
     last = _last(layers)
@@ -104,7 +104,7 @@ def for_inference(network: nn.Sequential, temperature: float) -> nn.Sequential:
 
 
 def for_margin(network: nn.Sequential) -> nn.Sequential:
-    """A copy that returns log-odds of slip (N, 1), folded like `for_inference`."""
+    """Return a copy that gives log-odds of slip (N, 1), folded like `for_inference`."""
     layers = _folded(copy.deepcopy(network).eval())
     last = _last(layers)
     margin = nn.Linear(last.in_features, 1)
@@ -154,7 +154,7 @@ def _drop(config: NetworkConfig) -> list[nn.Module]:
 
 
 def _folded(network: nn.Sequential) -> list[nn.Module]:
-    """The layers with batch norm folded and dropout left out. Changes the network given."""
+    """Return the layers without batch norm (folded) and dropout. Changes `network`."""
     layers: list[nn.Module] = []
     for layer in network:
         if isinstance(layer, nn.BatchNorm2d) and isinstance(layers[-1], nn.Conv2d):

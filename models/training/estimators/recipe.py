@@ -1,4 +1,4 @@
-"""How a network is trained: one-cycle AdamW, or as published; seeded, on fixed threads."""
+"""Train a network, by one-cycle AdamW or as published; seeded, on fixed threads."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from models.training.estimators.configs import (
 from models.training.estimators.networks import build
 
 INFERENCE_BATCH = 512
-"""Inputs per forward pass: bounds memory, changes nothing else."""
+"""Most inputs of a forward pass; it limits memory and changes nothing else."""
 KERAS_ADAM_EPSILON = 1e-8
-"""Of Keras 2.0.8, with which the published networks were trained."""
+"""Epsilon of Adam in Keras 2.0.8, which trained the published networks."""
 
 
 @contextmanager
 def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
-    """Seed torch, allow deterministic algorithms alone and fix its threads; restored afterwards."""
+    """Seed torch, fix its threads, and allow only deterministic algorithms, until the end."""
     threads_before = torch.get_num_threads()
     deterministic_before = torch.are_deterministic_algorithms_enabled()
     with torch.random.fork_rng(devices=[]):
@@ -54,7 +54,7 @@ def train_network(
     *,
     seed: int,
 ) -> nn.Sequential:
-    """Train a network on inputs (N, *shape) and labels (N,). It is returned in evaluation mode.
+    """Train a network on inputs (N, *shape) and labels (N,); return it in evaluation mode.
 
     The same arguments give the same weights on the same machine. Each epoch sees the grasps once,
     shuffled. Raises `ValueError` for less than two grasps.
@@ -73,7 +73,7 @@ def train_network(
 
 
 def logits(network: nn.Module, inputs: Floats32) -> Floats:
-    """Logits (N, 2), order (stable, slip), of inputs (N, *shape)."""
+    """Return the logits (N, 2), in the order (stable, slip), of inputs (N, *shape)."""
     batches = torch.split(torch.from_numpy(inputs), INFERENCE_BATCH)
     with reproducible(0), torch.no_grad():
         return torch.cat([network(batch) for batch in batches]).double().numpy()
@@ -122,7 +122,7 @@ def _fit(
 def optimization(
     network: nn.Sequential, recipe: AnyRecipe, steps: int
 ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-    """Optimizer and schedule of a recipe; an epoch has `steps` batches, each followed by a step."""
+    """Return optimizer and schedule of a recipe. `steps`: batches of an epoch."""
     weights = [parameter for parameter in network.parameters() if parameter.ndim > 1]
     others = [parameter for parameter in network.parameters() if parameter.ndim <= 1]
     optimizer: torch.optim.Optimizer
@@ -159,7 +159,7 @@ def optimization(
 
 
 def _batches(grasps: int, recipe: AnyRecipe) -> Sequence[slice]:
-    """Where the batches of one epoch lie in the shuffled order."""
+    """Return the slices of an epoch's shuffled order, one per batch."""
     batch = min(recipe.batch, grasps)
     # A batch norm cannot be trained on a single grasp; Keras takes any other remainder.
     least = batch if isinstance(recipe, Recipe) else 2

@@ -1,4 +1,4 @@
-"""The study of broken electrodes: what they cost unnoticed, and after their repair."""
+"""Study of broken electrodes: their cost unnoticed, and after repair."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from models.training.fitting.trained import Trained, train
 from models.training.systems.system import System
 
 FOLDS, JUDGED_FOLDS = 10, 3
-"""Of ten stratified folds, three are judged: enough to tell one point from twenty."""
+"""Number of stratified folds, and of those judged; three show a difference of a few points."""
 NUMBERS = (1, 2, 4, 8, 12)
 LOOKED_FOR_MAX = 13
-"""Broken electrodes of a reading that are looked for at most: one more than the daemon repairs in a
-hand (`BROKEN_MAX` of `daemon.judge.health`, 12). A reading with 13 is refused."""
+"""Most broken electrodes that are searched in a reading; the daemon refuses a reading with 13.
+
+It repairs at most 12 (`BROKEN_MAX` of `daemon.judge.health`).
+"""
 
 Breakage = Callable[[Numbers, np.random.Generator], Numbers]
 KINDS: dict[str, Breakage] = {
@@ -29,7 +31,7 @@ KINDS: dict[str, Breakage] = {
     "anywhere": lambda counts, random: random.integers(200, 3500, counts.shape).astype(np.uint16),
     "500 too high": lambda counts, _: np.minimum(counts + 500, COUNT_MAX - 1).astype(np.uint16),
 }
-"""What a broken electrode reads."""
+"""Values of a broken electrode, by kind of damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +40,15 @@ class Broken:
 
     number: int
     reads: str
-    """A key of `KINDS`."""
+    """Kind of damage, a key of `KINDS`."""
     unnoticed: float
     known: float
-    """With the broken electrodes known, and repaired."""
+    """F1 if all broken electrodes are known and repaired."""
     found: float
-    """With those repaired whose values do not fit the others of the reading. The daemon refuses a
-    reading with more than a few of them."""
+    """F1 if electrodes are repaired whose values do not fit the others of the reading.
+
+    The daemon refuses a reading with more than a few of them.
+    """
     detected: float
     """Fraction of the broken electrodes that were found by their values."""
 
@@ -63,8 +67,10 @@ class Study:
 
 
 def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
-    """Train on folds of the grasps, break electrodes of the grasps left out, and judge these.
-    The grasps have the system's fingers alone. Raises `TooFewGraspsError`."""
+    """Train on folds of the grasps, break electrodes of the held-out grasps, and judge those.
+
+    `grasps` have only the system's fingers. Raises `TooFewGraspsError`.
+    """
     folds = [
         _Fold(system, grasps, out, fold_seed(seed, fold))
         for fold, out in enumerate(left_out(grasps, seed))
@@ -86,8 +92,10 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
 
 
 def left_out(grasps: Grasps, seed: int) -> list[Bools]:
-    """Return, for each training of the study, True for the grasps (N,) that it is judged by.
-    Raises `TooFewGraspsError` for less than two grasps of a label."""
+    """Return for each training True for its held-out grasps, shape (N,).
+
+    Raises `TooFewGraspsError` for less than two grasps of a label.
+    """
     slips = int(grasps.slipped.sum())
     folds = min(FOLDS, max(2, min(slips, len(grasps) - slips)))
     fold_of = folds_of(grasps.slipped, folds, seed)

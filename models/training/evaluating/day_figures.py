@@ -1,4 +1,4 @@
-"""What verdicts are worth on another day: how many slips are among what is called stable."""
+"""Figures of verdicts on another day, such as the share of slips among `stable` ones."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ GROUPS = {name: (name,) for name in (A, B_DOWN, B_SIDE, C_DOWN, C_SIDE)} | {
 
 @dataclass(frozen=True, slots=True)
 class VerdictFigures:
-    """Figures of some verdicts as fractions, slip positive; None where nothing was called so."""
+    """Figures of verdicts as fractions; slip is positive."""
 
     grasps: int
     f1: float
     slips_among_stable: float | None
-    """Of what is called stable."""
+    """Share of slips among the grasps called stable; None: no such grasp."""
     slips_called_stable: float | None
-    """Of what slips."""
+    """Share of the slips that are called stable; None: no slip."""
     stable_called_slip: float | None
-    """Of what stays."""
+    """Share of the stable grasps that are called slip; None: no stable grasp."""
 
     @classmethod
     def of(cls, called_slip: Bools, slipped: Bools) -> VerdictFigures:
-        """Of verdicts (N,) and what came of them."""
+        """Return the figures of verdicts and outcomes, shape (N,) each."""
         missed, alarms = ~called_slip & slipped, called_slip & ~slipped
         return cls(
             len(slipped),
@@ -54,19 +54,19 @@ class DayFigures:
     """Figures of grasps of another day."""
 
     every: VerdictFigures
-    """With those that the daemon would refuse."""
+    """Figures of all grasps, also those that the daemon would refuse."""
     judged: VerdictFigures
-    """Without them."""
+    """Figures of the grasps that the daemon would judge."""
     coverage: float
-    """Fraction that is judged."""
+    """Fraction of the grasps that would be judged."""
     refused_slipped: float | None
-    """Fraction that slipped of what is refused; None if nothing is."""
+    """Fraction of slips among the refused grasps; None: no such grasp."""
 
 
 def day_figures(
     variant: str, folds: Sequence[Sequence[JobResult]], grasps: Grasps
 ) -> dict[str, DayFigures]:
-    """By group of streams; `folds` has, for each seed, the results of `days` in their order."""
+    """Return the figures by group of streams. `folds`: results of `days` for each seed."""
     parts: dict[str, list[JobResult]] = {}
     for results in folds:
         for index, result in enumerate(results):

@@ -16,17 +16,17 @@ from models.training.fitting.trained import Trained
 from models.training.systems.system import SessionFeatures
 
 CALIBRATED_FROM = 20
-"""Grasps from which on a session counts as calibrated: more of them gain two points at most."""
+"""Grasps from which a session counts as calibrated; more gain at most two points."""
 
 Judged = tuple[dict[str, Floats], dict[str, Bools], dict[str, Ints]]
-"""By variant: log-odds of slip, which are refused, and how old the session was at each grasp."""
+"""By variant: log-odds of slip, refusals, and age of the session at each grasp."""
 
 
 def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judged:
-    """How a trained system judges the rows `test` of grasps; each table is a session from nothing.
+    """Judge the rows `test` of grasps with a trained system; each table is a new session.
 
-    A session system judges each table in random order, and object by object. The daemon calls what
-    is refused `unknown`; what the system would have said of it is given all the same.
+    A session system judges each table in random order, and again object by object. Refused grasps,
+    which the daemon calls `unknown`, have margins too.
     """
     takes, fingers = trained.system.input, len(trained.system.fingers)
     counts, table_of = grasps.counts[test], grasps.table_of[test]
@@ -62,7 +62,7 @@ def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]
 
 
 class Day:
-    """What the daemon's `Plausibility` finds in sound readings."""
+    """Findings of the daemon's `Plausibility` in sound readings."""
 
     def __init__(self, trained: Trained) -> None:
         seen = trained.seen()
@@ -70,8 +70,10 @@ class Day:
         self._sound = np.zeros(self.electrodes.centre.shape, np.bool_)
 
     def look(self, counts: Numbers, session: Standards | None = None) -> tuple[Numbers, bool, bool]:
-        """Return counts (fingers, 24), repaired; if they were seen; if a session learns of them.
-        `session` is mean and spread of the counts in it."""
+        """Return repaired counts (fingers, 24), and two bools: judged, learned by a session.
+
+        `session`: mean and spread of the session's counts.
+        """
         now = session or Standards(self.electrodes.centre, self.electrodes.spread)
         scale = self.electrodes.spread / now.spread
         values = self.electrodes.centre + (counts.astype(np.float64) - now.mean) * scale
@@ -92,7 +94,7 @@ class Day:
 
 
 class SessionDay:
-    """A session from nothing, as the daemon's `SessionCalibration` has it."""
+    """A new session, like the daemon's `SessionCalibration`."""
 
     def __init__(self, trained: Trained) -> None:
         takes = trained.system.input
@@ -109,7 +111,7 @@ class SessionDay:
         """Inputs of the network, (features,), for the grasp that was judged last."""
 
     def look(self, counts: Numbers) -> tuple[Numbers, bool, bool]:
-        """What `Day.look` finds, of a session that may be odd."""
+        """Return the result of `Day.look`; the session may be odd."""
         mean, spread = (
             values[self._features :].reshape(counts.shape)
             for values in (self.session.mean, self.session.spread)
@@ -121,7 +123,7 @@ class SessionDay:
         return repaired, seen and not odd, learned or odd or young
 
     def judge(self, counts: Numbers) -> tuple[float, bool]:
-        """Log-odds of slip of a grasp, and whether it is refused; then learn from it."""
+        """Return log-odds of slip and True if refused; then learn from the grasp."""
         repaired, seen, learned = self.look(counts)
         features = slice(self._features)
         by = Standards(self.session.mean[features], self.session.spread[features])

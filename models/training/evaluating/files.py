@@ -1,4 +1,4 @@
-"""Result files: there whole or not at all, whenever the program ends."""
+"""Write result files that are complete or absent, whenever the program ends."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import msgspec
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path; the file written there then takes the place of `path`. Raises `OSError`.
-    After an exception `path` is unchanged, and nothing else is left in the folder."""
+    """Yield a path to write to; the file then replaces `path`. Raises `OSError`.
+
+    After an exception `path` is unchanged, and the folder has no other file.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part
@@ -31,5 +33,5 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def to_json(value: object) -> bytes:
-    """Indented JSON with a newline."""
+    """Return indented JSON with a newline."""
     return msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"

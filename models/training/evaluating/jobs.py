@@ -1,4 +1,4 @@
-"""One training and its judgement of the grasps left out, kept in a file by all it depends on."""
+"""Run one training, judge the held-out grasps, and store the result by a digest of its causes."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from models.training.fitting.trained import Trained, train
 from models.training.systems.system import SessionFeatures, System, digest
 
 FORMAT = 1
-"""Goes up when a job gives another result for the same configuration, or is written otherwise."""
+"""Version of results; raise it if a job gives another result, or its file changes."""
 MAX_FILE_BYTES = 64 * 2**20
-"""A larger file is no result: 4682 grasps in 8 variants take 0.4 MB."""
+"""Largest result file, bytes; 4682 grasps in 8 variants take 0.4 MB."""
 _ONE_AT_A_TIME = threading.Lock()
-"""torch's random state and its number of threads belong to the process."""
+"""Lock of torch's random state and number of threads, which the process shares."""
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ Number = TypeVar("Number", np.float64, np.int64, np.bool_)
 
 
 class BrokenResultError(Exception):
-    """A stored result is not what it claims to be: run the job again."""
+    """A stored result is damaged; run the job again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +51,18 @@ class Job:
     system: System
     protocol: EvalProtocol
     seed: int
-    """Of the split and, with the fold, of the training."""
+    """Seed of the split and, together with the fold, of the training."""
     fold: int
     folds: int = FOLDS
 
     def key(self, data: str) -> str:
-        """SHA-256 of all that the result depends on; `data` is the digest of the grasps."""
+        """Return the SHA-256 of everything that the result depends on. `data`: a digest."""
         parts = [FORMAT, digest(self.system), self.protocol, self.seed, self.fold]
         text = json.dumps([*parts, self.folds, data])
         return hashlib.sha256(text.encode()).hexdigest()
 
     def file_name(self, data: str) -> str:
-        """Of the stored result: different for every job and every data (a digest)."""
+        """Return the name of the stored result, unique for job and data. `data`: a digest."""
         readable = f"{self.system.name}.{self.protocol}.{self.seed}.{self.fold}"
         return f"{readable}.{self.key(data)[:16]}.npz"
 
@@ -81,7 +81,7 @@ def jobs_of(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobResult:
-    """How a trained system judges the test grasps of a job."""
+    """Verdicts of a trained system on the test grasps of a job."""
 
     test: Ints
     """Indices (n,) of the grasps, ascending."""
@@ -89,13 +89,13 @@ class JobResult:
     """By variant: uncalibrated log-odds of slip (n,)."""
     train_grasps: int
     seconds: float
-    """Of training and judging."""
+    """Time of training and judging, s."""
     parameters: int
-    """How many numbers the trained system consists of."""
+    """Number of parameters of the trained system."""
     ages: dict[str, Ints] = field(default_factory=dict)
-    """By running variant: grasps (n,) that the session had seen before."""
+    """Grasps (n,) that the session had before each one, by running variant."""
     refused: dict[str, Bools] = field(default_factory=dict)
-    """In `days`, by variant: which grasps (n,) the daemon would hold for never seen."""
+    """Grasps (n,) that the daemon would refuse, by variant; only in `days`."""
 
     def to_bytes(self) -> bytes:
         """Return a .npz file without pickled objects."""
@@ -115,7 +115,7 @@ class JobResult:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> JobResult:
-        """Read what `to_bytes` returned. Raises `BrokenResultError`."""
+        """Return the result in `data`, from `to_bytes`. Raises `BrokenResultError`."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
                 return _result({name: arrays[name] for name in arrays.files})

@@ -15,7 +15,7 @@ from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc
 from models.training.arrays import Bools, Floats, Ints
 
 TEMPERATURE_RANGE = (0.05, 20.0)
-"""Where a temperature is looked for; perfectly separated labels end at the low end."""
+"""Limits of a fitted temperature; perfectly separated labels end at the lower one."""
 ECE_BINS = 15
 """Bins of equal width, as in Guo et al."""
 HALVINGS = 60
@@ -27,7 +27,7 @@ Z_95 = 1.959963984540054
 CURVE_STEPS = 50
 """Points of an accuracy-coverage curve."""
 FEWEST_JUDGED = 50
-"""An accuracy over fewer verdicts than this sets no threshold: by chance alone it may be 100 %."""
+"""Fewest verdicts whose accuracy sets a threshold; of fewer, all may be right by chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Scores:
     recall: float
     f1: float
     auc: float
-    """Area under the ROC curve: does it rank, whatever the threshold. NaN for a single class."""
+    """Area under the ROC curve, which needs no threshold; NaN for a single class."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Spread:
     """A figure over folds and seeds."""
 
     mean: float
-    """Of the seeds' fold means."""
+    """Mean over the seeds of each seed's fold mean."""
     std: float
     """Population standard deviation over the folds, mean of the seeds; over the seeds where a seed
     has one fold only."""
@@ -76,7 +76,7 @@ class Fraction:
 
 @dataclass(frozen=True, slots=True)
 class CurvePoint:
-    """Judging only where max(p_slip, 1 - p_slip) reaches `confidence`."""
+    """Accuracy and coverage if grasps under `confidence` are not judged."""
 
     confidence: float
     accuracy: float
@@ -181,10 +181,10 @@ def wilson(accuracy: float, grasps: int) -> Fraction:
 def coverage_curve(
     probability: Floats, slipped: Bools, steps: int = CURVE_STEPS
 ) -> list[CurvePoint]:
-    """Accuracy of the most confident verdicts, from nearly none to all of them.
+    """Return the accuracy of the most confident verdicts, ascending in coverage up to all.
 
-    Of slip probabilities (N,) and labels (N,), N > 0; ascending in coverage. Verdicts of the same
-    confidence stay together.
+    Slip probabilities and labels have shape (N,), N > 0. Verdicts of equal confidence stay
+    together.
     """
     points = _points(probability, slipped)
     number = len(slipped)
@@ -200,8 +200,10 @@ def accuracy_at(probability: Floats, slipped: Bools, coverage: float) -> float:
 
 
 def reject_threshold(probability: Floats, slipped: Bools, wanted: float) -> CurvePoint | None:
-    """Return the lowest confidence from which on verdicts reach the wanted accuracy.
-    None if no confidence does so over `FEWEST_JUDGED` verdicts."""
+    """Return the lowest confidence from which verdicts reach the accuracy `wanted`.
+
+    None: no confidence reaches it with `FEWEST_JUDGED` verdicts.
+    """
     least = FEWEST_JUDGED / len(slipped)
     reached = (
         point
@@ -231,7 +233,7 @@ def _ece(probability: Floats, slipped: Bools) -> float:
 
 
 def _points(probability: Floats, slipped: Bools) -> list[CurvePoint]:
-    """One for each confidence that occurs, ascending in coverage."""
+    """Return a point for each confidence that occurs, ascending in coverage."""
     confidence, accuracy = _by_confidence(probability, slipped)
     ends = np.flatnonzero(np.append(confidence[1:] != confidence[:-1], True)).tolist()
     return [
@@ -241,7 +243,7 @@ def _points(probability: Floats, slipped: Bools) -> list[CurvePoint]:
 
 
 def _by_confidence(probability: Floats, slipped: Bools) -> tuple[Floats, Floats]:
-    """Confidences, falling, and the accuracy of all verdicts up to each."""
+    """Return the confidences, falling, and the accuracy of all verdicts down to each."""
     confidence = np.maximum(probability, 1.0 - probability)
     order = np.argsort(-confidence, kind="stable")
     right = ((probability > 0.5) == slipped)[order]

@@ -179,7 +179,7 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
     yield _table(("system", *columns), shown)
     young = {name: variants[RUNNING].ages for name, variants in here.items() if RUNNING in variants}
     if young:
-        yield "Accuracy, %, in a running session (objects mixed) after at least so many grasps:"
+        yield "Accuracy, %, in a running session (objects mixed), by grasps before:"
         bounds = sorted({age.grasps_before for ages in young.values() for age in ages})
         rows = []
         for name, ages in young.items():
@@ -194,7 +194,7 @@ def _days(by_group: ByGroup) -> Iterator[str]:
     trainings = ", ".join(f"`{one.system}` {len(one.seeds)} x {one.folds}" for one in here)
     yield (
         "Protocol `days`: each table is a session from nothing, its grasps judged one after the "
-        "other before they count, none of them labelled. F1 / slips among what is called stable, "
+        "other before they count, without labels. F1 / slips among what is called stable, "
         "%, every grasp judged, in random order; seeds times trainings: " + (trainings or NOT_RUN)
     )
     order = {RUNNING: "random", RUNNING_SORTED: "object by object"}

@@ -1,4 +1,4 @@
-"""Many jobs by joblib: here, in several processes, or on a Dask cluster (extra: cluster)."""
+"""Run many jobs by joblib: in processes, or on a Dask cluster (extra `cluster`)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from models.training.evaluating.jobs import Job, JobResult
 
 CONNECT_TIMEOUT_S = 10
 WORKERS_TIMEOUT_S = 60
-"""How long a cluster may take to show its first worker."""
+"""Longest wait for a cluster's first worker, s."""
 
 
 class ClusterError(Exception):
-    """The cluster is not there, or lost a job too often. What is finished is kept: try again."""
+    """The cluster is gone, or lost a job too often. Finished jobs are kept; try again."""
 
 
 def run_jobs(
@@ -34,12 +34,12 @@ def run_jobs(
     processes: int = 1,
     dask: str | None = None,
 ) -> Iterator[tuple[Job, JobResult]]:
-    """Yield each job with its result: first those that `folder` has, then the others as they end.
+    """Yield each job with its result: first the stored ones, then the others as they end.
 
-    Each result is in the folder before it is yielded, so an interrupted run goes on where it was.
-    `processes` jobs run at a time, or those that the Dask cluster takes whose scheduler has the
-    address `dask`: its workers need graspd with the extras `train` and `cluster`, no folder, no
-    data. A job whose worker is lost runs again.
+    Each result is stored in `folder` before it is yielded, so an interrupted run can continue.
+    `processes`: number of jobs at a time. `dask`: address of the scheduler of a Dask cluster, which
+    then runs the jobs. Its workers need graspd with the extras `train` and `cluster`, but no folder
+    and no data. A job whose worker is lost runs again.
 
     Raises what `jobs.run` raises, `ClusterError`, and `OSError` if the folder cannot be used.
     """

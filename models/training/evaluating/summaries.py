@@ -1,4 +1,4 @@
-"""What a system reached in a protocol: the figures of all its jobs in one file of JSON."""
+"""Figures of a system in a protocol, from all its jobs, in one JSON file."""
 
 from __future__ import annotations
 
@@ -43,12 +43,11 @@ from models.training.systems.system import digest
 
 FORMAT = 1
 HEADLINE = "n50"
-"""Variant whose figures are quoted for a session system in a later session: calibrated by 50
-unlabelled grasps."""
+"""Variant that is quoted for a session system in a later session: 50 unlabelled grasps before."""
 WANTED_ACCURACIES = (0.9, 0.95, 0.98, 0.99)
 COVERAGES = (0.9, 0.8, 0.5)
 AGES = (0, 5, 10, 20, 50, 100, 300)
-"""Bounds of the groups of grasps by what a running session had seen before, grasps."""
+"""Limits of the groups of grasps by the age of a running session, grasps."""
 LIBRARIES = ("numpy", "scikit-learn", "torch")
 
 _log = logging.getLogger(__name__)
@@ -65,13 +64,13 @@ class ObjectFigures:
 
 @dataclass(frozen=True, slots=True)
 class AgeFigures:
-    """Figures of the grasps that came when a running session was this old."""
+    """Figures of the grasps at one age of a running session."""
 
     grasps_before: int
-    """The fewest of the group; the most are one less than the next group's fewest."""
+    """Lowest age of the group, grasps; it ends below that of the next group."""
     share: Fraction
     temperature: float
-    """Makes these margins probabilities."""
+    """Temperature that makes these margins probabilities."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,38 +78,38 @@ class Variant:
     """Figures of one way of judging. Grasps of all seeds count alike."""
 
     spreads: dict[str, Spread]
-    """By name of the figure."""
+    """Mean and spread of each figure, by its name."""
     figures: dict[str, list[list[float | None]]]
-    """By name: of each fold (seeds, folds)."""
+    """Each figure in each fold (seeds, folds), by its name."""
     temperature: float
-    """Of all margins together; the figures' probabilities are cross-fitted."""
+    """Temperature of all margins together; probabilities of the figures are cross-fitted."""
     confusion: list[list[int]]
     """Grasps of all seeds: rows stable, slip as it was; columns as it was judged."""
     objects: dict[str, ObjectFigures]
     palms: dict[str, Fraction]
-    """By name of the table."""
+    """Share of right verdicts by name of the table."""
     curve: list[CurvePoint]
     coverages: dict[str, float]
-    """By share of the grasps, the most confident ones: accuracy."""
+    """Accuracy of the most confident grasps, by their share."""
     thresholds: dict[str, CurvePoint | None]
-    """By wanted accuracy: from which confidence on."""
+    """Lowest confidence that reaches an accuracy, by that accuracy."""
     bins: list[tuple[float, float, int]]
     """Mean slip probability, share that slipped, grasps."""
     ages: list[AgeFigures]
-    """Of running variants."""
+    """Figures of running variants, by age of the session."""
     days: dict[str, DayFigures] = field(default_factory=dict)
-    """Of the protocol `days`, by group of streams."""
+    """Figures of the protocol `days`, by group of streams."""
 
 
 @dataclass(frozen=True, slots=True)
 class SystemSummary:
-    """All that is known of a system in one protocol."""
+    """All figures of a system in one protocol."""
 
     format: int
     system: str
     description: str
     digest: str
-    """Of the system's configuration."""
+    """Digest of the system's configuration."""
     protocol: EvalProtocol
     data: str
     """Digest of the grasps."""
@@ -118,12 +117,12 @@ class SystemSummary:
     seeds: tuple[int, ...]
     folds: int
     train_grasps: float
-    """Mean over the trainings."""
+    """Number of training grasps, mean over the trainings."""
     test_grasps: float
     parameters: int
     """Numbers that a trained system consists of, mean over the trainings."""
     seconds: float
-    """Of all trainings, one thread each."""
+    """Time of all trainings, one thread each, s."""
     headline: str
     """The variant whose figures are quoted for the system."""
     variants: dict[str, Variant]
@@ -277,7 +276,7 @@ class _Pool:
             self.probability = p_slip(self.margins)
 
     def scores(self) -> list[Scores]:
-        """Of each fold."""
+        """Return the scores of each fold."""
         return [
             score(self.margins[inside], self._slipped[inside], self.probability[inside])
             for inside in (self._fold_of == fold for fold in np.unique(self._fold_of))

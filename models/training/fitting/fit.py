@@ -1,4 +1,4 @@
-"""Training a system of any kind, and what comes of it: margins, and the graph that gives them."""
+"""Train a system of any kind; the result gives margins, and their ONNX graph."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Fitted(Protocol):
 
     @property
     def parameters(self) -> int:
-        """How many numbers it consists of."""
+        """Number of parameters."""
 
     def margins(self, inputs: Floats32) -> Floats:
         """Return the log-odds of slip (N,), uncalibrated, of inputs (N, *shape)."""
@@ -106,7 +106,7 @@ class FittedBlend(Fitted):
 
     members: tuple[FittedNetwork | FittedClassical, ...]
     factors: tuple[float, ...]
-    """What each member's margin is multiplied by."""
+    """Factor of each member's margin."""
 
     @property
     def parameters(self) -> int:
@@ -129,9 +129,9 @@ class FittedStandardised(Fitted):
 
     inner: Fitted
     mean: Floats32
-    """Of the training, in the shape of an input."""
+    """Training mean, in the shape of an input."""
     scale: Floats32
-    """One over the spread in the training, in the shape of an input; 0 where nothing varied."""
+    """One over the training spread, in the shape of an input; 0 for a constant value."""
 
     @property
     def parameters(self) -> int:
@@ -152,7 +152,7 @@ def _fit_standardised(
     system: System, inputs: Floats32, slipped: Bools, seed: int
 ) -> FittedStandardised:
     spread = inputs.std(axis=0, dtype=np.float64)
-    # A value that never changes tells nothing: it becomes zero.
+    # A constant value has no information: it becomes zero.
     scale = np.divide(1.0, spread, where=spread > 0.0, out=np.zeros_like(spread))
     mean = inputs.mean(axis=0, dtype=np.float64).astype(np.float32)
     scale = scale.astype(np.float32)
@@ -185,7 +185,7 @@ def _fit_blend(blend: BlendConfig, inputs: Floats32, slipped: Bools, seed: int) 
         fitted = _fit_single(member.estimator, member.recipe, inputs, slipped, member_seed)
         spread = float(fitted.margins(inputs).std())
         members.append(fitted)
-        # A member that judges all grasps alike has learnt nothing and has no say.
+        # A member that judges all grasps alike has learnt nothing, and gets no weight.
         share = member.weight / (member.copies * total)
         factors.append(share / spread if spread > 0.0 else 0.0)
     return FittedBlend(tuple(members), tuple(factors))

@@ -1,4 +1,4 @@
-"""Novelty: what the training counts look like, and how much of other data is unlike them."""
+"""Novelty: describe the training counts, and measure how much other data is unlike them."""
 
 from __future__ import annotations
 
@@ -12,28 +12,41 @@ from models.training.arrays import Numbers
 from models.training.data.datasets import COUNT_MAX
 
 MARGIN_COUNTS = 100
-"""Beyond the training range still taken for seen: wide enough for held-out grasps of the same
-session, narrow enough that drifted electrodes are not: of the later session palm_45, which the
-network judges wrongly, 97 % are refused."""
+"""Margin around the training range, counts, within which a count still passes as seen.
+
+It is wide enough for held-out grasps of the same session, and narrow enough for drifted electrodes.
+It refuses 97 % of the later session palm_45, which the network judges wrongly.
+"""
 SESSION_MARGIN_COUNTS = 500
-"""The same for a session model, whose counts were mapped to the training's sensors first: drift is
-none of its business, and a young session's map is rough. 6 % of palm_45 are refused."""
+"""Margin of a session model, counts, which takes counts mapped to the training's sensors.
+
+It is wide because the mapping already follows drift, and is rough in a young session. It refuses
+6 % of palm_45.
+"""
 DISTANCE_MAX = 2.5
-"""Largest root-mean-square whitened deviation still taken for seen: a held-out grasp has 0.8 at
-the median, and 1 % are above; readings made up of possible but unrelated counts all are."""
+"""Largest root-mean-square whitened deviation that still passes as seen.
+
+Held-out grasps have a median of 0.8, and 1 % are above the limit. All readings made up of possible
+but unrelated counts are above it.
+"""
 DISTANCE_MIN = 0.33
-"""Smallest: of 3600 real grasps the nearest to the mean has 0.37; the mean itself, with the
-sensors' noise, 0.14 to 0.34."""
+"""Smallest root-mean-square whitened deviation that still passes as seen.
+
+The nearest of 3600 real grasps to the mean has 0.37. The mean itself, with the sensors' noise, has
+0.14 to 0.34.
+"""
 NOISE_COUNTS = 5.0
-"""Added to each electrode's spread, counts: the sensors' own noise (3 to 12 counts measured), so
-that two electrodes that always moved together may differ by it."""
+"""Noise that is added to each electrode's spread, counts (3 to 12 measured).
+
+Two electrodes that always moved together in the training may differ by it.
+"""
 DIGITS = 9
 """Significant decimal digits of the numbers in the contract."""
 RANDOM_READINGS = 10_000
 
 
 def seen_counts(counts: Numbers, margin: int = MARGIN_COUNTS) -> SeenCounts:
-    """What counts (N, fingers, 24) look like. Raises `ValueError` for fewer than two readings."""
+    """Return the description of counts (N, fingers, 24). Raises `ValueError` for N < 2."""
     if len(counts) < 2:
         raise ValueError("two readings at least have a covariance")
     flat = counts.reshape(len(counts), -1).astype(np.float64)
@@ -53,8 +66,10 @@ def seen_counts(counts: Numbers, margin: int = MARGIN_COUNTS) -> SeenCounts:
 
 
 def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN_COUNTS) -> float:
-    """Return the fraction of counts (N, fingers, 24) that are refused if their group is left out.
-    `group_of` (N,) are the folds or objects; each is compared with all others."""
+    """Return the refused fraction of counts (N, fingers, 24), each compared with other groups.
+
+    `group_of`: fold or object of each, shape (N,).
+    """
     never = np.empty(len(counts), dtype=np.bool_)
     for group in np.unique(group_of):
         inside = group_of == group
@@ -65,8 +80,10 @@ def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN
 
 
 def made_up_never_seen(counts: Numbers, seen: SeenCounts, seed: int) -> dict[str, float]:
-    """Return the fraction refused of readings that no hand ever made, by how they are made up.
-    `counts` (N, fingers, 24) are real ones, `seen` is what they look like."""
+    """Return the refused fraction of made-up readings, by the way they are made up.
+
+    `counts`: real ones, shape (N, fingers, 24). `seen`: their description.
+    """
     random = np.random.default_rng(seed)
     shape = (RANDOM_READINGS, *counts.shape[1:])
     low, high = np.array(seen.low), np.array(seen.high)

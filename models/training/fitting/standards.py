@@ -1,4 +1,4 @@
-"""By what a session model's features are standardised: in training, and when it is judged."""
+"""Mean and spread that standardise a session model's features, in training and evaluation."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from models.training.arrays import Floats, Floats32, Ints
 PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""
 NONE, TRAINING, ALL = "none", "training", "all"
-"""Variants: not calibrated; by the training rows of the same table; by the whole pool."""
+"""Variants of calibration: none; training rows of the same table; the whole pool."""
 RUNNING, RUNNING_SORTED = "running", "running-sorted"
-"""Variants: each grasp by what came before it, from nothing; objects mixed, or one by one."""
+"""Variants of a running session from nothing: objects mixed, or one after the other."""
 DRAWS = (5, 10, 20, 50)
 """Variants `n5` ...: calibrated by 5 ... grasps of the pool, drawn at random."""
 SESSION_VARIANTS = (NONE, *(f"n{number}" for number in DRAWS), ALL, RUNNING, RUNNING_SORTED)
@@ -26,15 +26,15 @@ class Standards:
 
     mean: Floats
     spread: Floats
-    """Above zero."""
+    """Spread, above zero."""
 
     @classmethod
     def of(cls, features: Floats) -> Standards:
-        """Of features (N, M). The spread of one that does not vary is 1."""
+        """Return mean and spread of features (N, M); a constant one has spread 1."""
         return cls(features.mean(axis=0), _positive(features.std(axis=0)))
 
     def apply(self, features: Floats, clip: float) -> Floats32:
-        """Features (N, M) standardised and cut off at +-`clip`, as `SessionBuilder` does."""
+        """Return features (N, M) standardised and clipped, as by `SessionBuilder`."""
         standard: Floats = (features - self.mean) * (1.0 / self.spread)
         return np.clip(standard, -clip, clip).astype(np.float32)
 
@@ -44,13 +44,13 @@ class TrainingStandards:
     """Statistics of the training rows of each table; a table stands for a session."""
 
     tables: dict[int, Standards]
-    """By index of the table."""
+    """Standards by index of the table."""
     prior: Standards
-    """Mean of all rows, and spread within a table: where a new session starts from."""
+    """Start of a new session: mean of all rows, spread within a table."""
 
     @classmethod
     def of(cls, features: Floats, table_of: Ints) -> TrainingStandards:
-        """Of training features (N, M) and the tables (N,) that they are from."""
+        """Return the standards of training features (N, M), by their tables (N,)."""
         tables, within = {}, np.empty_like(features)
         for table in np.unique(table_of):
             inside = table_of == table
@@ -60,14 +60,14 @@ class TrainingStandards:
         return cls(tables, Standards(features.mean(axis=0), spread))
 
     def each(self, table_of: Ints) -> Standards:
-        """Of shape (N, M): each grasp's by its table (N,). Raises `KeyError` for an unknown one."""
+        """Return each grasp's standards by its table (N,), shape (N, M). Raises `KeyError`."""
         standards = [self.tables[int(table)] for table in table_of]
         return Standards(
             np.stack([one.mean for one in standards]), np.stack([one.spread for one in standards])
         )
 
     def statistics(self) -> SessionStatistics:
-        """Those of a new session."""
+        """Return the statistics of a new session."""
         return SessionStatistics(self.prior.mean, self.prior.spread, PRIOR_GRASPS)
 
 
@@ -76,9 +76,9 @@ def later_session(
 ) -> tuple[dict[str, Standards], dict[str, Ints]]:
     """Return standards of the rows `test` of features (all grasps, M), by variant.
 
-    And, of the running variants, the grasps (N,) that were seen before each test grasp.
-    Only the rows `pool` calibrate `n5` ... and `all`; in a running session every grasp counts
-    once it was judged. Labels are not used.
+    The second result has, for running variants, the grasps (N,) before each test grasp. The rows
+    `pool` calibrate `n5` ... and `all`. In a running session each grasp counts after its judgement.
+    Labels are not used.
     """
     random = np.random.default_rng(seed)
     standards = {NONE: training.prior, ALL: Standards.of(features[pool])}
@@ -97,7 +97,7 @@ def later_session(
 def _running(
     features: Floats, order: Ints, test: Ints, training: TrainingStandards
 ) -> tuple[Standards, Ints]:
-    """Standards (len(test), M) and ages (len(test),) at the moment each test row comes."""
+    """Return standards (len(test), M) and ages (len(test),) at each test row."""
     place = {int(row): index for index, row in enumerate(test)}
     statistics = training.statistics()
     mean = np.empty((len(test), features.shape[1]))

@@ -1,4 +1,4 @@
-"""A system trained on tables, that judges counts: what a model file is made from."""
+"""A trained system that judges counts; model files are made from it."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from models.training.systems.system import SessionFeatures, System
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorMapping:
-    """From the counts of each table's sensors to those of the training's, and back.
+    """Map the counts of each table's sensors to the training's sensors, and back.
 
-    As the daemon maps a session's counts: each table by its own mean and spread. A model without
-    session calibration takes the counts as they are.
+    Each table is mapped by its own mean and spread, as the daemon maps a session. A model without a
+    session takes the counts unchanged.
     """
 
     margin: int
-    """Counts outside of the training range that are still taken for seen."""
+    """Counts outside the training range that still pass as seen."""
     tables: TrainingStandards | None = None
-    """Of the counts (fingers * 24,) of each table; every table is mapped to `prior`."""
+    """Standards of the counts (fingers * 24,) of each table; all tables map to `prior`."""
 
     @classmethod
     def of(cls, counts: Numbers, table_of: Ints, *, session: bool) -> SensorMapping:
-        """Of training counts (N, fingers, 24) and the tables (N,) that they are from."""
+        """Return the mapping of training counts (N, fingers, 24), by their tables (N,)."""
         if not session:
             return cls(MARGIN_COUNTS)
         tables = TrainingStandards.of(counts.reshape(len(counts), -1).astype(np.float64), table_of)
@@ -40,14 +40,14 @@ class SensorMapping:
         return cls(SESSION_MARGIN_COUNTS, replace(tables, prior=prior))
 
     def to_training(self, counts: Numbers, table_of: Ints) -> Floats:
-        """Counts (N, fingers, 24) of these tables (N,) as the training's sensors would read."""
+        """Return counts (N, fingers, 24) of tables (N,) as read by the training's sensors."""
         values = counts.astype(np.float64)
         if self.tables is None:
             return values
         return _moved(values, self.tables.each(table_of), self.tables.prior)
 
     def from_training(self, values: Floats, table_of: Ints) -> Floats:
-        """The inverse of `to_training`."""
+        """Return the inverse of `to_training`."""
         if self.tables is None:
             return values
         return _moved(values, self.tables.prior, self.tables.each(table_of))
@@ -55,17 +55,17 @@ class SensorMapping:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trained:
-    """A system and what it was trained on."""
+    """A system with its training data."""
 
     system: System
     fitted: Fitted
     grasps: Grasps
     sensors: SensorMapping
     standards: TrainingStandards | None
-    """Of a session system's features."""
+    """Standards of a session system's features; None for other systems."""
 
     def margins(self, counts: Numbers, table_of: Ints) -> Floats:
-        """Log-odds of slip (N,), uncalibrated, of counts (N, fingers, 24) of known tables (N,)."""
+        """Return uncalibrated log-odds of slip (N,) of counts (N, fingers, 24) and tables (N,)."""
         return self.fitted.margins(_inputs(self.system, self.standards, counts, table_of))
 
     def mapped_counts(self) -> Floats:
@@ -73,13 +73,15 @@ class Trained:
         return self.sensors.to_training(self.grasps.counts, self.grasps.table_of)
 
     def seen(self) -> SeenCounts:
-        """What the training counts look like, for the check of a reading's novelty."""
+        """Description of the training counts, to find readings unlike them."""
         return seen_counts(self.mapped_counts(), self.sensors.margin)
 
 
 def train(system: System, grasps: Grasps, seed: int) -> Trained:
-    """Train a system on these grasps, which have its fingers alone, on one thread.
-    Raises `ValueError` if they are too few."""
+    """Train a system on grasps with only its fingers, on one thread.
+
+    Raises `ValueError` if they are too few.
+    """
     counts, table_of = grasps.counts, grasps.table_of
     session = isinstance(system.input, SessionFeatures)
     standards = TrainingStandards.of(raw_features(counts), table_of) if session else None

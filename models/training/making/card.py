@@ -30,7 +30,7 @@ WEAK_POINTS = (
 )
 
 OWN_LICENCE = "whatever the owner of the tables says"
-"""Of data without a published table."""
+"""Licence of data without a published table."""
 
 
 class ExportedFile(msgspec.Struct, frozen=True):
@@ -48,7 +48,7 @@ class ExportedFile(msgspec.Struct, frozen=True):
 
 
 class Data(msgspec.Struct, frozen=True):
-    """Where the data comes from. Digests and rows stand in the contract."""
+    """Sources of the data. Digests and rows are in the contract."""
 
     licence: str = LICENCE
     repository: str | None = REPOSITORY
@@ -58,7 +58,7 @@ class Data(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, files: Sequence[Dataset]) -> Data:
-        """Of the tables that were trained on or judged by."""
+        """Return the sources of the tables used for training or judging."""
         not_published = tuple(unpublished(files))
         if len(lab_table_names(files)) < len(files):
             return cls(not_published=not_published)
@@ -84,7 +84,7 @@ class Measured(msgspec.Struct, frozen=True):
     calibrated_by: dict[str, Spread]
     """F1 by how the session was calibrated; empty where no session is left out."""
     days: dict[str, DayFigures]
-    """Of the protocol `days`, by group of streams."""
+    """Figures of the protocol `days`, by group of streams."""
 
     @classmethod
     def of(cls, summary: SystemSummary) -> Measured:
@@ -133,8 +133,7 @@ class Card(msgspec.Struct, frozen=True):
     """In the file, fitted on the margins of `calibrated_by`: grasps that were not trained on."""
     calibrated_by: str
     broken: Study | None
-    """What broken electrodes cost, and what is left of that after their repair; None if it was not
-    studied."""
+    """Cost of broken electrodes, before and after their repair; None: not studied."""
     never_seen: NeverSeen
     same_seed_same_margins: bool
     """Training the first fold again gave bit-identical margins."""

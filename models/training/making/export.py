@@ -1,4 +1,4 @@
-"""A trained system into the ONNX file that the daemon runs, proven to judge as it does."""
+"""Export a trained system to an ONNX file, and check that the daemon judges the same with it."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ TOLERANCE = 1e-5
 
 
 class ExportError(Exception):
-    """The exported file does not judge as the trained system does: our bug, nothing is written."""
+    """The exported file judges differently from the system: a bug; no file is written."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parity:
-    """How far the file is from the system it was made from, over `grasps` grasps."""
+    """Difference of a file and its system, over `grasps` grasps."""
 
     grasps: int
     largest_difference: float
-    """Of a probability: file against trainer, before anything was folded or rounded."""
+    """Largest difference of a probability between file and trainer, before any rounding."""
     verdicts_flipped: int
 
 

@@ -1,4 +1,4 @@
-"""From grasp tables to a model file and its card: measure, calibrate, train, export."""
+"""Make a model file and its card from grasp tables: measure, calibrate, train, export."""
 
 from __future__ import annotations
 
@@ -44,8 +44,10 @@ from models.training.making.plan import TrainingPlan
 from models.training.systems.system import SessionFeatures, System, configuration
 
 EXTRA_TRAININGS = 2
-"""Beside the folds: one for the repeatability, one for the model itself. The study of broken
-electrodes, three more, comes last."""
+"""Trainings beside the folds: one for repeatability, one for the model itself.
+
+The study of broken electrodes, three more, comes last.
+"""
 
 
 def make_model(
@@ -101,7 +103,7 @@ def make_model(
 
 
 def _calibrator(summaries: list[SystemSummary]) -> SystemSummary:
-    """What probabilities are calibrated by: new objects, where they were measured."""
+    """Return the summary that calibrates probabilities: of new objects, if measured."""
     return summaries[min(1, len(summaries) - 1)]
 
 
@@ -123,7 +125,7 @@ def _contract(
 
 
 def _confidence(summary: SystemSummary) -> tuple[ConfidenceStep, ...]:
-    """Of few grasps the surest are too few to say how often they are right."""
+    """Return the steps with enough grasps; few grasps do not show how often they are right."""
     judged = summary.folds * summary.test_grasps
     return tuple(
         ConfidenceStep(point.confidence, point.accuracy, point.coverage)
@@ -156,7 +158,7 @@ def _input(system: System, trained: Trained, summaries: list[SystemSummary]) -> 
 
 
 def _sharpness(summaries: list[SystemSummary]) -> tuple[Sharpness, ...]:
-    """How much less sure a young session is than the calibrated model, never more sure."""
+    """Return the temperatures of a young session, which is never surer than a calibrated one."""
     base = _calibrator(summaries).main.temperature
     later = next((s for s in summaries if s.protocol == "days"), None)
     if later is None:

@@ -1,4 +1,4 @@
-"""What one `graspd train` makes, and by which trainings it is measured."""
+"""Plan of one `graspd train`: the model to make, and the trainings that measure it."""
 
 from __future__ import annotations
 
@@ -24,12 +24,14 @@ class TrainingPlan:
     seed: int
     processes: int = 1
     only: EvalProtocol | None = None
-    """Measured by this protocol alone, and without the study of broken electrodes: for a model that
-    is compared and not used."""
+    """Protocol that alone measures the model, without the study of broken electrodes.
+
+    It is for a model that is only compared. None: all protocols.
+    """
     lab_files: tuple[str, ...] = ()
     """File names of the lab tables that are trained on, with their endings."""
     name: str | None = None
-    """Of the model that is made; that of the system and its lab tables unless given."""
+    """Name of the model; None: made from the system and its lab tables."""
 
     @property
     def model(self) -> str:
@@ -40,7 +42,7 @@ class TrainingPlan:
         return re.sub(r"[^A-Za-z0-9._]+", "-", words)[:NAME_MAX].rstrip("-.")
 
     def protocols(self, grasps: Grasps) -> tuple[EvalProtocol, ...]:
-        """By what it is measured: `cv` first; the second, with new objects, calibrates it."""
+        """Return the protocols that measure it: `cv`, then new objects, which calibrate it."""
         if self.only is not None:
             return (self.only,)
         there = {file.name for file in grasps.files}
@@ -52,7 +54,7 @@ class TrainingPlan:
         return ("cv", objects, "session", "days")
 
     def jobs(self, grasps: Grasps) -> list[Job]:
-        """Every training that is judged: the folds of each protocol, in the order of both."""
+        """Return all judged trainings: the folds of each protocol, in order."""
         return [
             job
             for protocol in self.protocols(grasps)
@@ -60,12 +62,12 @@ class TrainingPlan:
         ]
 
     def chosen(self, grasps: Grasps) -> Grasps:
-        """Those of the tables that the model that is kept is trained on."""
+        """Return the grasps of the tables that the kept model is trained on."""
         return grasps.rows(grasps.rows_of(self.system.tables))
 
     @property
     def command(self) -> str:
-        """The command line that repeats it, without the folders of this machine."""
+        """Return the command line that repeats it, without folders of this machine."""
         published = any(table.name in self.system.tables for table in TABLES)
         data = ["--data DIR"] if published else []
         data += [f"--own {shlex.quote(name)}" for name in self.lab_files]

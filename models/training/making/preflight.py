@@ -1,5 +1,7 @@
-"""Check, before training starts, that every training of a plan has enough grasps of both labels,
-and say what its model will not be able to do."""
+"""Check before training that all trainings of a plan have enough grasps of both labels.
+
+It also lists the limits of the resulting model.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,18 @@ from models.training.systems.system import SessionFeatures
 
 FEWEST_FOLDS = 2
 FEW_OBJECTS = 10
-"""The default folds leave out one object each then; the published tables have 41."""
+"""Number of objects at which each default fold leaves out one; published tables have 41."""
 FEW_OF_A_KIND = 20
-"""One grasp less is then five percent of what is known of a kind."""
+"""Number of grasps of a kind at which one grasp is 5 % of the knowledge of it."""
 FEWEST_STANDARD = 2
-"""Grasps of a table that a session model standardises it by: one alone has no spread."""
+"""Fewest grasps of a table for a session model; a single grasp has no spread."""
 
 
 def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
     """Raise `TooFewGraspsError` if a training of the plan lacks grasps of a label.
-    That of a session model also needs `FEWEST_STANDARD` of each table that it is judged by."""
+
+    A session model also needs `FEWEST_STANDARD` grasps of each table that it is judged by.
+    """
     session = isinstance(plan.system.input, SessionFeatures)
     for where, of, train, test in _trainings(plan, grasps):
         slips = int(of.slipped[train].sum())
@@ -45,7 +49,7 @@ def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
 
 
 def enough_folds(plan: TrainingPlan, grasps: Grasps) -> int | None:
-    """The most folds, fewer than the plan's, that these grasps are enough for; None if none are."""
+    """Return the most folds below the plan's for which the grasps suffice; None: none."""
     for folds in range(plan.folds - 1, FEWEST_FOLDS - 1, -1):
         try:
             preflight(dataclasses.replace(plan, folds=folds), grasps)
@@ -69,7 +73,7 @@ def with_enough_folds(plan: TrainingPlan, grasps: Grasps) -> tuple[TrainingPlan,
 
 
 def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
-    """What a model of these grasps will not be able to do, one sentence each."""
+    """Yield the limits of a model trained on these grasps, one sentence each."""
     grasps = plan.chosen(grasps)
     objects, slips = len(set(grasps.objects)), int(grasps.slipped.sum())
     own = lab_table_names(grasps.files)
@@ -99,8 +103,10 @@ def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
 
 
 def _trainings(plan: TrainingPlan, grasps: Grasps) -> Iterator[tuple[str, Grasps, Ints, Ints]]:
-    """Yield each training's name and grasps, and the rows that it trains on and is judged by.
-    A session that is calibrated while it is judged needs no rows of the training."""
+    """Yield each training's name and grasps, and the rows for training and judging.
+
+    A session that is calibrated while it is judged needs no training rows.
+    """
     for protocol in plan.protocols(grasps):
         for split in splits(protocol, grasps, plan.seed, plan.folds):
             alone = protocol == "days" or split.calibration is not None

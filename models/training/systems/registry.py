@@ -1,4 +1,4 @@
-"""Every system that can be trained, by name: its input, its estimator, its recipe."""
+"""All systems that can be trained, by name: input, estimator, recipe."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def image(
     fill: Fill = Fill.NEIGHBOUR_MEAN,
     composition: Composition = Composition.CHANNELS,
 ) -> ImageInput:
-    """An image input; by default the paper's best: D1, neighbour mean, fingers as channels."""
+    """Return an image input; default is the paper's best: D1, neighbour mean, channels."""
     return ImageInput(layout, fill.value, Normalisation.FILLED_IMAGE.value, composition.value)
 
 
@@ -62,7 +62,7 @@ def cnn(
     augmentation: Augmentation | None = None,
     takes: ImageInput = IMAGE,
 ) -> System:
-    """A convolutional network on tactile images, with the figures that the paper gives of it."""
+    """Return a convolutional network on tactile images, with the paper's figures of it."""
     return System(name, description, takes, network, recipe, augmentation, published=published)
 
 
@@ -251,4 +251,4 @@ SYSTEMS = {
     system.name: system
     for system in _PAPER + _LAYOUTS + _COMPOSITIONS + _ELECTRODES + _SESSION + _FEWER_FINGERS
 }
-"""By name, the paper's first. A new system is one more entry here."""
+"""Systems by name, the paper's first. A new system is one more entry here."""

@@ -1,4 +1,4 @@
-"""What a system is: one way from counts to the log-odds of slip, by configuration alone."""
+"""A system: the configuration of one way from counts to the log-odds of slip."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from models.training.data.protocols import EvalProtocol
 from models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
 
 CLIP = 3.0
-"""Standardised session features are cut off here: what is farther out is a sensor that moved."""
+"""Limit of standardised session features; one beyond it comes from a sensor that moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class Member:
 
     estimator: NetworkConfig | ClassicalConfig
     recipe: AnyRecipe | None = None
-    """Of a network."""
+    """Training recipe of a network; None for other estimators."""
     copies: int = 1
-    """How many of it are trained, each from another seed."""
+    """Number of trainings of the member, each with another seed."""
     weight: float = 1.0
-    """Of all copies together."""
+    """Weight of all copies together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,25 +64,25 @@ class PaperFigure:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """One way from counts to a margin, complete but for data and seed."""
+    """One way from counts to a margin, complete except for data and seed."""
 
     name: str
     description: str
     input: SystemInput
     estimator: Estimator
     recipe: AnyRecipe | None = None
-    """Of the network that `estimator` is; None for others."""
+    """Training recipe of the network `estimator`; None for other estimators."""
     augmentation: Augmentation | None = None
     standardise: bool = False
-    """Each value of an input by its own mean and spread in the training, within the model."""
+    """True: the model standardises each input value by its training mean and spread."""
     fingers: tuple[Finger, ...] = FINGERS
     tables: tuple[str, ...] = WHOLE
-    """What the model that is kept is trained on; protocols say for themselves."""
+    """Training tables of the kept model; protocols have their own."""
     published: tuple[PaperFigure, ...] = ()
 
 
 def digest(system: System) -> str:
-    """SHA-256, hexadecimal, of all that decides a fold's result; name and description do not."""
+    """Return the SHA-256 of everything that decides a result, without name and description."""
     parts = configuration(system, "input", "estimator", "recipe", "augmentation", "standardise")
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
@@ -112,7 +112,7 @@ def _with_epochs(recipe: AnyRecipe | None, epochs: int) -> AnyRecipe | None:
 
 
 def _plain(value: object) -> Any:  # noqa: ANN401 - JSON
-    """JSON-like, with the names of the classes: two kinds with the same fields differ."""
+    """Return a value for JSON with class names, so that kinds with equal fields differ."""
     if isinstance(value, tuple):
         return [_plain(part) for part in value]
     if isinstance(value, msgspec.Struct):

@@ -242,7 +242,7 @@ def test_a_subscriber_in_another_process_gets_every_paced_verdict(
 def test_replay_fails_when_nobody_subscribes(tmp_path: Path) -> None:
     result = graspd("replay", "--publish", f"ipc://{tmp_path}/graspd", "--wait", 0.1)
     assert result.returncode == 1
-    assert result.stderr.startswith("graspd: nobody subscribed to ipc://")
+    assert result.stderr.startswith("graspd: no subscriber of ipc://")
 
 
 def peak_memory_kib(recording: Path) -> int:

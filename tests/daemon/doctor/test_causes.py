@@ -88,7 +88,7 @@ def test_a_port_that_is_missing_is_told_with_those_that_there_are(
     ("group", "advice"),
     [
         ("dialout", "sudo usermod -aG dialout $USER, then log in again"),
-        ("root", "install deploy/udev/70-graspd.rules, and plug it in anew"),
+        ("root", "install deploy/udev/70-graspd.rules, and plug it in again"),
     ],
 )
 def test_a_port_that_is_denied_is_told_with_its_group(

@@ -145,7 +145,7 @@ def test_grids_are_the_papers() -> None:
     ("arguments", "message"),
     [
         (["svn"], "no system 'svn': there are cnn0, "),
-        (["cnn1", "--grid"], "none of these systems has a grid"),
+        (["cnn1", "--grid"], "these systems have no grid"),
         (["svm", "--data", "nowhere"], "nowhere: no such folder"),
     ],
 )

@@ -1,0 +1,70 @@
+"""The checker of words finds what it refuses, where it stands, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.words import INSTEAD, check_file, check_subjects, checked_files
+
+SOURCE = '''\
+"""Drop old sweeps.
+
+Of two sweeps, keep the newer."""
+
+LIMIT = 3
+"""Limit, sweeps. Raised but
+for palms."""
+
+# One reading waits so
+# long only if nobody asks.
+def wait(name: str) -> None:
+    """Wait, as far as needed. That `name` is late is no error."""
+    raise ValueError(f"{name}: started anew")
+'''
+
+
+def phrases(path: Path) -> list[tuple[int, str]]:
+    return [(each.line, each.phrase) for each in check_file(path)]
+
+
+def test_phrases_of_python_are_found_with_their_lines(tmp_path: Path) -> None:
+    path = tmp_path / "module.py"
+    path.write_text(SOURCE)
+    assert phrases(path) == [
+        (3, "Of ..."),
+        (6, "but for"),
+        (9, "so long"),
+        (10, "nobody"),
+        (12, "That ..."),
+        (12, "as far as"),
+        (13, "anew"),
+    ]
+
+
+@pytest.mark.parametrize("phrase", INSTEAD)
+def test_each_phrase_is_found_in_a_page(tmp_path: Path, phrase: str) -> None:
+    path = tmp_path / "page.md"
+    path.write_text(f"# Title\n\nThe hand, {phrase.replace(' ', chr(10))} rests.\n")
+    assert phrases(path) == [(3, phrase)]
+
+
+def test_plain_words_and_names_are_let_through(tmp_path: Path) -> None:
+    path = tmp_path / "module.py"
+    path.write_text(
+        '"""Return the newest so. Wait long; what follows is new."""\nso_many = "anew"\n'
+    )
+    assert phrases(path) == []
+
+
+def test_a_subject_may_have_72_characters() -> None:
+    log = f"1a2b3c4 {'x' * 72}\n2b3c4d5 {'y' * 73}\n"
+    (complaint,) = check_subjects(log)
+    assert complaint.startswith("commit 2b3c4d5: subject of 73 characters")
+
+
+def test_source_and_pages_of_the_tree_are_checked() -> None:
+    root = Path(__file__).parents[1]
+    names = {str(path.relative_to(root)) for path in checked_files()}
+    assert {"daemon/cli.py", "README.md", "deploy/bridge/BUILD.md", "models/RESULTS.md"} <= names
