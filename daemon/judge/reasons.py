@@ -143,6 +143,17 @@ class GateState(StrEnum):
     """Nothing touches any more, for a moment."""
 
 
+class FingerState(StrEnum):
+    """State of a finger in a word: free, in touch or sliding."""
+
+    FREE = "free"
+    """It does not touch."""
+    TOUCH = "touch"
+    """It touches, and nothing moves along it more than along a finger that holds."""
+    SLIDE = "slide"
+    """It touches and something moves: the object slides, or the finger presses or lets go."""
+
+
 class GateCause(StrEnum):
     """Why the gate changed its state."""
 
@@ -202,3 +213,5 @@ class Moment(NamedTuple):
     """How each finger moves, in units of its noise; None where that is not known."""
     motion_limits: dict[Finger, float] | None = None
     """Largest motion of a finger that is still."""
+    fingers: dict[Finger, FingerState | None] | None = None
+    """State of each finger; None: not known."""

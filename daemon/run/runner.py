@@ -17,12 +17,14 @@ from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets, plan
 from daemon.run.loop import Ended, Loop, LoopTiming
 from daemon.run.reload import Reload
+from daemon.scene.drivers import ReplayTactile
 from drivers.base import DriverError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.realtime import RealtimeMode
+    from daemon.run.replaying import Controller
     from daemon.run.systemd import Systemd
     from daemon.trust.trust import Trust
 
@@ -62,6 +64,15 @@ def enter_realtime(running: scene.Scene, stack: ExitStack) -> RealtimeMode | Non
     from daemon.run.realtime import RealtimeMode  # only where a scene wants realtime
 
     return stack.enter_context(RealtimeMode(running.realtime))
+
+
+def _controller(wanted: scene.Scene) -> Controller | None:
+    """Return what tells recorded outcomes, if the scene wants it."""
+    if not isinstance(wanted.tactile, ReplayTactile) or not wanted.tactile.outcomes:
+        return None
+    from daemon.run.replaying import Controller  # only where a scene wants it
+
+    return Controller(only_lifted=True)
 
 
 class Runner:
@@ -159,8 +170,10 @@ class Runner:
             around.keep_session()
             realtime = enter_realtime(running, stack)
             around.record()
+            controller = _controller(running)
             companions = [
-                *(self._reload, self._manager, *around.companions, self._printer, realtime)
+                *(self._reload, self._manager, *around.companions),
+                *(self._printer, realtime, controller),
             ]
             loop = Loop(
                 parts.drivers,

@@ -110,6 +110,8 @@ class ReplayTactile(Section):
     """Readings per second of a grasp table, which has no times."""
     loop: bool = False
     """True: start again at the end, without end."""
+    outcomes: bool = False
+    """True: tell the recorded outcome of each lift that a verdict allows, as a controller does."""
     strict: bool = False
     """True: stop at the first value that is not a 12-bit count."""
     faults: ReplayFaultsSection = ReplayFaultsSection()

@@ -27,6 +27,8 @@ DEMO_DAY = Path(__file__).parent / "demo" / "synthetic_day.csv"
 """Table of synthetic grasps of sensors that drift, drawn by the same module."""
 DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
 """Stream of whole synthetic grasps, made by `drivers.twins.grasps.whole_grasps`."""
+SHOW_RECORDING = Path(__file__).parent / "demo" / "synthetic_show.csv"
+"""Stream of synthetic grasps that are each held for two seconds, for people to watch."""
 IGNORED_COLUMNS_LOGGED = 10
 """Most names of ignored columns in a log line."""
 

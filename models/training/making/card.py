@@ -141,6 +141,8 @@ class Card(msgspec.Struct, frozen=True):
     """Makes the file again, byte for byte on a machine of the same kind."""
     made_with: dict[str, str]
     weak_points: tuple[str, ...]
+    worth: dict[str, Any] | None = None
+    """Results of `graspd report worth --card` for networks of this system; None: none."""
 
 
 def weak_points(summaries: Sequence[SystemSummary], grasps: Grasps) -> tuple[str, ...]:
