@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-SOURCE = ("daemon", "drivers", "models", "deploy/clients/python")
+SOURCE = ("daemon", "drivers", "models", "deploy")
 """Folders of Python whose docstrings, comments and messages are checked."""
 PAGES = ("README.md", "deploy/**/*.md", "models/*.md")
 SUBJECT_MAX = 72

@@ -27,7 +27,7 @@ MESSAGE_MAX = 320
 """Longest error, characters: it may quote what the server sent."""
 
 UPSTREAM = "https://raw.githubusercontent.com/3dperceptionlab/biotacsp-stability-set-v2/master"
-"""Where GitHub serves the files of `models.bts3.REPOSITORY`."""
+"""Address of the files of `models.bts3.REPOSITORY` at GitHub."""
 
 
 class DataError(Exception):

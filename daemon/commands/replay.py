@@ -51,7 +51,7 @@ NO_SILENCE_NS = 3_600_000_000_000
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
-DEMO_TITLE = "A day on which the sensors drift. All grasps are synthetic: nobody ever grasped them."
+DEMO_TITLE = "A day on which the sensors drift. All grasps are synthetic: no hand made them."
 RISK_OPTIONS = ("max_slip_when_stable", "warm_up", "explore")
 
 

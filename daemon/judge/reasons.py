@@ -144,7 +144,7 @@ class GateState(StrEnum):
 
 
 class FingerState(StrEnum):
-    """What a finger feels, in a word."""
+    """State of a finger in a word: free, in touch or sliding."""
 
     FREE = "free"
     """It does not touch."""
@@ -214,4 +214,4 @@ class Moment(NamedTuple):
     motion_limits: dict[Finger, float] | None = None
     """Largest motion of a finger that is still."""
     fingers: dict[Finger, FingerState | None] | None = None
-    """What each finger feels; None where that is not known."""
+    """State of each finger; None: not known."""

@@ -43,11 +43,11 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Reliability:
-    """What `p_slip` is worth after outcomes, with scales that its own objects did not fit."""
+    """Reliability of `p_slip` after outcomes, with scales fitted without its own objects."""
 
     parts: list[Part]
     slope: float
-    """Of outcomes on log-odds; 1 is honest."""
+    """Slope of outcomes on log-odds; 1 is honest."""
     sessions: tuple[float, ...]
     """The same of single sessions, at the quantiles `SPREAD`."""
     scales: list[float]

@@ -43,7 +43,7 @@ from models.zoo import read_card
 ALLOWED: Final = 0.05
 TARGETS: Final = (0.02, ALLOWED, 0.1, 0.2)
 WARM_UP, EXPLORE = 50, 0.05
-"""Of the scene's `[risk]`, as it is unless it is set."""
+"""Defaults of the scene's `[risk]`."""
 WARM_UPS: Final = (0, 20, WARM_UP, 100)
 """Lengths of the warm-up that are compared, outcomes."""
 ALL_DAYS: Final = "all"
@@ -79,7 +79,7 @@ Curves = dict[str, list[WorthPoint]]
 
 @dataclass(frozen=True, slots=True)
 class RiskFigures:
-    """What became of a target in the sessions of one day, as fractions."""
+    """Results of a target in the sessions of one day, as fractions."""
 
     target: float
     warm_up: int
@@ -87,11 +87,11 @@ class RiskFigures:
     day: str
     sessions: int
     kept: float
-    """Of all grasps that held, mean of the sessions."""
+    """Share of `stable` among the grasps that held, mean of the sessions."""
     slips: float
-    """Of all that was called stable."""
+    """Share of slips among all `stable` grasps."""
     above: float
-    """Of the sessions: those of which more than the target slipped."""
+    """Share of the sessions in which more than the target slipped."""
     supervised: float
     """Lifts under supervision that a session asks for, mean of the sessions; no fraction."""
 
@@ -117,7 +117,7 @@ class Worth:
     risk: list[RiskFigures]
     """By target and day."""
     warm_up: list[RiskFigures]
-    """Of `ALLOWED` by length of the warm-up, all days together."""
+    """Results of `ALLOWED` by length of the warm-up, all days together."""
     days: list[DayF1]
     reliability: Reliability
 

@@ -105,7 +105,7 @@ class Verdict(_Message, frozen=True, kw_only=True):
     motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
     """Most motion of a finger that is still."""
     fingers: Annotated[dict[Finger, FingerState | None], _HAND] | None = None
-    """What each finger feels; null where that is not known. Null with a null `gate`."""
+    """State of each finger; null: not known. Null with a null `gate`."""
 
 
 class GateMessage(_Message, frozen=True, kw_only=True):

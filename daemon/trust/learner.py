@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 TEMPERATURE: Final = 1.5
 """Divisor of the model's margin; networks are too sure of another day's grasps."""
 SCALE: Final = 1.6
-"""What moderated log-odds are multiplied by, so that of the grasps with a `p_slip` of 0.1 a tenth
-slips: they are timid by this factor on days, objects and poses that no network saw. Fitted on the
-sessions of three quarters of the objects it is 1.61 to 1.69; with it the slope of outcomes on
-log-odds is 1.00 on the others (`graspd report worth`, `worth` on the card of `small-session`)."""
+"""Factor of moderated log-odds, which are too timid on days, objects and poses that are new.
+
+With it, a tenth of the grasps with a `p_slip` of 0.1 slips. Fitted on the sessions of three
+quarters of the objects it is 1.61 to 1.69. The slope of outcomes on log-odds is then 1.00 on the
+others (`graspd report worth`, `worth` on the card of `small-session`).
+"""
 MARGIN_MAX: Final = 30.0
 """Larger margins, log-odds, say no more: the logarithm of the smallest probability that a network's
 float32 output is taken for."""

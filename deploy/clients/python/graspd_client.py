@@ -105,7 +105,7 @@ class Decision(str, Enum):  # noqa: UP042 - StrEnum needs Python 3.11
 
 
 class FingerState(str, Enum):  # noqa: UP042 - StrEnum needs Python 3.11
-    """What a finger feels; equal to the wire's word and printed as it."""
+    """State of a finger; equal to the wire's word and printed like it."""
 
     FREE = "free"
     TOUCH = "touch"
@@ -199,7 +199,7 @@ class LiftAnswer:
 
 @dataclass(frozen=True)
 class SlideAnswer:
-    """What the fingers felt during a lift. True in an `if` exactly when it is to be stopped."""
+    """Answer about a lift by its fingers. True in an `if` exactly when it must be stopped."""
 
     verdict: Verdict
     """The newest; its `fingers` and `reasons` say what is known."""

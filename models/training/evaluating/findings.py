@@ -1,4 +1,4 @@
-"""What the tables of RESULTS.md say, with their figures."""
+"""Findings from the tables of RESULTS.md, with their figures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FINDINGS = (
     "{svm-session/session}, which is {svm-session/session/difference} to `cnn1`; in `days`, from "
     "nothing, `small-session` {small-session/days}.",
 )
-"""What the tables say. A figure is `SYSTEM/PROTOCOL`, F1, or the part of it that comes after; a
+"""Sentences on the tables. A figure is `SYSTEM/PROTOCOL`, F1, or the part of it that comes after; a
 finding without all of its figures is left out. Read the words again when the figures change."""
 HOW_SURE = (
     "How sure: one hand, 41 objects, three tables. Folds share grasps, so standard errors of "

@@ -142,7 +142,7 @@ class Card(msgspec.Struct, frozen=True):
     made_with: dict[str, str]
     weak_points: tuple[str, ...]
     worth: dict[str, Any] | None = None
-    """What `graspd report worth --card` measured of networks of this system; None: nothing."""
+    """Results of `graspd report worth --card` for networks of this system; None: none."""
 
 
 def weak_points(summaries: Sequence[SystemSummary], grasps: Grasps) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ Learnt = list[NDArray[np.generic]]
 
 
 def grasps(number: int) -> NDArray[np.uint16]:
-    """Counts of grasps that nobody ever grasped, shape (number, 3, 24)."""
+    """Counts of made-up grasps, shape (number, 3, 24)."""
     drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(1), number)
     return drawn.counts.reshape(number, 3, 24)
 
