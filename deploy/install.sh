@@ -253,7 +253,7 @@ environment() {
     digest=$(sha256sum <"$scratch/inputs")
     current=$root$prefix/venv
     if [ -z "$rebuild" ] && [ "$(cat "$current/inputs.sha256" 2>/dev/null)" = "$digest" ] &&
-        "$current/bin/python" -I -m daemon --version >/dev/null 2>&1; then
+        "$current/bin/python" -I -m graspd --version >/dev/null 2>&1; then
         return
     fi
     say "making a virtual environment in $prefix"
@@ -262,7 +262,7 @@ environment() {
     chmod 755 "$new"
     "$python" -I -m venv "$new" || fail "no virtual environment; nothing has changed"
     packages || fail "pip failed; nothing has changed"
-    "$new/bin/python" -I -m daemon --version >/dev/null ||
+    "$new/bin/python" -I -m graspd --version >/dev/null ||
         fail "the new graspd does not start; nothing has changed"
     settle
     printf '%s\n' "$digest" >"$new/inputs.sha256"

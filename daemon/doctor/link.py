@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
-from drivers.base import DeviceFault, Fact, LinkCause
+from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
+from graspd.drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
 """Share of the nominal rate below which the link is slow."""

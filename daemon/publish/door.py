@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Final
 
 import zmq
 
-from daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.listener import Listener, PublishError
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
-    from daemon.process.signals import StopSignal
+    from graspd.daemon.process.signals import StopSignal
 
 log = logging.getLogger("graspd")
 

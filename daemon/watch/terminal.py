@@ -10,9 +10,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daemon.process.text import printable
-from daemon.watch.fingers import FingerImage, FingerMotion
-from daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
+from graspd.daemon.process.text import printable
+from graspd.daemon.watch.fingers import FingerImage, FingerMotion
+from graspd.daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
 
 STYLES = {
     Tone.STABLE: "bold #ffffff on #2da44e",

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision
-from drivers.base import JointReading, TactileReading
-from drivers.twins.grasps.grasp_script import EndPoint, Timetable
-from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.whole_grasps import (
+from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision
+from graspd.drivers.base import JointReading, TactileReading
+from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
+from graspd.drivers.twins.grasps.grasps import recorded_counts
+from graspd.drivers.twins.grasps.whole_grasps import (
     GraspRow,
     Sampling,
     WholeGrasps,
     rest_above,
 )
-from models.runtime import TactileModel
+from graspd.models.runtime import TactileModel
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
 
 TABLES = ("palm_down", "palm_side")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import zmq
 
-from daemon.publish.keys import load_pair, make
+from graspd.daemon.publish.keys import load_pair, make
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.clients.bench import Daemon, free_endpoint
 
@@ -96,7 +96,9 @@ def removed_key(plan: Plan) -> Outcome:
             with clients.connect(context, "leaving") as again:
                 anew += _hears(again, QUIET_S)
         tried += 1
-    happened = f"{former} removed keys went on hearing, {anew} got in again, {lost} others were lost"
+    happened = (
+        f"{former} removed keys went on hearing, {anew} got in again, {lost} others were lost"
+    )
     return Outcome(tried, happened, held=not (former or anew or lost))
 
 
