@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from models import zoo
+from graspd.models import zoo
 
 ROOT = Path(__file__).parents[1]
 PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "deploy/MEASURED.md")}

@@ -18,11 +18,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from daemon.measure.reliability import reliability_table
-from daemon.measure.streams import Life, Stream, live, streams
-from daemon.process.text import complain, markdown_table, progress, write_lines
-from daemon.trust.risk import RiskLimits
-from models.training.data.datasets import DatasetError, read_all
+from graspd.daemon.measure.reliability import reliability_table
+from graspd.daemon.measure.streams import Life, Stream, live, streams
+from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
+from graspd.daemon.trust.risk import RiskLimits
+from graspd.models.training.data.datasets import DatasetError, read_all
 
 ALLOWED: Final = 0.05
 TARGETS: Final = (ALLOWED, 0.1)

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from models.training.data.protocols import PROTOCOLS
-from models.training.evaluating.summaries import SystemSummary
-from models.training.fitting.standards import SESSION_VARIANTS
+from graspd.models.training.data.protocols import PROTOCOLS
+from graspd.models.training.evaluating.summaries import SystemSummary
+from graspd.models.training.fitting.standards import SESSION_VARIANTS
 
 FORMATS = ("png", "svg")
 DPI = 130
