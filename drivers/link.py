@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from enum import StrEnum
 
-from drivers.base import Fact, LinkCause
+from graspd.drivers.base import Fact, LinkCause
 
 BACKOFF_FIRST_S = 0.05
 BACKOFF_FACTOR = 1.8

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from models.layout import ELECTRODES
+from graspd.models.layout import ELECTRODES
 
 METADATA_KEY = "graspd"
 CLASSES = ("stable", "slip")
@@ -53,7 +53,7 @@ class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the training counts look like; `models.electrodes` says what follows for a reading."""
+    """What the training counts look like; `graspd.models.electrodes` says what follows for a reading."""
 
     low: tuple[tuple[Count, ...], ...]
     """Smallest count of each electrode, shape (fingers, 24)."""

@@ -15,7 +15,7 @@ from operator import gt
 import numpy as np
 from numpy.typing import NDArray
 
-from models.contract import SeenCounts
+from graspd.models.contract import SeenCounts
 
 ROUNDING = 1e-9
 """Share of a limit within which `Electrodes.plain_square` leaves it open whether it is kept: some

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from models.contract import (
+from graspd.models.contract import (
     FEATURES_PER_FINGER,
     CountsInput,
     ImageInput,
@@ -16,7 +16,7 @@ from models.contract import (
     SessionInput,
     VectorInput,
 )
-from models.layout import ELECTRODES, LAYOUTS
+from graspd.models.layout import ELECTRODES, LAYOUTS
 
 Floats = NDArray[np.float64]
 SPREAD_FLOOR_COUNTS = 1.0
@@ -49,7 +49,7 @@ def builder(wanted: Input, fingers: int) -> InputBuilder:
     """The builder of what a contract asks for. Raises `ModelError` for what is not known."""
     match wanted:
         case ImageInput():
-            from models.tactile_image import (  # only where it is needed
+            from graspd.models.tactile_image import (  # only where it is needed
                 Composition,
                 Fill,
                 Normalisation,

@@ -9,9 +9,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from models import trial, zoo
-from models.contract import ModelError
-from models.runtime import ModelFile, read
+from graspd.models import trial, zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import ModelFile, read
 
 SYSTEM_FOLDER = Path("/var/lib/graspd/models")
 """Looked into by everybody; the service's user has no other."""

@@ -10,9 +10,9 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from models import zoo
-from models.contract import METADATA_KEY, OUTPUT_NAME, ModelContract, ModelError
-from models.inputs import InputBuilder, builder
+from graspd.models import zoo
+from graspd.models.contract import METADATA_KEY, OUTPUT_NAME, ModelContract, ModelError
+from graspd.models.inputs import InputBuilder, builder
 
 MAX_MODEL_BYTES = 256 * 2**20
 """A larger file is no model of this kind: the published CNN1 has 12 MB."""
@@ -34,7 +34,7 @@ class TactileModel:
 
     def __init__(self, path: Path, tried: ModelFile | None = None) -> None:
         """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent.
-        `tried` is its content, where that has been read and checked (`models.trial`)."""
+        `tried` is its content, where that has been read and checked (`graspd.models.trial`)."""
         file = read(path) if tried is None else tried
         self.path = path
         self.sha256 = file.sha256
@@ -83,7 +83,7 @@ def read(path: Path) -> ModelFile:
 
 def check_operators(path: Path, data: bytes) -> None:
     """Raise `ModelError` unless the content is the whole model, and must come to an end."""
-    from models import onnx_file  # which no model of the zoo needs
+    from graspd.models import onnx_file  # which no model of the zoo needs
 
     try:
         onnx_file.check(data)

@@ -7,8 +7,8 @@ from typing import Any, Final, Self
 
 import msgspec
 
-from drivers.base import FINGERS
-from models.session_statistics import SessionState
+from graspd.drivers.base import FINGERS
+from graspd.models.session_statistics import SessionState
 
 _TEXTS: Final = ("boot_id", "model", "model_sha256", "judge", "trust")
 """Fields that are texts, or bytes in base64; the others are JSON."""
@@ -33,13 +33,13 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
     wall_minus_monotonic_ns: int = 0
     """Log times less the daemon's monotonic times, ns."""
     judge: bytes = b""
-    """From `daemon.judge.memory.encode`; empty if not known."""
+    """From `graspd.daemon.judge.memory.encode`; empty if not known."""
     axis_ns: int = 0
     """`t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
     session: SessionState | None = None
     """None if the model needs none."""
     trust: bytes = b""
-    """From `daemon.trust.trust.encode`; empty if nothing learns."""
+    """From `graspd.daemon.trust.trust.encode`; empty if nothing learns."""
     says_judged: bool = True
     """True if the file has `judged` messages."""
 

@@ -1,5 +1,5 @@
 """The scene: one TOML file that names what the hand has, read and checked."""
 
-from daemon.scene.scene import Scene, SceneError, load, parse
+from graspd.daemon.scene.scene import Scene, SceneError, load, parse
 
 __all__ = ["Scene", "SceneError", "load", "parse"]

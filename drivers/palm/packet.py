@@ -13,17 +13,17 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from drivers.base import ELECTRODES
-from drivers.udp.driver import DatagramCounters
+from graspd.drivers.base import ELECTRODES
+from graspd.drivers.udp.driver import DatagramCounters
 
 CYCLE_NS = 1_000_000
 """The palm makes one packet per millisecond."""
 SENSORS = 37
-"""Words of `sensors`, of which 0..25 are Hall sensors (`drivers.palm.calibration`)."""
+"""Words of `sensors`, of which 0..25 are Hall sensors (`graspd.drivers.palm.calibration`)."""
 MOTOR_BYTES: Final = 8 + 10 * 4
 """Behind `which_motors`: two masks, and the records of the even or the odd ones of 20 motors."""
 TACTILE_FINGERS = 5
-"""Tactile slots, in the order of `drivers.base.FINGERS`."""
+"""Tactile slots, in the order of `graspd.drivers.base.FINGERS`."""
 
 COMMAND_EMPTY: Final = 0
 """`command` of a packet for which the palm was too late: all zeros."""
@@ -101,7 +101,7 @@ class PalmPacket:
     tactile_valid: int
     """Bit 0 first finger ... bit 4 thumb."""
     tactile: tuple[TactileSlot, ...]
-    """5 slots, in the order of `drivers.base.FINGERS`."""
+    """5 slots, in the order of `graspd.drivers.base.FINGERS`."""
 
     def to_bytes(self) -> bytes:
         """Return the packet as the palm sends it, with zeros in the rest. Raises `ValueError`."""

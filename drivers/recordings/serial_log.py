@@ -1,6 +1,6 @@
 """The link log of a serial line: its bytes with their times, and what the bridge says in them.
 
-Each record is a frame of `drivers.spi.messages`: type 1 for bytes from the device, 2 for bytes to
+Each record is a frame of `graspd.drivers.spi.messages`: type 1 for bytes from the device, 2 for bytes to
 it, 3 for the port having been opened; payload `t: u64` (monotonic ns) and the bytes. So a reader
 finds the next record after any damage.
 """
@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers.base import Reading
-from drivers.link import LinkState
-from drivers.recordings.csv_rows import open_recording
-from drivers.spi.conversation import Conversation
-from drivers.spi.line import LineEvent
-from drivers.spi.messages import FrameParser, encode_frame
+from graspd.drivers.base import Reading
+from graspd.drivers.link import LinkState
+from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.spi.conversation import Conversation
+from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.messages import FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960
 """Bytes of one record: a frame has 1024 at most. What came at once is cut into several."""

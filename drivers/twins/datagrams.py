@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterable
 
-from drivers.udp.receiver import Endpoint
+from graspd.drivers.udp.receiver import Endpoint
 
 BEHIND_MAX_NS = 100_000_000
 """A sender that is further behind its schedule, ns, starts a new one instead of catching up."""

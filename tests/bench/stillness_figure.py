@@ -13,7 +13,7 @@ from typing import Final
 
 from matplotlib.figure import Figure
 
-from models.training.evaluating.style import BLUE, OLIVE, style, to_svg
+from graspd.models.training.evaluating.style import BLUE, OLIVE, style, to_svg
 from tests.conftest import ROOT
 
 PAGE: Final = ROOT / "deploy" / "JUDGING.md"

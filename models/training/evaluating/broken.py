@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.metrics import f1_score
 
-from models.electrodes import Electrodes
-from models.training.arrays import Bools, Numbers
-from models.training.data.datasets import COUNT_MAX, Grasps
-from models.training.data.protocols import fold_seed, folds_of
-from models.training.fitting.trained import Trained, train
-from models.training.systems.system import System
+from graspd.models.electrodes import Electrodes
+from graspd.models.training.arrays import Bools, Numbers
+from graspd.models.training.data.datasets import COUNT_MAX, Grasps
+from graspd.models.training.data.protocols import fold_seed, folds_of
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.systems.system import System
 
 FOLDS, JUDGED_FOLDS = 10, 3
 """Of ten stratified folds, three are judged: enough to tell one point from twenty."""
 NUMBERS = (1, 2, 4, 8, 12)
 LOOKED_FOR_MAX = 13
 """Broken electrodes of a reading that are looked for at most: one more than the daemon repairs in a
-hand (`BROKEN_MAX` of `daemon.judge.health`, 12). A reading with 13 is refused."""
+hand (`BROKEN_MAX` of `graspd.daemon.judge.health`, 12). A reading with 13 is refused."""
 
 Breakage = Callable[[Numbers, np.random.Generator], Numbers]
 KINDS: dict[str, Breakage] = {

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.contract import SeenCounts
-from models.electrodes import NoveltyCheck
-from models.training.arrays import Numbers
-from models.training.data.datasets import COUNT_MAX
+from graspd.models.contract import SeenCounts
+from graspd.models.electrodes import NoveltyCheck
+from graspd.models.training.arrays import Numbers
+from graspd.models.training.data.datasets import COUNT_MAX
 
 MARGIN_COUNTS = 100
 """Beyond the training range still taken for seen: wide enough for held-out grasps of the same
