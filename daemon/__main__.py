@@ -1,4 +1,4 @@
-"""The process `graspd`, also `python -m daemon`. Ctrl-C never ends in a traceback."""
+"""The process `graspd`, also `python -m graspd`. Ctrl-C never ends in a traceback."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def main() -> int:
         if heeded:
             signal.signal(signal.SIGINT, _leave_at_once)
         try:
-            from daemon.process.streams import guarded
+            from graspd.daemon.process.streams import guarded
 
             return guarded(lambda: _run(heeded))
         finally:
@@ -29,10 +29,10 @@ def main() -> int:
 
 
 def _run(heeded: bool) -> int:
-    from daemon.process import set_up_libraries
+    from graspd.daemon.process import set_up_libraries
 
     set_up_libraries()
-    from daemon.cli import parse
+    from graspd.daemon.cli import parse
 
     command = parse()
     gc.freeze()  # a search of all modules would stop the loop for 30 ms

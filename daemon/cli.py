@@ -16,43 +16,55 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from daemon import __version__
-from daemon.commands.arguments import Parser
-from daemon.process import logs
-from daemon.process.extras import needs
-from daemon.process.text import complain
+from graspd.daemon import __version__
+from graspd.daemon.commands.arguments import Parser
+from graspd.daemon.process import logs
+from graspd.daemon.process.extras import needs
+from graspd.daemon.process.text import complain
 
 COMMANDS = {
-    "run": ("daemon.commands.run", "run the daemon on a scene"),
-    "replay": ("daemon.commands.replay", "judge recordings and print the verdicts"),
-    "watch": ("daemon.commands.watch", "see it live, in a terminal (extra: watch) or a browser"),
-    "scene": ("daemon.commands.texts", "print an example scene, or what each of its keys means"),
-    "check": ("daemon.commands.check", "say whether a scene is right and what it needs"),
+    "run": ("graspd.daemon.commands.run", "run the daemon on a scene"),
+    "replay": ("graspd.daemon.commands.replay", "judge recordings and print the verdicts"),
+    "watch": (
+        "graspd.daemon.commands.watch",
+        "see it live, in a terminal (extra: watch) or a browser",
+    ),
+    "scene": (
+        "graspd.daemon.commands.texts",
+        "print an example scene, or what each of its keys means",
+    ),
+    "check": ("graspd.daemon.commands.check", "say whether a scene is right and what it needs"),
     "doctor": (
-        "daemon.commands.doctor",
+        "graspd.daemon.commands.doctor",
         "look at hardware, model and privileges for what is wrong",
     ),
-    "twin": ("daemon.commands.twin", "stand in for a bridge, a CAN board or a palm"),
-    "data": ("daemon.commands.data", "get the real grasp recordings"),
-    "schema": ("daemon.commands.texts", "print the JSON Schema of the messages"),
-    "models": ("daemon.commands.models", "list the models and show their cards"),
-    "session": ("daemon.commands.session", "show, reset or seed what is known of the sensors"),
+    "twin": ("graspd.daemon.commands.twin", "stand in for a bridge, a CAN board or a palm"),
+    "data": ("graspd.daemon.commands.data", "get the real grasp recordings"),
+    "schema": ("graspd.daemon.commands.texts", "print the JSON Schema of the messages"),
+    "models": ("graspd.daemon.commands.models", "list the models and show their cards"),
+    "session": (
+        "graspd.daemon.commands.session",
+        "show, reset or seed what is known of the sensors",
+    ),
     "export-grasps": (
-        "daemon.commands.export_grasps",
+        "graspd.daemon.commands.export_grasps",
         "make a grasp table of what was recorded, for train (extra: record)",
     ),
-    "keys": ("daemon.commands.keys", "make and list the keys of those who may connect by TCP"),
-    "train": ("models.training.commands.train", "train and export a model (extra: train)"),
+    "keys": (
+        "graspd.daemon.commands.keys",
+        "make and list the keys of those who may connect by TCP",
+    ),
+    "train": ("graspd.models.training.commands.train", "train and export a model (extra: train)"),
     "evaluate": (
-        "models.training.commands.evaluate",
+        "graspd.models.training.commands.evaluate",
         "measure how good systems are (extra: train)",
     ),
     "report": (
-        "daemon.commands.report",
+        "graspd.daemon.commands.report",
         "measure error, time and exactness of the models (extras: train, report)",
     ),
-    "completion": ("daemon.commands.texts", "print what makes a shell complete commands"),
-    "manual": ("daemon.commands.texts", "print the manual page: graspd manual | man -l -"),
+    "completion": ("graspd.daemon.commands.texts", "print what makes a shell complete commands"),
+    "manual": ("graspd.daemon.commands.texts", "print the manual page: graspd manual | man -l -"),
 }
 """Commands by name: a module with `add_arguments(parser)` and `run(args) -> int`, and help."""
 EXTRAS = {
@@ -68,7 +80,7 @@ WRONG = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code. `daemon.__main__` sets up the process."""
+    """Run one command and return its exit code. `graspd.daemon.__main__` sets up the process."""
     return parse(arguments)()
 
 

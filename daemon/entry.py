@@ -25,7 +25,7 @@ def main() -> int:
     if problem is not None:
         sys.stderr.write(f"graspd: {problem}\n")
         return WRONG
-    from daemon.__main__ import main as graspd
+    from graspd.daemon.__main__ import main as graspd
 
     return graspd()
 

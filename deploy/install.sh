@@ -253,7 +253,7 @@ environment() {
     digest=$(sha256sum <"$scratch/inputs")
     current=$root$prefix/venv
     if [ -z "$rebuild" ] && [ "$(cat "$current/inputs.sha256" 2>/dev/null)" = "$digest" ] &&
-        "$current/bin/python" -I -m daemon --version >/dev/null 2>&1; then
+        "$current/bin/python" -I -m graspd --version >/dev/null 2>&1; then
         return
     fi
     say "making a virtual environment in $prefix"
@@ -280,7 +280,7 @@ environment() {
 
 # The first line of graspd --version, such as "graspd 0.1.0".
 version_of() {
-    "$1/bin/python" -I -m daemon --version >"$scratch/version" || return 1
+    "$1/bin/python" -I -m graspd --version >"$scratch/version" || return 1
     sed -n 1p "$scratch/version"
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from enum import StrEnum
 
-from drivers.base import Fact, LinkCause
+from graspd.drivers.base import Fact, LinkCause
 
 BACKOFF_FIRST_S = 0.05
 """Wait after the first failure, s: a board that resets is back in a moment."""

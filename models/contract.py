@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from models.layout import ELECTRODES
+from graspd.models.layout import ELECTRODES
 
 METADATA_KEY = "graspd"
 CLASSES = ("stable", "slip")
@@ -53,7 +53,7 @@ class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Description of the training counts, used by `models.electrodes`."""
+    """Description of the training counts, used by `graspd.models.electrodes`."""
 
     low: tuple[tuple[Count, ...], ...]
     """Smallest count of each electrode, shape (fingers, 24)."""

@@ -13,7 +13,7 @@ from operator import gt
 import numpy as np
 from numpy.typing import NDArray
 
-from models.contract import SeenCounts
+from graspd.models.contract import SeenCounts
 
 ROUNDING = 1e-9
 """Distance from a limit, as a share of it, at which `Electrodes.plain_square` does not decide.

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from models.contract import (
+from graspd.models.contract import (
     FEATURES_PER_FINGER,
     CountsInput,
     ImageInput,
@@ -16,7 +16,7 @@ from models.contract import (
     SessionInput,
     VectorInput,
 )
-from models.layout import ELECTRODES, LAYOUTS
+from graspd.models.layout import ELECTRODES, LAYOUTS
 
 Floats = NDArray[np.float64]
 SPREAD_FLOOR_COUNTS = 1.0
@@ -54,7 +54,7 @@ def builder(kind: Input, fingers: int) -> InputBuilder:
     """Return the builder that a contract asks for. Raises `ModelError` for an unknown one."""
     match kind:
         case ImageInput():
-            from models.tactile_image import (  # only where it is needed
+            from graspd.models.tactile_image import (  # only where it is needed
                 Composition,
                 Fill,
                 Normalisation,

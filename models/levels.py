@@ -11,8 +11,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from models.layout import D1, ELECTRODES
-from models.tactile_image import Fill, fill_matrix
+from graspd.models.layout import D1, ELECTRODES
+from graspd.models.tactile_image import Fill, fill_matrix
 
 HEIGHT, WIDTH = D1.shape
 FULL = 100

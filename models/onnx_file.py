@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from models.contract import ModelError
+from graspd.models.contract import ModelError
 
 FIELDS_MAX = 4_000_000
 """Most fields of a file; a forest of 34,000 nodes has 350,000."""

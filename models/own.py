@@ -11,9 +11,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from models import trial, zoo
-from models.contract import ModelError
-from models.runtime import ModelFile, read
+from graspd.models import trial, zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import ModelFile, read
 
 SYSTEM_FOLDER = Path("/var/lib/graspd/models")
 """Folder of added models for all users; the service's user has only this one."""

@@ -10,9 +10,9 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from models import zoo
-from models.contract import METADATA_KEY, OUTPUT_NAME, ModelContract, ModelError
-from models.inputs import InputBuilder, builder
+from graspd.models import zoo
+from graspd.models.contract import METADATA_KEY, OUTPUT_NAME, ModelContract, ModelError
+from graspd.models.inputs import InputBuilder, builder
 
 MAX_MODEL_BYTES = 256 * 2**20
 """Largest model file, bytes; the published CNN1 has 12 MB."""
@@ -37,7 +37,7 @@ class TactileModel:
     def __init__(self, path: Path, tried: ModelFile | None = None) -> None:
         """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent.
 
-        `tried`: its content, if `models.trial` has read and checked it.
+        `tried`: its content, if `graspd.models.trial` has read and checked it.
         """
         file = read(path) if tried is None else tried
         self.path = path
@@ -87,7 +87,7 @@ def read(path: Path) -> ModelFile:
 
 def check_operators(path: Path, data: bytes) -> None:
     """Raise `ModelError` unless the file is complete and its operators surely end."""
-    from models import onnx_file  # models of the zoo do not need it
+    from graspd.models import onnx_file  # models of the zoo do not need it
 
     try:
         onnx_file.check(data)

@@ -12,8 +12,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inputs import scale_of
-from models.layout import D1, ELECTRODES, Layout
+from graspd.models.inputs import scale_of
+from graspd.models.layout import D1, ELECTRODES, Layout
 
 
 class Fill(StrEnum):

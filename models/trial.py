@@ -11,9 +11,9 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
-from models import zoo
-from models.contract import ModelError
-from models.runtime import ModelFile, TactileModel, check_operators, read
+from graspd.models import zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import ModelFile, TactileModel, check_operators, read
 
 TRIAL_S = 10.0
 """Longest trial, s: loading and the first runs. A model of 12 MB takes 0.3.
@@ -25,7 +25,7 @@ MEMORY_MAX_BYTES = 640 << 20
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
 """Option of prctl(2): a signal for this process when its parent ends."""
-_BEGIN = "import sys; sys.path[:] = sys.argv[2:]; from models.trial import main; main()"
+_BEGIN = "import sys; sys.path[:] = sys.argv[2:]; from graspd.models.trial import main; main()"
 
 passed: deque[str] = deque(maxlen=8)
 """Digests of models that passed their trial, the newest last."""

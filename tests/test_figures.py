@@ -9,8 +9,8 @@ from typing import Any, cast
 
 import pytest
 
-from models import zoo
-from models.training.evaluating.findings import FINDINGS
+from graspd.models import zoo
+from graspd.models.training.evaluating.findings import FINDINGS
 
 ROOT = Path(__file__).parents[1]
 PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "deploy/MEASURED.md")}

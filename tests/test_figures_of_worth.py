@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from daemon.trust.learner import SCALE
-from models import zoo
+from graspd.daemon.trust.learner import SCALE
+from graspd.models import zoo
 from tests.conftest import ROOT
 
 WORTH: Mapping[str, Any] = zoo.card("small-session")["worth"]

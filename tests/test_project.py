@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-import daemon
-from drivers.spi.messages import FIRMWARE
+from graspd import daemon
+from graspd.drivers.spi.messages import FIRMWARE
 
 ROOT = Path(__file__).parents[1]
 VERSION = daemon.__version__

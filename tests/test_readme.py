@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.clients.building import skip_unless_it_can_be_compiled
 from tests.kit.messages import decode_verdict
 
@@ -35,7 +35,7 @@ def block(language: str) -> str:
 
 def run_subscriber(command: list[str], endpoint: str) -> list[str]:
     """What a subscriber prints: of nobody at first, then of a replay of 200 verdicts."""
-    replay = [sys.executable, "-m", "daemon", "replay", str(DEMO_TABLE), "--speed", "2"]
+    replay = [sys.executable, "-m", "graspd", "replay", str(DEMO_TABLE), "--speed", "2"]
     replay += ["--publish", endpoint, "--wait", "20"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as subscriber:
         try:

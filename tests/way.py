@@ -22,12 +22,12 @@ from typing import Final, cast
 
 import zmq
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.parts import Assembly, Parts
-from daemon.process.signals import StopSignal
-from daemon.publish.sockets import Sockets
-from daemon.run.loop import Loop, LoopTiming
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.run.loop import Loop, LoopTiming
 from tests.conftest import ROOT
 from tests.daemon.processes import start, wait_for
 

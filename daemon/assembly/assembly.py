@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
-from daemon.judge.pipeline import Pipeline
-from daemon.process.extras import needs
-from daemon.scene import Scene, SceneError
-from daemon.scene.drivers import (
+from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.process.extras import needs
+from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.drivers import (
     CanTactile,
     PalmJoints,
     PalmTactile,
@@ -22,16 +22,16 @@ from daemon.scene.drivers import (
     SpiTactile,
     StreamJoints,
 )
-from daemon.scene.scene import GateMode
-from daemon.trust.risk import RiskLimits
-from daemon.trust.trust import Trust
-from drivers.base import Driver, DriverError, LinkError
-from models import own, trial, zoo
-from models.contract import ModelError, SessionInput
-from models.runtime import TactileModel
+from graspd.daemon.scene.scene import GateMode
+from graspd.daemon.trust.risk import RiskLimits
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import Driver, DriverError, LinkError
+from graspd.models import own, trial, zoo
+from graspd.models.contract import ModelError, SessionInput
+from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from drivers.recordings.csv_rows import Columns
+    from graspd.drivers.recordings.csv_rows import Columns
 
 DEFAULT_MODEL = "small-session"
 RECORDED_MAX_AGE_MS = 1000.0
@@ -154,7 +154,7 @@ def hand_limits(scene: Scene) -> HandLimits | None:
 
 
 def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
-    from drivers.recordings.csv_rows import columns_of
+    from graspd.drivers.recordings.csv_rows import columns_of
 
     return [columns_of(path, scene.hand.fingers) for path in options.recordings]
 
@@ -170,7 +170,7 @@ def is_mcap(options: ReplayTactile) -> bool:
 def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
     if not is_mcap(options):
         return any(columns.joints for columns in _columns(scene, options))
-    from daemon.record.mcap import header_of
+    from graspd.daemon.record.mcap import header_of
 
     return any(header_of(path).joints for path in options.recordings)
 
@@ -191,7 +191,7 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
     with _section("tactile"):
         drivers = [_tactile(scene, clock)]
     if isinstance(scene.joints, StreamJoints):
-        from drivers.joints.driver import JointStreamDriver
+        from graspd.drivers.joints.driver import JointStreamDriver
 
         with _section("joints"):
             source, only_from = scene.joints.source, scene.joints.only_from
@@ -222,12 +222,12 @@ def _tactile(scene: Scene, clock: Clock) -> Driver:
         case ReplayTactile() as options:
             return _replay(scene, options, clock)
         case SpiTactile() as options:
-            from drivers.spi.driver import SpiBridgeDriver
+            from graspd.drivers.spi.driver import SpiBridgeDriver
 
             arguments = options.model_dump(exclude={"driver"})
             return SpiBridgeDriver(fingers=scene.hand.fingers, clock=clock, **arguments)
         case CanTactile() as options:
-            from drivers.can.driver import CanBridgeDriver
+            from graspd.drivers.can.driver import CanBridgeDriver
 
             arguments = options.model_dump(exclude={"driver"})
             return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **arguments)
@@ -242,7 +242,7 @@ def _palm(
 ) -> Driver:
     heed = options.heed_finger_bits
     if options.source.startswith("udp://"):
-        from drivers.palm.driver import PalmDriver
+        from graspd.drivers.palm.driver import PalmDriver
 
         return PalmDriver(
             options.source,
@@ -252,8 +252,8 @@ def _palm(
             heed_finger_bits=heed,
             clock=clock,
         )
-    from drivers.recordings.link_log_player import LinkLogDriver
-    from drivers.recordings.palm_file import PalmFile
+    from graspd.drivers.recordings.link_log_player import LinkLogDriver
+    from graspd.drivers.recordings.palm_file import PalmFile
 
     log = PalmFile(fingers, calibration=calibration, heed_finger_bits=heed)
     return LinkLogDriver([Path(options.source)], log, speed=1.0, clock=clock)
@@ -262,9 +262,9 @@ def _palm(
 def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     if is_mcap(options):
         return _replay_mcap(scene, options, clock)
-    from drivers.recordings.csv_player import ReplayDriver
-    from drivers.recordings.csv_rows import SLIPPED
-    from drivers.recordings.faults import ReplayFaults
+    from graspd.drivers.recordings.csv_player import ReplayDriver
+    from graspd.drivers.recordings.csv_rows import SLIPPED
+    from graspd.drivers.recordings.faults import ReplayFaults
 
     if options.outcomes and not all(columns.has_labels for columns in _columns(scene, options)):
         raise ValueError(f"outcomes needs the column `{SLIPPED}` in every recording")
@@ -286,7 +286,7 @@ def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     if options.outcomes:
         raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
     try:
-        from daemon.record.player import McapReplayDriver
+        from graspd.daemon.record.player import McapReplayDriver
     except ModuleNotFoundError as error:
         raise ValueError(needs("replaying MCAP", "record", error)) from error
     speed = options.speed if options.pace == "realtime" else None

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.parts import Parts
-from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion
-from daemon.scene import Scene, SceneError
-from daemon.scene.drivers import CanTactile, SpiTactile
-from drivers.recordings.link_log_player import CANDUMP, SERIAL, LinkLogDriver
-from models.runtime import TactileModel
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.publish.companion import Companion
+from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.drivers import CanTactile, SpiTactile
+from graspd.drivers.recordings.link_log_player import CANDUMP, SERIAL, LinkLogDriver
+from graspd.models.runtime import TactileModel
 
 _DRIVER = {CANDUMP: "can", SERIAL: "spi"}
 _SECTIONS = ("hand", "tactile", "model", "gate", "session")
@@ -84,12 +84,12 @@ def changed(
 def _driver(replayed: Scene, paths: Sequence[Path], speed: float | None) -> LinkLogDriver[Any]:
     tactile, fingers = replayed.tactile, replayed.hand.fingers
     if isinstance(tactile, SpiTactile):
-        from drivers.recordings.serial_log import SerialLog
+        from graspd.drivers.recordings.serial_log import SerialLog
 
         return LinkLogDriver(paths, SerialLog(fingers, tactile.sensors), speed=speed)
     if not isinstance(tactile, CanTactile):
         raise ValueError("link logs are of the drivers can and spi")
-    from drivers.recordings.can_log import CanLog
+    from graspd.drivers.recordings.can_log import CanLog
 
     board = tactile.model_dump(
         exclude={"driver", "interface", "channel", "bitrate", "data_bitrate"}

@@ -9,19 +9,19 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daemon.assembly import assembly
-from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Answer, Companion, at_once
-from daemon.publish.outbox import Outbox, Output
-from daemon.publish.sockets import Sockets
-from daemon.scene import Scene
-from daemon.session.sensors import SensorWatch
-from drivers.base import Driver
-from models.runtime import TactileModel
+from graspd.daemon.assembly import assembly
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.publish.companion import Answer, Companion, at_once
+from graspd.daemon.publish.outbox import Outbox, Output
+from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.scene import Scene
+from graspd.daemon.session.sensors import SensorWatch
+from graspd.drivers.base import Driver
+from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.record.link_log import Tap
-    from daemon.session.file import SessionFile
+    from graspd.daemon.record.link_log import Tap
+    from graspd.daemon.session.file import SessionFile
 
 log = logging.getLogger("graspd")
 
@@ -69,7 +69,7 @@ class Assembly:
         """Open the drivers; tap the link if it is recorded. Raises as `open_driver`."""
         record, drivers = self._parts.scene.record, self._parts.drivers
         if record is not None and record.raw:
-            from daemon.record.link_log import tap_of
+            from graspd.daemon.record.link_log import tap_of
 
             self._tap = tap_of(drivers[0], self._parts.scene.tactile)
         for driver in drivers:
@@ -89,7 +89,7 @@ class Assembly:
             )
             self.companions.append(watch)
             return False
-        from daemon.session.keeper import SessionKeeper
+        from graspd.daemon.session.keeper import SessionKeeper
 
         self._stack.callback(file.close)
         keeper = SessionKeeper(
@@ -111,7 +111,7 @@ class Assembly:
         scene, pipeline = self._parts.scene, self._parts.pipeline
         if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
             return None
-        from daemon.session.file import SessionFile, SessionFileError
+        from graspd.daemon.session.file import SessionFile, SessionFileError
 
         try:
             return SessionFile(scene.session_path)
@@ -124,7 +124,7 @@ class Assembly:
         parts = self._parts
         if parts.scene.record is None:
             return
-        from daemon.assembly.recorder import build_recorder
+        from graspd.daemon.assembly.recorder import build_recorder
 
         recorder = build_recorder(
             parts.scene, parts.model, parts.pipeline, self._boot_id, self._tap

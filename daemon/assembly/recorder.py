@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from daemon.assembly import assembly
-from daemon.judge.memory import encode, remember
-from daemon.judge.pipeline import Pipeline
-from daemon.process.extras import needs
-from daemon.record.header import RecordingHeader
-from daemon.scene import Scene, SceneError
-from daemon.trust.trust import encode as encode_trust
-from models.runtime import TactileModel
+from graspd.daemon.assembly import assembly
+from graspd.daemon.judge.memory import encode, remember
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.process.extras import needs
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.trust.trust import encode as encode_trust
+from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.record.link_log import Tap
-    from daemon.record.recorder import Recorder
+    from graspd.daemon.record.link_log import Tap
+    from graspd.daemon.record.recorder import Recorder
 
 
 def build_recorder(
@@ -30,8 +30,8 @@ def build_recorder(
     if scene.record is None or directory is None:
         return None
     try:
-        from daemon.record.files import Retention
-        from daemon.record.recorder import Recorder
+        from graspd.daemon.record.files import Retention
+        from graspd.daemon.record.recorder import Recorder
     except ModuleNotFoundError as error:
         raise SceneError(needs("[record]", "record", error)) from error
     options = scene.record

@@ -8,20 +8,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.assembly import assembly
-from daemon.assembly.link_logs import changed
-from daemon.assembly.parts import Parts
-from daemon.judge.memory import recall
-from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion
-from daemon.publish.messages import OutcomeMessage
-from daemon.record.mcap import header_of
-from daemon.record.player import McapReplayDriver, RecordedEvent
-from daemon.record.topics import Exchanged, Topic
-from daemon.scene import Scene, SceneError, parse
-from daemon.trust.lift_book import GraspId, Report
-from daemon.trust.trust import decode
-from models.runtime import TactileModel
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.link_logs import changed
+from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.judge.memory import recall
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.publish.companion import Companion
+from graspd.daemon.publish.messages import OutcomeMessage
+from graspd.daemon.record.mcap import header_of
+from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
+from graspd.daemon.record.topics import Exchanged, Topic
+from graspd.daemon.scene import Scene, SceneError, parse
+from graspd.daemon.trust.lift_book import GraspId, Report
+from graspd.daemon.trust.trust import decode
+from graspd.models.runtime import TactileModel
 
 log = logging.getLogger("graspd")
 

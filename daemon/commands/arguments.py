@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
 from typing import Any
 
-from daemon.process.text import did_you_mean
+from graspd.daemon.process.text import did_you_mean
 
 
 class Parser(argparse.ArgumentParser):

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import msgspec
 import numpy as np
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.commands.models import f1_percent
-from daemon.doctor.computer import NETWORK
-from daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
-from daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
-from daemon.process.text import (
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.commands.models import f1_percent
+from graspd.daemon.doctor.computer import NETWORK
+from graspd.daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
+from graspd.daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
+from graspd.daemon.process.text import (
     Colour,
     coloured,
     complain,
@@ -28,16 +28,16 @@ from daemon.process.text import (
     write_json,
     write_lines,
 )
-from daemon.scene import drivers as scene_drivers
-from daemon.scene.scene import Realtime, Record, RiskSection
-from drivers.base import DriverError
-from drivers.udp.receiver import SCHEME, Endpoint
-from models.contract import Finger, ModelError, SessionInput
-from models.runtime import TactileModel
+from graspd.daemon.scene import drivers as scene_drivers
+from graspd.daemon.scene.scene import Realtime, Record, RiskSection
+from graspd.drivers.base import DriverError
+from graspd.drivers.udp.receiver import SCHEME, Endpoint
+from graspd.models.contract import Finger, ModelError, SessionInput
+from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.decision import GateLimits, HandLimits
-    from daemon.measure.cost import Footprint
+    from graspd.daemon.judge.decision import GateLimits, HandLimits
+    from graspd.daemon.measure.cost import Footprint
 
 TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     costs: list[tuple[Path, Footprint]] = []
     codes = [_check(path, args, costs) for path in args.scene]
     if len(codes) > 1 and costs and not args.json:
-        from daemon.measure.cost import markdown
+        from graspd.daemon.measure.cost import markdown
 
         write_lines(*markdown(costs))
     return max(codes)
@@ -92,7 +92,7 @@ def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footpri
     }
     cost_lines: Iterable[str] = ()
     if args.cost:
-        from daemon.measure import cost
+        from graspd.daemon.measure import cost
 
         try:
             progress(f"measuring what {path} costs, some seconds")
@@ -166,7 +166,7 @@ def _try_drivers(wanted: scene.Scene) -> int | None:
         with contextlib.closing(driver):
             assembly.open_driver(driver)
     if isinstance(joints, scene_drivers.PalmJoints):
-        from drivers.palm.calibration import load_calibration
+        from graspd.drivers.palm.calibration import load_calibration
 
         load_calibration(joints.calibration)
     return driver.period_ns
@@ -175,7 +175,7 @@ def _try_drivers(wanted: scene.Scene) -> int | None:
 def _try_keys(wanted: scene.Scene) -> None:
     if wanted.curve is None:
         return
-    from daemon.publish.keys import KeysError, load_clients, load_own
+    from graspd.daemon.publish.keys import KeysError, load_clients, load_own
 
     try:
         load_own(wanted.curve.secret_key)

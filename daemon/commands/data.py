@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from daemon.process.files import write_atomically
-from daemon.process.text import complain, printable, write_lines
-from models.bts3 import CITATIONS, LICENCE, TABLES, TableFile
+from graspd.daemon.process.files import write_atomically
+from graspd.daemon.process.text import complain, printable, write_lines
+from graspd.models.bts3 import CITATIONS, LICENCE, TABLES, TableFile
 
 MAX_BYTES = 16 * 2**20
 """Longest answer that is read. No file of the set has more than 1 MB."""
@@ -27,7 +27,7 @@ MESSAGE_MAX = 320
 """Longest error, characters: it may quote what the server sent."""
 
 UPSTREAM = "https://raw.githubusercontent.com/3dperceptionlab/biotacsp-stability-set-v2/master"
-"""Address of the files of `models.bts3.REPOSITORY` at GitHub."""
+"""Address of the files of `graspd.models.bts3.REPOSITORY` at GitHub."""
 
 
 class DataError(Exception):

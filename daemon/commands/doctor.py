@@ -14,14 +14,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.commands.arguments import within
-from daemon.doctor import computer
-from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause, Finding, Level, fine, roots, warning
-from daemon.doctor.link import counter_findings, device_findings, rate_finding
-from daemon.doctor.surroundings import (
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.commands.arguments import within
+from graspd.daemon.doctor import computer
+from graspd.daemon.doctor.electrodes import ElectrodeStatistics
+from graspd.daemon.doctor.finding import Cause, Finding, Level, fine, roots, warning
+from graspd.daemon.doctor.link import counter_findings, device_findings, rate_finding
+from graspd.daemon.doctor.surroundings import (
     can_finding,
     explained,
     model_finding,
@@ -29,8 +29,15 @@ from daemon.doctor.surroundings import (
     shared_findings,
     socket_findings,
 )
-from daemon.process.text import Colour, coloured, complain, printable, write_json, write_lines
-from drivers.base import Driver, DriverError, Fact, LinkError, TactileReading
+from graspd.daemon.process.text import (
+    Colour,
+    coloured,
+    complain,
+    printable,
+    write_json,
+    write_lines,
+)
+from graspd.drivers.base import Driver, DriverError, Fact, LinkError, TactileReading
 
 LISTEN_S = 3.0
 LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0

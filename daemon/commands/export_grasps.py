@@ -8,13 +8,13 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.process.files import write_atomically
-from daemon.process.text import complain, write_lines
-from daemon.publish.messages import OBJECT_PATTERN
-from drivers.base import RecordingError
+from graspd.daemon.process.files import write_atomically
+from graspd.daemon.process.text import complain, write_lines
+from graspd.daemon.publish.messages import OBJECT_PATTERN
+from graspd.drivers.base import RecordingError
 
 if TYPE_CHECKING:
-    from daemon.record.export import Export
+    from graspd.daemon.record.export import Export
 
 WRONG, FAILED = 2, 1
 
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.exists() and not args.force:
         complain(f"{args.out} is there already: --force replaces it")
         return WRONG
-    from daemon.record.export import collect, write
+    from graspd.daemon.record.export import collect, write
 
     try:
         export = collect(args.recordings)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from daemon.process.text import complain, printable, write_json, write_lines
-from daemon.publish import keys
-from daemon.publish.keys import KeysError
+from graspd.daemon.process.text import complain, printable, write_json, write_lines
+from graspd.daemon.publish import keys
+from graspd.daemon.publish.keys import KeysError
 
 FOLDER = Path("/etc/graspd/keys")
 CLIENTS = "clients"

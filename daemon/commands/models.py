@@ -12,12 +12,12 @@ from typing import Any
 
 import msgspec
 
-from daemon.assembly.assembly import DEFAULT_MODEL
-from daemon.process.files import write_atomically
-from daemon.process.text import complain, printable, write_json, write_lines
-from models import own, zoo
-from models.contract import MeasuredError, ModelContract, ModelError
-from models.runtime import read
+from graspd.daemon.assembly.assembly import DEFAULT_MODEL
+from graspd.daemon.process.files import write_atomically
+from graspd.daemon.process.text import complain, printable, write_json, write_lines
+from graspd.models import own, zoo
+from graspd.models.contract import MeasuredError, ModelContract, ModelError
+from graspd.models.runtime import read
 
 TITLES = {
     "cv": "known objects",

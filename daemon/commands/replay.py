@@ -10,38 +10,38 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.parts import Assembly, Parts
-from daemon.commands.arguments import positive, within
-from daemon.judge.pipeline import Pipeline
-from daemon.process.extras import needs
-from daemon.process.signals import StopSignal
-from daemon.process.sleep import Sleep
-from daemon.process.text import complain, printable
-from daemon.publish.companion import Companion
-from daemon.publish.listener import PublishError
-from daemon.publish.sockets import Sockets
-from daemon.run.day_table import PUBLISHED, DayTable
-from daemon.run.loop import Loop, LoopTiming
-from daemon.run.printer import Printer
-from daemon.run.replaying import Comparison, Controller, trained_on
-from daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSummary, trained_on_line
-from daemon.scene import Scene, SceneError
-from daemon.scene.endpoints import check_endpoint, is_private
-from daemon.scene.scene import Hand
-from daemon.session.file import SessionFileError, load, statistics_of
-from drivers.base import DriverError, RecordingError
-from drivers.recordings.csv_player import DEMO_DAY
-from drivers.recordings.csv_rows import SLIPPED, columns_of
-from models import zoo
-from models.bts3 import FINGERS, TABLES
-from models.contract import ModelError
-from models.runtime import TactileModel
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.commands.arguments import positive, within
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.process.extras import needs
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.process.sleep import Sleep
+from graspd.daemon.process.text import complain, printable
+from graspd.daemon.publish.companion import Companion
+from graspd.daemon.publish.listener import PublishError
+from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.run.day_table import PUBLISHED, DayTable
+from graspd.daemon.run.loop import Loop, LoopTiming
+from graspd.daemon.run.printer import Printer
+from graspd.daemon.run.replaying import Comparison, Controller, trained_on
+from graspd.daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSummary, trained_on_line
+from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.endpoints import check_endpoint, is_private
+from graspd.daemon.scene.scene import Hand
+from graspd.daemon.session.file import SessionFileError, load, statistics_of
+from graspd.drivers.base import DriverError, RecordingError
+from graspd.drivers.recordings.csv_player import DEMO_DAY
+from graspd.drivers.recordings.csv_rows import SLIPPED, columns_of
+from graspd.models import zoo
+from graspd.models.bts3 import FINGERS, TABLES
+from graspd.models.contract import ModelError
+from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.assembly.link_logs import LinkLogs
-    from daemon.assembly.recordings import RecordedRun
+    from graspd.daemon.assembly.link_logs import LinkLogs
+    from graspd.daemon.assembly.recordings import RecordedRun
 
 Source: TypeAlias = "_Tables | LinkLogs | RecordedRun"
 """Source of recorded readings. Recordings of graspd contain the scene that judged them."""
@@ -315,11 +315,11 @@ def _source(args: argparse.Namespace) -> Source:
     if args.loop or args.strict:
         raise SceneError("what graspd has recorded is played as it is: no --loop or --strict")
     if assembly.MCAP not in endings:
-        from daemon.assembly.link_logs import LinkLogs
+        from graspd.daemon.assembly.link_logs import LinkLogs
 
         return LinkLogs(args.recordings, args.scene)
     try:
-        from daemon.assembly.recordings import RecordedRun
+        from graspd.daemon.assembly.recordings import RecordedRun
     except ModuleNotFoundError as error:
         raise SceneError(needs("replaying MCAP", "record", error)) from error
     return RecordedRun(args.recordings)

@@ -78,17 +78,17 @@ def _worth(parser: argparse.ArgumentParser) -> None:
 
 REPORTS = {
     "error-vs-time": (
-        "daemon.measure.error_vs_time",
+        "graspd.daemon.measure.error_vs_time",
         "how wrong each model is against how long it takes",
         _error_vs_time,
     ),
     "stability": (
-        "daemon.measure.stability",
+        "graspd.daemon.measure.stability",
         "numerical error of the whole chain on stiff and extreme readings",
         _stability,
     ),
     "worth": (
-        "daemon.measure.worth",
+        "graspd.daemon.measure.worth",
         "what `stable` is worth on another day, by how many outcomes were told",
         _worth,
     ),

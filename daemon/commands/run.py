@@ -12,16 +12,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.process.signals import StopSignal
-from daemon.process.text import complain
-from daemon.publish.listener import PublishError
-from daemon.run.runner import Runner
-from daemon.scene import SceneError
-from drivers.base import DriverError, LinkCause, LinkError, RecordingError
-from models.contract import ModelError
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.process.text import complain
+from graspd.daemon.publish.listener import PublishError
+from graspd.daemon.run.runner import Runner
+from graspd.daemon.scene import SceneError
+from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
+from graspd.models.contract import ModelError
 
 if TYPE_CHECKING:
-    from daemon.run.systemd import Systemd
+    from graspd.daemon.run.systemd import Systemd
 
 DESCRIPTORS = 65_536
 """Descriptors for all peers: libzmq 4.3.5 ends the process where a Unix socket finds none left."""
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
             stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
             printer = None
             if args.print:
-                from daemon.run.printer import Printer
+                from graspd.daemon.run.printer import Printer
 
                 printer = Printer(as_json=False)
             Runner(args.scene, stop, printer=printer, manager=_manager(stack)).run()
@@ -65,7 +65,7 @@ def _held_by(endpoint: str | None) -> str:
     """Name the processes that hold a port, if there is one and /proc can be read."""
     if endpoint is None:
         return ""
-    from daemon.doctor.computer import port_holders
+    from graspd.daemon.doctor.computer import port_holders
 
     scheme, _, address = endpoint.partition("://")
     holders = port_holders(scheme, int(address.rpartition(":")[2]))
@@ -88,7 +88,7 @@ def _manager(stack: ExitStack) -> Systemd | None:
     """Return systemd if it started this process and waits for notifications."""
     if "NOTIFY_SOCKET" not in os.environ:
         return None
-    from daemon.run.systemd import Systemd
+    from graspd.daemon.run.systemd import Systemd
 
     manager = Systemd.of(os.environ)
     if manager is not None:

@@ -13,15 +13,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Reason
-from daemon.process.extras import needs
-from daemon.process.text import complain, printable, write_json, write_lines
-from daemon.run.replaying import trained_on
-from daemon.scene import drivers as scene_drivers
-from daemon.session.file import (
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Reason
+from graspd.daemon.process.extras import needs
+from graspd.daemon.process.text import complain, printable, write_json, write_lines
+from graspd.daemon.run.replaying import trained_on
+from graspd.daemon.scene import drivers as scene_drivers
+from graspd.daemon.session.file import (
     KeptSession,
     SessionFile,
     SessionFileError,
@@ -31,12 +31,12 @@ from daemon.session.file import (
     others,
     read,
 )
-from daemon.trust.lift_book import GraspId, LiftBook
-from daemon.trust.trust import Trust, TrustState, decode
-from drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
-from models.contract import ModelError, SessionInput
-from models.runtime import TactileModel
-from models.session_statistics import SessionState
+from graspd.daemon.trust.lift_book import GraspId, LiftBook
+from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
+from graspd.models.contract import ModelError, SessionInput
+from graspd.models.runtime import TactileModel
+from graspd.models.session_statistics import SessionState
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -297,7 +297,7 @@ def _readings(wanted: scene.Scene) -> Iterator[Reading]:
 def _recorded_grasps(paths: Sequence[Path], fingers: Sequence[str]) -> Iterator[TactileReading]:
     """Yield grasps with an outcome. Raises `SceneError` or `RecordingError`."""
     try:
-        from daemon.record.export import collect
+        from graspd.daemon.record.export import collect
     except ModuleNotFoundError as error:
         raise scene.SceneError(needs("seeding from MCAP", "record", error)) from error
     export = collect(paths)

@@ -7,8 +7,8 @@ import json
 import sys
 from pathlib import Path
 
-from daemon.publish.messages import schema
-from daemon.scene import explained
+from graspd.daemon.publish.messages import schema
+from graspd.daemon.scene import explained
 
 FILES = Path(__file__).parent / "shell"
 """Made of the command line's parsers by `python -m tests.daemon.commands.shell_files`."""

@@ -11,14 +11,14 @@ from dataclasses import fields
 from pathlib import Path
 from types import FrameType
 
-from daemon.process.signals import STOPPING
-from daemon.process.text import complain, write_json
-from drivers.base import ELECTRODES, DriverError
-from drivers.biotac import SEQUENCES
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts, recorded_counts
-from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, synthetic_grasps
-from models.bts3 import FINGERS
+from graspd.daemon.process.signals import STOPPING
+from graspd.daemon.process.text import complain, write_json
+from graspd.drivers.base import ELECTRODES, DriverError
+from graspd.drivers.biotac import SEQUENCES
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, synthetic_grasps
+from graspd.models.bts3 import FINGERS
 
 log = logging.getLogger("graspd")
 
@@ -204,7 +204,7 @@ def _electrode(text: str) -> tuple[int, int]:
 def _serve_spi(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
 ) -> Mapping[str, int]:
-    from drivers.twins.spi import SpiTwin
+    from graspd.drivers.twins.spi import SpiTwin
 
     channels = SEQUENCES[args.sequence]
     counts = _counts(args, args.rate)
@@ -217,7 +217,7 @@ def _serve_spi(
 def _serve_can(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
 ) -> Mapping[str, int]:
-    from drivers.twins.can import CanTwin
+    from graspd.drivers.twins.can import CanTwin
 
     twin = CanTwin(
         args.interface,
@@ -238,8 +238,8 @@ def _serve_can(
 def _serve_datagrams(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
 ) -> Mapping[str, int]:
-    from drivers.twins.joints import JointTwin
-    from drivers.twins.palm import PalmTwin
+    from graspd.drivers.twins.joints import JointTwin
+    from graspd.drivers.twins.palm import PalmTwin
 
     twin: JointTwin | PalmTwin
     if args.kind == "palm":

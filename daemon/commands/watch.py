@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import zmq
 
-from daemon import scene
-from daemon.process.extras import needs
-from daemon.process.signals import StopSignal
-from daemon.process.text import complain
-from daemon.publish.keys import KeysError
-from daemon.scene import SceneError
-from daemon.watch.feed import Feed, load_keys
-from daemon.watch.view import TICK_S, HandFeed, View
+from graspd.daemon import scene
+from graspd.daemon.process.extras import needs
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.process.text import complain
+from graspd.daemon.publish.keys import KeysError
+from graspd.daemon.scene import SceneError
+from graspd.daemon.watch.feed import Feed, load_keys
+from graspd.daemon.watch.view import TICK_S, HandFeed, View
 
 ENDPOINT = "ipc:///run/graspd/right.ipc"
 """Default endpoint of the daemon."""
@@ -166,7 +166,7 @@ def _terminal(hands: list[HandFeed]) -> int:
     if not sys.stdout.isatty():
         raise UsageError("watch draws on a terminal; see --web, or `graspd run --print` for a pipe")
     try:
-        from daemon.watch.screen import can_draw, show
+        from graspd.daemon.watch.screen import can_draw, show
     except ModuleNotFoundError as error:
         advice = needs("watch", "watch", error)
         raise UsageError(f"{advice}; or watch --web, which needs none") from None
@@ -177,7 +177,7 @@ def _terminal(hands: list[HandFeed]) -> int:
 
 
 def _page(hands: list[HandFeed], port: int) -> int:
-    from daemon.watch.web import serve
+    from graspd.daemon.watch.web import serve
 
     try:
         serve(hands, port)
@@ -189,7 +189,7 @@ def _page(hands: list[HandFeed], port: int) -> int:
 
 def _foxglove(hands: list[HandFeed], port: int) -> int:
     try:
-        from daemon.record.live import LiveServer
+        from graspd.daemon.record.live import LiveServer
     except ModuleNotFoundError as error:
         raise UsageError(needs("watch --foxglove", "foxglove", error)) from None
     try:

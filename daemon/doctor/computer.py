@@ -80,7 +80,7 @@ class Process:
     def is_graspd(self) -> bool:
         """True if it is one of graspd's commands."""
         words = self.command.split()
-        return "-m daemon" in self.command or any(Path(word).name == "graspd" for word in words[:3])
+        return "-m graspd" in self.command or any(Path(word).name == "graspd" for word in words[:3])
 
 
 def serial_ports() -> list[SerialPort]:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
-from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
+from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
+from graspd.drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 
 RAIL_COUNTS = 20
 """A mean this near to 0 or 4095 is a rail; 0.3 % of loaded electrodes come this low."""

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
-from drivers.base import DeviceFault, Fact, LinkCause
+from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
+from graspd.drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
 """Share of the nominal rate below which the link is slow."""

@@ -11,14 +11,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from daemon.assembly import assembly
-from daemon.doctor import computer
-from daemon.doctor.finding import Cause, Finding, error, fine, warning
-from daemon.run.realtime import RealtimeMode
-from daemon.scene import Scene
-from daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
-from drivers.udp.receiver import Endpoint
-from models.contract import ModelError
+from graspd.daemon.assembly import assembly
+from graspd.daemon.doctor import computer
+from graspd.daemon.doctor.finding import Cause, Finding, error, fine, warning
+from graspd.daemon.run.realtime import RealtimeMode
+from graspd.daemon.scene import Scene
+from graspd.daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
+from graspd.drivers.udp.receiver import Endpoint
+from graspd.models.contract import ModelError
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
 """Default bit rates of the boards in deploy/can/PROTOCOL.md, bit/s."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX
-from models.contract import SessionInput
-from models.inputs import raw_features
-from models.session_statistics import SessionState, SessionStatistics, is_odd
+from graspd.drivers.base import COUNT_MAX
+from graspd.models.contract import SessionInput
+from graspd.models.inputs import raw_features
+from graspd.models.session_statistics import SessionState, SessionStatistics, is_odd
 
 
 @dataclass(frozen=True, slots=True, eq=False)

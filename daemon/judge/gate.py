@@ -22,12 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import HandLimits
-from daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
-from daemon.judge.stillness import ONES, Motion, MotionLimits
-from daemon.judge.windows import LONG_NS, SHORT_NS
-from drivers.base import ELECTRODES
-from models.contract import Finger
+from graspd.daemon.judge.decision import HandLimits
+from graspd.daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
+from graspd.daemon.judge.stillness import ONES, Motion, MotionLimits
+from graspd.daemon.judge.windows import LONG_NS, SHORT_NS
+from graspd.drivers.base import ELECTRODES
+from graspd.models.contract import Finger
 
 REFRESH_NS = 50_000_000
 """Age at which a verdict is refreshed, ns: half of `STANDS_NS`, so that it never grows older,

@@ -16,17 +16,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.contact import Contact
-from daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
-from daemon.judge.gate import Gate
-from daemon.judge.health import NO_COUNT, Checked
-from daemon.judge.reasons import FingerState, Moment, Reason
-from daemon.judge.stillness import Motion
-from drivers.base import ELECTRODES, JointReading
-from models.contract import Finger
+from graspd.daemon.judge.contact import Contact
+from graspd.daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
+from graspd.daemon.judge.gate import Gate
+from graspd.daemon.judge.health import NO_COUNT, Checked
+from graspd.daemon.judge.reasons import FingerState, Moment, Reason
+from graspd.daemon.judge.stillness import Motion
+from graspd.drivers.base import ELECTRODES, JointReading
+from graspd.models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.judge.joint_motion import JointMotion
+    from graspd.daemon.judge.joint_motion import JointMotion
 
 OUTAGE_NS = 1_000_000_000
 """After this long without a usable reading the sensors may have been exchanged or powered again."""
@@ -170,7 +170,7 @@ class HandTracker:
         self._contact = Contact(len(fingers), limits.contact)
         self._joints: JointMotion | None = None
         if limits.joints is not None:
-            from daemon.judge.joint_motion import JointMotion  # only where it is needed
+            from graspd.daemon.judge.joint_motion import JointMotion  # only where it is needed
 
             self._joints = JointMotion(limits.joints)
         self.gate = Gate(fingers, limits)

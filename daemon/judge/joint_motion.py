@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import JointLimits
-from daemon.judge.reasons import Reason
-from drivers.base import JointReading
+from graspd.daemon.judge.decision import JointLimits
+from graspd.daemon.judge.reasons import Reason
+from graspd.drivers.base import JointReading
 
 ANGLES = 16
 """Angles remembered of a window; of faster readings, some are left out."""

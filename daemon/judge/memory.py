@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.pipeline import Pipeline
 
 MAX_BYTES: Final = 1 << 20  # before it is compressed; three fingers take 80 kB
 KINDS: Final = {np.dtype(kind).str: np.dtype(kind) for kind in ("u1", "u2", "i8", "f4", "f8", "?")}

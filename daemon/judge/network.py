@@ -10,16 +10,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.health import too_many
-from daemon.judge.reasons import Reason
-from drivers.base import COUNT_MAX, ELECTRODES
-from models.contract import Finger, ModelError, SeenCounts
-from models.electrodes import CONTRADICTING_MAX, ROUNDING, Electrodes, NoveltyCheck
-from models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
-from models.runtime import TactileModel
+from graspd.daemon.judge.health import too_many
+from graspd.daemon.judge.reasons import Reason
+from graspd.drivers.base import COUNT_MAX, ELECTRODES
+from graspd.models.contract import Finger, ModelError, SeenCounts
+from graspd.models.electrodes import CONTRADICTING_MAX, ROUNDING, Electrodes, NoveltyCheck
+from graspd.models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
+from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.calibration import Calibration
+    from graspd.daemon.judge.calibration import Calibration
 
 FLAT_SPREAD_COUNTS = 70.0
 """Standard deviation of a finger's electrodes below which it is not touching, or not working: half

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import (
+from graspd.daemon.judge.decision import (
     HELD,
     NO_RECENT_VERDICT,
     WITHHELD,
@@ -19,22 +19,22 @@ from daemon.judge.decision import (
     RecentVerdict,
     decide,
 )
-from daemon.judge.health import Health, Number
-from daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
-from daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
-from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
-from daemon.trust.trust import Assessment
-from drivers.base import JointReading, TactileReading
-from models.contract import Finger, ModelError, SessionInput
-from models.electrodes import Electrodes
-from models.runtime import TactileModel
+from graspd.daemon.judge.health import Health, Number
+from graspd.daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
+from graspd.daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
+from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
+from graspd.daemon.trust.trust import Assessment
+from graspd.drivers.base import JointReading, TactileReading
+from graspd.models.contract import Finger, ModelError, SessionInput
+from graspd.models.electrodes import Electrodes
+from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.calibration import SessionCalibration
-    from daemon.judge.hand import HandTracker
-    from daemon.trust.learner import LearnerState
-    from daemon.trust.trust import Trust
-    from models.session_statistics import SessionState
+    from graspd.daemon.judge.calibration import SessionCalibration
+    from graspd.daemon.judge.hand import HandTracker
+    from graspd.daemon.trust.learner import LearnerState
+    from graspd.daemon.trust.trust import Trust
+    from graspd.models.session_statistics import SessionState
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False):
@@ -111,7 +111,9 @@ class Pipeline:
         electrodes = Electrodes(contract.seen)
         self._session: SessionCalibration | None = None
         if isinstance(contract.input, SessionInput):
-            from daemon.judge.calibration import SessionCalibration  # only where it is needed
+            from graspd.daemon.judge.calibration import (
+                SessionCalibration,  # only where it is needed
+            )
 
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
@@ -133,7 +135,7 @@ class Pipeline:
         self.on_request = False
         """True if a settled grasp is judged only when the controller asks."""
         if hand is not None:
-            from daemon.judge.hand import HandTracker  # only where it is needed
+            from graspd.daemon.judge.hand import HandTracker  # only where it is needed
 
             self.hand, self.on_request = HandTracker(fingers, hand), hand.on_request
         self.memory = PipelineMemory(np.zeros(electrodes.centre.shape))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from models.contract import Finger
+from graspd.models.contract import Finger
 
 
 class Decision(StrEnum):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.windows import (
+from graspd.daemon.judge.windows import (
     APART,
     BLOCK_STEPS,
     BLOCKS,
@@ -25,7 +25,7 @@ from daemon.judge.windows import (
     MotionMemory,
     Noise,
 )
-from drivers.base import ELECTRODES
+from graspd.drivers.base import ELECTRODES
 
 SPIKE_COUNTS = 20.0
 """A value that jumps further is believed once the next one does too. Spikes last for one sweep:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.health import Number
-from drivers.base import ELECTRODES
+from graspd.daemon.judge.health import Number
+from graspd.drivers.base import ELECTRODES
 
 STEP_NS = 5_000_000
 """Shortest step of the window, ns; of faster sweeps the mean is kept."""

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from daemon.measure.picture import Row
-from daemon.measure.timing import Step
-from models.bts3 import FINGERS
-from models.contract import ModelError
-from models.layout import D1
-from models.runtime import TactileModel
-from models.training.data.datasets import Grasps
-from models.training.estimators.configs import CNN1
+from graspd.daemon.measure.picture import Row
+from graspd.daemon.measure.timing import Step
+from graspd.models.bts3 import FINGERS
+from graspd.models.contract import ModelError
+from graspd.models.layout import D1
+from graspd.models.runtime import TactileModel
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.estimators.configs import CNN1
 
 CONFIDENCE = 0.95
 Candidate = tuple[Row, Step]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from daemon.process.text import markdown_table, printable
+from graspd.daemon.process.text import markdown_table, printable
 
 TIMEOUT_S = 120.0
 """Longest measurement, s. A scene takes about a second."""
@@ -65,7 +65,14 @@ def measure(scene: Path) -> Footprint:
     Nothing is published, and no device or kept session is touched."""
     with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
         # -P, so that the files in the folder at hand are not taken for modules.
-        command = [sys.executable, "-P", "-m", "daemon.measure.footprint", str(scene), folder]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "graspd.daemon.measure.footprint",
+            str(scene),
+            folder,
+        ]
         try:
             result = subprocess.run(
                 [*command, str(time.monotonic_ns())],

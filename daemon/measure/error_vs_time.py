@@ -13,14 +13,14 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from daemon.measure.candidates import candidates
-from daemon.measure.picture import DEFAULT, PANELS, Report, Row, draw, error_of
-from daemon.measure.timing import measure
-from daemon.process.text import complain, markdown_table, progress, write_lines
-from models import zoo
-from models.contract import ModelError
-from models.training.data.datasets import DatasetError, Grasps, read_all
-from models.training.evaluating.style import QUICK
+from graspd.daemon.measure.candidates import candidates
+from graspd.daemon.measure.picture import DEFAULT, PANELS, Report, Row, draw, error_of
+from graspd.daemon.measure.timing import measure
+from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
+from graspd.models import zoo
+from graspd.models.contract import ModelError
+from graspd.models.training.data.datasets import DatasetError, Grasps, read_all
+from graspd.models.training.evaluating.style import QUICK
 
 READINGS, PACED = 2000, 300
 QUICK_READINGS, QUICK_PACED = 100, 5

@@ -1,4 +1,4 @@
-"""The cost of a scene, measured in a process of its own, which `daemon.measure.cost` starts.
+"""The cost of a scene, measured in a process of its own, which `graspd.daemon.measure.cost` starts.
 
 It adds and measures parts in the order of `graspd run`. Imports stand where they are measured.
 """
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from contextlib import ExitStack
     from pathlib import Path
 
-    from daemon.assembly.parts import Parts
-    from daemon.judge.pipeline import Pipeline
-    from daemon.publish.outbox import Outbox
-    from daemon.scene import Scene
-    from drivers.base import Driver, Reading
-    from models.contract import SeenCounts
+    from graspd.daemon.assembly.parts import Parts
+    from graspd.daemon.judge.pipeline import Pipeline
+    from graspd.daemon.publish.outbox import Outbox
+    from graspd.daemon.scene import Scene
+    from graspd.drivers.base import Driver, Reading
+    from graspd.models.contract import SeenCounts
 
 CORE = (
     ("numpy", ("numpy",)),
     ("msgspec", ("msgspec",)),
     ("onnxruntime", ("onnxruntime",)),
     ("pydantic", ("pydantic.main", "pydantic.types")),
-    ("graspd", ("daemon.commands.run",)),
+    ("graspd", ("graspd.daemon.commands.run",)),
 )
 """Parts that every scene imports, with their modules."""
 READINGS = 300
@@ -67,7 +67,7 @@ def main(arguments: list[str]) -> int:
     import gc
     import importlib
 
-    from daemon.process import set_up_libraries
+    from graspd.daemon.process import set_up_libraries
 
     set_up_libraries()
     for name, modules in CORE:
@@ -78,11 +78,11 @@ def main(arguments: list[str]) -> int:
     from contextlib import ExitStack
     from pathlib import Path
 
-    from daemon.process.text import complain, write_json
-    from daemon.publish.listener import PublishError
-    from daemon.scene import SceneError
-    from drivers.base import DriverError
-    from models.contract import ModelError
+    from graspd.daemon.process.text import complain, write_json
+    from graspd.daemon.publish.listener import PublishError
+    from graspd.daemon.scene import SceneError
+    from graspd.drivers.base import DriverError
+    from graspd.models.contract import ModelError
 
     try:
         with ExitStack() as stack:
@@ -95,9 +95,9 @@ def main(arguments: list[str]) -> int:
 
 
 def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[str, object]:
-    from daemon import scene
-    from daemon.assembly import assembly
-    from daemon.assembly.parts import Parts
+    from graspd.daemon import scene
+    from graspd.daemon.assembly import assembly
+    from graspd.daemon.assembly.parts import Parts
 
     wanted = _apart(scene.load(path), folder)
     meter.take("scene")
@@ -122,8 +122,8 @@ def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[s
 
 def _apart(wanted: Scene, folder: Path) -> Scene:
     """Return the scene with its sockets and session in `folder`, playing recordings at once."""
-    from daemon.scene.drivers import ReplayTactile
-    from daemon.scene.scene import Ask
+    from graspd.daemon.scene.drivers import ReplayTactile
+    from graspd.daemon.scene.scene import Ask
 
     changes: dict[str, object] = {
         "publish": wanted.publish.model_copy(update={"endpoint": f"ipc://{folder}/verdicts"}),
@@ -138,15 +138,15 @@ def _apart(wanted: Scene, folder: Path) -> Scene:
 
 def _drivers(wanted: Scene, stack: ExitStack) -> list[Driver]:
     """Construct the drivers, and open one that plays recordings."""
-    from daemon.assembly import assembly
-    from daemon.scene.drivers import PalmJoints, ReplayTactile
+    from graspd.daemon.assembly import assembly
+    from graspd.daemon.scene.drivers import PalmJoints, ReplayTactile
 
     drivers = assembly.build_drivers(wanted)
     if isinstance(wanted.tactile, ReplayTactile):
         stack.callback(drivers[0].close)
         assembly.open_driver(drivers[0])
     if isinstance(wanted.joints, PalmJoints):
-        from drivers.palm.calibration import load_calibration
+        from graspd.drivers.palm.calibration import load_calibration
 
         load_calibration(wanted.joints.calibration)
     return drivers
@@ -154,8 +154,8 @@ def _drivers(wanted: Scene, stack: ExitStack) -> list[Driver]:
 
 def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     """Build what `graspd run` puts around the judge."""
-    from daemon.assembly.parts import Assembly
-    from daemon.publish.sockets import Sockets
+    from graspd.daemon.assembly.parts import Assembly
+    from graspd.daemon.publish.sockets import Sockets
 
     around = Assembly(parts, stack)
     if around.keep_session():
@@ -163,9 +163,9 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     around.add_sockets(stack.enter_context(Sockets(parts.scene)))
     outbox = around.build_outbox()
     meter.take("sockets")
-    from daemon.process.signals import StopSignal
-    from daemon.run.loop import Loop, LoopTiming
-    from daemon.run.reload import Reload
+    from graspd.daemon.process.signals import StopSignal
+    from graspd.daemon.run.loop import Loop, LoopTiming
+    from graspd.daemon.run.reload import Reload
 
     stop = Reload(stack.enter_context(StopSignal()), lambda: parts, lambda: None)
     stack.callback(stop.close)
@@ -177,7 +177,7 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
 
 def _readings(wanted: Scene, driver: Driver, seen: SeenCounts) -> Iterator[Reading]:
     """Yield the readings of the scene's own recordings, else synthetic grasps made now."""
-    from daemon.scene.drivers import ReplayTactile
+    from graspd.daemon.scene.drivers import ReplayTactile
 
     if isinstance(wanted.tactile, ReplayTactile):
         while not driver.exhausted:
@@ -185,8 +185,8 @@ def _readings(wanted: Scene, driver: Driver, seen: SeenCounts) -> Iterator[Readi
         return
     import numpy as np
 
-    from daemon.run.rehearsal import PERIOD_NS, grasps
-    from drivers.base import JointReading, TactileReading
+    from graspd.daemon.run.rehearsal import PERIOD_NS, grasps
+    from graspd.drivers.base import JointReading, TactileReading
 
     hall_rad = 0.0006  # a count of a Hall sensor: frozen angles would not be believed
     for number, counts in enumerate(grasps(seen, READINGS)):
@@ -201,7 +201,7 @@ def _readings(wanted: Scene, driver: Driver, seen: SeenCounts) -> Iterator[Readi
 
 def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> dict[str, int]:
     """Return ns of CPU by what was done: `reading`, `judged` if the network ran, `report`."""
-    from drivers.base import JointReading
+    from graspd.drivers.base import JointReading
 
     if isinstance(reading, JointReading):
         pipeline.observe_joints(reading)

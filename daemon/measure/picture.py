@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from models.training.evaluating.style import (
+from graspd.models.training.evaluating.style import (
     BLUE,
     ORANGE,
     PAPER,

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from daemon.process.extras import needs
-from daemon.process.text import (
+from graspd.daemon.process.extras import needs
+from graspd.daemon.process.text import (
     complain,
     markdown_table,
     printable,
@@ -24,9 +24,9 @@ from daemon.process.text import (
     write_json,
     write_lines,
 )
-from models import zoo
-from models.bts3 import TABLES
-from models.contract import ModelError
+from graspd.models import zoo
+from graspd.models.bts3 import TABLES
+from graspd.models.contract import ModelError
 
 CHECKOUT = Path(__file__).parents[2]
 CASES = Path("tests/stability")

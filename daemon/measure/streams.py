@@ -14,18 +14,18 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.process.text import progress
-from daemon.trust.learner import SCALE, sigmoid
-from daemon.trust.lift_book import GraspId
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import Trust
-from models.training.arrays import Ints
-from models.training.data.datasets import Grasps
-from models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
-from models.training.evaluating.days import SessionDay, by_object
-from models.training.fitting.trained import Trained, train
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import with_recipes
+from graspd.daemon.process.text import progress
+from graspd.daemon.trust.learner import SCALE, sigmoid
+from graspd.daemon.trust.lift_book import GraspId
+from graspd.daemon.trust.risk import Permission, RiskLimits
+from graspd.daemon.trust.trust import Trust
+from graspd.models.training.arrays import Ints
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
+from graspd.models.training.evaluating.days import SessionDay, by_object
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import with_recipes
 
 OWN, PUBLISHED = "small-session", "cnn1"
 """Systems that judge: graspd's default, and the published network on the plain image."""

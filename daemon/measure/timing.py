@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from daemon.process.text import progress
+from graspd.daemon.process.text import progress
 
 WARM_UP = 20
 ROUNDS = 10

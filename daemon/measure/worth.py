@@ -19,15 +19,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from daemon.measure.reliability import Reliability, fitted_scales, reliability, reliability_lines
-from daemon.measure.streams import Life, Stream, live, streams
-from daemon.process.text import complain, markdown_table, progress, write_lines
-from daemon.trust.risk import RiskLimits
-from models.contract import ModelError
-from models.training.data.datasets import DatasetError, read_all
-from models.training.evaluating.day_figures import VerdictFigures
-from models.training.evaluating.files import to_json, write_whole
-from models.training.evaluating.style import (
+from graspd.daemon.measure.reliability import (
+    Reliability,
+    fitted_scales,
+    reliability,
+    reliability_lines,
+)
+from graspd.daemon.measure.streams import Life, Stream, live, streams
+from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
+from graspd.daemon.trust.risk import RiskLimits
+from graspd.models.contract import ModelError
+from graspd.models.training.data.datasets import DatasetError, read_all
+from graspd.models.training.evaluating.day_figures import VerdictFigures
+from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.evaluating.style import (
     BLUE,
     NAVY,
     OLIVE,
@@ -38,7 +43,7 @@ from models.training.evaluating.style import (
     style,
     to_svg,
 )
-from models.zoo import read_card
+from graspd.models.zoo import read_card
 
 ALLOWED: Final = 0.05
 TARGETS: Final = (0.02, ALLOWED, 0.1, 0.2)

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from enum import IntEnum
 from typing import TextIO
 
-from daemon.process.logs import JOURNAL_ERROR, is_journal
+from graspd.daemon.process.logs import JOURNAL_ERROR, is_journal
 
 PROGRESS_MAX = 78
 """Longest progress line, characters; a wrapped line could not be erased."""

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar
 
-from daemon.judge.pipeline import Judgement
-from daemon.publish.messages import Status, Verdict
-from daemon.trust.lift_book import GraspId, LiftBook, Report
-from drivers.base import Reading, TactileReading
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.publish.messages import Status, Verdict
+from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
+from graspd.drivers.base import Reading, TactileReading
 
 P = ParamSpec("P")
 R = TypeVar("R")

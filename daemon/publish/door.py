@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Final
 
 import zmq
 
-from daemon.publish.listener import Listener, PublishError
-from daemon.publish.lookout import EVENTS, Lookout, Seldom
+from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.lookout import EVENTS, Lookout, Seldom
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
-    from daemon.process.signals import StopSignal
+    from graspd.daemon.process.signals import StopSignal
 
 log = logging.getLogger("graspd")
 

@@ -10,7 +10,7 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-from daemon.process.files import read_regular
+from graspd.daemon.process.files import read_regular
 
 PUBLIC, SECRET = ".key", ".key_secret"
 """Endings of key files, as pyzmq and czmq have them."""

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Literal, Protocol, TypedDict
 
 import onnxruntime
 
-from daemon import __version__
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, GateChange, Moment, Reason
-from daemon.publish.messages import (
+from graspd.daemon import __version__
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, GateChange, Moment, Reason
+from graspd.daemon.publish.messages import (
     DECISION_CODE,
     GateMessage,
     LearnerHealth,
@@ -27,12 +27,12 @@ from daemon.publish.messages import (
     Verdict,
     encode,
 )
-from daemon.trust.lift_book import Report
-from drivers.base import JointReading, TactileReading
-from models.contract import Finger
+from graspd.daemon.trust.lift_book import Report
+from graspd.drivers.base import JointReading, TactileReading
+from graspd.models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.trust.trust import Trust
+    from graspd.daemon.trust.trust import Trust
 
 SHA_DIGITS = 12
 BUCKET_RATIO = 1.02

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from daemon.publish.companion import REPEATED, Requests
-from daemon.publish.door import Frames
-from daemon.publish.messages import OBJECT_PATTERN
-from daemon.trust.lift_book import GraspId, Report
+from graspd.daemon.publish.companion import REPEATED, Requests
+from graspd.daemon.publish.door import Frames
+from graspd.daemon.publish.messages import OBJECT_PATTERN
+from graspd.daemon.trust.lift_book import GraspId, Report
 
 JUDGE, LIFT = b"judge", b"lift"
 """Questions. Only `lift` makes the peer the owner of the grasp."""

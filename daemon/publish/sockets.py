@@ -10,18 +10,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from daemon.judge.reasons import Decision
-from daemon.publish.companion import Companion, PublishedVerdict, Requests
-from daemon.publish.door import Admission, Door
-from daemon.publish.listener import Listener, PublishError
-from daemon.publish.messages import Status
-from daemon.scene import Scene, SceneError
-from daemon.scene.scene import Curve
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
+from graspd.daemon.publish.door import Admission, Door
+from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.messages import Status
+from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.scene import Curve
 
 if TYPE_CHECKING:
-    from daemon.process.signals import StopSignal
-    from daemon.publish.keys import Clients
-    from daemon.publish.questions import Questions
+    from graspd.daemon.process.signals import StopSignal
+    from graspd.daemon.publish.keys import Clients
+    from graspd.daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
 
@@ -70,7 +70,7 @@ class Sockets(Companion):
         self._publish = Listener(wanted.endpoint, mode, publish.group)
         if wanted.ask_endpoint is not None:
             self._ask = Listener(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
-            from daemon.publish.questions import Questions  # only where peers may ask
+            from graspd.daemon.publish.questions import Questions  # only where peers may ask
 
             self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6))
 
@@ -88,7 +88,7 @@ class Sockets(Companion):
             self._filenos = [self._door.fileno()]
 
     def _load_keys(self, curve: Curve) -> Admission:
-        from daemon.publish import keys  # only where there are any
+        from graspd.daemon.publish import keys  # only where there are any
 
         self._keys_seen = _state(curve.clients)
         try:
@@ -174,7 +174,7 @@ class Sockets(Companion):
                 log.error("%s; no peer can connect", error)
 
     def _take_keys(self, curve: Curve, admission: Admission) -> None:
-        from daemon.publish import keys
+        from graspd.daemon.publish import keys
 
         try:
             clients = keys.load_clients(curve.clients)

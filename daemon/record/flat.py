@@ -8,7 +8,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import inspect
 
-from drivers.base import ELECTRODES
+from graspd.drivers.base import ELECTRODES
 
 JsonSchema = dict[str, Any]
 TABLE: Final = (

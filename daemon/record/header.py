@@ -7,8 +7,8 @@ from typing import Any, Final, Self
 
 import msgspec
 
-from drivers.base import FINGERS
-from models.session_statistics import SessionState
+from graspd.drivers.base import FINGERS
+from graspd.models.session_statistics import SessionState
 
 _TEXTS: Final = ("boot_id", "model", "model_sha256", "judge", "trust")
 """Fields written as text, or as base64 if they are bytes; all others are JSON."""
@@ -33,13 +33,13 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
     wall_minus_monotonic_ns: int = 0
     """Wall time less the daemon's monotonic time, ns."""
     judge: bytes = b""
-    """State of the judge, from `daemon.judge.memory.encode`; empty: not known."""
+    """State of the judge, from `graspd.daemon.judge.memory.encode`; empty: not known."""
     axis_ns: int = 0
     """Difference `t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
     session: SessionState | None = None
     """Statistics of the session; None for a model without a session."""
     trust: bytes = b""
-    """State of learning, from `daemon.trust.trust.encode`; empty without learning."""
+    """State of learning, from `graspd.daemon.trust.trust.encode`; empty without learning."""
     says_judged: bool = True
     """True if the file has `judged` messages."""
 

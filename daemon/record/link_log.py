@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
-from drivers.base import Driver
+from graspd.daemon.scene.drivers import CanTactile, SpiTactile, Tactile
+from graspd.drivers.base import Driver
 
 EARLY_MAX: Final = 1000
 """Most entries that are held until the recorder starts."""
@@ -53,8 +53,8 @@ class Tap:
 def tap_of(driver: Driver, section: Tactile) -> Tap | None:
     """Return a tap on a CAN or serial link; None for other drivers."""
     if isinstance(section, CanTactile):
-        from drivers.can.driver import CanBridgeDriver
-        from drivers.recordings.can_log import encode_frames
+        from graspd.drivers.can.driver import CanBridgeDriver
+        from graspd.drivers.recordings.can_log import encode_frames
 
         name = section.channel.replace(" ", "_")
         tap = Tap(".can.log", lambda _, offset_ns, frames: encode_frames(frames, offset_ns, name))
@@ -62,8 +62,8 @@ def tap_of(driver: Driver, section: Tactile) -> Tap | None:
             driver.tap(tap.take)
         return tap
     if isinstance(section, SpiTactile):
-        from drivers.recordings.serial_log import encode_records
-        from drivers.spi.driver import SpiBridgeDriver
+        from graspd.drivers.recordings.serial_log import encode_records
+        from graspd.drivers.spi.driver import SpiBridgeDriver
 
         tap = Tap(".serial", lambda at_ns, _, event, data: encode_records(event, at_ns, data))
         if isinstance(driver, SpiBridgeDriver):

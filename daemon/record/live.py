@@ -10,9 +10,9 @@ from typing import Final, Self
 import foxglove
 import msgspec
 
-from daemon.record.flat import flat
-from daemon.record.topics import schemas
-from daemon.record.viewers import Viewer
+from graspd.daemon.record.flat import flat
+from graspd.daemon.record.topics import schemas
+from graspd.daemon.record.viewers import Viewer
 
 ADDRESS: Final = "127.0.0.1"
 """Address of the server; only loopback, because it does not check who connects."""

@@ -19,11 +19,11 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 
-from daemon.record.files import RecordingFile
-from daemon.record.header import RecordingHeader
-from daemon.record.topics import schemas
-from drivers.base import RecordingError
-from drivers.recordings.csv_rows import open_recording
+from graspd.daemon.record.files import RecordingFile
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.topics import schemas
+from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.csv_rows import open_recording
 
 METADATA: Final = "graspd"
 """Name of the metadata record at the start of each file of graspd."""

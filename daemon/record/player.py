@@ -8,9 +8,9 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.publish.messages import OutcomeMessage, decode_outcome
-from daemon.record.mcap import McapReader, RecordedMessage, header_of
-from daemon.record.topics import (
+from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome
+from graspd.daemon.record.mcap import McapReader, RecordedMessage, header_of
+from graspd.daemon.record.topics import (
     EVENTS,
     Exchanged,
     Topic,
@@ -18,9 +18,9 @@ from daemon.record.topics import (
     joint_reading,
     tactile_reading,
 )
-from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
-from drivers.recordings.csv_rows import open_recording
-from drivers.recordings.player import RecordedDriver
+from graspd.drivers.base import DriverCounters, Reading, RecordingError, TactileReading
+from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.player import RecordedDriver
 
 _log = logging.getLogger(__name__)
 

@@ -17,22 +17,22 @@ from typing import TYPE_CHECKING, Final, cast
 import msgspec
 from msgspec.structs import replace
 
-from daemon.process.worker import Worker
-from daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
-from daemon.record.files import RecordingFile, Retention
-from daemon.record.flat import flat
-from daemon.record.header import RecordingHeader
-from daemon.record.mcap import McapWriter
-from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
-from daemon.record.viewers import Viewer
-from daemon.scene.scene import Record
-from drivers.base import JointReading, Reading
+from graspd.daemon.process.worker import Worker
+from graspd.daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
+from graspd.daemon.record.files import RecordingFile, Retention
+from graspd.daemon.record.flat import flat
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.mcap import McapWriter
+from graspd.daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
+from graspd.daemon.record.viewers import Viewer
+from graspd.daemon.scene.scene import Record
+from graspd.drivers.base import JointReading, Reading
 
 if TYPE_CHECKING:
-    from daemon.publish.messages import Status
-    from daemon.record.link_log import Tap
-    from daemon.trust.learner import LearnerState
-    from models.session_statistics import SessionState
+    from graspd.daemon.publish.messages import Status
+    from graspd.daemon.record.link_log import Tap
+    from graspd.daemon.trust.learner import LearnerState
+    from graspd.models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 

@@ -11,15 +11,15 @@ from typing import Annotated, Any, Final, Literal, Self
 import msgspec
 import numpy as np
 
-from daemon.judge.pipeline import Judgement
-from daemon.publish import messages
-from daemon.publish.messages import WIRE_VERSION, Count, Tactile
-from daemon.record.flat import schema_of, table
-from daemon.record.viewers import Log, RawImage
-from daemon.trust.learner import LearnerState
-from drivers.base import ELECTRODES, JointReading, TactileReading
-from drivers.hand import JOINTS
-from models.session_statistics import SessionState
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.publish import messages
+from graspd.daemon.publish.messages import WIRE_VERSION, Count, Tactile
+from graspd.daemon.record.flat import schema_of, table
+from graspd.daemon.record.viewers import Log, RawImage
+from graspd.daemon.trust.learner import LearnerState
+from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
+from graspd.drivers.hand import JOINTS
+from graspd.models.session_statistics import SessionState
 
 _ANGLES = msgspec.Meta(
     extra_json_schema={"properties": {name: {"type": "number"} for name in sorted(JOINTS)}}

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import ADVICE, Decision, GateState, Reason, to_act_on
-from daemon.publish.messages import (
+from graspd.daemon.judge.reasons import ADVICE, Decision, GateState, Reason, to_act_on
+from graspd.daemon.publish.messages import (
     MESSAGES,
     Count,
     GateMessage,
@@ -21,8 +21,8 @@ from daemon.publish.messages import (
     Tactile,
     Verdict,
 )
-from drivers.base import ELECTRODES
-from models.levels import FULL, HEIGHT, PIXELS, WIDTH, RestCounts, fall_of, levels_of
+from graspd.drivers.base import ELECTRODES
+from graspd.models.levels import FULL, HEIGHT, PIXELS, WIDTH, RestCounts, fall_of, levels_of
 
 INFO: Final = 2
 WARNING: Final = 3

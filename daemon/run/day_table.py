@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from daemon.judge.network import Examined, Network
-from daemon.judge.reasons import Decision
-from daemon.process.text import Colour, coloured, write_lines
-from daemon.publish.companion import Companion, PublishedVerdict
-from daemon.run.summary import Tally
-from daemon.trust.trust import Trust
-from models.runtime import TactileModel
+from graspd.daemon.judge.network import Examined, Network
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.process.text import Colour, coloured, write_lines
+from graspd.daemon.publish.companion import Companion, PublishedVerdict
+from graspd.daemon.run.summary import Tally
+from graspd.daemon.trust.trust import Trust
+from graspd.models.runtime import TactileModel
 
 GRASPS = 25
 """Grasps of one line."""

@@ -11,10 +11,10 @@ from enum import Enum
 from functools import partial
 from typing import Final
 
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.process.signals import StopSignal
-from daemon.process.sleep import Sleep
-from daemon.publish.companion import (
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.process.sleep import Sleep
+from graspd.daemon.publish.companion import (
     REPEATED,
     Answer,
     Companion,
@@ -23,11 +23,11 @@ from daemon.publish.companion import (
     at_once,
     hooks,
 )
-from daemon.publish.messages import State, Verdict
-from daemon.publish.outbox import Deadlines, Outbox
-from daemon.run.overload import LoadShedder, mark_repeats
-from daemon.run.reload import Reload
-from daemon.trust.lift_book import (
+from graspd.daemon.publish.messages import State, Verdict
+from graspd.daemon.publish.outbox import Deadlines, Outbox
+from graspd.daemon.run.overload import LoadShedder, mark_repeats
+from graspd.daemon.run.reload import Reload
+from graspd.daemon.trust.lift_book import (
     NOT_YOURS,
     REFUSALS,
     UNKNOWN_START,
@@ -35,7 +35,7 @@ from daemon.trust.lift_book import (
     OutcomeStatus,
     Report,
 )
-from drivers.base import Driver, JointReading, Reading, TactileReading
+from graspd.drivers.base import Driver, JointReading, Reading, TactileReading
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
 """Time between two status messages, ns."""

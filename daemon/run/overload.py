@@ -15,7 +15,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.base import ElectrodeFault, TactileReading
 
 BACKLOG_MAX_NS: Final = 10_000_000
 """Longest backlog, ns, that is judged completely; one sensor period if that is longer."""

@@ -6,14 +6,14 @@ import json
 import sys
 import time
 
-from daemon.judge.reasons import Decision, GateState
-from daemon.process.text import Colour, coloured, printable
-from daemon.publish.companion import Companion, PublishedVerdict
-from daemon.publish.messages import Verdict
-from daemon.run.summary import RunSummary
-from daemon.trust.lift_book import Report
-from daemon.trust.trust import Trust
-from drivers.base import Annotation
+from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.daemon.process.text import Colour, coloured, printable
+from graspd.daemon.publish.companion import Companion, PublishedVerdict
+from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.run.summary import RunSummary
+from graspd.daemon.trust.lift_book import Report
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import Annotation
 
 NAME_MAX = 80
 """Most printed characters of an object's name."""

@@ -10,9 +10,9 @@ import resource
 from contextlib import suppress
 from typing import Self
 
-from daemon.publish.companion import Companion
-from daemon.publish.messages import Status
-from daemon.scene.scene import Realtime
+from graspd.daemon.publish.companion import Companion
+from graspd.daemon.publish.messages import Status
+from graspd.daemon.scene.scene import Realtime
 
 log = logging.getLogger("graspd")
 

@@ -8,9 +8,9 @@ from random import Random
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.pipeline import Pipeline
-from drivers.base import TactileReading
-from models.contract import SeenCounts
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.drivers.base import TactileReading
+from graspd.models.contract import SeenCounts
 
 PERIOD_NS = 10_000_000
 """Time between two readings, ns (100 Hz, as the tare expects)."""

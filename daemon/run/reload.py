@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from daemon.assembly.parts import Parts
-from daemon.process.signals import StopSignal
-from daemon.process.worker import Worker
-from daemon.publish.companion import Companion
+from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.process.worker import Worker
+from graspd.daemon.publish.companion import Companion
 
 PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two preparations, ns, from start to start."""

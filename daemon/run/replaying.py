@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion, PublishedVerdict, Requests
-from daemon.publish.messages import OBJECT_PATTERN
-from daemon.run.summary import RunSummary
-from daemon.trust.lift_book import GraspId, Report
-from models.runtime import TactileModel
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
+from graspd.daemon.publish.messages import OBJECT_PATTERN
+from graspd.daemon.run.summary import RunSummary
+from graspd.daemon.trust.lift_book import GraspId, Report
+from graspd.models.runtime import TactileModel
 
 
 class _Lift(NamedTuple):

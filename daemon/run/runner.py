@@ -9,24 +9,24 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.parts import Assembly, Parts
-from daemon.process.signals import StopSignal
-from daemon.publish.listener import PublishError
-from daemon.publish.sockets import Sockets, plan
-from daemon.run.loop import Ended, Loop, LoopTiming
-from daemon.run.reload import Reload
-from daemon.scene.drivers import ReplayTactile
-from drivers.base import DriverError
-from models.contract import ModelError
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.listener import PublishError
+from graspd.daemon.publish.sockets import Sockets, plan
+from graspd.daemon.run.loop import Ended, Loop, LoopTiming
+from graspd.daemon.run.reload import Reload
+from graspd.daemon.scene.drivers import ReplayTactile
+from graspd.drivers.base import DriverError
+from graspd.models.contract import ModelError
 
 if TYPE_CHECKING:
-    from daemon.run.printer import Printer
-    from daemon.run.realtime import RealtimeMode
-    from daemon.run.replaying import Controller
-    from daemon.run.systemd import Systemd
-    from daemon.trust.trust import Trust
+    from graspd.daemon.run.printer import Printer
+    from graspd.daemon.run.realtime import RealtimeMode
+    from graspd.daemon.run.replaying import Controller
+    from graspd.daemon.run.systemd import Systemd
+    from graspd.daemon.trust.trust import Trust
 
 log = logging.getLogger("graspd")
 
@@ -45,7 +45,7 @@ def prepare(path: Path) -> Parts:
 
 def rehearse_grasp(parts: Parts) -> None:
     """Judge a synthetic grasp."""
-    from daemon.run.rehearsal import rehearse  # only where a scene wants realtime
+    from graspd.daemon.run.rehearsal import rehearse  # only where a scene wants realtime
 
     # With its own model, because judging changes the scaling of a model's inputs.
     try:
@@ -61,7 +61,7 @@ def enter_realtime(running: scene.Scene, stack: ExitStack) -> RealtimeMode | Non
     """Enter realtime mode until `stack` closes; None without `[realtime]`."""
     if running.realtime is None:
         return None
-    from daemon.run.realtime import RealtimeMode  # only where a scene wants realtime
+    from graspd.daemon.run.realtime import RealtimeMode  # only where a scene wants realtime
 
     return stack.enter_context(RealtimeMode(running.realtime))
 
@@ -70,7 +70,7 @@ def _controller(wanted: scene.Scene) -> Controller | None:
     """Return what tells recorded outcomes, if the scene wants it."""
     if not isinstance(wanted.tactile, ReplayTactile) or not wanted.tactile.outcomes:
         return None
-    from daemon.run.replaying import Controller  # only where a scene wants it
+    from graspd.daemon.run.replaying import Controller  # only where a scene wants it
 
     return Controller(only_lifted=True)
 

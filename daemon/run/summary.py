@@ -8,11 +8,11 @@ from typing import Any, Final
 
 import msgspec
 
-from daemon.judge.pipeline import Judgement
-from daemon.judge.reasons import Decision, Reason
-from daemon.publish.messages import Verdict
-from daemon.publish.outbox import LatencyHistogram
-from daemon.trust.trust import Trust
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.publish.outbox import LatencyHistogram
+from graspd.daemon.trust.trust import Trust
 
 WINDOW: Final = 50
 """Number of `stable` lifts in a row among which the most slips are counted."""

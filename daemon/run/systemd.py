@@ -8,8 +8,8 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 
-from daemon.publish.companion import Companion
-from daemon.publish.messages import Status
+from graspd.daemon.publish.companion import Companion
+from graspd.daemon.publish.messages import Status
 
 log = logging.getLogger("graspd")
 

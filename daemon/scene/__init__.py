@@ -1,5 +1,5 @@
 """The scene: one TOML file that describes a hand and how to judge, read and checked."""
 
-from daemon.scene.scene import Scene, SceneError, load, parse
+from graspd.daemon.scene.scene import Scene, SceneError, load, parse
 
 __all__ = ["Scene", "SceneError", "load", "parse"]

@@ -15,8 +15,8 @@ from pydantic import (
     field_validator,
 )
 
-from drivers.base import COUNT_MAX, ELECTRODES
-from models.contract import Finger
+from graspd.drivers.base import COUNT_MAX, ELECTRODES
+from graspd.models.contract import Finger
 
 StrOrPath = TypeVar("StrOrPath", str, Path)
 

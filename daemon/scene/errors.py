@@ -9,7 +9,7 @@ from typing import get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from daemon.process.text import did_you_mean, printable
+from graspd.daemon.process.text import did_you_mean, printable
 
 Section = type[BaseModel]
 

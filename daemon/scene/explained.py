@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import drivers.recordings
-from daemon.process.text import markdown_table
-from daemon.scene import Scene
+import graspd.drivers.recordings
+from graspd.daemon.process.text import markdown_table
+from graspd.daemon.scene import Scene
 
 EXAMPLES = Path(__file__).parent / "examples"
 """Folder of examples: in the repository a link to deploy/scenes, installed a copy."""
@@ -43,7 +43,7 @@ def examples() -> list[str]:
 def example(name: str) -> str:
     """Return an example scene with absolute paths, so that it works from any folder."""
     text = (EXAMPLES / f"{name}.toml").read_text()
-    recordings = Path(drivers.recordings.__file__).resolve().parent
+    recordings = Path(graspd.drivers.recordings.__file__).resolve().parent
     text = text.replace("../../drivers/recordings", str(recordings))
     return text.replace(f"./{SCHEMA}", (EXAMPLES / SCHEMA).resolve().as_uri())
 

@@ -1,6 +1,6 @@
 """The scene: one TOML file that describes a hand, and how to judge its grasps."""
 
-# Without postponed annotations, as in `daemon.scene.drivers`.
+# Without postponed annotations, as in `graspd.daemon.scene.drivers`.
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,10 +14,10 @@ from pydantic import (
     model_validator,
 )
 
-from daemon.judge.decision import ContactLimits, GateLimits, JointLimits, Limits
-from daemon.process.files import read_regular
-from daemon.process.text import printable
-from daemon.scene.drivers import (
+from graspd.daemon.judge.decision import ContactLimits, GateLimits, JointLimits, Limits
+from graspd.daemon.process.files import read_regular
+from graspd.daemon.process.text import printable
+from graspd.daemon.scene.drivers import (
     CanTactile,
     FilePath,
     Joints,
@@ -30,9 +30,9 @@ from daemon.scene.drivers import (
     Tactile,
     unit,
 )
-from daemon.scene.endpoints import check_endpoint, is_private
-from drivers import toml
-from models.contract import Finger
+from graspd.daemon.scene.endpoints import check_endpoint, is_private
+from graspd.drivers import toml
+from graspd.models.contract import Finger
 
 SCENE_MAX_BYTES = 128 << 10
 """Largest scene file, bytes; one that names a thousand recordings has 100 kB."""
@@ -380,7 +380,7 @@ def load(path: Path) -> Scene:
     except toml.NestedTooDeeplyError as error:
         raise SceneError(f"{path}: not TOML that can be read: {error}") from error
     except ValueError as error:  # TOMLDecodeError, or Python's limit on long numbers
-        from daemon.scene.errors import MESSAGE_MAX
+        from graspd.daemon.scene.errors import MESSAGE_MAX
 
         raise SceneError(f"{path}: not TOML: {printable(str(error), MESSAGE_MAX)}") from error
     return parse(data, path)
@@ -391,6 +391,6 @@ def parse(data: Mapping[str, Any], path: Path) -> Scene:
     try:
         return Scene.model_validate(data, context={"base": path.parent})
     except ValidationError as error:
-        from daemon.scene.errors import lines_of
+        from graspd.daemon.scene.errors import lines_of
 
         raise SceneError("\n".join(lines_of(error, Scene, path))) from error

@@ -15,10 +15,10 @@ from typing import Annotated, Final, Self
 
 import msgspec
 
-from daemon.process.files import read_regular, write_atomically
-from daemon.trust.trust import TrustState, encode
-from drivers.base import COUNT_MAX
-from models.session_statistics import SessionState
+from graspd.daemon.process.files import read_regular, write_atomically
+from graspd.daemon.trust.trust import TrustState, encode
+from graspd.drivers.base import COUNT_MAX
+from graspd.models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 
@@ -46,7 +46,7 @@ class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     statistics: SessionState | None
     """Statistics of a session model; None if no model needed any."""
     trust: bytes | None = None
-    """State of learning, from `daemon.trust.trust.encode`; None without learning."""
+    """State of learning, from `graspd.daemon.trust.trust.encode`; None without learning."""
     rest: tuple[Annotated[float, msgspec.Meta(ge=0.0, le=COUNT_MAX)], ...] | None = None
     """Resting count of each electrode, finger by finger; 0: not known."""
 

@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from daemon.judge.calibration import SessionCalibration
-from daemon.process.worker import Worker
-from daemon.publish.companion import Answer, Requests
-from daemon.session.file import (
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.process.worker import Worker
+from graspd.daemon.publish.companion import Answer, Requests
+from graspd.daemon.session.file import (
     OTHERS_MAX,
     KeptSession,
     SessionFile,
@@ -25,11 +25,11 @@ from daemon.session.file import (
     others,
     statistics_of,
 )
-from daemon.session.rest import Rest, moved_fingers
-from daemon.session.sensors import UNTOLD, OnExchange, SensorWatch
-from daemon.trust.trust import Trust, TrustState, decode
-from drivers.base import ELECTRODES, Driver
-from models.session_statistics import SessionState
+from graspd.daemon.session.rest import Rest, moved_fingers
+from graspd.daemon.session.sensors import UNTOLD, OnExchange, SensorWatch
+from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.drivers.base import ELECTRODES, Driver
+from graspd.models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 

@@ -6,13 +6,13 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
-from daemon.publish.companion import Companion
-from daemon.session.rest import Rest, has_drifted, moved_fingers
-from drivers.base import Driver, Reading
+from graspd.daemon.publish.companion import Companion
+from graspd.daemon.session.rest import Rest, has_drifted, moved_fingers
+from graspd.drivers.base import Driver, Reading
 
 if TYPE_CHECKING:
-    from daemon.trust.learner import LearnerState
-    from models.session_statistics import SessionState
+    from graspd.daemon.trust.learner import LearnerState
+    from graspd.models.session_statistics import SessionState
 
 OnExchange = Callable[["SessionState | None", "LearnerState | None"], None]
 """Called with the states of the new sensors' session and learning; None: unknown."""

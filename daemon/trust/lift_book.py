@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from daemon.trust.learner import vector
+from graspd.daemon.trust.learner import vector
 
 LIFTS_MAX: Final = 256
 """Grasps in the book: those of an hour and more. Outcomes of older ones are refused."""

@@ -15,9 +15,15 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from daemon.trust.learner import Learner, LearnerState, sigmoid
-from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, LiftBookState, OutcomeStatus
-from daemon.trust.risk import Permission, Risk, RiskLimits, RiskReport, RiskState
+from graspd.daemon.trust.learner import Learner, LearnerState, sigmoid
+from graspd.daemon.trust.lift_book import (
+    NOT_ASSESSED,
+    GraspId,
+    LiftBook,
+    LiftBookState,
+    OutcomeStatus,
+)
+from graspd.daemon.trust.risk import Permission, Risk, RiskLimits, RiskReport, RiskState
 
 MAX_BYTES: Final = 1 << 20
 """Largest uncompressed state, bytes; three fingers with all outcomes still out take 240 kB."""

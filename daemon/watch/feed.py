@@ -10,8 +10,8 @@ from typing import Final, Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from daemon.process.sleep import boottime_ns
-from daemon.publish.keys import load_pair, load_public
+from graspd.daemon.process.sleep import boottime_ns
+from graspd.daemon.publish.keys import load_pair, load_public
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX: Final = 2000

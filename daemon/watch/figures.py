@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from daemon.judge.reasons import Decision
-from daemon.judge.windows import LONG_NS
-from daemon.publish.messages import Status, Verdict
-from daemon.watch.snapshot import Line
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.judge.windows import LONG_NS
+from graspd.daemon.publish.messages import Status, Verdict
+from graspd.daemon.watch.snapshot import Line
 
 SURE_MS = LONG_NS / 1e6
 """Time without motion, ms, after which a slow slide is excluded."""

@@ -7,11 +7,11 @@ from collections.abc import Collection
 import msgspec
 import numpy as np
 
-from daemon.judge.reasons import FingerState
-from daemon.publish.messages import Tactile, Verdict
-from models.contract import Finger
-from models.layout import ELECTRODES
-from models.levels import PIXELS, RestCounts, fall_of, levels_of
+from graspd.daemon.judge.reasons import FingerState
+from graspd.daemon.publish.messages import Tactile, Verdict
+from graspd.models.contract import Finger
+from graspd.models.layout import ELECTRODES
+from graspd.models.levels import PIXELS, RestCounts, fall_of, levels_of
 
 OLD_NS = 1_000_000_000
 """Older images are not shown."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 
-from daemon.judge.reasons import Decision, GateState
-from daemon.publish.messages import OutcomeMessage, Verdict
-from daemon.watch.figures import lift
-from daemon.watch.snapshot import JudgedGrasp
+from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.daemon.publish.messages import OutcomeMessage, Verdict
+from graspd.daemon.watch.figures import lift
+from graspd.daemon.watch.snapshot import JudgedGrasp
 
 GRASPS_MAX = 8
 OPEN = {GateState.IDLE, GateState.RELEASED}

@@ -17,9 +17,9 @@ from typing import Self
 from rich.console import Console
 from rich.live import Live
 
-from daemon.process.signals import StopSignal
-from daemon.watch.terminal import Screen, draw
-from daemon.watch.view import TICK_S, HandFeed, snapshots
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.watch.terminal import Screen, draw
+from graspd.daemon.watch.view import TICK_S, HandFeed, snapshots
 
 SIGNALS_MAX = 64
 

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import msgspec
 
-from daemon.watch.fingers import FingerImage
+from graspd.daemon.watch.fingers import FingerImage
 
 
 class Tone(StrEnum):

@@ -12,9 +12,9 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from daemon.process.text import printable
-from daemon.watch.fingers import FingerImage, FingerMotion
-from daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
+from graspd.daemon.process.text import printable
+from graspd.daemon.watch.fingers import FingerImage, FingerMotion
+from graspd.daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
 
 STYLES = {
     Tone.STABLE: "bold #ffffff on #2da44e",

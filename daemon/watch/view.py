@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from daemon.judge.reasons import (
+from graspd.daemon.judge.reasons import (
     ADVICE,
     OF_THE_HAND,
     WATCHED_LIFT,
@@ -18,8 +18,8 @@ from daemon.judge.reasons import (
     Reason,
     to_act_on,
 )
-from daemon.process.sleep import boottime_ns
-from daemon.publish.messages import (
+from graspd.daemon.process.sleep import boottime_ns
+from graspd.daemon.publish.messages import (
     MESSAGES,
     GateMessage,
     OutcomeMessage,
@@ -27,12 +27,12 @@ from daemon.publish.messages import (
     Tactile,
     Verdict,
 )
-from daemon.watch import figures
-from daemon.watch.feed import CONNECTED, Feed
-from daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
-from daemon.watch.fingers import Fingers
-from daemon.watch.grasps import OPEN, GraspLog
-from daemon.watch.snapshot import Line, Snapshot, Tone
+from graspd.daemon.watch import figures
+from graspd.daemon.watch.feed import CONNECTED, Feed
+from graspd.daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
+from graspd.daemon.watch.fingers import Fingers
+from graspd.daemon.watch.grasps import OPEN, GraspLog
+from graspd.daemon.watch.snapshot import Line, Snapshot, Tone
 
 TICK_S = 0.02
 """Time between two looks at the feeds, s: silence is timed this exactly."""

@@ -18,8 +18,8 @@ from typing import Any, Final
 
 import msgspec
 
-from daemon.process.signals import StopSignal
-from daemon.watch.view import TICK_S, HandFeed, snapshots
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.watch.view import TICK_S, HandFeed, snapshots
 
 log = logging.getLogger("graspd.watch")
 
@@ -168,7 +168,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 def load_page() -> tuple[bytes, str]:
     """Return the page, and the policy that lets it run its own script and style alone."""
-    folder = resources.files("daemon.watch")
+    folder = resources.files("graspd.daemon.watch")
     text = folder.joinpath("page.html").read_text("utf-8")
     policy = "default-src 'none'; "
     for element, file in (("script", "page.js"), ("style", "page.css")):

@@ -19,8 +19,8 @@ from typing import Any, Final
 
 import can
 
-from drivers.base import DriverError, LinkCause, LinkError
-from drivers.can.frames import (
+from graspd.drivers.base import DriverError, LinkCause, LinkError
+from graspd.drivers.can.frames import (
     CANFD_FRAME,
     ERROR,
     EXTENDED,
@@ -31,8 +31,8 @@ from drivers.can.frames import (
     Stamped,
     unpack_frame,
 )
-from drivers.can.readings import CanCounters
-from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
 
 FRAMES_PER_DRAIN: Final = 512
 """Most frames of one call: about 100 ms of a full bus. The loop must get its turn."""

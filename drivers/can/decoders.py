@@ -7,9 +7,9 @@ from typing import TypedDict
 
 import numpy as np
 
-from drivers.base import FINGERS, ElectrodeFault, TactileReading, check_fingers, sensor_rows
-from drivers.biotac import SEQUENCES, decode_words
-from drivers.can.formats import (
+from graspd.drivers.base import FINGERS, ElectrodeFault, TactileReading, check_fingers, sensor_rows
+from graspd.drivers.biotac import SEQUENCES, decode_words
+from graspd.drivers.can.formats import (
     SWEEP_BASE_ID,
     CanFormat,
     Reject,
@@ -18,16 +18,16 @@ from drivers.can.formats import (
     parse_sweep,
     sample_length,
 )
-from drivers.can.frames import (
+from graspd.drivers.can.frames import (
     EXTENDED,
     EXTENDED_ID_MAX,
     FD,
     STANDARD_ID_MAX,
     CanFrame,
 )
-from drivers.can.readings import CanCounters
-from drivers.can.samples import SampleAssembler
-from drivers.can.sweep_frames import FrameAssembler
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.samples import SampleAssembler
+from graspd.drivers.can.sweep_frames import FrameAssembler
 
 
 class SynTouchDecoder:
@@ -169,7 +169,7 @@ def make_decoder(
     takes the id of the first sound sample until the link is lost; use that for bring-up only.
 
     The rest is for `syntouch`. `sensors`: the fingers in the order of the board's words, at most
-    three; None: `fingers`. `sequence`: a key of `drivers.biotac.SEQUENCES`. `data_length`: bytes of
+    three; None: `fingers`. `sequence`: a key of `graspd.drivers.biotac.SEQUENCES`. `data_length`: bytes of
     a frame, if the board pads its frames.
     """
     check_fingers(fingers)

@@ -13,14 +13,14 @@ from typing import Any, Final, Unpack
 
 import can
 
-from drivers.base import DriverError, Fact, LinkError, Opened, Reading
-from drivers.can.bus import STAMPED_INTERFACES, CanBus
-from drivers.can.decoders import BoardOptions
-from drivers.can.formats import CanFormat
-from drivers.can.frames import LOST, Stamped
-from drivers.can.readings import CanCounters
-from drivers.can.stream import NAME, CanStream
-from drivers.link import CLOSED, UP, WAITING, LinkState
+from graspd.drivers.base import DriverError, Fact, LinkError, Opened, Reading
+from graspd.drivers.can.bus import STAMPED_INTERFACES, CanBus
+from graspd.drivers.can.decoders import BoardOptions
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.can.frames import LOST, Stamped
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.stream import NAME, CanStream
+from graspd.drivers.link import CLOSED, UP, WAITING, LinkState
 
 POLL_NS: Final = 1_000_000
 """Time between reads of a bus without a descriptor, ns."""
@@ -61,7 +61,7 @@ class CanBridgeDriver(Opened):
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`fingers` and `board`: see `drivers.can.decoders.make_decoder`.
+        """`fingers` and `board`: see `graspd.drivers.can.decoders.make_decoder`.
 
         `bitrate`, `data_bitrate`: bit/s; not for socketcan, where `ip link` sets them.
         """

@@ -1,7 +1,7 @@
 """The two formats of a CAN frame's data: SynTouch's samples, and graspd's sweep frames.
 
 SynTouch's board sends one classic frame per sample: the command byte, then each sensor's response
-word (`drivers.biotac`). Source: the public driver `clearpathrobotics/numatac_can_driver`
+word (`graspd.drivers.biotac`). Source: the public driver `clearpathrobotics/numatac_can_driver`
 (`numatac_can_driver.cpp`, `bt_can.h`). Arbitration id and frame length are not public, so the scene
 gives them. The sweep frame is graspd's own: one CAN FD frame per finger and sweep.
 `deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc` describe both.
@@ -18,9 +18,9 @@ from typing import Final
 
 import msgspec
 
-from drivers.base import ELECTRODES, FINGERS
-from drivers.biotac import channel_of, sample_command
-from drivers.can.frames import CLASSIC_DATA_MAX, FD_DATA_MAX
+from graspd.drivers.base import ELECTRODES, FINGERS
+from graspd.drivers.biotac import channel_of, sample_command
+from graspd.drivers.can.frames import CLASSIC_DATA_MAX, FD_DATA_MAX
 
 SENSORS_MAX: Final = 3
 """Most sensors whose words fit into a classic frame behind the command byte."""
@@ -75,7 +75,7 @@ class SweepFrame(msgspec.Struct, frozen=True, gc=False):
     """All electrodes of one finger, sampled in one sweep."""
 
     finger: int
-    """Index in `drivers.base.FINGERS`: 0 ff, 1 mf, 2 rf, 3 lf, 4 th."""
+    """Index in `graspd.drivers.base.FINGERS`: 0 ff, 1 mf, 2 rf, 3 lf, 4 th."""
     sequence: int
     """Number of the device's sweep, the same for all fingers, modulo 65536."""
     tick_us: int

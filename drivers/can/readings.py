@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.base import DriverCounters
+from graspd.drivers.base import DriverCounters
 
 PERIODS_KEPT: Final = 15
 PERIODS_NEEDED: Final = 5

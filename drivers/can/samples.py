@@ -22,9 +22,9 @@ from typing import Final
 
 import numpy as np
 
-from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.biotac import E1, E24, make_reading
-from drivers.can.readings import OUTAGE_NS, CanCounters, SweepPeriod
+from graspd.drivers.base import ELECTRODES, ElectrodeFault, TactileReading
+from graspd.drivers.biotac import E1, E24, make_reading
+from graspd.drivers.can.readings import OUTAGE_NS, CanCounters, SweepPeriod
 
 REORDER_MAX: Final = 3
 """Most places by which a sample may be late; adapters with few buffers swap neighbours."""

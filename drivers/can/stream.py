@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, Unpack
 
-from drivers.base import DeviceFault, Fact, LinkCause, LinkError, Reading
-from drivers.can.decoders import BoardOptions, make_decoder
-from drivers.can.formats import CanFormat
-from drivers.can.frames import (
+from graspd.drivers.base import DeviceFault, Fact, LinkCause, LinkError, Reading
+from graspd.drivers.can.decoders import BoardOptions, make_decoder
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.can.frames import (
     ERROR,
     LOST,
     REMOTE,
@@ -18,8 +18,8 @@ from drivers.can.frames import (
     is_bus_off,
     is_overflow,
 )
-from drivers.can.readings import CanCounters
-from drivers.link import GREETING, UP, Link
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.link import GREETING, UP, Link
 
 NAME: Final = "can"
 SILENCE_PERIODS: Final = 10

@@ -11,9 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.biotac import make_reading
-from drivers.can.readings import CanCounters, SweepPeriod
+from graspd.drivers.base import ELECTRODES, ElectrodeFault, TactileReading
+from graspd.drivers.biotac import make_reading
+from graspd.drivers.can.readings import CanCounters, SweepPeriod
 
 SEQUENCE_JUMP_MAX: Final = 1000
 """Largest jump of the sweep number that counts as a loss (ten seconds); more is a restart."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.joints.message import DATAGRAM_BYTES_MAX, JointCounters, JointStream
-from drivers.udp.driver import DatagramDriver
+from graspd.drivers.joints.message import DATAGRAM_BYTES_MAX, JointCounters, JointStream
+from graspd.drivers.udp.driver import DatagramDriver
 
 
 class JointStreamDriver(DatagramDriver[JointStream]):

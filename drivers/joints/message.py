@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import JointReading
-from drivers.hand import joint_name
-from drivers.udp.driver import DatagramCounters
+from graspd.drivers.base import JointReading
+from graspd.drivers.hand import joint_name
+from graspd.drivers.udp.driver import DatagramCounters
 
 DATAGRAM_BYTES_MAX = 4096
 """Longest message, bytes; all 28 joints in full precision take about 900."""

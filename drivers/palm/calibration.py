@@ -35,8 +35,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import toml
-from drivers.base import COUNT_MAX, DriverError
+from graspd.drivers import toml
+from graspd.drivers.base import COUNT_MAX, DriverError
 
 HALL_SENSORS: Final = {
     **{

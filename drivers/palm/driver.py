@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from drivers.base import Reading
-from drivers.link import LinkState
-from drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
-from drivers.palm.stream import ROUND_NS, PalmStream
-from drivers.udp.driver import DatagramDriver
+from graspd.drivers.base import Reading
+from graspd.drivers.link import LinkState
+from graspd.drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
+from graspd.drivers.palm.stream import ROUND_NS, PalmStream
+from graspd.drivers.udp.driver import DatagramDriver
 
 SPARE_CYCLES: Final = 2
 """Cycles before the end of a round from which the driver waits for packets again."""

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from drivers.base import ELECTRODES
-from drivers.udp.driver import DatagramCounters
+from graspd.drivers.base import ELECTRODES
+from graspd.drivers.udp.driver import DatagramCounters
 
 CYCLE_NS = 1_000_000
 """Time between two packets of a palm, ns."""
 SENSORS = 37
-"""Number of words in `sensors`; 0..25 are Hall sensors (`drivers.palm.calibration`)."""
+"""Number of words in `sensors`; 0..25 are Hall sensors (`graspd.drivers.palm.calibration`)."""
 MOTOR_BYTES: Final = 8 + 10 * 4
 """Bytes behind `which_motors`: two masks, and records of the even or odd ones of 20 motors."""
 TACTILE_FINGERS = 5
-"""Number of tactile slots, in the order of `drivers.base.FINGERS`."""
+"""Number of tactile slots, in the order of `graspd.drivers.base.FINGERS`."""
 
 COMMAND_EMPTY: Final = 0
 """`command` of a packet that the palm was too late to fill; all its bytes are zero."""
@@ -101,7 +101,7 @@ class PalmPacket:
     tactile_valid: int
     """Bit i is set if slot i is valid: 0 first finger ... 4 thumb."""
     tactile: tuple[TactileSlot, ...]
-    """Five slots, in the order of `drivers.base.FINGERS`."""
+    """Five slots, in the order of `graspd.drivers.base.FINGERS`."""
 
     def to_bytes(self) -> bytes:
         """Return the packet as bytes; skipped fields are zero. Raises `ValueError`."""

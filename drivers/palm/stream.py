@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
+from graspd.drivers.base import (
     COUNT_MAX,
     ELECTRODES,
     FINGERS,
@@ -34,7 +34,7 @@ from drivers.base import (
     TactileReading,
     check_fingers,
 )
-from drivers.palm.packet import (
+from graspd.drivers.palm.packet import (
     CHANNELS,
     CYCLE_NS,
     ROUND,
@@ -53,7 +53,7 @@ from drivers.palm.packet import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from drivers.palm.calibration import JointCalibration
+    from graspd.drivers.palm.calibration import JointCalibration
 
 ROUND_NS: Final = ROUND * CYCLE_NS
 """Time between two samples of an electrode, ns (71.43 Hz)."""
@@ -117,7 +117,7 @@ class PalmStream:
         self._joint_seq = 0
         if calibration is not None:
             # Imported here so that a scene without joints does not load joint code.
-            from drivers.palm.calibration import load_calibration
+            from graspd.drivers.palm.calibration import load_calibration
 
             self._calibration = load_calibration(calibration)
             counts = range(SENSORS)  # any valid values
@@ -290,7 +290,7 @@ class PalmStream:
     def _joint_reading(self, packet: PalmPacket, t_ns: int) -> JointReading | None:
         if self._calibration is None or t_ns < self._joint_due_ns:
             return None
-        from drivers.palm.calibration import JOINTS, impossible_angles
+        from graspd.drivers.palm.calibration import JOINTS, impossible_angles
 
         self._joint_due_ns += JOINT_PERIOD_NS
         if self._joint_due_ns <= t_ns:

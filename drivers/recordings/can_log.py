@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, Unpack
 
-from drivers.base import Reading
-from drivers.can.decoders import BoardOptions
-from drivers.can.frames import (
+from graspd.drivers.base import Reading
+from graspd.drivers.can.decoders import BoardOptions
+from graspd.drivers.can.frames import (
     CLASSIC_DATA_MAX,
     ERR_FLAG,
     ERROR,
@@ -28,8 +28,8 @@ from drivers.can.frames import (
     CanFrame,
     Stamped,
 )
-from drivers.can.stream import CanStream
-from drivers.recordings.csv_rows import open_recording
+from graspd.drivers.can.stream import CanStream
+from graspd.drivers.recordings.csv_rows import open_recording
 
 LINE_MAX: Final = 256
 """Longest line, characters; a frame of CAN FD takes 170."""

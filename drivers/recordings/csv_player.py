@@ -10,23 +10,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
+from graspd.drivers.base import (
     ElectrodeFault,
     JointReading,
     Reading,
     TactileReading,
     check_fingers,
 )
-from drivers.recordings.csv_rows import Row, columns_of, read_rows
-from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
-from drivers.recordings.player import RecordedDriver
+from graspd.drivers.recordings.csv_rows import Row, columns_of, read_rows
+from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
+from graspd.drivers.recordings.player import RecordedDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
-"""Table of synthetic grasps, drawn by `drivers.twins.grasps.synthetic`."""
+"""Table of synthetic grasps, drawn by `graspd.drivers.twins.grasps.synthetic`."""
 DEMO_DAY = Path(__file__).parent / "demo" / "synthetic_day.csv"
 """Table of synthetic grasps of sensors that drift, drawn by the same module."""
 DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
-"""Stream of whole synthetic grasps, made by `drivers.twins.grasps.whole_grasps`."""
+"""Stream of whole synthetic grasps, made by `graspd.drivers.twins.grasps.whole_grasps`."""
 SHOW_RECORDING = Path(__file__).parent / "demo" / "synthetic_show.csv"
 """Stream of synthetic grasps that are each held for two seconds, for people to watch."""
 IGNORED_COLUMNS_LOGGED = 10

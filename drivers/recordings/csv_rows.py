@@ -20,7 +20,7 @@ from typing import BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
+from graspd.drivers.base import (
     COUNT_MAX,
     ELECTRODES,
     FINGERS,
@@ -28,7 +28,7 @@ from drivers.base import (
     ElectrodeFault,
     RecordingError,
 )
-from drivers.hand import joint_name
+from graspd.drivers.hand import joint_name
 
 TIME = "t"
 """Column of seconds, with any zero. Files with it are streams, files without it grasp tables."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES, DriverCounters, ElectrodeFault
+from graspd.drivers.base import COUNT_MAX, ELECTRODES, DriverCounters, ElectrodeFault
 
 WORD_MAX = 0xFFFF
 """Largest value of the 16-bit word in which a BioTac SP answers."""

@@ -7,9 +7,9 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from drivers.base import DriverCounters, Reading, RecordingError
-from drivers.recordings.csv_rows import open_recording
-from drivers.recordings.player import RecordedDriver
+from graspd.drivers.base import DriverCounters, Reading, RecordingError
+from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.player import RecordedDriver
 
 CANDUMP, SERIAL = ".log", ".serial"
 """File name endings of the two kinds of link log that graspd writes."""

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from drivers.base import Reading, RecordingError
-from drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, parse_packet
-from drivers.palm.stream import PalmStream
-from drivers.recordings.csv_rows import open_recording
+from graspd.drivers.base import Reading, RecordingError
+from graspd.drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, parse_packet
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.recordings.csv_rows import open_recording
 
 PACKETS_TRIED: Final = 64
 """Number of packets by which the packet length of a file is found."""

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from drivers.base import Fact, Opened, Reading, RecordingError
+from graspd.drivers.base import Fact, Opened, Reading, RecordingError
 
 Item = TypeVar("Item")
 

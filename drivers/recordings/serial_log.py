@@ -1,6 +1,6 @@
 """The link log of a serial line: its bytes with their times.
 
-Each record is a frame of `drivers.spi.messages`, so a reader finds the next one after any damage.
+Each record is a frame of `graspd.drivers.spi.messages`, so a reader finds the next one after any damage.
 Type 1: bytes from the device. Type 2: bytes to it. Type 3: the port was opened. The payload is
 `t: u64` (monotonic ns) and the bytes.
 """
@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers.base import Reading
-from drivers.link import LinkState
-from drivers.recordings.csv_rows import open_recording
-from drivers.spi.conversation import Conversation
-from drivers.spi.line import LineEvent
-from drivers.spi.messages import FrameParser, encode_frame
+from graspd.drivers.base import Reading
+from graspd.drivers.link import LinkState
+from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.spi.conversation import Conversation
+from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.messages import FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960
 """Most bytes of one record; a frame has at most 1024. Longer pieces are cut."""

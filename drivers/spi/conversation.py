@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from drivers.base import DeviceFault, Fact, LinkCause, Reading, TactileReading, sensor_rows
-from drivers.link import GREETING, WAITING, Link
-from drivers.spi.messages import (
+from graspd.drivers.base import DeviceFault, Fact, LinkCause, Reading, TactileReading, sensor_rows
+from graspd.drivers.link import GREETING, WAITING, Link
+from graspd.drivers.spi.messages import (
     DELIMITER,
     DIGEST,
     FIRMWARE,
@@ -24,7 +24,7 @@ from drivers.spi.messages import (
     encode,
     layout_of,
 )
-from drivers.spi.sweeps import BridgeCounters, SweepDecoder
+from graspd.drivers.spi.sweeps import BridgeCounters, SweepDecoder
 
 NAME: Final = "spi"
 GREETING_NS = 500_000_000

@@ -6,12 +6,12 @@ import contextlib
 import time
 from collections.abc import Callable, Sequence
 
-from drivers.base import Fact, LinkError, Opened, Reading
-from drivers.link import CLOSED, GREETING, UP, WAITING, LinkState
-from drivers.spi.conversation import NAME, NONCES, Conversation
-from drivers.spi.line import LineEvent, SerialLine
-from drivers.spi.messages import Stop, encode
-from drivers.spi.sweeps import BridgeCounters
+from graspd.drivers.base import Fact, LinkError, Opened, Reading
+from graspd.drivers.link import CLOSED, GREETING, UP, WAITING, LinkState
+from graspd.drivers.spi.conversation import NAME, NONCES, Conversation
+from graspd.drivers.spi.line import LineEvent, SerialLine
+from graspd.drivers.spi.messages import Stop, encode
+from graspd.drivers.spi.sweeps import BridgeCounters
 
 BAUD = 921_600
 """Bits per second: 92 kB/s, three times the longest sequence; 115200 is too slow for any."""

@@ -14,7 +14,7 @@ from enum import IntEnum
 
 import serial
 
-from drivers.base import DriverError, LinkCause, LinkError
+from graspd.drivers.base import DriverError, LinkCause, LinkError
 
 READ_BYTES = 4096
 """Bytes of one read: a terminal of Linux returns at most this many."""

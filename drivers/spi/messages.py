@@ -16,8 +16,8 @@ import numpy as np
 from cobs import cobs
 from numpy.typing import NDArray
 
-from drivers.base import DriverCounters
-from drivers.biotac import FORBIDDEN_COMMAND
+from graspd.drivers.base import DriverCounters
+from graspd.drivers.biotac import FORBIDDEN_COMMAND
 
 DELIMITER: Final = b"\0"
 """Byte that ends a frame and occurs in no frame, so the next one is found after any damage."""

@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.biotac import E1, E24, channel_of, make_reading
-from drivers.spi.messages import FrameCounters, Hello, Sweep
+from graspd.drivers.base import ELECTRODES, ElectrodeFault, TactileReading
+from graspd.drivers.biotac import E1, E24, channel_of, make_reading
+from graspd.drivers.spi.messages import FrameCounters, Hello, Sweep
 
 SEQ_HALF, SEQ_END = 1 << 31, 1 << 32
 SEQ_FIRST_MAX = 1_000

@@ -10,19 +10,28 @@ from typing import Any, Final
 
 import can
 
-from drivers.base import FINGERS, Opened
-from drivers.biotac import E1, PAC, PDC, SEQUENCE_ELECTRODES, SEQUENCES, TAC, TDC, encode_word
-from drivers.can.bus import open_bus
-from drivers.can.formats import (
+from graspd.drivers.base import FINGERS, Opened
+from graspd.drivers.biotac import (
+    E1,
+    PAC,
+    PDC,
+    SEQUENCE_ELECTRODES,
+    SEQUENCES,
+    TAC,
+    TDC,
+    encode_word,
+)
+from graspd.drivers.can.bus import open_bus
+from graspd.drivers.can.formats import (
     SWEEP_BASE_ID,
     SWEEP_VERSION,
     CanFormat,
     SweepFrame,
     encode_sample,
 )
-from drivers.can.frames import STANDARD_ID_MAX
-from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps.grasps import Counts
+from graspd.drivers.can.frames import STANDARD_ID_MAX
+from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
 
 SAMPLE_ID: Final = 0x100
 """Default arbitration id of samples; that of the real board is not public."""

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterable
 
-from drivers.udp.receiver import Endpoint
+from graspd.drivers.udp.receiver import Endpoint
 
 BEHIND_MAX_NS = 100_000_000
 """Longest delay, ns, that a sender catches up with; after more, its schedule starts again."""

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from drivers.joints.message import JointMessage
-from drivers.twins.datagrams import send_paced
-from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.udp.receiver import Endpoint
+from graspd.drivers.joints.message import JointMessage
+from graspd.drivers.twins.datagrams import send_paced
+from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
+from graspd.drivers.udp.receiver import Endpoint
 
 NAMES = ("FFJ3", "MFJ3", "THJ5")
 RATE_HZ = 100.0

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from drivers.base import FINGERS
-from drivers.palm.packet import (
+from graspd.drivers.base import FINGERS
+from graspd.drivers.palm.packet import (
     CHANNELS,
     COMMAND_SENSOR_DATA,
     CYCLE_NS,
@@ -19,10 +19,10 @@ from drivers.palm.packet import (
     PalmPacket,
     TactileSlot,
 )
-from drivers.twins.datagrams import send_paced
-from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps.grasps import Counts
-from drivers.udp.receiver import Endpoint
+from graspd.drivers.twins.datagrams import send_paced
+from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.udp.receiver import Endpoint
 
 SENSORS_AT_REST = (
     *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706),

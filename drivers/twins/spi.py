@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Opened
-from drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.spi.messages import (
+from graspd.drivers.base import Opened
+from graspd.drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_command
+from graspd.drivers.spi.messages import (
     DELIMITER,
     DIGEST,
     FIRMWARE,
@@ -34,8 +34,8 @@ from drivers.spi.messages import (
     decode,
     encode,
 )
-from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
 
 TICK_HZ = 1_000_000
 SLOT_NS = 80_000

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from drivers.base import DriverCounters, Fact, LinkCause, LinkError, Opened, Reading
-from drivers.link import Link, LinkState
-from drivers.udp.receiver import DatagramReceiver, Endpoint, Sender
+from graspd.drivers.base import DriverCounters, Fact, LinkCause, LinkError, Opened, Reading
+from graspd.drivers.link import Link, LinkState
+from graspd.drivers.udp.receiver import DatagramReceiver, Endpoint, Sender
 
 DRAIN_MAX = 256
 """Most datagrams of one call, so that a flood does not keep the loop from its other work."""

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from drivers.base import LinkError
-from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, read_stamps
+from graspd.drivers.base import LinkError
+from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, read_stamps
 
 SCHEME = "udp://"
 RECEIVE_BUFFER_BYTES: Final = 128 * 1024

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
 
-from models.contract import Finger, ModelError
+from graspd.models.contract import Finger, ModelError
 
 ZOO = Path(__file__).parent
 CARD_MAX_BYTES = 16 << 20

@@ -20,11 +20,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.assembly import assembly
-from daemon.scene.scene import Scene
-from drivers.base import TactileReading
-from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.twins.grasps.grasps import recorded_counts
+from graspd.daemon.assembly import assembly
+from graspd.daemon.scene.scene import Scene
+from graspd.drivers.base import TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.twins.grasps.grasps import recorded_counts
 
 READINGS = 1000
 """Readings of each kind that are counted: start-up differs by as much as 20 of them cost."""

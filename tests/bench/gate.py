@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
-from daemon.judge.hand import HandTracker
-from daemon.judge.health import Checked
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, FingerState, GateState, Moment
-from drivers.base import ELECTRODES, JointReading, TactileReading
-from drivers.twins.grasps.grasp_script import EndPoint, Timetable
-from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.whole_grasps import (
+from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
+from graspd.daemon.judge.hand import HandTracker
+from graspd.daemon.judge.health import Checked
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, FingerState, GateState, Moment
+from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
+from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
+from graspd.drivers.twins.grasps.grasps import recorded_counts
+from graspd.drivers.twins.grasps.whole_grasps import (
     FreshSampler,
     GraspRow,
     HeldSampler,
@@ -32,8 +32,8 @@ from drivers.twins.grasps.whole_grasps import (
     WholeGrasps,
     rest_above,
 )
-from models.contract import Finger
-from models.runtime import TactileModel
+from graspd.models.contract import Finger
+from graspd.models.runtime import TactileModel
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
 from tests.drivers.twins.slides import SLIDE_SPREAD, HeldNoise, Hold
 

@@ -20,7 +20,7 @@ from typing import Final
 
 import zmq
 
-from drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.record.recorded import messages
 from tests.kit.messages import decode_verdict

@@ -26,15 +26,15 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from daemon.process.text import markdown_table
-from drivers.base import FINGERS
-from drivers.spi.messages import Message, Sweep
-from drivers.twins.can import CanTwin
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasp_script import Durations
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.grasps.whole_grasps import synthetic_grasps
-from drivers.twins.spi import SpiTwin
+from graspd.daemon.process.text import markdown_table
+from graspd.drivers.base import FINGERS
+from graspd.drivers.spi.messages import Message, Sweep
+from graspd.drivers.twins.can import CanTwin
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.drivers.twins.spi import SpiTwin
 
 PATIENCE_S = 30.0
 """Longest wait for what must come, s."""
@@ -240,7 +240,7 @@ class Child:
 
 def start_daemon(scene: Path, log: Path | None = None) -> Child:
     """The process of graspd, to be entered as a block."""
-    return Child(["-m", "daemon", "run", str(scene)], log)
+    return Child(["-m", "graspd", "run", str(scene)], log)
 
 
 def start_twin(plan: TwinPlan) -> Child:

@@ -20,10 +20,10 @@ from typing import Self
 
 import numpy as np
 
-from daemon.judge.reasons import Decision, Reason
-from daemon.publish.messages import Verdict
-from drivers.joints.message import JointMessage
-from drivers.twins.spi import SpiTwin
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.publish.messages import Verdict
+from graspd.drivers.joints.message import JointMessage
+from graspd.drivers.twins.spi import SpiTwin
 from tests.bench.live import (
     PATIENCE_S,
     Child,

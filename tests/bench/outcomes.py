@@ -26,15 +26,15 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.session.file import SessionFile, kept_now, load
-from daemon.trust.lift_book import GraspId, OutcomeStatus
-from daemon.trust.trust import Trust, TrustState, decode
 from deploy.clients.python.graspd_client import Client, Outcome, Verdict
-from drivers.base import TactileReading
-from drivers.recordings.csv_player import DEMO_TABLE
-from drivers.recordings.csv_rows import read_rows
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.session.file import SessionFile, kept_now, load
+from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
+from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.drivers.base import TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_rows import read_rows
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.judge.health import Health
-from daemon.judge.reasons import Reason
-from drivers.base import TactileReading
-from drivers.twins.grasps.grasps import Counts
+from graspd.daemon.judge.health import Health
+from graspd.daemon.judge.reasons import Reason
+from graspd.drivers.base import TactileReading
+from graspd.drivers.twins.grasps.grasps import Counts
 
 TABLES = ("palm_45", "palm_down", "palm_side")
 UNTOUCHED = Path("untouched") / "untouched.csv"

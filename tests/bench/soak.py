@@ -27,8 +27,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from drivers.base import ELECTRODES
-from drivers.twins.faults import LinkFaults
+from graspd.drivers.base import ELECTRODES
+from graspd.drivers.twins.faults import LinkFaults
 from tests.bench.live import (
     PATIENCE_S,
     STOP_S,

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import Reason
-from daemon.publish.messages import Status, Verdict
+from graspd.daemon.judge.reasons import Reason
+from graspd.daemon.publish.messages import Status, Verdict
 from tests.bench.live import TALLIED, Usage
 from tests.kit.messages import decode_status, decode_verdict
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.spi.messages import DELIMITER, FrameParser, encode_frame
+from graspd.drivers.spi.messages import DELIMITER, FrameParser, encode_frame
 from tests.bench.fuzz import FRAMES, TARGETS, FuzzError, Target, fuzz, load, main
 
 

@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from daemon.judge.reasons import Decision
-from daemon.publish.messages import State, Status, Verdict, encode
-from drivers.twins.faults import LinkFaults
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.publish.messages import State, Status, Verdict, encode
+from graspd.drivers.twins.faults import LinkFaults
 from tests.bench.live import TALLIED, Kind, Usage
 from tests.bench.soak import Plan, link_faults, soak
 from tests.bench.soak_judge import Found, Heard, Row, judge, slope

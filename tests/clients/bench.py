@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 
 PATIENCE_S = 100.0

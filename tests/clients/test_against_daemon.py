@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.publish.keys import make
-from daemon.publish.messages import OutcomeMessage, decode_outcome
 from deploy.clients.python.graspd_client import Client, Keys, Outcome
+from graspd.daemon.publish.keys import make
+from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome
 from tests.clients.bench import Daemon, free_endpoint, until
 
 SILENCE_S = 0.1

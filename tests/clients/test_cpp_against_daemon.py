@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.publish.keys import make
+from graspd.daemon.publish.keys import make
 from tests.clients.bench import Daemon, free_endpoint
 from tests.clients.building import asked, sleep_at_will
 from tests.clients.messages import frames, verdict

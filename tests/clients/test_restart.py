@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from deploy.clients.python.graspd_client import Client, Decision
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.clients.bench import PATIENCE_S
 from tests.daemon.processes import start
 from tests.threads import at_work

@@ -12,8 +12,8 @@ from typing import Any
 import zmq
 
 from deploy.clients.python.graspd_client import Client, Outcome
-from drivers.twins.grasps.grasp_script import Durations
-from drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
 from tests.clients.bench import Daemon, until
 from tests.daemon.processes import TIMEOUT_S
 

@@ -8,12 +8,12 @@ from typing import cast
 
 import numpy as np
 
-from daemon.judge.decision import HandLimits, Limits
-from daemon.judge.pipeline import Pipeline
-from daemon.trust.lift_book import GraspId, LiftBook
-from daemon.trust.trust import Trust
-from drivers.base import DriverCounters, DriverError, Fact, Reading, TactileReading
-from models.contract import (
+from graspd.daemon.judge.decision import HandLimits, Limits
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.trust.lift_book import GraspId, LiftBook
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import DriverCounters, DriverError, Fact, Reading, TactileReading
+from graspd.models.contract import (
     Dataset,
     Finger,
     ImageInput,
@@ -22,8 +22,8 @@ from models.contract import (
     ModelError,
     SeenCounts,
 )
-from models.runtime import TactileModel
-from models.tactile_image import TactileImager
+from graspd.models.runtime import TactileModel
+from graspd.models.tactile_image import TactileImager
 from tests.kit.clock import Clock as Clock
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-GRASPD = (sys.executable, "-m", "daemon")
+GRASPD = (sys.executable, "-m", "graspd")
 TIMEOUT_S = 200
 NICENESS = -15
 

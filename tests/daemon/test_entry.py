@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.entry import OURS
+from graspd.daemon.entry import OURS
 
 ROOT = Path(__file__).parents[2]
 

@@ -27,7 +27,7 @@ def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
         "daemon/__main__.py": f"def main() -> None:\n{answer}\n\nmain()\n",
         f"{info}/METADATA": f"Metadata-Version: 2.1\nName: graspd\nVersion: {version}\n",
         f"{info}/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
-        f"{info}/entry_points.txt": "[console_scripts]\ngraspd = daemon.__main__:main\n",
+        f"{info}/entry_points.txt": "[console_scripts]\ngraspd = graspd.daemon.__main__:main\n",
     }
     record = "".join(f"{name},,\n" for name in [*files, f"{info}/RECORD"])
     with zipfile.ZipFile(folder / f"graspd-{version}-py3-none-any.whl", "w") as wheel:
@@ -84,6 +84,6 @@ def version_below(root: Path, prefix: str = "/opt/graspd") -> str:
     """What the graspd that is installed below `root` says of itself."""
     python = f"{root}{prefix}/venv/bin/python"
     done = subprocess.run(
-        [python, "-I", "-m", "daemon", "--version"], capture_output=True, text=True, check=True
+        [python, "-I", "-m", "graspd", "--version"], capture_output=True, text=True, check=True
     )
     return done.stdout.strip()

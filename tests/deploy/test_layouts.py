@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from daemon.record.topics import schemas
+from graspd.daemon.record.topics import schemas
 
 LAYOUTS = Path(__file__).parents[2] / "deploy" / "layouts"
 LICHTBLICK = json.loads((LAYOUTS / "lichtblick.json").read_bytes())

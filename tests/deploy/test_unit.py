@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.scene import Scene
-from daemon.scene.drivers import SpiTactile
-from daemon.scene.scene import STATE_DIRECTORY, Hand, Realtime
+from graspd.daemon.scene import Scene
+from graspd.daemon.scene.drivers import SpiTactile
+from graspd.daemon.scene.scene import STATE_DIRECTORY, Hand, Realtime
 from tests.deploy.staging import DEPLOY, INSTALLER
 
 UNIT = DEPLOY / "systemd/graspd@.service"

@@ -13,7 +13,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES, Reading, TactileReading
+from graspd.drivers.base import ELECTRODES, Reading, TactileReading
 
 FIRST, NUMBERS = 50, 4000
 """The count of sweep 0, and how many sweeps there are before a count comes again."""

@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from drivers.base import (
+from graspd.drivers.base import (
     ELECTRODES,
     FINGERS,
     DriverCounters,
@@ -15,13 +15,13 @@ from drivers.base import (
     TactileReading,
     sensor_rows,
 )
-from drivers.can.readings import CanCounters
-from drivers.joints.message import JointCounters
-from drivers.palm.packet import PalmCounters
-from drivers.recordings.faults import ReplayCounters
-from drivers.spi.messages import FrameCounters
-from drivers.spi.sweeps import BridgeCounters
-from drivers.udp.driver import DatagramCounters
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.joints.message import JointCounters
+from graspd.drivers.palm.packet import PalmCounters
+from graspd.drivers.recordings.faults import ReplayCounters
+from graspd.drivers.spi.messages import FrameCounters
+from graspd.drivers.spi.sweeps import BridgeCounters
+from graspd.drivers.udp.driver import DatagramCounters
 
 COUNTERS = (
     *(DriverCounters, DatagramCounters, JointCounters, PalmCounters),

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import ElectrodeFault
-from drivers.biotac import (
+from graspd.drivers.base import ElectrodeFault
+from graspd.drivers.biotac import (
     CHANNELS,
     ERROR_WORDS,
     FORBIDDEN_COMMAND,

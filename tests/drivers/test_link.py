@@ -6,8 +6,8 @@ import logging
 
 import pytest
 
-from drivers.base import LinkCause
-from drivers.link import Link, LinkState
+from graspd.drivers.base import LinkCause
+from graspd.drivers.link import Link, LinkState
 from tests.kit.clock import Clock
 
 

@@ -15,19 +15,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import Reading
-from drivers.biotac import SEQUENCES
-from drivers.can.decoders import CanDecoder, make_decoder
-from drivers.can.formats import CanFormat, SweepFrame, encode_sample
-from drivers.can.frames import FD, CanFrame
-from drivers.can.readings import CanCounters
-from drivers.joints.message import JointMessage, JointStream
-from drivers.palm.stream import PalmStream
-from drivers.recordings.can_log import CanLog, frame_of, line_of
-from drivers.recordings.serial_log import SerialLog, encode_records, parse_records
-from drivers.spi.line import LineEvent
-from drivers.spi.messages import FrameParser, Ping, Sweep, encode
-from drivers.twins.palm import PalmTwin
+from graspd.drivers.base import Reading
+from graspd.drivers.biotac import SEQUENCES
+from graspd.drivers.can.decoders import CanDecoder, make_decoder
+from graspd.drivers.can.formats import CanFormat, SweepFrame, encode_sample
+from graspd.drivers.can.frames import FD, CanFrame
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.joints.message import JointMessage, JointStream
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
+from graspd.drivers.recordings.serial_log import SerialLog, encode_records, parse_records
+from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.messages import FrameParser, Ping, Sweep, encode
+from graspd.drivers.twins.palm import PalmTwin
 from tests.drivers.can.can_words import SLOT_NS, word
 from tests.drivers.one_sweep import (
     Step,

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import toml
+from graspd.drivers import toml
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = [*ROOT.glob("deploy/**/*.toml"), ROOT / "pyproject.toml"]

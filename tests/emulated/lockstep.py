@@ -8,10 +8,10 @@ import tty
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from drivers.base import TactileReading
-from drivers.link import LinkState
-from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.line import LineEvent
+from graspd.drivers.base import TactileReading
+from graspd.drivers.link import LinkState
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.spi.line import LineEvent
 from tests.drivers.spi.bridge_c import START, frame
 from tests.emulated.board import MS, Board
 

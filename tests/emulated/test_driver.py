@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import TactileReading
-from drivers.link import LinkState
-from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.line import LineEvent
-from drivers.twins.grasps.grasps import Counts, recorded_counts
-from drivers.twins.spi import SpiTwin
+from graspd.drivers.base import TactileReading
+from graspd.drivers.link import LinkState
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
+from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.spi.bridge_c import pattern
 from tests.emulated.board import Board
 from tests.emulated.conftest import Image

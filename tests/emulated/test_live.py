@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.publish.messages import Status, Tactile
-from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.twins.grasps.grasps import recorded_counts
+from graspd.daemon.publish.messages import Status, Tactile
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.twins.grasps.grasps import recorded_counts
 from tests.bench.live import Subscriber
 from tests.daemon.processes import TIMEOUT_S, graspd, put_first, start, wait_for
 from tests.emulated.board import BOARD_ID

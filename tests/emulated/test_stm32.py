@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import TactileReading
-from drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.base import TactileReading
+from graspd.drivers.spi.driver import SpiBridgeDriver
 from tests.drivers.spi.bridge_c import (
     BRIDGE,
     HELLO,

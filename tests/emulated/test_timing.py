@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from daemon.commands.doctor import BRIDGE_VENDOR
-from drivers.biotac import ERROR_WORDS
+from graspd.daemon.commands.doctor import BRIDGE_VENDOR
+from graspd.drivers.biotac import ERROR_WORDS
 from tests.drivers.spi.bridge_c import (
     ELECTRODE_COMMANDS,
     PAC,

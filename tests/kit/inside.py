@@ -9,8 +9,8 @@ import resource
 from collections.abc import Iterator
 from subprocess import CompletedProcess
 
-from daemon import cli
-from daemon.process.logs import LOGGERS
+from graspd.daemon import cli
+from graspd.daemon.process.logs import LOGGERS
 
 
 def graspd(*arguments: object) -> CompletedProcess[str]:

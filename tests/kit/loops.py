@@ -6,15 +6,15 @@ import selectors
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 
-from daemon.judge.decision import HandLimits
-from daemon.process.signals import StopSignal
-from daemon.process.sleep import Sleep
-from daemon.publish.companion import Answer, Companion, PublishedVerdict, at_once
-from daemon.publish.messages import Status, Verdict
-from daemon.publish.outbox import Outbox
-from daemon.run.loop import Ended, Loop, LoopTiming
-from daemon.trust.trust import Trust
-from drivers.base import TactileReading
+from graspd.daemon.judge.decision import HandLimits
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.process.sleep import Sleep
+from graspd.daemon.publish.companion import Answer, Companion, PublishedVerdict, at_once
+from graspd.daemon.publish.messages import Status, Verdict
+from graspd.daemon.publish.outbox import Outbox
+from graspd.daemon.run.loop import Ended, Loop, LoopTiming
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline
 from tests.kit.messages import decode_status
 

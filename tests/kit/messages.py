@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from daemon.publish.messages import MESSAGES, GateMessage, Message, Status, Tactile, Verdict
+from graspd.daemon.publish.messages import MESSAGES, GateMessage, Message, Status, Tactile, Verdict
 
 GOLDEN = Path(__file__).parents[1] / "daemon" / "publish" / "golden"
 

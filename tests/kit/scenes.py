@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 
 
 def demo_scene(folder: Path, tactile: str = "", *, sections: str = "") -> Path:

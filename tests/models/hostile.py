@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from models import zoo
+from graspd.models import zoo
 
 
 def _zoo_model() -> Any:  # noqa: ANN401 - onnx has no types

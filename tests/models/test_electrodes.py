@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models import zoo
-from models.contract import SeenCounts
-from models.electrodes import IMPLAUSIBLE, Electrodes
-from models.runtime import TactileModel
-from models.training.data.datasets import Grasps, read_table
+from graspd.models import zoo
+from graspd.models.contract import SeenCounts
+from graspd.models.electrodes import IMPLAUSIBLE, Electrodes
+from graspd.models.runtime import TactileModel
+from graspd.models.training.data.datasets import Grasps, read_table
 
 SHAPE = (3, 24)
 NOTHING = np.zeros(SHAPE, dtype=np.bool_)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.contract import (
+from graspd.models.contract import (
     CountsInput,
     ImageInput,
     Input,
@@ -14,9 +14,9 @@ from models.contract import (
     Sharpness,
     VectorInput,
 )
-from models.inputs import SessionBuilder, VectorBuilder, builder, raw_features
-from models.layout import D1
-from models.tactile_image import Composition, TactileImager
+from graspd.models.inputs import SessionBuilder, VectorBuilder, builder, raw_features
+from graspd.models.layout import D1
+from graspd.models.tactile_image import Composition, TactileImager
 
 
 def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:

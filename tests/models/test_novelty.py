@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from models.contract import ModelContract, ModelError, SeenCounts, SessionInput, Sharpness
-from models.electrodes import NoveltyCheck
+from graspd.models.contract import ModelContract, ModelError, SeenCounts, SessionInput, Sharpness
+from graspd.models.electrodes import NoveltyCheck
 from tests.daemon.fakes import contract
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models import onnx_file, zoo
-from models.contract import ModelError
+from graspd.models import onnx_file, zoo
+from graspd.models.contract import ModelError
 
 onnx = pytest.importorskip("onnx", reason="needs the train extra")
 DecodeError = pytest.importorskip("google.protobuf.message").DecodeError

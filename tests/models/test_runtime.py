@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models import zoo
-from models.contract import ModelError
-from models.runtime import TactileModel
+from graspd.models import zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import TactileModel
 
 CNN1 = zoo.find("cnn1")
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics, is_odd
+from graspd.models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics, is_odd
 
 WIDTH = 5
 

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from models.inputs import SPREAD_FLOOR_COUNTS
-from models.layout import D1, LAYOUTS, Layout
-from models.tactile_image import (
+from graspd.models.inputs import SPREAD_FLOOR_COUNTS
+from graspd.models.layout import D1, LAYOUTS, Layout
+from graspd.models.tactile_image import (
     Fill,
     Normalisation,
     TactileImager,

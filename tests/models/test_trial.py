@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from models import trial, zoo
-from models.contract import ModelError
-from models.runtime import TactileModel
+from graspd.models import trial, zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import TactileModel
 from tests.models import hostile
 
 

@@ -13,11 +13,11 @@ import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
-from models import zoo
-from models.contract import ModelError
-from models.runtime import TactileModel
-from models.tactile_image import TactileImager
-from models.training.data.datasets import Grasps, read_whole
+from graspd.models import zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import TactileModel
+from graspd.models.tactile_image import TactileImager
+from graspd.models.training.data.datasets import Grasps, read_whole
 
 CARD: dict[str, Any] = json.loads((zoo.ZOO / "cnn1.json").read_text())
 

@@ -18,7 +18,7 @@ from subprocess import CompletedProcess
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
 from tests.kit.inside import graspd
 from tests.process_replay.alike import lines_apart
 from tests.process_replay.judging import Case, run

@@ -10,21 +10,21 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.recorder import header_now, header_of
-from daemon.judge.pipeline import Pipeline
-from daemon.process.signals import StopSignal
-from daemon.publish.companion import Companion, PublishedVerdict, Requests
-from daemon.publish.outbox import Outbox
-from daemon.record.files import Retention
-from daemon.record.header import RecordingHeader
-from daemon.record.recorder import Recorder
-from daemon.run.loop import Loop, LoopTiming
-from daemon.scene import Scene
-from daemon.scene.scene import Record
-from daemon.trust.lift_book import GraspId, Report
-from drivers.base import DriverCounters, Fact, Reading, TactileReading
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.recorder import header_now, header_of
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
+from graspd.daemon.publish.outbox import Outbox
+from graspd.daemon.record.files import Retention
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.recorder import Recorder
+from graspd.daemon.run.loop import Loop, LoopTiming
+from graspd.daemon.scene import Scene
+from graspd.daemon.scene.scene import Record
+from graspd.daemon.trust.lift_book import GraspId, Report
+from graspd.drivers.base import DriverCounters, Fact, Reading, TactileReading
 from tests.kit.clock import Clock
 from tests.kit.loops import ClockSelector
 from tests.process_replay.streams import FINGERS, PERIOD_NS, START_NS

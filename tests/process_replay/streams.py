@@ -11,24 +11,33 @@ from typing import BinaryIO, Final
 
 import numpy as np
 
-from drivers.base import Reading
-from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.can.formats import CanFormat
-from drivers.can.frames import FD, CanFrame
-from drivers.can.stream import CanStream
-from drivers.link import LinkState
-from drivers.palm.stream import PalmStream
-from drivers.recordings.can_log import line_of
-from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
-from drivers.recordings.serial_log import encode_records
-from drivers.spi.conversation import Conversation
-from drivers.spi.line import LineEvent
-from drivers.spi.messages import DIGEST, FrameParser, Hello, Message, Ping, Sweep, decode, encode
-from drivers.twins.can import CanTwin
-from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps.grasps import Counts, recorded_counts
-from drivers.twins.palm import PalmTwin
-from models.contract import Finger
+from graspd.drivers.base import Reading
+from graspd.drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.can.frames import FD, CanFrame
+from graspd.drivers.can.stream import CanStream
+from graspd.drivers.link import LinkState
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.recordings.can_log import line_of
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
+from graspd.drivers.recordings.serial_log import encode_records
+from graspd.drivers.spi.conversation import Conversation
+from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.messages import (
+    DIGEST,
+    FrameParser,
+    Hello,
+    Message,
+    Ping,
+    Sweep,
+    decode,
+    encode,
+)
+from graspd.drivers.twins.can import CanTwin
+from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
+from graspd.drivers.twins.palm import PalmTwin
+from graspd.models.contract import Finger
 from tests.kit.clock import Clock
 
 CHECKOUT: Final = Path(__file__).parents[2]

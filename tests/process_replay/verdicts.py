@@ -15,9 +15,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, Final
 
-from drivers.base import Reading
-from drivers.can.formats import CanFormat
-from drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING
+from graspd.drivers.base import Reading
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING
 from tests.daemon.record.recorded import IGNORED_FIELDS
 from tests.process_replay import streams
 from tests.process_replay.commands import execute

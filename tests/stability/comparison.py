@@ -10,17 +10,17 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import HELD, Limits, decide
-from daemon.judge.network import Examined, Network
-from daemon.judge.pipeline import Pipeline
-from daemon.judge.reasons import Decision, Reason
-from drivers.base import TactileReading
-from models import zoo
-from models.contract import ModelContract, SessionInput
-from models.electrodes import Electrodes
-from models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
-from models.runtime import TactileModel
-from models.session_statistics import HORIZON_GRASPS, SessionState
+from graspd.daemon.judge.decision import HELD, Limits, decide
+from graspd.daemon.judge.network import Examined, Network
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.drivers.base import TactileReading
+from graspd.models import zoo
+from graspd.models.contract import ModelContract, SessionInput
+from graspd.models.electrodes import Electrodes
+from graspd.models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
+from graspd.models.runtime import TactileModel
+from graspd.models.session_statistics import HORIZON_GRASPS, SessionState
 from tests.stability.exact import Exact, exact_input, exact_softening, exact_standard
 from tests.stability.readings import Counts, Raw
 from tests.stability.reference import Reference

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from models import zoo
+from graspd.models import zoo
 
 DEFAULT = "small-session"
 

@@ -1,7 +1,7 @@
 """What a model should be fed with, in extended precision and by definition, step for step.
 
 Pixels are filled one by one in passes, moments are taken in two passes: none of the shortcuts of
-`models.tactile_image` and `models.inputs` is taken here.
+`graspd.models.tactile_image` and `graspd.models.inputs` is taken here.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.network import TINY
-from models.contract import CountsInput, ImageInput, ModelContract, SessionInput
-from models.inputs import SPREAD_FLOOR_COUNTS
-from models.layout import LAYOUTS, Layout
-from models.session_statistics import SessionState
-from models.tactile_image import Composition, Fill, Normalisation
+from graspd.daemon.judge.network import TINY
+from graspd.models.contract import CountsInput, ImageInput, ModelContract, SessionInput
+from graspd.models.inputs import SPREAD_FLOOR_COUNTS
+from graspd.models.layout import LAYOUTS, Layout
+from graspd.models.session_statistics import SessionState
+from graspd.models.tactile_image import Composition, Fill, Normalisation
 
 Exact = NDArray[np.longdouble]
 Standard = tuple[Exact, Exact]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from models.contract import SeenCounts
+from graspd.models.contract import SeenCounts
 
 ELECTRODES, COUNT_MAX = 24, 4095
 RANDOM_READINGS = 300

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from models.contract import OUTPUT_NAME
+from graspd.models.contract import OUTPUT_NAME
 
 CHUNK = 128
 """Readings at a time: the products of a convolution of these take 30 MB."""

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 pytest.importorskip("onnx", reason="the reference needs onnx, of the extra `train`")
 
-from daemon.judge.network import Examined, Network
-from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
-from drivers.recordings.csv_rows import read_rows
-from models import zoo
-from models.inputs import builder
-from models.runtime import TactileModel
+from graspd.daemon.judge.network import Examined, Network
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.csv_rows import read_rows
+from graspd.models import zoo
+from graspd.models.inputs import builder
+from graspd.models.runtime import TactileModel
 from tests.stability.comparison import (
     INPUT_RELATIVE_MAX,
     P_SLIP_ERROR_MAX,

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.judge.decision import HandLimits
-from daemon.judge.hand import HandTracker
-from daemon.judge.health import Checked
-from daemon.judge.reasons import Reason
-from drivers.palm.calibration import CoupledTable, Table, parse_calibration
-from models.contract import Finger
+from graspd.daemon.judge.decision import HandLimits
+from graspd.daemon.judge.hand import HandTracker
+from graspd.daemon.judge.health import Checked
+from graspd.daemon.judge.reasons import Reason
+from graspd.drivers.palm.calibration import CoupledTable, Table, parse_calibration
+from graspd.models.contract import Finger
 
 Note = Callable[..., None]
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

@@ -19,15 +19,20 @@ import torch
 from onnx import helper, numpy_helper
 from torch import nn
 
-from daemon.judge.decision import HELD, Limits, decide
-from daemon.judge.reasons import Decision
-from models import zoo
-from models.contract import METADATA_KEY, ModelContract, VectorInput
-from models.inputs import builder
-from models.runtime import TactileModel
-from models.training.estimators.configs import NetworkConfig
-from models.training.estimators.graphs import IR_VERSION, MARGIN_NAME, OPSET, with_probability
-from models.training.estimators.networks import IMAGE_SHAPE, build, for_inference
+from graspd.daemon.judge.decision import HELD, Limits, decide
+from graspd.daemon.judge.reasons import Decision
+from graspd.models import zoo
+from graspd.models.contract import METADATA_KEY, ModelContract, VectorInput
+from graspd.models.inputs import builder
+from graspd.models.runtime import TactileModel
+from graspd.models.training.estimators.configs import NetworkConfig
+from graspd.models.training.estimators.graphs import (
+    IR_VERSION,
+    MARGIN_NAME,
+    OPSET,
+    with_probability,
+)
+from graspd.models.training.estimators.networks import IMAGE_SHAPE, build, for_inference
 from tests.stability.comparison import P_SLIP_ERROR_MAX
 
 Note = Callable[..., None]

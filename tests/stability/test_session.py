@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics
+from graspd.models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics
 
 WIDTH = 24
 UPDATES = 4000

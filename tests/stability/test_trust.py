@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.trust.learner import Learner
-from daemon.trust.risk import Permission, Risk, RiskLimits
+from graspd.daemon.trust.learner import Learner
+from graspd.daemon.trust.risk import Permission, Risk, RiskLimits
 
 Note = Callable[..., None]
 Random = np.random.Generator

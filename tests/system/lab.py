@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.twins.grasps.grasp_script import Durations
-from drivers.twins.grasps.whole_grasps import synthetic_grasps
-from drivers.twins.spi import SpiTwin
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.drivers.twins.spi import SpiTwin
 from tests.system.machine import COMMAND_TIMEOUT_S, Machine
 from tests.system.messages import Message
 from tests.threads import at_work

@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
-from drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
 from tests.system.image import ImageError, run
 from tests.system.lab import GRASPS, RATE_HZ
 

@@ -62,7 +62,7 @@ def _replayed() -> list[float]:
         write_recording(recording)
         command = ["replay", "--json", "--model", CAN_MODEL, str(recording)]
         done = subprocess.run(
-            [sys.executable, "-m", "daemon", *command], capture_output=True, text=True, check=False
+            [sys.executable, "-m", "graspd", *command], capture_output=True, text=True, check=False
         )
     verdicts = [json.loads(line) for line in done.stdout.splitlines()]
     expected = [each["p_slip"] for each in verdicts if each["judged"] and each["valid"]]

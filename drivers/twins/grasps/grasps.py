@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES, FINGERS, RecordingError
-from drivers.recordings.csv_rows import read_rows
+from graspd.drivers.base import COUNT_MAX, ELECTRODES, FINGERS, RecordingError
+from graspd.drivers.recordings.csv_rows import read_rows
 
 Counts = NDArray[np.uint16]
 """Shape (fingers, 24), raw counts 0..4095."""

@@ -5,7 +5,7 @@ Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019). It has 5763 parameters pe
 about 92,000 counts of a class, and contains no real grasp. A class is a mixture of three Gaussians
 over the raw counts of ff, mf, th, with the 24 largest principal axes of each.
 
-`python -m drivers.twins.grasps.synthetic` writes the demo table and the demo day.
+`python -m graspd.drivers.twins.grasps.synthetic` writes the demo table and the demo day.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES
-from drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
-from drivers.recordings.csv_rows import OBJECT, SLIPPED, electrode_columns
+from graspd.drivers.base import COUNT_MAX, ELECTRODES
+from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
+from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, electrode_columns
 
 FINGERS = ("ff", "mf", "th")
 COUNTS = len(FINGERS) * ELECTRODES

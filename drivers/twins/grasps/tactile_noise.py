@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES
+from graspd.drivers.base import ELECTRODES
 
 NOISE_COUNTS = 3.5
 """Standard deviation of an untouched electrode, counts; measured 2.9 to 4.3 (robust)."""

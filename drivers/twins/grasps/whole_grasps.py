@@ -3,7 +3,7 @@
 End points are rows of a grasp table, or drawn. The way between them is made up, with measured
 noise. Contact lowers counts, so a plausible end point is not above the rest; see `rest_above`.
 
-`python -m drivers.twins.grasps.whole_grasps` writes both demo recordings again, byte for byte.
+`python -m graspd.drivers.twins.grasps.whole_grasps` writes both demo recordings again, byte for byte.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Protocol, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES
-from drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
-from drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
-from drivers.twins.grasps import synthetic
-from drivers.twins.grasps.grasp_script import (
+from graspd.drivers.base import COUNT_MAX, ELECTRODES
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
+from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
+from graspd.drivers.twins.grasps import synthetic
+from graspd.drivers.twins.grasps.grasp_script import (
     JOINT_NAMES,
     Durations,
     EndPoint,
     GraspScript,
     Timetable,
 )
-from drivers.twins.grasps.tactile_noise import MeasuredNoise, TactileNoise
+from graspd.drivers.twins.grasps.tactile_noise import MeasuredNoise, TactileNoise
 
 RATE_HZ = 100.0
 """Rows per second in the public recordings; sweeps per second of an SPI bridge."""

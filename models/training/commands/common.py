@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from models.training.data.datasets import DatasetError
-from models.training.data.protocols import TooFewGraspsError
+from graspd.models.training.data.datasets import DatasetError
+from graspd.models.training.data.protocols import TooFewGraspsError
 
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 

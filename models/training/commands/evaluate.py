@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from models.training.commands.common import EXIT_INPUT, exit_code, say, whole
-from models.training.data.protocols import ABOUT, PROTOCOLS
-from models.training.systems.registry import SYSTEMS
+from graspd.models.training.commands.common import EXIT_INPUT, exit_code, say, whole
+from graspd.models.training.data.protocols import ABOUT, PROTOCOLS
+from graspd.models.training.systems.registry import SYSTEMS
 
 MAX_PROCESSES = 1024
 
@@ -83,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate; what is finished is kept and not run again.
     Returns 0, 1 (the cluster failed), 2 (input or folder), 130 (Ctrl-C)."""
-    from models.training.commands.evaluation import evaluate
-    from models.training.evaluating.run_jobs import ClusterError
+    from graspd.models.training.commands.evaluation import evaluate
+    from graspd.models.training.evaluating.run_jobs import ClusterError
 
     if args.data is None and not args.own:
         say("evaluate", "needs --data DIR, --own FILE, or both")

@@ -14,31 +14,31 @@ from importlib.util import find_spec
 import numpy as np
 from sklearn.model_selection import ParameterGrid
 
-from models.training.commands.common import (
+from graspd.models.training.commands.common import (
     WrongInputError,
     progress_bar,
     say,
     warn_of_unpublished,
 )
-from models.training.data.datasets import Grasps, lab_table_names, unpublished
-from models.training.data.lab_tables import read_with_lab_tables
-from models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
-from models.training.estimators.configs import GRIDS, NetworkConfig
-from models.training.evaluating.files import to_json, write_whole
-from models.training.evaluating.jobs import Job, JobResult, jobs_of
-from models.training.evaluating.results_table import Made, results_table
-from models.training.evaluating.run_jobs import run_jobs
-from models.training.evaluating.summaries import (
+from graspd.models.training.data.datasets import Grasps, lab_table_names, unpublished
+from graspd.models.training.data.lab_tables import read_with_lab_tables
+from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
+from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
+from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.evaluating.jobs import Job, JobResult, jobs_of
+from graspd.models.training.evaluating.results_table import Made, results_table
+from graspd.models.training.evaluating.run_jobs import run_jobs
+from graspd.models.training.evaluating.summaries import (
     SystemSummary,
     made_with,
     read_summaries,
     summarise,
     write_summary,
 )
-from models.training.making.plan import TrainingPlan
-from models.training.making.preflight import with_enough_folds
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import BlendConfig, System, digest, with_recipes
+from graspd.models.training.making.plan import TrainingPlan
+from graspd.models.training.making.preflight import with_enough_folds
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import BlendConfig, System, digest, with_recipes
 
 SEEDS = 3
 """Split seeds of an evaluation unless `--seeds` says otherwise."""
@@ -205,7 +205,7 @@ def _report(data: str, args: argparse.Namespace) -> None:
         args.table.parent.mkdir(parents=True, exist_ok=True)
         write_whole(args.table, results_table(summaries, made).encode())
     if args.plots:
-        from models.training.evaluating.plots import draw
+        from graspd.models.training.evaluating.plots import draw
 
         draw(summaries, args.plots, quick=args.quick)
 

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from models import own, zoo
-from models.training.commands.common import (
+from graspd.models import own, zoo
+from graspd.models.training.commands.common import (
     EXIT_INPUT,
     WrongInputError,
     exit_code,
@@ -19,14 +19,14 @@ from models.training.commands.common import (
     warn_of_unpublished,
     whole,
 )
-from models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
-from models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
-from models.training.data.protocols import FOLDS, TooFewGraspsError
-from models.training.systems.registry import SYSTEMS
+from graspd.models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
+from graspd.models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
+from graspd.models.training.data.protocols import FOLDS, TooFewGraspsError
+from graspd.models.training.systems.registry import SYSTEMS
 
 if TYPE_CHECKING:
-    from models.training.making.card import Card
-    from models.training.making.plan import TrainingPlan
+    from graspd.models.training.making.card import Card
+    from graspd.models.training.making.plan import TrainingPlan
 
 MAX_SEED = 2**32 - 1
 """The largest that scikit-learn takes."""
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     if args.data is None and not args.own:
         say("train", "needs --data DIR, --own FILE, or both")
         return EXIT_INPUT
-    from models.training.making.export import ExportError
+    from graspd.models.training.making.export import ExportError
 
     name = _plan(args).model
     if args.own and name in zoo.names():
@@ -112,9 +112,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train(args: argparse.Namespace, out: Path) -> None:
-    from models.training.commands.common import progress_bar
-    from models.training.making.make_model import EXTRA_TRAININGS, make_model
-    from models.training.making.preflight import limits, preflight, with_enough_folds
+    from graspd.models.training.commands.common import progress_bar
+    from graspd.models.training.making.make_model import EXTRA_TRAININGS, make_model
+    from graspd.models.training.making.preflight import limits, preflight, with_enough_folds
 
     started_s = time.monotonic()
     grasps = read_with_lab_tables(args.data, args.own)
@@ -146,7 +146,7 @@ def _train(args: argparse.Namespace, out: Path) -> None:
 
 def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
     """Say with which options these grasps are enough, if there are such."""
-    from models.training.making.preflight import enough_folds
+    from graspd.models.training.making.preflight import enough_folds
 
     for only in (plan.only, "cv"):
         other = dataclasses.replace(plan, only=only, folds=plan.folds + (only != plan.only))
@@ -157,7 +157,7 @@ def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
 
 
 def _plan(args: argparse.Namespace) -> TrainingPlan:
-    from models.training.making.plan import TrainingPlan
+    from graspd.models.training.making.plan import TrainingPlan
 
     system, lab = SYSTEMS[args.model], tuple(path.stem for path in args.own)
     if lab:

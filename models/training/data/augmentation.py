@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.training.arrays import Bools, Floats32
+from graspd.models.training.arrays import Bools, Floats32
 
 COPIES = 4
 """Copies of each grasp: itself, flipped both ways, rotated."""

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bts3 import FINGERS, NEW_SESSION, TABLES, WHOLE
-from models.contract import Dataset
-from models.layout import ELECTRODES
-from models.training.arrays import Bools, Ints
+from graspd.models.bts3 import FINGERS, NEW_SESSION, TABLES, WHOLE
+from graspd.models.contract import Dataset
+from graspd.models.layout import ELECTRODES
+from graspd.models.training.arrays import Bools, Ints
 
 COUNT_MAX = 4095
 """Largest 12-bit count."""

@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from models.bts3 import TABLES
-from models.training.data.datasets import DatasetError, Grasps, concatenate, read_all, read_table
+from graspd.models.bts3 import TABLES
+from graspd.models.training.data.datasets import (
+    DatasetError,
+    Grasps,
+    concatenate,
+    read_all,
+    read_table,
+)
 
 FEWEST_GRASPS = 20
 """Fewest grasps of a lab table; from this number a session counts as calibrated."""

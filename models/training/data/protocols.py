@@ -13,9 +13,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from models.bts3 import NEW_SESSION, WHOLE
-from models.training.arrays import Bools, Ints
-from models.training.data.datasets import Grasps, lab_table_names
+from graspd.models.bts3 import NEW_SESSION, WHOLE
+from graspd.models.training.arrays import Bools, Ints
+from graspd.models.training.data.datasets import Grasps, lab_table_names
 
 EvalProtocol = Literal[
     "cv", "unknown", "objects", "objects-whole", "session", "days", "cv-palm-down", "cv-palm-side"

@@ -15,8 +15,8 @@ from sklearn.neural_network import MLPClassifier
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
-from models.training.arrays import Bools, Floats, Floats32
-from models.training.estimators.configs import (
+from graspd.models.training.arrays import Bools, Floats, Floats32
+from graspd.models.training.estimators.configs import (
     BoostingConfig,
     ClassicalConfig,
     ForestConfig,

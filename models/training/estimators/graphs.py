@@ -19,10 +19,10 @@ from sklearn.neural_network import MLPClassifier
 from sklearn.svm import SVC
 from torch import nn
 
-from models.contract import OUTPUT_NAME
-from models.training.arrays import Floats, Floats32, Numbers
-from models.training.estimators.classical import PROBABILITY_FLOOR, Boosting, ClassicalModel
-from models.training.estimators.networks import for_inference, for_margin
+from graspd.models.contract import OUTPUT_NAME
+from graspd.models.training.arrays import Floats, Floats32, Numbers
+from graspd.models.training.estimators.classical import PROBABILITY_FLOOR, Boosting, ClassicalModel
+from graspd.models.training.estimators.networks import for_inference, for_margin
 
 OPSET = 18
 """Operator set of the exporters; all allowed versions of onnxruntime have it."""

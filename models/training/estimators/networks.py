@@ -9,10 +9,10 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
-from models.contract import FEATURES_PER_FINGER
-from models.layout import D1, ELECTRODES
-from models.tactile_image import Fill, fill_matrix
-from models.training.estimators.configs import NetworkConfig
+from graspd.models.contract import FEATURES_PER_FINGER
+from graspd.models.layout import D1, ELECTRODES
+from graspd.models.tactile_image import Fill, fill_matrix
+from graspd.models.training.estimators.configs import NetworkConfig
 
 IMAGE_SHAPE = (12, 11, 3)
 """Height, width, fingers of the D1 image."""

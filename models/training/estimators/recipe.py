@@ -10,10 +10,10 @@ import torch
 from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from models.contract import FEATURES_PER_FINGER
-from models.layout import ELECTRODES
-from models.training.arrays import Bools, Floats, Floats32
-from models.training.estimators.configs import (
+from graspd.models.contract import FEATURES_PER_FINGER
+from graspd.models.layout import ELECTRODES
+from graspd.models.training.arrays import Bools, Floats, Floats32
+from graspd.models.training.estimators.configs import (
     THREADS,
     AnyRecipe,
     DayShift,
@@ -22,7 +22,7 @@ from models.training.estimators.configs import (
     Recipe,
     SessionRecipe,
 )
-from models.training.estimators.networks import build
+from graspd.models.training.estimators.networks import build
 
 INFERENCE_BATCH = 512
 """Most inputs of a forward pass; it limits memory and changes nothing else."""

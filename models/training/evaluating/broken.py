@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.metrics import f1_score
 
-from models.electrodes import Electrodes
-from models.training.arrays import Bools, Numbers
-from models.training.data.datasets import COUNT_MAX, Grasps
-from models.training.data.protocols import fold_seed, folds_of
-from models.training.fitting.trained import Trained, train
-from models.training.systems.system import System
+from graspd.models.electrodes import Electrodes
+from graspd.models.training.arrays import Bools, Numbers
+from graspd.models.training.data.datasets import COUNT_MAX, Grasps
+from graspd.models.training.data.protocols import fold_seed, folds_of
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.systems.system import System
 
 FOLDS, JUDGED_FOLDS = 10, 3
 """Number of stratified folds, and of those judged; three show a difference of a few points."""
@@ -21,7 +21,7 @@ NUMBERS = (1, 2, 4, 8, 12)
 LOOKED_FOR_MAX = 13
 """Most broken electrodes that are searched in a reading; the daemon refuses a reading with 13.
 
-It repairs at most 12 (`BROKEN_MAX` of `daemon.judge.health`).
+It repairs at most 12 (`BROKEN_MAX` of `graspd.daemon.judge.health`).
 """
 
 Breakage = Callable[[Numbers, np.random.Generator], Numbers]

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.bts3 import NEW_SESSION, WHOLE
-from models.training.arrays import Bools
-from models.training.data.datasets import Grasps
-from models.training.data.protocols import DAYS
-from models.training.evaluating.jobs import JobResult
-from models.training.evaluating.metrics import score
+from graspd.models.bts3 import NEW_SESSION, WHOLE
+from graspd.models.training.arrays import Bools
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.data.protocols import DAYS
+from graspd.models.training.evaluating.jobs import JobResult
+from graspd.models.training.evaluating.metrics import score
 
 A, B_DOWN, B_SIDE = f"A {NEW_SESSION}", f"B {WHOLE[0]}", f"B {WHOLE[1]}"
 C_DOWN, C_SIDE = f"C {WHOLE[0]}", f"C {WHOLE[1]}"

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.electrodes import CONTRADICTING_MAX, Electrodes, NoveltyCheck
-from models.inputs import builder, raw_features
-from models.session_statistics import SessionStatistics, is_odd
-from models.training.arrays import Bools, Floats, Ints, Numbers
-from models.training.data.datasets import COUNT_MAX, Grasps
-from models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED, Standards
-from models.training.fitting.standards import PRIOR_GRASPS as PRIOR
-from models.training.fitting.trained import Trained
-from models.training.systems.system import SessionFeatures
+from graspd.models.electrodes import CONTRADICTING_MAX, Electrodes, NoveltyCheck
+from graspd.models.inputs import builder, raw_features
+from graspd.models.session_statistics import SessionStatistics, is_odd
+from graspd.models.training.arrays import Bools, Floats, Ints, Numbers
+from graspd.models.training.data.datasets import COUNT_MAX, Grasps
+from graspd.models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED, Standards
+from graspd.models.training.fitting.standards import PRIOR_GRASPS as PRIOR
+from graspd.models.training.fitting.trained import Trained
+from graspd.models.training.systems.system import SessionFeatures
 
 CALIBRATED_FROM = 20
 """Grasps from which a session counts as calibrated; more gain at most two points."""

@@ -18,15 +18,20 @@ import joblib
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inputs import raw_features
-from models.training.arrays import Bools, Floats, Ints, Numbers
-from models.training.data.datasets import Grasps
-from models.training.data.protocols import FOLDS, EvalProtocol, Split, fold_seed, splits
-from models.training.evaluating.days import judged_days
-from models.training.evaluating.files import write_whole
-from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
-from models.training.fitting.trained import Trained, train
-from models.training.systems.system import SessionFeatures, System, digest
+from graspd.models.inputs import raw_features
+from graspd.models.training.arrays import Bools, Floats, Ints, Numbers
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.data.protocols import FOLDS, EvalProtocol, Split, fold_seed, splits
+from graspd.models.training.evaluating.days import judged_days
+from graspd.models.training.evaluating.files import write_whole
+from graspd.models.training.fitting.standards import (
+    NONE,
+    TRAINING,
+    TrainingStandards,
+    later_session,
+)
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.systems.system import SessionFeatures, System, digest
 
 FORMAT = 1
 """Version of results; raise it if a job gives another result, or its file changes."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc_auc_score
 
-from models.training.arrays import Bools, Floats, Ints
+from graspd.models.training.arrays import Bools, Floats, Ints
 
 TEMPERATURE_RANGE = (0.05, 20.0)
 """Limits of a fitted temperature; perfectly separated labels end at the lower one."""

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from models.training.data.protocols import PROTOCOLS
-from models.training.evaluating.style import (
+from graspd.models.training.data.protocols import PROTOCOLS
+from graspd.models.training.evaluating.style import (
     BLUE,
     NAVY,
     ORANGE,
@@ -19,8 +19,8 @@ from models.training.evaluating.style import (
     style,
     to_svg,
 )
-from models.training.evaluating.summaries import SystemSummary
-from models.training.fitting.standards import SESSION_VARIANTS
+from graspd.models.training.evaluating.summaries import SystemSummary
+from graspd.models.training.fitting.standards import SESSION_VARIANTS
 
 FORMATS = ("png", "svg")
 DPI = 130

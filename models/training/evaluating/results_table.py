@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
-from models.training.evaluating.day_figures import GROUPS, DayFigures
-from models.training.evaluating.findings import HOW_SURE, findings
-from models.training.evaluating.metrics import Spread, paired_difference
-from models.training.evaluating.summaries import HEADLINE, SystemSummary
-from models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import PaperFigure, System
+from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
+from graspd.models.training.evaluating.day_figures import GROUPS, DayFigures
+from graspd.models.training.evaluating.findings import HOW_SURE, findings
+from graspd.models.training.evaluating.metrics import Spread, paired_difference
+from graspd.models.training.evaluating.summaries import HEADLINE, SystemSummary
+from graspd.models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import PaperFigure, System
 
 NOT_RUN = "-"
 REFERENCE = "cnn1"

@@ -13,9 +13,9 @@ from pathlib import Path
 import joblib
 from joblib.externals.loky import get_reusable_executor
 
-from models.training.data.datasets import Grasps
-from models.training.evaluating import jobs
-from models.training.evaluating.jobs import Job, JobResult
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.evaluating import jobs
+from graspd.models.training.evaluating.jobs import Job, JobResult
 
 CONNECT_TIMEOUT_S = 10
 WORKERS_TIMEOUT_S = 60

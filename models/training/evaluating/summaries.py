@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 from sklearn.metrics import confusion_matrix
 
-from models.contract import Dataset
-from models.training.arrays import Bools, Ints
-from models.training.data.datasets import Grasps
-from models.training.data.protocols import PROTOCOLS, EvalProtocol
-from models.training.evaluating.day_figures import DayFigures, day_figures
-from models.training.evaluating.files import to_json, write_whole
-from models.training.evaluating.jobs import Job, JobResult
-from models.training.evaluating.metrics import (
+from graspd.models.contract import Dataset
+from graspd.models.training.arrays import Bools, Ints
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.data.protocols import PROTOCOLS, EvalProtocol
+from graspd.models.training.evaluating.day_figures import DayFigures, day_figures
+from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.evaluating.jobs import Job, JobResult
+from graspd.models.training.evaluating.metrics import (
     METRICS,
     CurvePoint,
     Fraction,
@@ -39,7 +39,7 @@ from models.training.evaluating.metrics import (
     score,
     wilson,
 )
-from models.training.systems.system import digest
+from graspd.models.training.systems.system import digest
 
 FORMAT = 1
 HEADLINE = "n50"

@@ -10,19 +10,19 @@ import numpy as np
 import onnx
 from torch import nn
 
-from models.training.arrays import Bools, Floats, Floats32
-from models.training.data.augmentation import augment
-from models.training.estimators import graphs
-from models.training.estimators.classical import (
+from graspd.models.training.arrays import Bools, Floats, Floats32
+from graspd.models.training.data.augmentation import augment
+from graspd.models.training.estimators import graphs
+from graspd.models.training.estimators.classical import (
     ClassicalModel,
     classical_margins,
     classical_size,
     fit_classical,
 )
-from models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
-from models.training.estimators.networks import parameter_count
-from models.training.estimators.recipe import logits, train_network
-from models.training.systems.system import BlendConfig, System
+from graspd.models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
+from graspd.models.training.estimators.networks import parameter_count
+from graspd.models.training.estimators.recipe import logits, train_network
+from graspd.models.training.systems.system import BlendConfig, System
 
 
 class Fitted(Protocol):

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.contract import SeenCounts
-from models.electrodes import NoveltyCheck
-from models.training.arrays import Numbers
-from models.training.data.datasets import COUNT_MAX
+from graspd.models.contract import SeenCounts
+from graspd.models.electrodes import NoveltyCheck
+from graspd.models.training.arrays import Numbers
+from graspd.models.training.data.datasets import COUNT_MAX
 
 MARGIN_COUNTS = 100
 """Margin around the training range, counts, within which a count still passes as seen.

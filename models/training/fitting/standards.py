@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.session_statistics import SessionStatistics
-from models.training.arrays import Floats, Floats32, Ints
+from graspd.models.session_statistics import SessionStatistics
+from graspd.models.training.arrays import Floats, Floats32, Ints
 
 PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""

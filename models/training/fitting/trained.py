@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.contract import SeenCounts
-from models.inputs import builder, raw_features
-from models.training.arrays import Floats, Floats32, Ints, Numbers
-from models.training.data.datasets import Grasps
-from models.training.fitting.fit import Fitted, fit
-from models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS, seen_counts
-from models.training.fitting.standards import Standards, TrainingStandards
-from models.training.systems.system import SessionFeatures, System
+from graspd.models.contract import SeenCounts
+from graspd.models.inputs import builder, raw_features
+from graspd.models.training.arrays import Floats, Floats32, Ints, Numbers
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.fitting.fit import Fitted, fit
+from graspd.models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS, seen_counts
+from graspd.models.training.fitting.standards import Standards, TrainingStandards
+from graspd.models.training.systems.system import SessionFeatures, System
 
 
 @dataclass(frozen=True, slots=True, eq=False)

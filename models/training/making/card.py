@@ -9,16 +9,16 @@ from typing import Any
 
 import msgspec
 
-from models.bts3 import CITATIONS, LICENCE, REPOSITORY
-from models.contract import Dataset, ModelContract
-from models.training.data.datasets import Grasps, lab_table_names, unpublished
-from models.training.data.lab_tables import ENOUGH_GRASPS
-from models.training.estimators.graphs import OPSET
-from models.training.evaluating.broken import Study
-from models.training.evaluating.day_figures import DayFigures
-from models.training.evaluating.metrics import CurvePoint, Fraction, Spread
-from models.training.evaluating.summaries import ObjectFigures, SystemSummary, Variant
-from models.training.making.export import Parity
+from graspd.models.bts3 import CITATIONS, LICENCE, REPOSITORY
+from graspd.models.contract import Dataset, ModelContract
+from graspd.models.training.data.datasets import Grasps, lab_table_names, unpublished
+from graspd.models.training.data.lab_tables import ENOUGH_GRASPS
+from graspd.models.training.estimators.graphs import OPSET
+from graspd.models.training.evaluating.broken import Study
+from graspd.models.training.evaluating.day_figures import DayFigures
+from graspd.models.training.evaluating.metrics import CurvePoint, Fraction, Spread
+from graspd.models.training.evaluating.summaries import ObjectFigures, SystemSummary, Variant
+from graspd.models.training.making.export import Parity
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 

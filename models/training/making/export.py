@@ -9,12 +9,12 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from models.contract import METADATA_KEY, ModelContract
-from models.inputs import SessionBuilder, builder
-from models.runtime import TactileModel
-from models.training.evaluating.files import replacing
-from models.training.fitting.fit import Fitted
-from models.training.fitting.standards import Standards
+from graspd.models.contract import METADATA_KEY, ModelContract
+from graspd.models.inputs import SessionBuilder, builder
+from graspd.models.runtime import TactileModel
+from graspd.models.training.evaluating.files import replacing
+from graspd.models.training.fitting.fit import Fitted
+from graspd.models.training.fitting.standards import Standards
 
 TOLERANCE = 1e-5
 """Largest allowed difference of a probability between the trained system and its file."""

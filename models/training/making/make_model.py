@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from models.contract import (
+from graspd.models.contract import (
     CLASSES,
     ConfidenceStep,
     Input,
@@ -18,19 +18,19 @@ from models.contract import (
     SessionInput,
     Sharpness,
 )
-from models.training.data.datasets import Grasps
-from models.training.evaluating import jobs
-from models.training.evaluating.broken import broken_study
-from models.training.evaluating.days import CALIBRATED_FROM
-from models.training.evaluating.files import to_json, write_whole
-from models.training.evaluating.jobs import JobResult
-from models.training.evaluating.metrics import FEWEST_JUDGED
-from models.training.evaluating.run_jobs import run_jobs
-from models.training.evaluating.summaries import SystemSummary, made_with, summarise
-from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
-from models.training.fitting.standards import PRIOR_GRASPS, RUNNING
-from models.training.fitting.trained import Trained, train
-from models.training.making.card import (
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.evaluating import jobs
+from graspd.models.training.evaluating.broken import broken_study
+from graspd.models.training.evaluating.days import CALIBRATED_FROM
+from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.evaluating.jobs import JobResult
+from graspd.models.training.evaluating.metrics import FEWEST_JUDGED
+from graspd.models.training.evaluating.run_jobs import run_jobs
+from graspd.models.training.evaluating.summaries import SystemSummary, made_with, summarise
+from graspd.models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
+from graspd.models.training.fitting.standards import PRIOR_GRASPS, RUNNING
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.making.card import (
     LIBRARIES,
     Card,
     Data,
@@ -39,9 +39,9 @@ from models.training.making.card import (
     NeverSeen,
     weak_points,
 )
-from models.training.making.export import export
-from models.training.making.plan import TrainingPlan
-from models.training.systems.system import SessionFeatures, System, configuration
+from graspd.models.training.making.export import export
+from graspd.models.training.making.plan import TrainingPlan
+from graspd.models.training.systems.system import SessionFeatures, System, configuration
 
 EXTRA_TRAININGS = 2
 """Trainings beside the folds: one for repeatability, one for the model itself.

@@ -7,12 +7,12 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from models.bts3 import NEW_SESSION, TABLES, WHOLE
-from models.own import NAME_MAX
-from models.training.data.datasets import Grasps
-from models.training.data.protocols import EvalProtocol
-from models.training.evaluating.jobs import Job, jobs_of
-from models.training.systems.system import System
+from graspd.models.bts3 import NEW_SESSION, TABLES, WHOLE
+from graspd.models.own import NAME_MAX
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.data.protocols import EvalProtocol
+from graspd.models.training.evaluating.jobs import Job, jobs_of
+from graspd.models.training.systems.system import System
 
 
 @dataclass(frozen=True, slots=True)

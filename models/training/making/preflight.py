@@ -10,13 +10,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from models.training.arrays import Ints
-from models.training.data.datasets import Grasps, lab_table_names
-from models.training.data.lab_tables import ENOUGH_GRASPS
-from models.training.data.protocols import TooFewGraspsError, splits
-from models.training.evaluating.broken import left_out
-from models.training.making.plan import TrainingPlan
-from models.training.systems.system import SessionFeatures
+from graspd.models.training.arrays import Ints
+from graspd.models.training.data.datasets import Grasps, lab_table_names
+from graspd.models.training.data.lab_tables import ENOUGH_GRASPS
+from graspd.models.training.data.protocols import TooFewGraspsError, splits
+from graspd.models.training.evaluating.broken import left_out
+from graspd.models.training.making.plan import TrainingPlan
+from graspd.models.training.systems.system import SessionFeatures
 
 FEWEST_FOLDS = 2
 FEW_OBJECTS = 10

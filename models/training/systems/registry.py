@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
-from models.bts3 import FINGERS, NEW_SESSION, WHOLE
-from models.contract import CountsInput, Finger, ImageInput, VectorInput
-from models.layout import D1, D2A, D2B, D3
-from models.tactile_image import Composition, Fill, Normalisation
-from models.training.data.augmentation import Augmentation
-from models.training.estimators.configs import (
+from graspd.models.bts3 import FINGERS, NEW_SESSION, WHOLE
+from graspd.models.contract import CountsInput, Finger, ImageInput, VectorInput
+from graspd.models.layout import D1, D2A, D2B, D3
+from graspd.models.tactile_image import Composition, Fill, Normalisation
+from graspd.models.training.data.augmentation import Augmentation
+from graspd.models.training.estimators.configs import (
     CNN0,
     CNN1,
     CNN2,
@@ -24,8 +24,8 @@ from models.training.estimators.configs import (
     SecondConvolution,
     SessionRecipe,
 )
-from models.training.estimators.configs import SvmConfig as Svm
-from models.training.systems.system import (
+from graspd.models.training.estimators.configs import SvmConfig as Svm
+from graspd.models.training.systems.system import (
     BlendConfig,
     Member,
     PaperFigure,

@@ -10,11 +10,11 @@ from typing import Any
 
 import msgspec
 
-from models.bts3 import FINGERS, WHOLE
-from models.contract import CountsInput, Finger, ImageInput, VectorInput
-from models.training.data.augmentation import Augmentation
-from models.training.data.protocols import EvalProtocol
-from models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
+from graspd.models.bts3 import FINGERS, WHOLE
+from graspd.models.contract import CountsInput, Finger, ImageInput, VectorInput
+from graspd.models.training.data.augmentation import Augmentation
+from graspd.models.training.data.protocols import EvalProtocol
+from graspd.models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
 
 CLIP = 3.0
 """Limit of standardised session features; one beyond it comes from a sensor that moved."""

@@ -17,7 +17,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from daemon.process.text import markdown_table
+from graspd.daemon.process.text import markdown_table
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import end_children_at_sigterm
 

@@ -18,8 +18,8 @@ from typing import Self
 
 import zmq
 
-from daemon.publish.keys import load_pair, make
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.daemon.publish.keys import load_pair, make
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import PATIENCE_S, Child, start_daemon
 from tests.ports import free_port

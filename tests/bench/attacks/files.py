@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
-from drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon, usage
 from tests.models.hostile import giant

@@ -16,17 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.judge.reasons import Decision
-from daemon.publish.messages import Verdict
-from drivers.joints.message import JointMessage
-from drivers.twins.grasps.grasp_script import JOINT_NAMES
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.grasps.whole_grasps import (
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.publish.messages import Verdict
+from graspd.drivers.joints.message import JointMessage
+from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.grasps.whole_grasps import (
     PALM_RATE_HZ,
     RATE_HZ,
     synthetic_grasps,
 )
-from drivers.twins.spi import SpiTwin
+from graspd.drivers.twins.spi import SpiTwin
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import (
     HELD,

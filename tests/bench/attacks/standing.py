@@ -14,13 +14,13 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from daemon.judge.hand import FreshMedian
-from daemon.publish.messages import Tactile, Verdict
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.grasps.whole_grasps import synthetic_grasps
-from drivers.twins.spi import SpiTwin
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.judge.hand import FreshMedian
+from graspd.daemon.publish.messages import Tactile, Verdict
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.drivers.twins.spi import SpiTwin
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import HELD, PATIENCE_S, Subscriber, start_daemon, tactile_section
 from tests.kit.messages import decode_tactile, decode_verdict

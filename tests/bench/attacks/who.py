@@ -10,7 +10,7 @@ from pathlib import Path
 
 import zmq
 
-from daemon.publish.keys import load_pair, make
+from graspd.daemon.publish.keys import load_pair, make
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.clients.bench import Daemon, free_endpoint
 

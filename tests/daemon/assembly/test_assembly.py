@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from daemon.assembly import assembly
-from daemon.assembly.parts import Assembly, Parts
-from daemon.judge.reasons import Decision
-from daemon.scene import Scene, parse
-from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
-from drivers.spi.driver import SpiBridgeDriver
-from models.contract import ModelError
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.scene import Scene, parse
+from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.models.contract import ModelError
 from tests.daemon.fakes import Clock, reading
 
 REPLAY = {"driver": "replay", "recordings": [str(DEMO_TABLE)]}

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from daemon.assembly import assembly
-from daemon.scene import Scene, SceneError, parse
-from drivers.base import DriverError, LinkCause, LinkError, RecordingError
-from drivers.palm.calibration import CalibrationError
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.daemon.assembly import assembly
+from graspd.daemon.scene import Scene, SceneError, parse
+from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
+from graspd.drivers.palm.calibration import CalibrationError
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.fakes import Clock, FakeDriver
 
 
@@ -46,14 +46,14 @@ PALM = {"driver": "palm", "source": "udp://127.0.0.1:5555"}
 def test_the_palm_is_told_whom_to_hear_and_what_to_heed(
     monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], address: str | None, heeded: bool
 ) -> None:
-    named = made(monkeypatch, "drivers.palm.driver.PalmDriver", scene(PALM | keys))
+    named = made(monkeypatch, "graspd.drivers.palm.driver.PalmDriver", scene(PALM | keys))
     assert named["only_from"] == address
     assert named["heed_finger_bits"] is heeded
 
 
 def test_the_can_bridge_is_told_the_order_of_its_sensors(monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = scene({"driver": "can", "sensors": ["th", "ff", "mf"]})
-    named = made(monkeypatch, "drivers.can.driver.CanBridgeDriver", wanted)
+    named = made(monkeypatch, "graspd.drivers.can.driver.CanBridgeDriver", wanted)
     assert named["sensors"] == ("th", "ff", "mf")
     assert named["fingers"] == ("ff", "mf", "th")
 

@@ -13,10 +13,10 @@ from typing import Final
 import shtab
 from argparse_manpage.manpage import Manpage
 
-from daemon.cli import whole_parser
-from daemon.commands.arguments import Parser
-from daemon.commands.texts import SHELLS
-from models import zoo
+from graspd.daemon.cli import whole_parser
+from graspd.daemon.commands.arguments import Parser
+from graspd.daemon.commands.texts import SHELLS
+from graspd.models import zoo
 
 FOLDER: Final = Path(__file__).parents[3] / "deploy" / "shell"
 SECTIONS: Final = {

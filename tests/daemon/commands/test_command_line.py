@@ -12,8 +12,8 @@ from importlib.metadata import version
 import pytest
 import zmq
 
-from daemon.cli import COMMANDS, LIBRARIES, whole_parser
-from daemon.commands.arguments import Parser
+from graspd.daemon.cli import COMMANDS, LIBRARIES, whole_parser
+from graspd.daemon.commands.arguments import Parser
 from tests.conftest import ROOT
 from tests.daemon.processes import GRASPD, graspd
 
@@ -31,7 +31,7 @@ class Missing:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
 sys.meta_path.insert(0, Missing())
-from daemon.cli import main
+from graspd.daemon.cli import main
 """
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.publish.messages import Verdict
-from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.daemon.publish.messages import Verdict
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon import processes
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
 from tests.kit.inside import graspd

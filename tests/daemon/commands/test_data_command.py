@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from daemon.commands.data import DataError, fetch
-from models.bts3 import TABLES
+from graspd.daemon.commands.data import DataError, fetch
+from graspd.models.bts3 import TABLES
 from tests.kit.inside import graspd
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.publish.messages import Tactile, Verdict
-from drivers.base import TactileReading
-from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
+from graspd.daemon.publish.messages import Tactile, Verdict
+from graspd.drivers.base import TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from tests.bench.live import Subscriber, can_id, where_of
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from daemon.assembly import assembly
-from daemon.commands import models
-from daemon.scene import Scene, parse
-from models import own, zoo
-from models.contract import ModelError
-from models.runtime import read
+from graspd.daemon.assembly import assembly
+from graspd.daemon.commands import models
+from graspd.daemon.scene import Scene, parse
+from graspd.models import own, zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import read
 from tests.kit.inside import graspd
 
 

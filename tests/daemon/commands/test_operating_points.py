@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from daemon.commands.check import operating_points
-from daemon.judge.stillness import Motion, Tails
+from graspd.daemon.commands.check import operating_points
+from graspd.daemon.judge.stillness import Motion, Tails
 
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
 """Of real held touches: by the differences of sweeps, over the root of 2; at one sweep."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from models.runtime import read
+from graspd.models.runtime import read
 from tests.daemon.processes import graspd
 from tests.models.training.evaluation_samples import table, write
 

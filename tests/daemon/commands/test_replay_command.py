@@ -17,11 +17,11 @@ from typing import Any
 import jsonschema
 import pytest
 
-from daemon.publish.messages import schema
-from drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
-from drivers.recordings.csv_rows import read_rows
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.publish.messages import schema
+from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.csv_rows import read_rows
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 from tests.kit.messages import decode_verdict

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.session.file import SessionFile, kept_now
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.daemon.session.file import SessionFile, kept_now
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import graspd
 
 SCENE = """

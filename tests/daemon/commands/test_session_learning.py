@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon import scene as scenes
-from daemon.assembly import assembly
-from daemon.session.file import SessionFile, former_of, kept_now, load
-from daemon.trust.lift_book import GraspId
-from daemon.trust.trust import Trust, TrustState, decode
-from drivers.recordings.csv_player import DEMO_TABLE
-from drivers.recordings.csv_rows import SLIPPED, read_rows
+from graspd.daemon import scene as scenes
+from graspd.daemon.assembly import assembly
+from graspd.daemon.session.file import SessionFile, former_of, kept_now, load
+from graspd.daemon.trust.lift_book import GraspId
+from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_rows import SLIPPED, read_rows
 from tests.daemon.record.test_export import Writer
 from tests.kit.inside import graspd
 

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("shtab", reason="of the extra `test`")
 pytest.importorskip("argparse_manpage", reason="of the extra `test`")
 
-from models import zoo
+from graspd.models import zoo
 from tests.daemon.commands.shell_files import FOLDER, files
 
 LINES = {

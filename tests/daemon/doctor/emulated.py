@@ -16,21 +16,21 @@ from pathlib import Path
 
 import pytest
 
-from daemon.commands import doctor
-from daemon.commands.doctor import examine
-from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Finding, Level
-from drivers.base import Driver, TactileReading
-from drivers.can.driver import CanBridgeDriver
-from drivers.joints.driver import JointStreamDriver
-from drivers.palm.driver import PalmDriver
-from drivers.spi.driver import SpiBridgeDriver
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.grasps.whole_grasps import synthetic_grasps
-from drivers.twins.joints import JointTwin
-from drivers.twins.palm import PalmTwin
-from drivers.twins.spi import SpiTwin
+from graspd.daemon.commands import doctor
+from graspd.daemon.commands.doctor import examine
+from graspd.daemon.doctor.electrodes import ElectrodeStatistics
+from graspd.daemon.doctor.finding import Finding, Level
+from graspd.drivers.base import Driver, TactileReading
+from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.joints.driver import JointStreamDriver
+from graspd.drivers.palm.driver import PalmDriver
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.drivers.twins.joints import JointTwin
+from graspd.drivers.twins.palm import PalmTwin
+from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.can.can_standin import StampingTwin, channel
 from tests.kit.clock import Clock
 

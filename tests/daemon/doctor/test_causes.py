@@ -19,14 +19,14 @@ from types import SimpleNamespace
 import can
 import pytest
 
-from daemon.commands import doctor
-from daemon.doctor import computer
-from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause, Finding, Level
-from daemon.doctor.surroundings import can_finding
-from drivers.twins import spi as spi_twin
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.daemon.commands import doctor
+from graspd.daemon.doctor import computer
+from graspd.daemon.doctor.electrodes import ElectrodeStatistics
+from graspd.daemon.doctor.finding import Cause, Finding, Level
+from graspd.daemon.doctor.surroundings import can_finding
+from graspd.drivers.twins import spi as spi_twin
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from tests.daemon.doctor.emulated import (
     CAN,
     FINGERS,
@@ -219,7 +219,7 @@ def test_an_interface_that_is_down_or_at_another_rate_is_told_with_the_command(
     there = computer.CanInterface(LOOPBACK, *interface)
     monkeypatch.setattr(computer, "can_interfaces", lambda: [there])
     with SocketBus() as bus:
-        monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **_: bus)
+        monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", lambda **_: bus)
         text = CAN.format(LOOPBACK) + more + MODEL + published(tmp_path)
         (told,) = look(tmp_path, capsys, text)
     assert told["cause"] == cause
@@ -239,7 +239,7 @@ def test_a_board_that_is_heard_has_the_bit_rate_of_its_interface(
     there = computer.CanInterface(LOOPBACK, "error-active", 500_000)
     monkeypatch.setattr(computer, "can_interfaces", lambda: [there])
     with SocketBus() as bus:
-        monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **_: bus)
+        monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", lambda **_: bus)
         for sweep in range(3):
             for frame in sweep_of_frames(sweep):
                 bus.send(frame)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause, Level
-from daemon.doctor.link import COUNTERS, counter_findings, device_findings, rate_finding
-from daemon.record.player import McapCounters
-from drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
-from drivers.can.readings import CanCounters
-from drivers.joints.message import JointCounters
-from drivers.link import LinkState
-from drivers.palm.packet import PalmCounters
-from drivers.recordings.faults import ReplayCounters
-from drivers.spi.sweeps import BridgeCounters
+from graspd.daemon.doctor.electrodes import ElectrodeStatistics
+from graspd.daemon.doctor.finding import Cause, Level
+from graspd.daemon.doctor.link import COUNTERS, counter_findings, device_findings, rate_finding
+from graspd.daemon.record.player import McapCounters
+from graspd.drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.joints.message import JointCounters
+from graspd.drivers.link import LinkState
+from graspd.drivers.palm.packet import PalmCounters
+from graspd.drivers.recordings.faults import ReplayCounters
+from graspd.drivers.spi.sweeps import BridgeCounters
 
 FINGERS = ("ff", "mf", "th")
 Counts = NDArray[np.float64]

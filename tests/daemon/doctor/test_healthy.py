@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.doctor.electrodes import ElectrodeStatistics
-from drivers.twins.faults import LinkFaults
+from graspd.daemon.doctor.electrodes import ElectrodeStatistics
+from graspd.drivers.twins.faults import LinkFaults
 from tests.daemon.doctor.emulated import FINGERS, LINKS, STEPS_PER_S, Hand, faults_told, listen
 
 HOUR_S, EVERY_S, LOOK_S = 3600, 20, 3

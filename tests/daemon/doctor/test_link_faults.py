@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from daemon.commands.doctor import examine
-from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Cause, Level
-from drivers.can.frames import ERROR, CanFrame
-from drivers.spi.messages import FIRMWARE
-from drivers.twins import spi as spi_twin
-from drivers.twins.faults import LinkFaults
+from graspd.daemon.commands.doctor import examine
+from graspd.daemon.doctor.electrodes import ElectrodeStatistics
+from graspd.daemon.doctor.finding import Cause, Level
+from graspd.drivers.can.frames import ERROR, CanFrame
+from graspd.drivers.spi.messages import FIRMWARE
+from graspd.drivers.twins import spi as spi_twin
+from graspd.drivers.twins.faults import LinkFaults
 from tests.daemon.doctor.emulated import (
     CAN,
     FINGERS,

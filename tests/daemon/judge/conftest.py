@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.twins.grasps.grasps import recorded_counts
+from graspd.drivers.twins.grasps.grasps import recorded_counts
 from tests.conftest import data_dir
 
 

@@ -12,14 +12,14 @@ from functools import cache
 
 import numpy as np
 
-from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, GateState, Reason
-from drivers.base import JointReading, TactileReading
-from drivers.twins.grasps.grasp_script import Durations
-from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.drivers.base import JointReading, TactileReading
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, Clock
 
 START_NS = 10**12

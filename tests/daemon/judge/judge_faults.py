@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm.packet import ROUND
-from drivers.palm.stream import PalmStream
-from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
-from drivers.twins.faults import LinkFaults
-from drivers.twins.palm import PalmTwin
+from graspd.drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
+from graspd.drivers.palm.packet import ROUND
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.palm import PalmTwin
 from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.fault_bench import Fault, Step
 from tests.drivers.palm.palm_stream import tactile

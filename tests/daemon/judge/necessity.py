@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import JointReading, TactileReading
+from graspd.drivers.base import JointReading, TactileReading
 
 MS = 1_000_000
 AGE_MAX_MS = 100

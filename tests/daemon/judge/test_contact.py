@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.contact import Contact
-from daemon.judge.decision import ContactLimits
-from daemon.judge.hand import FreshMedian
+from graspd.daemon.judge.contact import Contact
+from graspd.daemon.judge.decision import ContactLimits
+from graspd.daemon.judge.hand import FreshMedian
 
 FF, MF, TH = 0, 1, 2
 PERIOD_NS = 10_000_000

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from daemon.judge import decision
-from daemon.judge.decision import HELD, Limits, decide
-from daemon.judge.reasons import Decision, Moment, Reason
+from graspd.daemon.judge import decision
+from graspd.daemon.judge.decision import HELD, Limits, decide
+from graspd.daemon.judge.reasons import Decision, Moment, Reason
 from tests.kit.mutants import mutants
 
 LIMIT_NS = 100

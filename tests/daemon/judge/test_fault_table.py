@@ -12,7 +12,7 @@ from functools import cache
 
 import pytest
 
-from daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from tests.daemon.judge.fault_bench import UNDER_FAULT, Finding, grasp
 from tests.daemon.judge.judge_faults import EARLIER, FAULTS, JOINTS_LOST_FOR
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import onnxruntime as ort
 import pytest
 
-from daemon.publish.messages import Verdict
-from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
-from models import zoo
-from models.contract import FEATURES_PER_FINGER, OUTPUT_NAME
+from graspd.daemon.publish.messages import Verdict
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.models import zoo
+from graspd.models.contract import FEATURES_PER_FINGER, OUTPUT_NAME
 from tests.kit.inside import graspd
 from tests.kit.messages import decode_verdict
 

@@ -7,15 +7,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from daemon.judge.decision import Limits
-from daemon.judge.hand import FingerMemory, HandTracker
-from daemon.judge.health import Checked
-from daemon.judge.pipeline import Pipeline
-from daemon.judge.reasons import FingerState, GateState, Reason
-from drivers.base import ElectrodeFault, TactileReading
-from models import zoo
-from models.contract import Finger
-from models.runtime import TactileModel
+from graspd.daemon.judge.decision import Limits
+from graspd.daemon.judge.hand import FingerMemory, HandTracker
+from graspd.daemon.judge.health import Checked
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import FingerState, GateState, Reason
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.models import zoo
+from graspd.models.contract import Finger
+from graspd.models.runtime import TactileModel
 from tests.daemon.judge.test_gate import ALL, FINGERS, LIMITS, MS, Scenario, readings
 
 FREE, TOUCH, SLIDE = FingerState

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import GateLimits, HandLimits, JointLimits
-from daemon.judge.hand import HandTracker
-from daemon.judge.health import Checked
-from daemon.judge.reasons import GateChange, GateState, Reason
-from drivers.base import JointReading, TactileReading
-from models.contract import Finger
+from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits
+from graspd.daemon.judge.hand import HandTracker
+from graspd.daemon.judge.health import Checked
+from graspd.daemon.judge.reasons import GateChange, GateState, Reason
+from graspd.drivers.base import JointReading, TactileReading
+from graspd.models.contract import Finger
 
 MS = 1_000_000
 START_NS = 10**12

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.reasons import Decision, Reason
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.bench.gate import Study, end_points, streams, study
 
 GRASPS = 40

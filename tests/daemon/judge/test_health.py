@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.health import Checked, Health, too_many
-from daemon.judge.reasons import Reason
-from drivers.base import ElectrodeFault, TactileReading
+from graspd.daemon.judge.health import Checked, Health, too_many
+from graspd.daemon.judge.reasons import Reason
+from graspd.drivers.base import ElectrodeFault, TactileReading
 
 FINGERS = 3
-# What wears an electrode out, by the words of `daemon.judge.health`.
+# What wears an electrode out, by the words of `graspd.daemon.judge.health`.
 UNCHANGED_MAX = 16
 JUMP_COUNTS, JUMPS_MAX, JUMPS_FADE = 150, 2.0, 0.9
 STILL, STILL_COUNTS = 20, 30
@@ -20,7 +20,7 @@ Flags = NDArray[np.uint8]
 
 
 class Definition:
-    """What is broken, and which finger repeats itself, by the words of `daemon.judge.health`."""
+    """What is broken, and which finger repeats itself, by the words of `graspd.daemon.judge.health`."""
 
     def __init__(self) -> None:
         self.before: list[list[int]] | None = None

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import HandLimits, JointLimits, Limits
-from daemon.judge.joint_motion import JointMemory, JointMotion
-from daemon.judge.pipeline import Pipeline
-from daemon.judge.reasons import Reason
-from drivers.base import JointReading
+from graspd.daemon.judge.decision import HandLimits, JointLimits, Limits
+from graspd.daemon.judge.joint_motion import JointMemory, JointMotion
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import Reason
+from graspd.drivers.base import JointReading
 from tests.daemon.fakes import FINGERS
 from tests.daemon.judge.fault_bench import network
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from daemon.judge.health import REASON_OF_FAULT
-from daemon.judge.reasons import ADVICE, Decision, Reason
-from drivers.base import ElectrodeFault, TactileReading
-from models.contract import ModelError
+from graspd.daemon.judge.health import REASON_OF_FAULT
+from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.models.contract import ModelError
 from tests.daemon.fakes import FINGERS, HIGH, LOW, MARGIN, MS, Clock, FakeModel, pipeline, reading
 
 

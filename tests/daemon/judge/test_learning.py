@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.calibration import SessionCalibration
-from daemon.judge.decision import Limits
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, Reason
-from drivers.base import TactileReading
-from drivers.twins.grasps import synthetic
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.decision import Limits
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.drivers.base import TactileReading
+from graspd.drivers.twins.grasps import synthetic
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 
 Learnt = list[NDArray[np.generic]]
 

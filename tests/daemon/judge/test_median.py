@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.hand import FreshMedian
+from graspd.daemon.judge.hand import FreshMedian
 
 SHAPE = (3, 24)
 ALL = np.ones(SHAPE, dtype=np.bool_)

@@ -14,17 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.judge.memory import encode, recall, remember
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, Reason
-from daemon.trust import trust
-from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
-from models.contract import Finger
-from models.runtime import TactileModel
-from models.session_statistics import SessionState
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.judge.memory import encode, recall, remember
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.trust import trust
+from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
+from graspd.models.contract import Finger
+from graspd.models.runtime import TactileModel
+from graspd.models.session_statistics import SessionState
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 SECTIONS: dict[str, Any] = {

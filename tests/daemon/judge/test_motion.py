@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.stillness import Motion
-from daemon.judge.windows import STEPS
-from drivers.twins.grasps.whole_grasps import Sampling
+from graspd.daemon.judge.stillness import Motion
+from graspd.daemon.judge.windows import STEPS
+from graspd.drivers.twins.grasps.whole_grasps import Sampling
 from tests.drivers.twins.slides import STANDSTILL_S, held
 
 REST_S = 1.5

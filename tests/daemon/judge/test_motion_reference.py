@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from daemon.judge.stillness import Motion
+from graspd.daemon.judge.stillness import Motion
 
 MS = 1_000_000
 FALSE_ALARMS = 0.03

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from daemon.judge.calibration import Calibration
-from daemon.judge.network import Examined, Network, Plausibility
-from daemon.judge.reasons import Reason
-from models import zoo
-from models.electrodes import Electrodes
-from models.runtime import TactileModel
+from graspd.daemon.judge.calibration import Calibration
+from graspd.daemon.judge.network import Examined, Network, Plausibility
+from graspd.daemon.judge.reasons import Reason
+from graspd.models import zoo
+from graspd.models.electrodes import Electrodes
+from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, FakeModel, seen_box
 
 COUNTS = np.random.default_rng(1).integers(1000, 3000, (3, 24)).astype(np.uint16)

@@ -10,14 +10,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daemon.judge.calibration import Calibration
-from daemon.judge.network import Plausibility
-from daemon.judge.reasons import Reason
-from drivers.twins.grasps import synthetic
-from models import zoo
-from models.contract import SeenCounts
-from models.electrodes import Electrodes
-from models.runtime import TactileModel
+from graspd.daemon.judge.calibration import Calibration
+from graspd.daemon.judge.network import Plausibility
+from graspd.daemon.judge.reasons import Reason
+from graspd.drivers.twins.grasps import synthetic
+from graspd.models import zoo
+from graspd.models.contract import SeenCounts
+from graspd.models.electrodes import Electrodes
+from graspd.models.runtime import TactileModel
 
 NOTHING = np.zeros((3, 24), dtype=np.bool_)
 # Of different fingers and apart, so that none explains another.

@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import HandLimits, Limits
-from daemon.judge.health import Health
-from daemon.judge.pipeline import Pipeline
-from daemon.judge.reasons import Decision, GateState, Reason
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.palm.packet import ROUND, PalmPacket
-from drivers.palm.stream import PalmStream
-from drivers.twins.grasps.grasp_script import Durations
-from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
-from drivers.twins.palm import PalmTwin
+from graspd.daemon.judge.decision import HandLimits, Limits
+from graspd.daemon.judge.health import Health
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.palm.packet import ROUND, PalmPacket
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.grasps import recorded_counts
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
+from graspd.drivers.twins.palm import PalmTwin
 from tests.bench.recurrence import TABLES, UNTOUCHED, again
 from tests.daemon.fakes import FINGERS, MS, Clock
 from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
 from tests.drivers.palm.palm_stream import tactile
 
-# By the words of `daemon.judge.health`.
+# By the words of `graspd.daemon.judge.health`.
 SWEEPS, EQUAL_MIN, READ_MIN = 128, 20, 12
 GRACE = 3
 """Sweeps after the first turn of a ring from which no verdict may be `stable` any more."""

@@ -12,18 +12,18 @@ import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.calibration import SessionCalibration
-from daemon.judge.decision import Limits
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.trust.lift_book import GraspId
-from daemon.trust.risk import RiskLimits
-from daemon.trust.trust import Trust
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.grasps.whole_grasps import synthetic_grasps
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.decision import Limits
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.trust.lift_book import GraspId
+from graspd.daemon.trust.risk import RiskLimits
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.bench.attacks.standing import drifting
 from tests.daemon.fakes import MS, Clock
 from tests.daemon.judge.test_only_stable_if import HELD, Feel, Flaw, Hand, limits, tared

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.judge.decision import HandLimits
-from daemon.judge.pipeline import Judgement
-from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.trust.lift_book import GraspId, OutcomeStatus
-from daemon.trust.risk import RiskLimits
-from daemon.trust.trust import Trust
+from graspd.daemon.judge.decision import HandLimits
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
+from graspd.daemon.trust.risk import RiskLimits
+from graspd.daemon.trust.trust import Trust
 from tests.daemon.judge.test_only_stable_if import HELD, Feel, Hand, begins, feels, gates, tared
 from tests.daemon.judge.test_only_stable_if import limits as gate_limits
 

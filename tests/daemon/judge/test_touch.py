@@ -1,6 +1,6 @@
 """One finger's touch and tare, number by number: each limit from both sides.
 
-The numbers are those of the rule as `daemon.judge.contact` states it: a touch takes 20 counts, 0.6
+The numbers are those of the rule as `graspd.daemon.judge.contact` states it: a touch takes 20 counts, 0.6
 of that or a quarter of how deep it was held keeps it, half of that after a minute.
 """
 
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.contact import Contact, Rest, Touch, Window
-from daemon.judge.decision import ContactLimits
+from graspd.daemon.judge.contact import Contact, Rest, Touch, Window
+from graspd.daemon.judge.decision import ContactLimits
 
 THRESHOLD = 20.0
 S = 1_000_000_000

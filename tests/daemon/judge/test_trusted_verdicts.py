@@ -8,12 +8,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, Reason
-from daemon.trust.lift_book import GraspId
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import Trust
-from drivers.base import ElectrodeFault
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.trust.lift_book import GraspId
+from graspd.daemon.trust.risk import Permission, RiskLimits
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import ElectrodeFault
 from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
 
 BOOT = "b" * 32

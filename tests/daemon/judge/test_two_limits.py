@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.judge.calibration import SessionCalibration
-from daemon.judge.decision import HandLimits, Limits
-from daemon.judge.pipeline import Pipeline
-from daemon.judge.reasons import GateState, Moment, Reason
-from drivers.twins.grasps.grasps import Counts
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.decision import HandLimits, Limits
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import GateState, Moment, Reason
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.daemon.judge.test_gate_limits import Steps
 from tests.daemon.judge.test_learning import grasps, judge
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.judge.stillness import Tails, creep, fast_limit
-from daemon.judge.windows import Noise
+from graspd.daemon.judge.stillness import Tails, creep, fast_limit
+from graspd.daemon.judge.windows import Noise
 
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
 """Of real held touches: by the differences of sweeps, over the root of 2; at one sweep."""

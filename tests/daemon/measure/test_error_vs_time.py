@@ -19,14 +19,14 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from daemon.commands.report import add_arguments
-from daemon.measure import error_vs_time, picture
-from daemon.measure.candidates import errors, loop_image, model_step
-from daemon.measure.timing import measure
-from models import zoo
-from models.contract import ModelError
-from models.runtime import TactileModel
-from models.tactile_image import TactileImager
+from graspd.daemon.commands.report import add_arguments
+from graspd.daemon.measure import error_vs_time, picture
+from graspd.daemon.measure.candidates import errors, loop_image, model_step
+from graspd.daemon.measure.timing import measure
+from graspd.models import zoo
+from graspd.models.contract import ModelError
+from graspd.models.runtime import TactileModel
+from graspd.models.tactile_image import TactileImager
 from tests.daemon.fakes import FakeModel, contract
 from tests.models.training.evaluation_samples import sessions
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.measure.cost import CostError, Footprint, measure
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.daemon.measure.cost import CostError, Footprint, measure
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
 from tests.kit.inside import graspd
 
@@ -22,44 +22,71 @@ SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
 NEVER = {
     *("torch", "sklearn", "onnx", "onnxscript", "skl2onnx", "scipy", "pandas", "matplotlib"),
     *("rich", "distributed", "mcap", "msgpack", "pydantic.v1", "pydantic_settings", "yaml"),
-    *("models.training", "models.onnx_file", "drivers.twins", "drivers.recordings.can_log"),
-    *("drivers.recordings.serial_log", "drivers.recordings.link_log_player"),
-    *("daemon.measure.candidates", "daemon.measure.picture", "daemon.measure.stability"),
-    *("daemon.measure.streams", "daemon.measure.worth", "daemon.measure.cost"),
-    *("daemon.run.printer", "daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
-    *("daemon.scene.errors", "daemon.commands.doctor", "daemon.watch", "daemon.judge.memory"),
-    *("daemon.record", "daemon.assembly.recorder", "daemon.assembly.recordings"),
-    *("daemon.assembly.link_logs", "daemon.publish.keys", "numpy.ma", "numpy.random"),
+    *(
+        "graspd.models.training",
+        "graspd.models.onnx_file",
+        "graspd.drivers.twins",
+        "graspd.drivers.recordings.can_log",
+    ),
+    *("graspd.drivers.recordings.serial_log", "graspd.drivers.recordings.link_log_player"),
+    *(
+        "graspd.daemon.measure.candidates",
+        "graspd.daemon.measure.picture",
+        "graspd.daemon.measure.stability",
+    ),
+    *("graspd.daemon.measure.streams", "graspd.daemon.measure.worth", "graspd.daemon.measure.cost"),
+    *(
+        "graspd.daemon.run.printer",
+        "graspd.daemon.run.summary",
+        "graspd.daemon.run.realtime",
+        "graspd.daemon.run.systemd",
+    ),
+    *(
+        "graspd.daemon.scene.errors",
+        "graspd.daemon.commands.doctor",
+        "graspd.daemon.watch",
+        "graspd.daemon.judge.memory",
+    ),
+    *(
+        "graspd.daemon.record",
+        "graspd.daemon.assembly.recorder",
+        "graspd.daemon.assembly.recordings",
+    ),
+    *("graspd.daemon.assembly.link_logs", "graspd.daemon.publish.keys", "numpy.ma", "numpy.random"),
     *("numpy.testing", "jsonschema", "zstandard", "lz4", "zmq.auth", "difflib"),
 }
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
 for a service, realtime, known keys or a model that is not of the zoo."""
 BUSES = {
     "replay": {
-        "drivers.recordings.csv_player",
-        "drivers.recordings.csv_rows",
-        "drivers.recordings.faults",
+        "graspd.drivers.recordings.csv_player",
+        "graspd.drivers.recordings.csv_rows",
+        "graspd.drivers.recordings.faults",
     },
-    "spi": {"serial", "cobs", "drivers.spi.driver", "drivers.spi.line"},
+    "spi": {"serial", "cobs", "graspd.drivers.spi.driver", "graspd.drivers.spi.line"},
     "can": {
         *("can", "asyncio", "sqlite3"),
-        *("drivers.can.driver", "drivers.can.bus"),
+        *("graspd.drivers.can.driver", "graspd.drivers.can.bus"),
     },
-    "palm": {"drivers.palm.driver", "drivers.palm.packet"},
+    "palm": {"graspd.drivers.palm.driver", "graspd.drivers.palm.packet"},
 }
 """Modules that only this driver needs; python-can brings asyncio and sqlite3."""
-JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
-HALL = {"drivers.palm.calibration"}
-GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")}
-STATISTICS = {"daemon.judge.calibration", "models.session_statistics"}
-KEPT = {"daemon.session.file", "daemon.session.keeper"}
-ASK = {"daemon.publish.questions"}
+JOINTS = {
+    "graspd.daemon.judge.joint_motion",
+    "graspd.drivers.joints.driver",
+    "graspd.drivers.joints.message",
+}
+HALL = {"graspd.drivers.palm.calibration"}
+GATE = {f"graspd.daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")}
+STATISTICS = {"graspd.daemon.judge.calibration", "graspd.models.session_statistics"}
+KEPT = {"graspd.daemon.session.file", "graspd.daemon.session.keeper"}
+ASK = {"graspd.daemon.publish.questions"}
 
 FORBIDDEN = {
     # The demo's recording has joints; nothing is kept of a replay.
     "demo": {
         *(BUSES["spi"] | BUSES["can"] | BUSES["palm"]),
-        "drivers.joints.driver",
+        "graspd.drivers.joints.driver",
         *HALL,
         *KEPT,
         *ASK,
@@ -135,8 +162,8 @@ def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measur
     cost = measured(scene)
     assert below(NEVER | FORBIDDEN[scene.stem], cost.modules) == []
     assert BUSES[DRIVER.get(scene.stem, scene.stem)] <= set(cost.modules)
-    commands = [name for name in cost.modules if name.startswith("daemon.commands.")]
-    assert commands == ["daemon.commands.run"]
+    commands = [name for name in cost.modules if name.startswith("graspd.daemon.commands.")]
+    assert commands == ["graspd.daemon.commands.run"]
     assert cost.start.rss_kib < MEMORY_MIB[scene.stem] * 1024
     assert cost.start.cpu_ms < START_CPU_S[scene.stem] * 1e3
     assert cost.start.threads == 1 + ZMQ_THREADS
@@ -204,8 +231,10 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     )
     found = measured(written(tmp_path, text))
     parts = {part.name: part for part in found.parts}
-    assert HALL | ASK | {"daemon.judge.joint_motion"} <= set(found.modules)
-    assert below({"drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
+    assert HALL | ASK | {"graspd.daemon.judge.joint_motion"} <= set(found.modules)
+    assert (
+        below({"graspd.drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
+    )
     assert parts["sockets"].threads == ZMQ_THREADS + 1
     assert parts["sockets"].descriptors == SOCKET + ASK_SOCKET
     assert found.timed["judged"].number > 0
@@ -213,16 +242,16 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
 
 def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training() -> None:
     code = (
-        "import json, sys; from daemon.__main__ import main; sys.argv[1:] = ['replay']; main(); "
+        "import json, sys; from graspd.daemon.__main__ import main; sys.argv[1:] = ['replay']; main(); "
         "sys.stderr.write(json.dumps(sorted(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     modules = tuple(json.loads(result.stderr))
-    unwanted = NEVER - {"daemon.run.printer", "daemon.run.summary"}
+    unwanted = NEVER - {"graspd.daemon.run.printer", "graspd.daemon.run.summary"}
     unwanted |= BUSES["spi"] | BUSES["can"] | BUSES["palm"] | HALL | ASK
-    unwanted.add("daemon.session.keeper")
+    unwanted.add("graspd.daemon.session.keeper")
     assert below(unwanted, modules) == []
-    assert "drivers.recordings.csv_player" in modules
+    assert "graspd.drivers.recordings.csv_player" in modules
 
 
 def test_what_is_measured_leaves_sockets_and_sessions_alone(tmp_path: Path) -> None:

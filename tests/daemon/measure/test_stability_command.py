@@ -14,8 +14,8 @@ import pytest
 pytest.importorskip("onnx", reason="the report needs onnx, of the extra `train`")
 pytest.importorskip("torch", reason="the report needs torch, of the extra `train`")
 
-from daemon.commands.report import add_arguments
-from daemon.measure import stability
+from graspd.daemon.commands.report import add_arguments
+from graspd.daemon.measure import stability
 
 BROKEN_TESTS = """
 import json

@@ -17,12 +17,12 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
-from daemon.commands.report import add_arguments
-from daemon.measure import streams as module
-from daemon.measure import worth
-from daemon.measure.reliability import fitted_scales, outcomes_of, slope
-from daemon.measure.streams import Stream, judged, live, streams
-from daemon.measure.worth import (
+from graspd.daemon.commands.report import add_arguments
+from graspd.daemon.measure import streams as module
+from graspd.daemon.measure import worth
+from graspd.daemon.measure.reliability import fitted_scales, outcomes_of, slope
+from graspd.daemon.measure.streams import Stream, judged, live, streams
+from graspd.daemon.measure.worth import (
     ALLOWED,
     ALONE,
     LEARNING,
@@ -33,15 +33,15 @@ from daemon.measure.worth import (
     measured,
     risk_figures,
 )
-from daemon.trust.learner import SCALE
-from daemon.trust.risk import RiskLimits
-from models import zoo
-from models.training.arrays import Ints
-from models.training.data.datasets import Grasps, read_all
-from models.training.data.protocols import object_folds
-from models.training.fitting.trained import Trained, train
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import System, with_recipes
+from graspd.daemon.trust.learner import SCALE
+from graspd.daemon.trust.risk import RiskLimits
+from graspd.models import zoo
+from graspd.models.training.arrays import Ints
+from graspd.models.training.data.datasets import Grasps, read_all
+from graspd.models.training.data.protocols import object_folds
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import System, with_recipes
 
 GRASPS = 300
 LIMITS = limits(ALLOWED)

@@ -10,7 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from daemon.process.logs import BURST, KINDS_MAX, WINDOW_S, JournalFormatter, RateLimit, is_journal
+from graspd.daemon.process.logs import (
+    BURST,
+    KINDS_MAX,
+    WINDOW_S,
+    JournalFormatter,
+    RateLimit,
+    is_journal,
+)
 
 
 def record(level: int, text: str, *values: object) -> logging.LogRecord:
@@ -49,7 +56,7 @@ def test_a_complaint_in_the_journal_is_an_error(tmp_path: Path) -> None:
     with log.open("wb") as stream:
         there = os.fstat(stream.fileno())
         code = subprocess.run(
-            [sys.executable, "-m", "daemon", "run", str(tmp_path / "missing.toml")],
+            [sys.executable, "-m", "graspd", "run", str(tmp_path / "missing.toml")],
             stderr=stream,
             env={**os.environ, "JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"},
             check=False,

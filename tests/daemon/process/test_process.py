@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.process.text import printable, progress
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.daemon.process.text import printable, progress
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit import inside
 from tests.kit.scenes import demo_scene
@@ -24,7 +24,7 @@ DEMO_SCENE = ROOT / "deploy" / "scenes" / "demo.toml"
 
 def python(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     """Run code, then graspd, in one process."""
-    code += "\nimport sys\nfrom daemon.__main__ import main\nsys.exit(main())\n"
+    code += "\nimport sys\nfrom graspd.daemon.__main__ import main\nsys.exit(main())\n"
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
         capture_output=True,
@@ -46,7 +46,7 @@ sys.meta_path.insert(0, Finder)
 """Ctrl-C in the moment in which a module is imported."""
 
 
-@pytest.mark.parametrize("module", ["daemon.cli", "onnxruntime"])
+@pytest.mark.parametrize("module", ["graspd.daemon.cli", "onnxruntime"])
 def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
     result = python(AT_IMPORT.format(module=module), "replay")
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
@@ -54,7 +54,7 @@ def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
 
 def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, "loop = true")
-    result = python(AT_IMPORT.format(module="drivers.recordings.faults"), "run", scene)
+    result = python(AT_IMPORT.format(module="graspd.drivers.recordings.faults"), "run", scene)
     assert result.returncode == 0, result.stderr
     assert "Traceback" not in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
@@ -98,7 +98,7 @@ def test_graspd_loads_no_plugins_of_pydantic(
 
 WHILE_LEAVING = """
 import os, signal
-from daemon.process.signals import StopSignal
+from graspd.daemon.process.signals import StopSignal
 leave = StopSignal.__exit__
 def leave_and_interrupt(self, *error):
     os.kill(os.getpid(), signal.SIGINT)
@@ -204,10 +204,10 @@ def test_closed_errors_do_not_change_the_exit_code() -> None:
 
 def test_only_an_output_that_nobody_reads_may_break_quietly() -> None:
     code = """
-import daemon.commands.texts
+import graspd.daemon.commands.texts
 def run(args):
     raise BrokenPipeError(32, "the serial line broke")
-daemon.commands.texts.run = run
+graspd.daemon.commands.texts.run = run
 """
     result = python(code, "schema")
     assert result.returncode == 1

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from daemon.process.worker import SWITCH_S, Worker
+from graspd.daemon.process.worker import SWITCH_S, Worker
 from tests.kit.waiting import PATIENCE_S
 
 

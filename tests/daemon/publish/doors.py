@@ -9,13 +9,13 @@ from typing import Self
 
 import zmq
 
-from daemon import scene
-from daemon.publish.companion import Answer
-from daemon.publish.door import Door
-from daemon.publish.keys import load_pair, make
-from daemon.publish.listener import Listener
-from daemon.publish.sockets import Sockets
-from daemon.trust.lift_book import Report
+from graspd.daemon import scene
+from graspd.daemon.publish.companion import Answer
+from graspd.daemon.publish.door import Door
+from graspd.daemon.publish.keys import load_pair, make
+from graspd.daemon.publish.listener import Listener
+from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.trust.lift_book import Report
 from tests.ports import free_port
 
 WAIT_MS = 100_000

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.process.signals import StopSignal
-from daemon.publish.door import QUESTIONS_MAX, Door, Frames
-from daemon.publish.listener import Listener, PublishError
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.door import QUESTIONS_MAX, Door, Frames
+from graspd.daemon.publish.listener import Listener, PublishError
 from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message
 from tests.ports import free_port
 from tests.threads import at_work

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.judge.reasons import Decision, Reason
-from daemon.publish.messages import Verdict
-from daemon.publish.outbox import BUCKETS, LatencyHistogram
-from daemon.run.summary import WITHOUT_LEARNING, RunSummary, Tally
-from daemon.trust.lift_book import GraspId
-from daemon.trust.trust import Trust
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.publish.outbox import BUCKETS, LatencyHistogram
+from graspd.daemon.run.summary import WITHOUT_LEARNING, RunSummary, Tally
+from graspd.daemon.trust.lift_book import GraspId
+from graspd.daemon.trust.trust import Trust
 from tests.kit.messages import GOLDEN_VERDICT
 
 

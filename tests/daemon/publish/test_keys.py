@@ -13,11 +13,11 @@ import pytest
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
-from daemon.publish import door as doors
-from daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
-from daemon.publish.listener import PublishError
-from daemon.publish.lookout import Seldom
-from drivers.recordings.csv_player import DEMO_TABLE
+from graspd.daemon.publish import door as doors
+from graspd.daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
+from graspd.daemon.publish.listener import PublishError
+from graspd.daemon.publish.lookout import Seldom
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.publish.doors import QUIET_S, Asked, KeyedDoor
 from tests.kit.inside import graspd
 from tests.kit.messages import GOLDEN_STATUS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.publish.outbox import Deadlines
+from graspd.daemon.publish.outbox import Deadlines
 from tests.daemon.fakes import MS, reading
 
 PERIOD_NS = 10 * MS

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.listener import Listener, PublishError
 from tests.daemon.publish.doors import Publisher
 
 

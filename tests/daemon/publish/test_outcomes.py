@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.publish.companion import REPEATED, Answer
-from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
-from daemon.publish.outbox import Outbox
-from daemon.publish.questions import Questions
-from daemon.trust.lift_book import GraspId, Report
+from graspd.daemon.publish.companion import REPEATED, Answer
+from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome, schema
+from graspd.daemon.publish.outbox import Outbox
+from graspd.daemon.publish.questions import Questions
+from graspd.daemon.trust.lift_book import GraspId, Report
 from tests.daemon.fakes import FINGERS, Clock
 from tests.daemon.publish.doors import Asked as Requests
 from tests.kit.loops import SentMessages

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.judge.reasons import Decision
-from daemon.publish.door import Frames
-from daemon.publish.messages import Verdict
-from daemon.publish.questions import WAITING_MAX, Questions
-from drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.publish.door import Frames
+from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.publish.questions import WAITING_MAX, Questions
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.publish.doors import Asked, Peers
 from tests.kit.messages import decode_verdict

@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 import zmq
 
-from daemon import scene
-from daemon.judge.network import Opinion
-from daemon.judge.pipeline import Judgement
-from daemon.judge.reasons import Decision, Moment
-from daemon.publish.companion import PublishedVerdict
-from daemon.publish.listener import PublishError
-from daemon.publish.sockets import Sockets, plan
-from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook
+from graspd.daemon import scene
+from graspd.daemon.judge.network import Opinion
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.judge.reasons import Decision, Moment
+from graspd.daemon.publish.companion import PublishedVerdict
+from graspd.daemon.publish.listener import PublishError
+from graspd.daemon.publish.sockets import Sockets, plan
+from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
 from tests.kit.inside import graspd

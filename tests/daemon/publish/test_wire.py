@@ -11,9 +11,9 @@ import jsonschema
 import msgspec
 import pytest
 
-from daemon.commands.texts import schema_text
-from daemon.judge.reasons import ADVICE, GateCause, GateState, Reason
-from daemon.publish.messages import MESSAGES, decode_outcome, encode, schema
+from graspd.daemon.commands.texts import schema_text
+from graspd.daemon.judge.reasons import ADVICE, GateCause, GateState, Reason
+from graspd.daemon.publish.messages import MESSAGES, decode_outcome, encode, schema
 from tests.kit.messages import GOLDEN, decode_verdict, golden
 
 SCHEMA_FILE = Path(__file__).parents[3] / "deploy" / "wire" / "messages.schema.json"

@@ -10,11 +10,11 @@ from typing import Any, cast
 
 import zmq
 
-from daemon.publish.messages import Status, Verdict
-from daemon.record.header import RecordingHeader
-from daemon.record.mcap import McapReader
-from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.recordings.csv_rows import open_recording
+from graspd.daemon.publish.messages import Status, Verdict
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.mcap import McapReader
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.recordings.csv_rows import open_recording
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_verdict
 

@@ -13,16 +13,16 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.publish.messages import OutcomeMessage, encode
-from daemon.record.export import collect
-from daemon.record.header import RecordingHeader
-from daemon.record.mcap import McapWriter
-from daemon.record.topics import Judged
-from drivers.base import ElectrodeFault, RecordingError, TactileReading
-from drivers.recordings.csv_player import DEMO_TABLE
-from models.training.data.datasets import read_table
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.publish.messages import OutcomeMessage, encode
+from graspd.daemon.record.export import collect
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.mcap import McapWriter
+from graspd.daemon.record.topics import Judged
+from graspd.drivers.base import ElectrodeFault, RecordingError, TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.models.training.data.datasets import read_table
 from tests.kit.inside import graspd
 
 BOOT = "0123456789abcdef" * 2

@@ -11,11 +11,11 @@ from typing import Any
 import can
 import pytest
 
-from daemon.record.mcap import header_of
-from drivers.base import TactileReading
-from drivers.recordings.can_log import CanLog
-from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.recordings.link_log_player import LinkLogDriver
+from graspd.daemon.record.mcap import header_of
+from graspd.drivers.base import TactileReading
+from graspd.drivers.recordings.can_log import CanLog
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.recordings.link_log_player import LinkLogDriver
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import compared, messages
 

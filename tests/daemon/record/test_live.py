@@ -19,7 +19,7 @@ import jsonschema
 import pytest
 import zmq
 
-from daemon.record.topics import schemas
+from graspd.daemon.record.topics import schemas
 from tests.conftest import ROOT
 from tests.daemon.processes import TIMEOUT_S, graspd, start
 
@@ -153,7 +153,7 @@ def test_no_thread_of_the_library_asks_python_to_log() -> None:
     """Such a thread may hold what the thread that runs Python waits for: once both hung."""
     script = """
         import logging
-        from daemon.record.live import LiveServer
+        from graspd.daemon.record.live import LiveServer
         from tests.daemon.record.test_live import ViewerClient
         with LiveServer(0) as server:
             server.send(b"status.right", b"{}")

@@ -21,9 +21,9 @@ from mcap.records import Chunk
 from mcap.writer import Writer
 from msgspec.structs import replace
 
-from daemon.publish.messages import Tactile, encode
-from daemon.record.header import RecordingHeader
-from daemon.record.mcap import (
+from graspd.daemon.publish.messages import Tactile, encode
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.mcap import (
     CHUNK_MAX_BYTES,
     METADATA,
     RATIO_MAX,
@@ -32,10 +32,10 @@ from daemon.record.mcap import (
     RecordedMessage,
     header_of,
 )
-from daemon.record.player import McapReplayDriver
-from daemon.record.topics import Joints
-from drivers.base import FINGERS, JointReading, RecordingError, TactileReading
-from models.session_statistics import SessionState
+from graspd.daemon.record.player import McapReplayDriver
+from graspd.daemon.record.topics import Joints
+from graspd.drivers.base import FINGERS, JointReading, RecordingError, TactileReading
+from graspd.models.session_statistics import SessionState
 
 BOOT = "0123456789abcdef" * 2
 OFFSET_NS = 10**18

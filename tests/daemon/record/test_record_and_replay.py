@@ -12,9 +12,9 @@ import jsonschema.validators
 import pytest
 from mcap.reader import make_reader
 
-from daemon.assembly.recordings import RecordedRun
-from daemon.publish.messages import encode
-from models.training.data.datasets import read_table
+from graspd.daemon.assembly.recordings import RecordedRun
+from graspd.daemon.publish.messages import encode
+from graspd.models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
 from tests.daemon.record.recorded import Lab, compared, messages, without_null, work
 

@@ -14,22 +14,22 @@ from typing import cast
 import pytest
 from msgspec.structs import replace
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.recorder import build_recorder
-from daemon.assembly.recordings import RecordedRun
-from daemon.judge.pipeline import Judgement
-from daemon.judge.reasons import GateCause
-from daemon.publish.companion import LoopEvent, PublishedVerdict
-from daemon.publish.messages import Verdict
-from daemon.publish.outbox import Outbox
-from daemon.record.files import Retention
-from daemon.record.header import RecordingHeader
-from daemon.record.mcap import McapWriter, header_of
-from daemon.record.recorder import Recorder
-from daemon.scene.scene import Record
-from drivers.base import TactileReading
-from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.recorder import build_recorder
+from graspd.daemon.assembly.recordings import RecordedRun
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.judge.reasons import GateCause
+from graspd.daemon.publish.companion import LoopEvent, PublishedVerdict
+from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.publish.outbox import Outbox
+from graspd.daemon.record.files import Retention
+from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.mcap import McapWriter, header_of
+from graspd.daemon.record.recorder import Recorder
+from graspd.daemon.scene.scene import Record
+from graspd.drivers.base import TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from tests.daemon.fakes import NO_LIFT
 from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
 from tests.kit.waiting import wait_until
@@ -106,7 +106,7 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
 def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_then(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.record.recorder.RETRY_NS", 100_000_000)
+    monkeypatch.setattr("graspd.daemon.record.recorder.RETRY_NS", 100_000_000)
     blocked = tmp_path / "record"
     blocked.write_text("a file where the folder should be")
     loop = Loop()
@@ -137,7 +137,9 @@ class Daemon:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
         self._now_ns = START_NS
-        monkeypatch.setattr("daemon.record.recorder.Recorder", partial(Recorder, clock=self._clock))
+        monkeypatch.setattr(
+            "graspd.daemon.record.recorder.Recorder", partial(Recorder, clock=self._clock)
+        )
         self.pipeline = assembly.build_pipeline(wanted, model, self._clock)
         self.pipeline.boot_id = BOOT
         recorder = build_recorder(wanted, model, self.pipeline, BOOT)

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon import scene
-from daemon.record import recorder as recorder_module
-from daemon.record.files import Retention
-from daemon.record.mcap import McapReader, McapWriter
-from daemon.record.recorder import QUEUE_MAX, Recorder
-from daemon.scene import SceneError
-from daemon.scene.scene import Record
-from drivers.recordings.csv_rows import open_recording
+from graspd.daemon import scene
+from graspd.daemon.record import recorder as recorder_module
+from graspd.daemon.record.files import Retention
+from graspd.daemon.record.mcap import McapReader, McapWriter
+from graspd.daemon.record.recorder import QUEUE_MAX, Recorder
+from graspd.daemon.scene import SceneError
+from graspd.daemon.scene.scene import Record
+from graspd.drivers.recordings.csv_rows import open_recording
 from tests.bench import kill_recorder
 from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
 from tests.kit.waiting import wait_until

@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.publish.companion import LoopEvent
-from daemon.publish.messages import State
-from daemon.record.files import Retention
-from daemon.record.flat import flat, schema_of, table
-from daemon.record.mcap import McapWriter
-from daemon.record.player import McapReplayDriver, RecordedEvent
-from daemon.record.recorder import Recorder
-from daemon.record.topics import Exchanged, Topic, schemas
-from daemon.record.viewers import INFO, SCALE, WARNING, Viewer
-from daemon.scene.scene import Record
-from daemon.trust.learner import LearnerState
-from drivers.base import JointReading, TactileReading
-from models.layout import D1
-from models.session_statistics import SessionState
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.publish.companion import LoopEvent
+from graspd.daemon.publish.messages import State
+from graspd.daemon.record.files import Retention
+from graspd.daemon.record.flat import flat, schema_of, table
+from graspd.daemon.record.mcap import McapWriter
+from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
+from graspd.daemon.record.recorder import Recorder
+from graspd.daemon.record.topics import Exchanged, Topic, schemas
+from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
+from graspd.daemon.scene.scene import Record
+from graspd.daemon.trust.learner import LearnerState
+from graspd.drivers.base import JointReading, TactileReading
+from graspd.models.layout import D1
+from graspd.models.session_statistics import SessionState
 from tests.daemon.record.recorded import BOOT, HEADER, messages
 from tests.daemon.watch.watch_fakes import status, tactile, verdict
 

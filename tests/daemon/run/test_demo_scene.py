@@ -6,15 +6,15 @@ import csv
 from collections import Counter
 from pathlib import Path
 
-from daemon.judge.reasons import Decision
-from daemon.process.signals import StopSignal
-from daemon.publish.companion import PublishedVerdict
-from daemon.publish.messages import Verdict
-from daemon.run.printer import Printer
-from daemon.run.runner import Runner
-from daemon.watch.figures import doubt
-from drivers.recordings.csv_player import SHOW_RECORDING
-from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.companion import PublishedVerdict
+from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.run.printer import Printer
+from graspd.daemon.run.runner import Runner
+from graspd.daemon.watch.figures import doubt
+from graspd.drivers.recordings.csv_player import SHOW_RECORDING
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
 
 SCENE = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
 LOOPS = 2

@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from daemon.judge.reasons import Decision, Reason
-from daemon.process.signals import StopSignal
-from daemon.publish.companion import (
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.companion import (
     Answer,
     Companion,
     LoopEvent,
@@ -21,12 +21,19 @@ from daemon.publish.companion import (
     Requests,
     hooks,
 )
-from daemon.publish.messages import Lifts, State
-from daemon.run.loop import Ended
-from daemon.session.sensors import SensorWatch
-from daemon.trust.lift_book import UNKNOWN_START, GraspId, OutcomeStatus, Report
-from daemon.trust.trust import Trust
-from drivers.base import DriverError, JointReading, LinkCause, LinkError, Reading, TactileReading
+from graspd.daemon.publish.messages import Lifts, State
+from graspd.daemon.run.loop import Ended
+from graspd.daemon.session.sensors import SensorWatch
+from graspd.daemon.trust.lift_book import UNKNOWN_START, GraspId, OutcomeStatus, Report
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import (
+    DriverError,
+    JointReading,
+    LinkCause,
+    LinkError,
+    Reading,
+    TactileReading,
+)
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, reading
 from tests.kit.loops import LoopBench
 from tests.kit.messages import decode_tactile

@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.judge.decision import ContactLimits, GateLimits, HandLimits
-from daemon.judge.reasons import Decision, Reason
-from daemon.process.signals import StopSignal
-from daemon.publish.companion import LoopEvent
-from daemon.publish.outbox import Outbox
-from daemon.run.loop import DRAINS_MAX, Loop, LoopTiming
-from daemon.run.overload import YIELD_AFTER_NS, YIELD_MAX_NS, LoadShedder, mark_repeats
-from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
+from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.companion import LoopEvent
+from graspd.daemon.publish.outbox import Outbox
+from graspd.daemon.run.loop import DRAINS_MAX, Loop, LoopTiming
+from graspd.daemon.run.overload import YIELD_AFTER_NS, YIELD_MAX_NS, LoadShedder, mark_repeats
+from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 from tests.daemon.judge.test_only_stable_if import POSES
 from tests.kit.loops import LoopBench

@@ -16,24 +16,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.parts import Parts
-from daemon.judge.reasons import GateState
-from daemon.run.realtime import RealtimeMode
-from daemon.run.rehearsal import rehearse
-from daemon.run.runner import rehearse_grasp
-from daemon.scene.scene import Realtime
-from drivers.base import TactileReading
-from drivers.recordings.csv_player import DEMO_TABLE
-from drivers.twins.grasps.grasps import Counts, recorded_counts
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.judge.reasons import GateState
+from graspd.daemon.run.realtime import RealtimeMode
+from graspd.daemon.run.rehearsal import rehearse
+from graspd.daemon.run.runner import rehearse_grasp
+from graspd.daemon.scene.scene import Realtime
+from graspd.drivers.base import TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
 from tests.kit.messages import GOLDEN_STATUS
 from tests.threads import at_work
 
 WORLD = """
 import ctypes, os, resource, sys
-from daemon.run.realtime import RealtimeMode
-from daemon.scene.scene import Realtime
+from graspd.daemon.run.realtime import RealtimeMode
+from graspd.daemon.scene.scene import Realtime
 """
 NOBODY = 65534
 
@@ -210,7 +210,7 @@ def test_the_kernel_takes_the_rests_of_an_overloaded_loop_for_sleep(tmp_path: Pa
     said = in_a_process(
         f"""
 import time
-from daemon.run.overload import LoadShedder
+from graspd.daemon.run.overload import LoadShedder
 RLIMIT_RTTIME = 15  # linux/asm-generic/resource.h
 resource.setrlimit(RLIMIT_RTTIME, ({RTTIME_US // 2}, {RTTIME_US}))
 with RealtimeMode(Realtime(priority=1, cpus=(max(os.sched_getaffinity(0)),), lock_memory=False)):

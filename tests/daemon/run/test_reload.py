@@ -13,10 +13,10 @@ from typing import cast
 
 import pytest
 
-from daemon.assembly.parts import Parts
-from daemon.process.signals import StopSignal
-from daemon.run import reload
-from daemon.run.reload import Reload
+from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.run import reload
+from graspd.daemon.run.reload import Reload
 from tests.kit.waiting import PATIENCE_S, wait_until
 
 PARTS = cast(Parts, object())

@@ -7,12 +7,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.judge.health import SWEEPS
-from daemon.judge.reasons import Decision, Reason
-from daemon.publish.companion import PublishedVerdict
-from daemon.run.replaying import Comparison, Controller
-from daemon.run.summary import WITHOUT_SESSION, RunSummary
-from drivers.base import Annotation
+from graspd.daemon.judge.health import SWEEPS
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.publish.companion import PublishedVerdict
+from graspd.daemon.run.replaying import Comparison, Controller
+from graspd.daemon.run.summary import WITHOUT_SESSION, RunSummary
+from graspd.drivers.base import Annotation
 from tests.daemon.fakes import NO_LIFT, Clock, FakeModel, pipeline, reading
 from tests.daemon.publish.doors import Asked
 from tests.kit.messages import GOLDEN_VERDICT

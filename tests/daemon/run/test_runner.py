@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.judge.reasons import Reason
-from daemon.process.signals import StopSignal
-from daemon.publish.messages import State, Status, Verdict
-from daemon.run import runner
-from daemon.scene import Scene
+from graspd.daemon.judge.reasons import Reason
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.messages import State, Status, Verdict
+from graspd.daemon.run import runner
+from graspd.daemon.scene import Scene
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, put_first
 from tests.kit.messages import decode_status, decode_verdict

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.judge.reasons import Decision, Reason
-from daemon.process.sleep import Sleep
-from daemon.publish.messages import State
-from daemon.run.loop import Ended
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.process.sleep import Sleep
+from graspd.daemon.publish.messages import State
+from graspd.daemon.run.loop import Ended
 from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, reading
 from tests.kit.loops import LoopBench
 

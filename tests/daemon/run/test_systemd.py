@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.publish.messages import State
-from daemon.run.systemd import Systemd, in_a_line
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.publish.messages import State
+from graspd.daemon.run.systemd import Systemd, in_a_line
 from tests.daemon.fakes import MS, Clock
 from tests.kit.messages import GOLDEN_STATUS
 

@@ -10,8 +10,8 @@ from typing import Any
 import jsonschema
 import pytest
 
-from daemon import scene
-from daemon.scene import explained
+from graspd.daemon import scene
+from graspd.daemon.scene import explained
 from tests.kit.inside import graspd
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
@@ -65,14 +65,14 @@ def test_no_key_is_forgotten() -> None:
 def test_the_schema_is_valid_and_the_file_of_the_editors_is_it() -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     assert (DEPLOY / "scenes" / explained.SCHEMA).read_text() == explained.schema_text(), (
-        "run: python -m daemon scene --schema > deploy/scenes/scene.schema.json"
+        "run: python -m graspd scene --schema > deploy/scenes/scene.schema.json"
     )
     assert graspd("scene", "--schema").stdout == explained.schema_text()
 
 
 def test_the_page_of_all_keys_is_up_to_date() -> None:
     text = (DEPLOY / "SCENE.md").read_text()
-    assert text == explained.page(), "run: python -m daemon scene --page > deploy/SCENE.md"
+    assert text == explained.page(), "run: python -m graspd scene --page > deploy/SCENE.md"
     assert text == graspd("scene", "--page").stdout
     assert "| `max_age_ms` | number | ms | `100.0` | above 0 to 10_000 |" in text
     assert "| `port` | string | - | needed | - |" in text

@@ -10,10 +10,10 @@ from typing import get_args
 import pytest
 from pydantic import BaseModel
 
-from daemon.scene import Scene, SceneError, load
-from daemon.scene.drivers import ReplayTactile
-from daemon.scene.endpoints import check_endpoint
-from daemon.scene.scene import SCENE_MAX_BYTES
+from graspd.daemon.scene import Scene, SceneError, load
+from graspd.daemon.scene.drivers import ReplayTactile
+from graspd.daemon.scene.endpoints import check_endpoint
+from graspd.daemon.scene.scene import SCENE_MAX_BYTES
 
 GOOD = """
 [tactile]

@@ -7,17 +7,17 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.calibration import SessionCalibration
-from daemon.publish.companion import Companion, Requests
-from daemon.session.file import KeptSession, SessionFile
-from daemon.session.keeper import SessionKeeper
-from daemon.trust.learner import LearnerState, sigmoid
-from daemon.trust.lift_book import GraspId, OutcomeStatus
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import Trust
-from drivers.base import Driver
-from models.contract import Finger, SessionInput, Sharpness
-from models.session_statistics import SessionState
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.publish.companion import Companion, Requests
+from graspd.daemon.session.file import KeptSession, SessionFile
+from graspd.daemon.session.keeper import SessionKeeper
+from graspd.daemon.trust.learner import LearnerState, sigmoid
+from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
+from graspd.daemon.trust.risk import Permission, RiskLimits
+from graspd.daemon.trust.trust import Trust
+from graspd.drivers.base import Driver
+from graspd.models.contract import Finger, SessionInput, Sharpness
+from graspd.models.session_statistics import SessionState
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

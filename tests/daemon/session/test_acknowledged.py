@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 import zmq
 
-from daemon.process.signals import StopSignal
-from daemon.publish.companion import Companion, PublishedVerdict
-from daemon.publish.outbox import Outbox
-from daemon.publish.sockets import Sockets
-from daemon.run.loop import Ended, Loop, LoopTiming
-from daemon.scene import parse
-from daemon.session.file import SessionFile, load
-from daemon.session.keeper import WAIT_S, SessionKeeper
-from daemon.trust.trust import Trust, decode
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.companion import Companion, PublishedVerdict
+from graspd.daemon.publish.outbox import Outbox
+from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.run.loop import Ended, Loop, LoopTiming
+from graspd.daemon.scene import parse
+from graspd.daemon.session.file import SessionFile, load
+from graspd.daemon.session.keeper import WAIT_S, SessionKeeper
+from graspd.daemon.trust.trust import Trust, decode
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 from tests.daemon.session.learning import BOOT, sensors
 from tests.daemon.session.test_keeping import Disk

@@ -13,10 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from daemon.session.file import SessionFile, kept_now, load
-from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAIT_S, WAITING_MAX, SessionKeeper
-from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.trust import Trust, TrustState, decode
+from graspd.daemon.session.file import SessionFile, kept_now, load
+from graspd.daemon.session.keeper import (
+    BUSY,
+    HANGS,
+    SAVE_PERIOD_NS,
+    WAIT_S,
+    WAITING_MAX,
+    SessionKeeper,
+)
+from graspd.daemon.trust.lift_book import OutcomeStatus
+from graspd.daemon.trust.trust import Trust, TrustState, decode
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.calibration import SessionCalibration
-from daemon.judge.decision import HandLimits, Limits
-from daemon.judge.pipeline import Pipeline
-from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.session.file import SessionFile, load, others
-from daemon.session.keeper import SessionKeeper
-from daemon.session.rest import moved_fingers
-from daemon.session.sensors import LOOK_EVERY, SensorWatch
-from drivers.base import TactileReading
-from drivers.twins.grasps.grasp_script import Durations, EndPoint
-from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
-from models import zoo
-from models.runtime import TactileModel
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.decision import HandLimits, Limits
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.session.file import SessionFile, load, others
+from graspd.daemon.session.keeper import SessionKeeper
+from graspd.daemon.session.rest import moved_fingers
+from graspd.daemon.session.sensors import LOOK_EVERY, SensorWatch
+from graspd.drivers.base import TactileReading
+from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint
+from graspd.drivers.twins.grasps.grasps import recorded_counts
+from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.bench.recurrence import TABLES, UNTOUCHED
 from tests.daemon.fakes import FINGERS, MS, Clock, reading
 from tests.daemon.session.learning import NOBODY, calibration, observe, sensors

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from daemon import scene
-from daemon.assembly import assembly
-from daemon.assembly.parts import Assembly, Parts
-from daemon.judge.pipeline import Pipeline
-from daemon.session.sensors import SensorWatch
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.session.sensors import SensorWatch
 from tests.daemon.session.learning import read_once, sensors
 
 

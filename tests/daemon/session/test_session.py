@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import HandLimits, Limits
-from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
-from daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.twins.grasps.grasp_script import Durations
-from drivers.twins.grasps.whole_grasps import synthetic_grasps
-from models import zoo
-from models.inputs import SessionBuilder, raw_features
-from models.runtime import TactileModel
-from models.training.data.datasets import read_table
+from graspd.daemon.judge.decision import HandLimits, Limits
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
+from graspd.daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.models import zoo
+from graspd.models.inputs import SessionBuilder, raw_features
+from graspd.models.runtime import TactileModel
+from graspd.models.training.data.datasets import read_table
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,

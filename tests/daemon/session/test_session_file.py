@@ -16,10 +16,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.session.file import SessionFile, SessionFileError, former_of, kept_now, load, read
-from daemon.trust.lift_book import LIFTS_MAX
-from daemon.trust.trust import decode
-from models.session_statistics import SessionState
+from graspd.daemon.session.file import (
+    SessionFile,
+    SessionFileError,
+    former_of,
+    kept_now,
+    load,
+    read,
+)
+from graspd.daemon.trust.lift_book import LIFTS_MAX
+from graspd.daemon.trust.trust import decode
+from graspd.models.session_statistics import SessionState
 from tests.daemon.session.learning import (
     FINGERS,
     calibration,

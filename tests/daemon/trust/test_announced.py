@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.risk import RiskLimits
-from daemon.trust.trust import decode, encode
+from graspd.daemon.trust.lift_book import OutcomeStatus
+from graspd.daemon.trust.risk import RiskLimits
+from graspd.daemon.trust.trust import decode, encode
 from tests.daemon.trust.grasps import RULE, judge, named, trust
 
 OUTSTANDING = (1, 2, 5, 9)
@@ -19,7 +19,7 @@ def test_announced_lifts_never_slip_beyond_the_bound(
 ) -> None:
     """Of 1,000 controllers some tell late, in any order, or never, and let slip what is stable."""
     decode(encode(trust().state()))  # so that no later test reads states with this bound
-    monkeypatch.setattr("daemon.trust.lift_book.LIFTS_MAX", 12)  # lifts are soon forgotten
+    monkeypatch.setattr("graspd.daemon.trust.lift_book.LIFTS_MAX", 12)  # lifts are soon forgotten
     for seed in range(first, first + 100):
         Protocol(seed).run(60)
 

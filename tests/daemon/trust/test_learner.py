@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
-from daemon.trust import learner as module
-from daemon.trust.learner import Learner, LearnerState, sigmoid
+from graspd.daemon.trust import learner as module
+from graspd.daemon.trust.learner import Learner, LearnerState, sigmoid
 from tests.daemon.trust.reference import Reference
 
 CLIP = 3.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.trust.lift_book import LIFTS_MAX, NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
+from graspd.daemon.trust.lift_book import LIFTS_MAX, NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
 
 BOOT = "0" * 32
 CONTROLLER, DASHBOARD = b"controller", b"dashboard"

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.trust.learner import sigmoid
-from daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
+from graspd.daemon.trust.learner import sigmoid
+from graspd.daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
+from graspd.daemon.trust.risk import Permission, RiskLimits
+from graspd.daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
 from tests.daemon.trust.grasps import INPUTS, RULE, inputs, judge, named, trust
 
 

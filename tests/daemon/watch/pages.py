@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from daemon.watch.feed import Feed
-from daemon.watch.snapshot import Snapshot
-from daemon.watch.view import TICK_S, HandFeed, View, snapshots
-from daemon.watch.web import Newest, Server
+from graspd.daemon.watch.feed import Feed
+from graspd.daemon.watch.snapshot import Snapshot
+from graspd.daemon.watch.view import TICK_S, HandFeed, View, snapshots
+from graspd.daemon.watch.web import Newest, Server
 from tests.kit.waiting import wait_until
 
 

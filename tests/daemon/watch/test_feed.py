@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.reasons import Decision
-from daemon.publish.keys import KeysError, make
-from daemon.watch.feed import Feed, load_keys
-from daemon.watch.view import View
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.publish.keys import KeysError, make
+from graspd.daemon.watch.feed import Feed, load_keys
+from graspd.daemon.watch.view import View
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import KeyedDoor, Publisher
 from tests.daemon.watch.watch_fakes import MS, verdict

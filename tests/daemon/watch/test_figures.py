@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from daemon.judge.reasons import Decision
+from graspd.daemon.judge.reasons import Decision
 from tests.daemon.watch.watch_fakes import MS, RISK, after, verdict
 
 NETWORK = "slip probability by the network alone 30 %"

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import Decision, GateState
-from daemon.watch.fingers import FingerImage
-from daemon.watch.view import View
-from models.layout import D1
-from models.levels import RestCounts
+from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.daemon.watch.fingers import FingerImage
+from graspd.daemon.watch.view import View
+from graspd.models.layout import D1
+from graspd.models.levels import RestCounts
 from tests.daemon.watch.watch_fakes import MS, RESTING, a_view, after, status, tactile, verdict
 
 SOUND = np.ones(24, dtype=np.bool_)

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from daemon.judge.reasons import Decision
-from daemon.watch.snapshot import Snapshot
-from daemon.watch.view import View
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.watch.snapshot import Snapshot
+from graspd.daemon.watch.view import View
 from tests.daemon.watch.browser import CHROMIUM, Browser, see, text
 from tests.daemon.watch.pages import Page, serving_hands
 from tests.daemon.watch.watch_fakes import Talker, whole_hand

@@ -10,10 +10,10 @@ import pytest
 from msgspec import structs
 from rich.console import Console
 
-from daemon.judge.reasons import ADVICE, Decision, FingerState, Reason
-from daemon.watch.fingers import FingerMotion
-from daemon.watch.snapshot import Snapshot, Tone
-from daemon.watch.terminal import STYLES, Screen, draw
+from graspd.daemon.judge.reasons import ADVICE, Decision, FingerState, Reason
+from graspd.daemon.watch.fingers import FingerMotion
+from graspd.daemon.watch.snapshot import Snapshot, Tone
+from graspd.daemon.watch.terminal import STYLES, Screen, draw
 from tests.daemon.watch.watch_fakes import (
     ENDPOINT,
     MS,

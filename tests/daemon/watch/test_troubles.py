@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon.commands.watch import where_to_look
-from daemon.judge.reasons import ADVICE, Decision, Reason
-from daemon.watch.snapshot import Line, Tone
-from daemon.watch.view import View
+from graspd.daemon.commands.watch import where_to_look
+from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
+from graspd.daemon.watch.snapshot import Line, Tone
+from graspd.daemon.watch.view import View
 from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, verdict
 
 

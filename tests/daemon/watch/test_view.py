@@ -10,13 +10,13 @@ import msgspec
 import pytest
 from msgspec import structs
 
-from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
-from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
-from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.risk import RiskReport
-from daemon.watch.figures import SUPERVISED
-from daemon.watch.snapshot import Line, Snapshot, Tone
-from daemon.watch.view import History
+from graspd.daemon.judge.reasons import ADVICE, Decision, GateState, Reason
+from graspd.daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
+from graspd.daemon.trust.lift_book import OutcomeStatus
+from graspd.daemon.trust.risk import RiskReport
+from graspd.daemon.watch.figures import SUPERVISED
+from graspd.daemon.watch.snapshot import Line, Snapshot, Tone
+from graspd.daemon.watch.view import History
 from tests.daemon.watch.watch_fakes import BOOT, MS, RISK, a_view, after, status, text_of, verdict
 from tests.kit.messages import GOLDEN
 

@@ -8,9 +8,9 @@ from typing import Literal
 
 import pytest
 
-from daemon.judge.reasons import Decision
-from daemon.watch.snapshot import Snapshot
-from daemon.watch.view import View
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.watch.snapshot import Snapshot
+from graspd.daemon.watch.view import View
 from tests.daemon.watch.browser import BANNER, CHROMIUM, Browser, see, text
 from tests.daemon.watch.pages import Page, serving_hands
 from tests.daemon.watch.watch_fakes import Talker, verdict, whole_hand

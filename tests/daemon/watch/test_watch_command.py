@@ -20,7 +20,7 @@ from typing import Self
 
 import pytest
 
-from daemon.judge.reasons import Decision
+from graspd.daemon.judge.reasons import Decision
 from tests.daemon.processes import GRASPD, start
 from tests.daemon.watch.watch_fakes import Talker
 from tests.kit.inside import graspd
@@ -259,7 +259,7 @@ def test_what_is_wrong_is_said_in_a_line(
 def test_without_rich_the_extra_is_named_and_the_page_still_works(endpoint: str, port: int) -> None:
     code = (
         "import sys; sys.modules['rich'] = None; sys.stdout.isatty = lambda: True\n"
-        "from daemon.cli import main\n"
+        "from graspd.daemon.cli import main\n"
         f"assert main(['watch', '--connect', {endpoint!r}]) == 2\n"
         f"sys.exit(main(['watch', '--connect', {endpoint!r}, '--web', '--port', '{port}']))"
     )

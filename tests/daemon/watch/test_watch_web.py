@@ -11,7 +11,7 @@ from contextlib import ExitStack, closing, suppress
 
 import pytest
 
-from daemon.watch.web import ADDRESS, CONNECTIONS_MAX, Server, load_page
+from graspd.daemon.watch.web import ADDRESS, CONNECTIONS_MAX, Server, load_page
 from tests.daemon.watch.pages import serving
 from tests.kit.waiting import wait_until
 
@@ -206,7 +206,7 @@ def test_connections_are_limited_and_a_place_becomes_free_again(server: Server) 
 def test_a_browser_that_goes_silent_within_a_request_is_cut_off(
     server: Server, monkeypatch: pytest.MonkeyPatch, begin: bytes
 ) -> None:
-    monkeypatch.setattr("daemon.watch.web._Handler.timeout", 0.2)
+    monkeypatch.setattr("graspd.daemon.watch.web._Handler.timeout", 0.2)
     with socket.create_connection((ADDRESS, server.server_port), 10) as link:
         link.sendall(begin)
         assert has_ended(link)

@@ -9,8 +9,8 @@ from typing import Any, Self
 
 from rich.console import Console
 
-from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.publish.messages import (
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.publish.messages import (
     DECISION_CODE,
     LearnerHealth,
     Lifts,
@@ -20,11 +20,11 @@ from daemon.publish.messages import (
     Verdict,
     encode,
 )
-from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.risk import RiskReport
-from daemon.watch.snapshot import Snapshot
-from daemon.watch.terminal import Screen, draw
-from daemon.watch.view import View
+from graspd.daemon.trust.lift_book import OutcomeStatus
+from graspd.daemon.trust.risk import RiskReport
+from graspd.daemon.watch.snapshot import Snapshot
+from graspd.daemon.watch.terminal import Screen, draw
+from graspd.daemon.watch.view import View
 from tests.daemon.publish.doors import Publisher
 
 RISK = RiskReport(

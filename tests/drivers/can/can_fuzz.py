@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import random
 
-from drivers.base import TactileReading
-from drivers.can.decoders import CanDecoder, make_decoder
-from drivers.can.formats import CanFormat, SweepFrame, encode_sample
-from drivers.can.frames import ERROR, FD, REMOTE, CanFrame, unpack_frame
-from drivers.can.readings import CanCounters
+from graspd.drivers.base import TactileReading
+from graspd.drivers.can.decoders import CanDecoder, make_decoder
+from graspd.drivers.can.formats import CanFormat, SweepFrame, encode_sample
+from graspd.drivers.can.frames import ERROR, FD, REMOTE, CanFrame, unpack_frame
+from graspd.drivers.can.readings import CanCounters
 from tests.drivers.can.can_words import pack_frame, samples, truth, word
 from tests.kit.clock import Clock
 

@@ -12,14 +12,14 @@ from unittest import mock
 import can
 import pytest
 
-from drivers.base import Reading, TactileReading
-from drivers.can.driver import CanBridgeDriver
-from drivers.can.formats import encode_sample
-from drivers.can.frames import CanFrame
-from drivers.kernel_stamps import SO_TIMESTAMPNS
-from drivers.twins.can import SAMPLE_ID, CanTwin
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts
+from graspd.drivers.base import Reading, TactileReading
+from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.can.formats import encode_sample
+from graspd.drivers.can.frames import CanFrame
+from graspd.drivers.kernel_stamps import SO_TIMESTAMPNS
+from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_words import pack_frame, samples
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
@@ -93,7 +93,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, opener: Opener) -> None:
     def open_bus(**_: object) -> object:
         return opener()
 
-    monkeypatch.setattr("drivers.can.bus.can.Bus", open_bus)
+    monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", open_bus)
 
 
 def channel() -> str:
@@ -138,7 +138,7 @@ class StampingTwin(CanTwin):
 
     def open(self) -> None:
         stamped = partial(can.Bus, preserve_timestamps=True)
-        with mock.patch("drivers.can.bus.can.Bus", stamped):
+        with mock.patch("graspd.drivers.can.bus.can.Bus", stamped):
             super().open()
 
 

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import TactileReading
-from drivers.biotac import E1, SEQUENCES
-from drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
-from drivers.can.readings import CanCounters
-from drivers.can.samples import SampleAssembler
+from graspd.drivers.base import TactileReading
+from graspd.drivers.biotac import E1, SEQUENCES
+from graspd.drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.samples import SampleAssembler
 
 # linux/can.h
 EFF_FLAG, RTR_FLAG, ERR_FLAG = 0x80000000, 0x40000000, 0x20000000

@@ -8,12 +8,12 @@ from typing import Any
 import can
 import pytest
 
-from drivers.base import Driver, DriverError, LinkError, TactileReading
-from drivers.biotac import SEQUENCES
-from drivers.can.driver import CanBridgeDriver
-from drivers.can.formats import CanFormat
-from drivers.link import LinkState
-from drivers.twins.grasps.grasps import Counts
+from graspd.drivers.base import Driver, DriverError, LinkError, TactileReading
+from graspd.drivers.biotac import SEQUENCES
+from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.link import LinkState
+from graspd.drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_standin import (
     TwinLink,
     bridge,

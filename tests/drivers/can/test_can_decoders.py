@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.base import TactileReading
-from drivers.can.formats import CanFormat, SweepFrame, SweepStatus, encode_sample
-from drivers.can.frames import EXTENDED, FD, CanFrame
+from graspd.drivers.base import TactileReading
+from graspd.drivers.can.formats import CanFormat, SweepFrame, SweepStatus, encode_sample
+from graspd.drivers.can.frames import EXTENDED, FD, CanFrame
 from tests.drivers.can.can_fuzz import SAMPLE_ID, decoder
 from tests.drivers.can.can_words import samples, truth, word
 from tests.drivers.can.test_can_formats import E1_SAMPLE, SWEEP_EXAMPLE

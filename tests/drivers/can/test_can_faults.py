@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.can.formats import CanFormat
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_fuzz import decoder, sweep_frames
 from tests.drivers.can.can_standin import (
     TwinLink,

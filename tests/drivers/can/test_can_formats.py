@@ -11,9 +11,9 @@ from cantools.database.can.database import Database
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.base import FINGERS
-from drivers.biotac import decode_words
-from drivers.can.formats import (
+from graspd.drivers.base import FINGERS
+from graspd.drivers.biotac import decode_words
+from graspd.drivers.can.formats import (
     SWEEP_BASE_ID,
     CanFormat,
     Reject,
@@ -23,7 +23,7 @@ from drivers.can.formats import (
     parse_sample,
     parse_sweep,
 )
-from drivers.can.frames import (
+from graspd.drivers.can.frames import (
     ERROR,
     EXTENDED,
     FD,

@@ -9,11 +9,11 @@ import struct
 import can
 import pytest
 
-from drivers.base import Reading
-from drivers.can.bus import CanBus
-from drivers.can.driver import CanBridgeDriver
-from drivers.link import LinkState
-from drivers.twins.can import SAMPLE_ID
+from graspd.drivers.base import Reading
+from graspd.drivers.can.bus import CanBus
+from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.link import LinkState
+from graspd.drivers.twins.can import SAMPLE_ID
 from tests.drivers.can.can_standin import (
     LOOPBACK,
     ScriptedBus,
@@ -166,7 +166,7 @@ def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen: dict[str, object] = {}
-    monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **options: seen.update(options))
+    monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", lambda **options: seen.update(options))
     CanBridgeDriver("virtual", "x", bitrate=500_000).open()
     assert seen["rx_queue_size"] == 16384
     assert seen["bitrate"] == 500_000

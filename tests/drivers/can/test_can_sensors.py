@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.can.driver import CanBridgeDriver
-from drivers.can.formats import encode_sample
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.can.formats import encode_sample
 from tests.drivers.can.can_standin import ScriptedBus, bridge, channel, message, stand_in, tactile
 from tests.drivers.can.can_words import SLOT_NS, samples, truth
 from tests.kit.clock import Clock

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
-from drivers.base import Reading
-from drivers.can.driver import (
+from graspd.drivers.base import Reading
+from graspd.drivers.can.driver import (
     CanBridgeDriver,
 )
-from drivers.link import LinkState
-from drivers.twins.can import SAMPLE_ID, CanTwin
+from graspd.drivers.link import LinkState
+from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from tests.drivers.can.can_standin import (
     ScriptedBus,
     contact,
@@ -87,7 +87,7 @@ def test_an_slcan_adapter_is_read_and_its_unplugging_leaves_nothing_open(
 
 def test_data_bit_rates_reach_an_slcan_adapter(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: dict[str, object] = {}
-    monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **options: seen.update(options))
+    monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", lambda **options: seen.update(options))
     bus = CanBridgeDriver(
         "slcan", "/dev/null", format="sweep_fd", bitrate=1_000_000, data_bitrate=5_000_000
     )

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.can.driver import (
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.can.driver import (
     CanBridgeDriver,
 )
-from drivers.can.formats import CanFormat
-from drivers.can.frames import ERROR, CanFrame
-from drivers.link import LinkState
-from drivers.twins.can import SAMPLE_ID, CanTwin
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.can.frames import ERROR, CanFrame
+from graspd.drivers.link import LinkState
+from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from tests.drivers.can.can_standin import (
     LOOPBACK,
     ScriptedBus,

@@ -9,10 +9,10 @@ from typing import Any
 import can
 import pytest
 
-from drivers.base import DriverError, TactileReading
-from drivers.can.driver import CanBridgeDriver
-from drivers.twins.can import CanTwin
-from drivers.twins.faults import LinkFaults
+from graspd.drivers.base import DriverError, TactileReading
+from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.twins.can import CanTwin
+from graspd.drivers.twins.faults import LinkFaults
 from tests.drivers.can.can_standin import (
     bridge,
     channel,
@@ -55,7 +55,7 @@ def test_a_twin_serves_at_its_rate_until_stopped(monkeypatch: pytest.MonkeyPatch
             if len(readings) >= 30:
                 stop.set()
 
-        monkeypatch.setattr("drivers.twins.can.time.sleep", sleep)
+        monkeypatch.setattr("graspd.drivers.twins.can.time.sleep", sleep)
         twin.serve(stop)
         period_ns = driver.period_ns
     assert 30 <= len(readings) <= 31
@@ -92,6 +92,6 @@ def test_packages_are_named_as_they_are_installed(
     def refuse(**_: object) -> object:
         raise can.CanInterfaceNotImplementedError(says)
 
-    monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
+    monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", refuse)
     with pytest.raises(DriverError, match=f"pip install {package}$"):
         CanTwin("slcan", "/dev/null", iter(())).open()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.can.readings import SweepPeriod
+from graspd.drivers.can.readings import SweepPeriod
 from tests.drivers.can.can_words import SLOT_NS, assembler, concatenated, samples
 
 MS = 1_000_000

@@ -9,8 +9,8 @@ from itertools import accumulate
 import numpy as np
 import pytest
 
-from drivers.base import TactileReading
-from drivers.biotac import SEQUENCES
+from graspd.drivers.base import TactileReading
+from graspd.drivers.biotac import SEQUENCES
 from tests.drivers.can.can_words import (
     SLOT_NS,
     Sample,

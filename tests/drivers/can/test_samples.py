@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.biotac import PAC, PDC, SEQUENCE_ELECTRODES, SEQUENCES
-from drivers.can.readings import CanCounters
-from drivers.can.samples import SampleAssembler
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.biotac import PAC, PDC, SEQUENCE_ELECTRODES, SEQUENCES
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.samples import SampleAssembler
 from tests.drivers.can.can_words import (
     FINGERS,
     SLOT_NS,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.can.readings import CanCounters
-from drivers.can.sweep_frames import FrameAssembler
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.sweep_frames import FrameAssembler
 from tests.drivers.can.can_words import FINGERS, assert_true, truth, word
 
 OUTAGE_NS = 2_000_000_000

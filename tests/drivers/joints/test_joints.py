@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.base import Driver, Fact, JointReading, LinkCause
-from drivers.joints.driver import JointStreamDriver
-from drivers.joints.message import (
+from graspd.drivers.base import Driver, Fact, JointReading, LinkCause
+from graspd.drivers.joints.driver import JointStreamDriver
+from graspd.drivers.joints.message import (
     JointCounters,
     JointMessage,
     JointStream,
 )
-from drivers.link import LinkState
-from drivers.twins.faults import LinkFaults
-from drivers.twins.joints import JointTwin
+from graspd.drivers.link import LinkState
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.joints import JointTwin
 from tests.drivers.palm.palm_stream import MS, DatagramClock, Sender, joints
 
 DATAGRAM_BYTES_MAX = 4096

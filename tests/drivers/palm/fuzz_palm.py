@@ -11,16 +11,16 @@ import itertools
 import math
 import random
 
-from drivers.base import COUNT_MAX, FINGERS
-from drivers.hand import JOINTS
-from drivers.joints.message import (
+from graspd.drivers.base import COUNT_MAX, FINGERS
+from graspd.drivers.hand import JOINTS
+from graspd.drivers.joints.message import (
     ANGLE_MAX_RAD,
     JointMessage,
     JointStream,
 )
-from drivers.palm.packet import CAN_RECORD_BYTES, Palm, PalmPacket, parse_packet
-from drivers.palm.stream import PalmStream
-from drivers.twins.palm import PalmTwin
+from graspd.drivers.palm.packet import CAN_RECORD_BYTES, Palm, PalmPacket, parse_packet
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.palm import PalmTwin
 from tests.bench.fuzz import Target
 from tests.drivers.twins.signals import GeneratedContact
 

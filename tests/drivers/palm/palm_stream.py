@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from drivers.joints.driver import JointStreamDriver
-from drivers.palm.driver import PalmDriver
-from drivers.palm.packet import Palm, PalmCounters, PalmPacket
-from drivers.palm.stream import PalmStream
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.palm import PalmTwin
-from drivers.udp.receiver import Datagram, DatagramReceiver
+from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
+from graspd.drivers.joints.driver import JointStreamDriver
+from graspd.drivers.palm.driver import PalmDriver
+from graspd.drivers.palm.packet import Palm, PalmCounters, PalmPacket
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.palm import PalmTwin
+from graspd.drivers.udp.receiver import Datagram, DatagramReceiver
 from tests.kit.clock import Clock
 
 FINGERS = ("ff", "mf", "th")

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.palm.calibration import (
+from graspd.drivers.palm.calibration import (
     HALL_SENSORS,
     JOINTS,
     CalibrationError,

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.base import Driver
-from drivers.palm.calibration import CalibrationError
-from drivers.palm.driver import PalmDriver
-from drivers.palm.packet import Palm
-from drivers.twins.palm import PalmTwin
+from graspd.drivers.base import Driver
+from graspd.drivers.palm.calibration import CalibrationError
+from graspd.drivers.palm.driver import PalmDriver
+from graspd.drivers.palm.packet import Palm
+from graspd.drivers.twins.palm import PalmTwin
 from tests.conftest import ROOT
 from tests.drivers.palm.palm_stream import (
     FINGERS,
@@ -133,7 +133,7 @@ def test_the_loop_is_not_woken_in_the_middle_of_a_round(
 def test_without_a_calibration_there_are_no_joints_and_no_joint_code() -> None:
     program = (
         "import sys\n"
-        "from drivers.palm.driver import PalmDriver\n"
+        "from graspd.drivers.palm.driver import PalmDriver\n"
         f"with PalmDriver({LOOPBACK!r}):\n"
         "    sys.exit(any('calibration' in name or 'twins' in name for name in sys.modules))\n"
     )

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.base import COUNT_MAX
-from drivers.twins.faults import LinkFaults
-from drivers.twins.palm import PalmTwin
+from graspd.drivers.base import COUNT_MAX
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import (
     MS,
     ROUND,

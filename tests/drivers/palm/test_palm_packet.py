@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from drivers.palm.packet import (
+from graspd.drivers.palm.packet import (
     CHANNELS,
     Palm,
     PalmCounters,

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.base import ElectrodeFault
-from drivers.palm.packet import PalmPacket
-from drivers.palm.stream import PalmStream
-from drivers.twins.palm import PalmTwin
+from graspd.drivers.base import ElectrodeFault
+from graspd.drivers.palm.packet import PalmPacket
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import (
     FINGERS,
     MS,

@@ -6,8 +6,8 @@ import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from drivers.base import RecordingError
-from drivers.recordings.csv_rows import Recording, Row, read_lines
+from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.csv_rows import Recording, Row, read_lines
 
 FINGERS = ("ff", "mf", "th")
 ELECTRODES = [f"{finger}_biotac_{number}" for finger in FINGERS for number in range(1, 25)]

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import (
+from graspd.drivers.base import (
     JointReading,
     Reading,
     RecordingError,
     TactileReading,
 )
-from drivers.recordings.csv_player import ReplayDriver
+from graspd.drivers.recordings.csv_player import ReplayDriver
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,

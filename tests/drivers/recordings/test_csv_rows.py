@@ -12,8 +12,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from drivers.base import ElectrodeFault, RecordingError
-from drivers.recordings.csv_rows import (
+from graspd.drivers.base import ElectrodeFault, RecordingError
+from graspd.drivers.recordings.csv_rows import (
     Recording,
     count_of,
     number_of,

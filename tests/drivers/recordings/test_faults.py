@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
-from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
+from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
 from tests.drivers.recordings.tables import stream, table, write
 
 MS = 1_000_000

@@ -11,19 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.base import RecordingError, TactileReading
-from drivers.biotac import sample_command
-from drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
-from drivers.recordings.can_log import CanLog, frame_of, line_of
-from drivers.recordings.link_log_player import LinkLogDriver
-from drivers.recordings.serial_log import (
+from graspd.drivers.base import RecordingError, TactileReading
+from graspd.drivers.biotac import sample_command
+from graspd.drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
+from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
+from graspd.drivers.recordings.link_log_player import LinkLogDriver
+from graspd.drivers.recordings.serial_log import (
     SerialLog,
     SerialRecord,
     encode_records,
     parse_records,
 )
-from drivers.spi.line import LineEvent
-from drivers.spi.messages import FrameParser
+from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.messages import FrameParser
 from tests.kit.clock import Clock
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)

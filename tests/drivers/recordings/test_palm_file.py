@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import RecordingError
-from drivers.palm.packet import Palm
-from drivers.recordings.link_log_player import LinkLogDriver
-from drivers.recordings.palm_file import PalmFile
-from drivers.twins.palm import PalmTwin
+from graspd.drivers.base import RecordingError
+from graspd.drivers.palm.packet import Palm
+from graspd.drivers.recordings.link_log_player import LinkLogDriver
+from graspd.drivers.recordings.palm_file import PalmFile
+from graspd.drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import MS, datagrams, rows, tactile
 from tests.kit.clock import Clock
 

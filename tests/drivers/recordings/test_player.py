@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import JointReading, RecordingError
-from drivers.recordings.player import RecordedDriver
+from graspd.drivers.base import JointReading, RecordingError
+from graspd.drivers.recordings.player import RecordedDriver
 from tests.drivers.palm.palm_stream import MS
 from tests.kit.clock import Clock
 

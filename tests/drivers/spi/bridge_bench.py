@@ -15,13 +15,22 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Reading, TactileReading
-from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.link import LinkState
-from drivers.spi.conversation import Conversation
-from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.messages import DIGEST, FrameParser, Hello, Message, Ping, Sweep, decode, encode
-from drivers.twins.spi import SpiTwin
+from graspd.drivers.base import Reading, TactileReading
+from graspd.drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
+from graspd.drivers.link import LinkState
+from graspd.drivers.spi.conversation import Conversation
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.spi.messages import (
+    DIGEST,
+    FrameParser,
+    Hello,
+    Message,
+    Ping,
+    Sweep,
+    decode,
+    encode,
+)
+from graspd.drivers.twins.spi import SpiTwin
 from tests.kit.clock import Clock
 
 MS = 1_000_000

@@ -1,4 +1,4 @@
-"""A device whose clock is known exactly: what `drivers.spi.sweeps` makes of it."""
+"""A device whose clock is known exactly: what `graspd.drivers.spi.sweeps` makes of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.spi.sweeps import DeviceClock
+from graspd.drivers.spi.sweeps import DeviceClock
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -6,7 +6,7 @@ import random
 
 import numpy as np
 
-from drivers.spi.messages import (
+from graspd.drivers.spi.messages import (
     DELIMITER,
     DIGEST,
     ENCODED_MAX_BYTES,

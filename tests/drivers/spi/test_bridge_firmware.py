@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.biotac import ERROR_WORDS
-from drivers.spi.messages import FIRMWARE
+from graspd.drivers.biotac import ERROR_WORDS
+from graspd.drivers.spi.messages import FIRMWARE
 from tests.conftest import ROOT
 from tests.drivers.spi.bridge_c import (
     BRIDGE,

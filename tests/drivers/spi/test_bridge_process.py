@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import ElectrodeFault, TactileReading
-from drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.spi.driver import SpiBridgeDriver
 from tests.drivers.spi.bridge_c import (
     DIGEST,
     ELECTRODE_COMMANDS,

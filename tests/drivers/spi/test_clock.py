@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.spi.sweeps import BridgeCounters, DeviceClock
+from graspd.drivers.spi.sweeps import BridgeCounters, DeviceClock
 from tests.drivers.spi.clock_error import (
     MS,
     START_NS,

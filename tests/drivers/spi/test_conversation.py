@@ -6,11 +6,11 @@ import dataclasses
 
 import pytest
 
-from drivers.base import DeviceFault, Fact, LinkCause
-from drivers.biotac import SEQUENCE_ALL
-from drivers.link import LinkState
-from drivers.spi.conversation import Conversation
-from drivers.spi.messages import (
+from graspd.drivers.base import DeviceFault, Fact, LinkCause
+from graspd.drivers.biotac import SEQUENCE_ALL
+from graspd.drivers.link import LinkState
+from graspd.drivers.spi.conversation import Conversation
+from graspd.drivers.spi.messages import (
     DIGEST,
     FIRMWARE,
     BridgeStatus,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.commands import doctor
+from graspd.daemon.commands import doctor
 from tests.drivers.spi.bridge_c import BRIDGE, StartBridge
 
 PAGE = (BRIDGE / "BUILD.md").read_text()

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from drivers.biotac import SEQUENCE_ELECTRODES, SEQUENCE_INTERLEAVED, sample_command
-from drivers.spi.messages import (
+from graspd.drivers.biotac import SEQUENCE_ELECTRODES, SEQUENCE_INTERLEAVED, sample_command
+from graspd.drivers.spi.messages import (
     DIGEST,
     SCHEMA,
     BridgeStatus,

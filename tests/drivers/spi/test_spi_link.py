@@ -11,11 +11,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.base import Driver, DriverError
-from drivers.link import LinkState
-from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.line import SerialLine
-from drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
+from graspd.drivers.base import Driver, DriverError
+from graspd.drivers.link import LinkState
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.spi.line import SerialLine
+from graspd.drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
 from tests.drivers.spi.bridge_bench import FINGERS, MS, Rig, ScriptedBridge, hello, sweep, take
 from tests.kit.clock import Clock
 

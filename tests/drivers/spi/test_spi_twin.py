@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from drivers.base import TactileReading
-from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.messages import DIGEST
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.spi import SpiTwin
+from graspd.drivers.base import TactileReading
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.spi.messages import DIGEST
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.spi.bridge_bench import FINGERS, replug_times_s, run
 from tests.drivers.twins.signals import GeneratedContact
 

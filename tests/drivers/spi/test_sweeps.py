@@ -5,9 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.base import ElectrodeFault
-from drivers.biotac import E1, PAC, SEQUENCE_ALL, SEQUENCE_ELECTRODES, SEQUENCE_INTERLEAVED, TDC
-from drivers.spi.conversation import Conversation
+from graspd.drivers.base import ElectrodeFault
+from graspd.drivers.biotac import (
+    E1,
+    PAC,
+    SEQUENCE_ALL,
+    SEQUENCE_ELECTRODES,
+    SEQUENCE_INTERLEAVED,
+    TDC,
+)
+from graspd.drivers.spi.conversation import Conversation
 from tests.drivers.spi.bridge_bench import FINGERS, T0, greeted, hear, hello, sweep, words
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES
-from drivers.recordings.csv_rows import read_rows
-from drivers.twins.grasps.grasp_script import EndPoint, Timetable
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.grasps.tactile_noise import (
+from graspd.drivers.base import COUNT_MAX, ELECTRODES
+from graspd.drivers.recordings.csv_rows import read_rows
+from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.grasps.tactile_noise import (
     DRIFT_COUNTS_PER_S,
     NOISE_COUNTS,
     SPIKE_COUNTS,

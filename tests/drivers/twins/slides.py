@@ -13,9 +13,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES
-from drivers.twins.grasps.grasps import Counts
-from drivers.twins.grasps.whole_grasps import RATE_HZ, FreshSampler, HeldSampler, Sampling
+from graspd.drivers.base import ELECTRODES
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, FreshSampler, HeldSampler, Sampling
 
 NOISE_COUNTS = (3.0, 4.5)
 """Standard deviation of an electrode, another one for each finger, counts. With the wander,

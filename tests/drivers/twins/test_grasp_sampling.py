@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.twins.grasps.grasp_script import Durations, EndPoint
-from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.tactile_noise import MeasuredNoise
-from drivers.twins.grasps.whole_grasps import GraspRow, Sampling, WholeGrasps
+from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint
+from graspd.drivers.twins.grasps.grasps import recorded_counts
+from graspd.drivers.twins.grasps.tactile_noise import MeasuredNoise
+from graspd.drivers.twins.grasps.whole_grasps import GraspRow, Sampling, WholeGrasps
 from tests.drivers.twins.signals import fresh_residuals, played
 
 REST = np.full((3, 24), 3000.0)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
-from drivers.twins.grasps import synthetic
+from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
+from graspd.drivers.twins.grasps import synthetic
 
 
 def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

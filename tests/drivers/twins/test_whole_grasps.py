@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
-from drivers.twins.grasps import whole_grasps
-from drivers.twins.grasps.grasp_script import EndPoint, Timetable
-from drivers.twins.grasps.whole_grasps import (
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
+from graspd.drivers.twins.grasps import whole_grasps
+from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
+from graspd.drivers.twins.grasps.whole_grasps import (
     GraspRow,
     Sampling,
     WholeGrasps,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from models.contract import Dataset
-from models.training.data.datasets import Grasps, concatenate
+from graspd.models.contract import Dataset
+from graspd.models.training.data.datasets import Grasps, concatenate
 from tests.models.training.training_samples import separable_counts, write_table
 
 UNKNOWN = ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case",

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.training.commands import evaluate, evaluation
-from models.training.commands.evaluation import grid_of
-from models.training.data.datasets import read_all
-from models.training.estimators.configs import GRIDS, ForestConfig, SvmConfig
-from models.training.evaluating import jobs, run_jobs
-from models.training.evaluating.jobs import Job
-from models.training.systems.registry import SYSTEMS
+from graspd.models.training.commands import evaluate, evaluation
+from graspd.models.training.commands.evaluation import grid_of
+from graspd.models.training.data.datasets import read_all
+from graspd.models.training.estimators.configs import GRIDS, ForestConfig, SvmConfig
+from graspd.models.training.evaluating import jobs, run_jobs
+from graspd.models.training.evaluating.jobs import Job
+from graspd.models.training.systems.registry import SYSTEMS
 from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
 
 ROOT = Path(__file__).parents[4]
@@ -204,7 +204,7 @@ def test_what_is_not_installed_is_said_before_any_training(
 def test_ctrl_c_ends_processes_with_130_and_leaves_results_of_one_process(
     data: Path, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "daemon", "evaluate", "mlp", "--protocol", "cv"]
+    command = [sys.executable, "-m", "graspd", "evaluate", "mlp", "--protocol", "cv"]
     options = ["--data", str(data), "--out", str(tmp_path), "--jobs", "2", "--seeds", "30"]
     process = subprocess.Popen(
         [*command, *options],

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.contract import Dataset, SessionInput
-from models.runtime import TactileModel
-from models.training.commands import train
-from models.training.data.datasets import Grasps
-from models.training.making import make_model
-from models.training.making.export import ExportError
+from graspd.models.contract import Dataset, SessionInput
+from graspd.models.runtime import TactileModel
+from graspd.models.training.commands import train
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.making import make_model
+from graspd.models.training.making.export import ExportError
 from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
 from tests.models.training.training_samples import separable_counts, write_table
 

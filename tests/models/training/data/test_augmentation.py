@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import rotate
 
-from models.training.data.augmentation import Augmentation, augment
+from graspd.models.training.data.augmentation import Augmentation, augment
 
 RANDOM = np.random.default_rng(3)
 IMAGES = RANDOM.normal(size=(20, 12, 11, 3)).astype(np.float32)

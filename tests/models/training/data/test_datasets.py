@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.bts3 import TABLES
-from models.training.data.datasets import (
+from graspd.models.bts3 import TABLES
+from graspd.models.training.data.datasets import (
     DatasetError,
     concatenate,
     read_table,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from models.training.data.datasets import DatasetError
-from models.training.data.lab_tables import read_with_lab_tables
+from graspd.models.training.data.datasets import DatasetError
+from graspd.models.training.data.lab_tables import read_with_lab_tables
 from tests.models.training.evaluation_samples import table, write, write_sessions
 from tests.models.training.training_samples import separable_counts, write_table
 

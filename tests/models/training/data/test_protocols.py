@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.training.data.datasets import Grasps, concatenate, read_all
-from models.training.data.protocols import (
+from graspd.models.training.data.datasets import Grasps, concatenate, read_all
+from graspd.models.training.data.protocols import (
     UNKNOWN_OBJECTS,
     EvalProtocol,
     TooFewGraspsError,

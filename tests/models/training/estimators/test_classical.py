@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.inputs import VectorBuilder
-from models.training.estimators.classical import classical_margins, classical_size, fit_classical
-from models.training.estimators.configs import (
+from graspd.models.inputs import VectorBuilder
+from graspd.models.training.estimators.classical import (
+    classical_margins,
+    classical_size,
+    fit_classical,
+)
+from graspd.models.training.estimators.configs import (
     BoostingConfig,
     ClassicalConfig,
     ForestConfig,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.training.estimators.configs import DayShift
-from models.training.estimators.recipe import on_another_day
+from graspd.models.training.estimators.configs import DayShift
+from graspd.models.training.estimators.recipe import on_another_day
 
 GRASPS = 4000
 

@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from models.layout import D1
-from models.tactile_image import TactileImager
-from models.training.estimators.configs import (
+from graspd.models.layout import D1
+from graspd.models.tactile_image import TactileImager
+from graspd.models.training.estimators.configs import (
     CNN0,
     CNN1,
     CNN2,
@@ -18,14 +18,14 @@ from models.training.estimators.configs import (
     NetworkConfig,
     SecondConvolution,
 )
-from models.training.estimators.networks import (
+from graspd.models.training.estimators.networks import (
     Beside,
     build,
     for_inference,
     for_margin,
     parameter_count,
 )
-from models.training.estimators.recipe import logits, reproducible
+from graspd.models.training.estimators.recipe import logits, reproducible
 from tests.models.training.training_samples import separable_counts
 
 TINY = NetworkConfig(filters=4, hidden=16)

@@ -8,18 +8,23 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from models.inputs import VectorBuilder
-from models.tactile_image import TactileImager
-from models.training.estimators import recipe as recipes
-from models.training.estimators.configs import (
+from graspd.models.inputs import VectorBuilder
+from graspd.models.tactile_image import TactileImager
+from graspd.models.training.estimators import recipe as recipes
+from graspd.models.training.estimators.configs import (
     DayShift,
     NetworkConfig,
     PublishedRecipe,
     Recipe,
     SessionRecipe,
 )
-from models.training.estimators.networks import build
-from models.training.estimators.recipe import logits, optimization, reproducible, train_network
+from graspd.models.training.estimators.networks import build
+from graspd.models.training.estimators.recipe import (
+    logits,
+    optimization,
+    reproducible,
+    train_network,
+)
 from tests.models.training.training_samples import separable_counts
 
 TINY = NetworkConfig(filters=4, hidden=16)

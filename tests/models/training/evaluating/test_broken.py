@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from models.training.evaluating.broken import KINDS, NUMBERS, broken_study
-from models.training.systems.registry import SYSTEMS
+from graspd.models.training.evaluating.broken import KINDS, NUMBERS, broken_study
+from graspd.models.training.systems.registry import SYSTEMS
 from tests.models.training.evaluation_samples import sessions
 
 
@@ -22,7 +22,7 @@ def test_dead_electrodes_cost_less_once_they_are_repaired(name: str) -> None:
 
 
 def test_the_study_looks_for_one_more_broken_electrode_than_the_daemon_repairs() -> None:
-    from daemon.judge.health import BROKEN_MAX
-    from models.training.evaluating.broken import LOOKED_FOR_MAX
+    from graspd.daemon.judge.health import BROKEN_MAX
+    from graspd.models.training.evaluating.broken import LOOKED_FOR_MAX
 
     assert LOOKED_FOR_MAX == BROKEN_MAX + 1

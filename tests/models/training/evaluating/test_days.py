@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.calibration import SessionCalibration
-from daemon.judge.network import Plausibility
-from models.contract import SessionInput, Sharpness
-from models.inputs import SessionBuilder
-from models.training.data.protocols import splits
-from models.training.evaluating import jobs
-from models.training.evaluating.day_figures import VerdictFigures, day_figures
-from models.training.evaluating.days import CALIBRATED_FROM, Day, SessionDay
-from models.training.evaluating.jobs import Job, JobResult
-from models.training.fitting.standards import PRIOR_GRASPS
-from models.training.fitting.trained import Trained, train
-from models.training.systems.registry import SYSTEMS
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.network import Plausibility
+from graspd.models.contract import SessionInput, Sharpness
+from graspd.models.inputs import SessionBuilder
+from graspd.models.training.data.protocols import splits
+from graspd.models.training.evaluating import jobs
+from graspd.models.training.evaluating.day_figures import VerdictFigures, day_figures
+from graspd.models.training.evaluating.days import CALIBRATED_FROM, Day, SessionDay
+from graspd.models.training.evaluating.jobs import Job, JobResult
+from graspd.models.training.fitting.standards import PRIOR_GRASPS
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.systems.registry import SYSTEMS
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(160)

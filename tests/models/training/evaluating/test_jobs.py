@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from sklearn.neural_network import MLPClassifier
 
-from models.contract import VectorInput
-from models.inputs import SessionBuilder, raw_features
-from models.training.estimators.configs import MlpConfig, SvmConfig
-from models.training.evaluating import jobs
-from models.training.evaluating.jobs import BrokenResultError, Job, JobResult
-from models.training.fitting.standards import (
+from graspd.models.contract import VectorInput
+from graspd.models.inputs import SessionBuilder, raw_features
+from graspd.models.training.estimators.configs import MlpConfig, SvmConfig
+from graspd.models.training.evaluating import jobs
+from graspd.models.training.evaluating.jobs import BrokenResultError, Job, JobResult
+from graspd.models.training.fitting.standards import (
     SESSION_VARIANTS,
     Standards,
     TrainingStandards,
     later_session,
 )
-from models.training.systems.system import SessionFeatures, System
+from graspd.models.training.systems.system import SessionFeatures, System
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(200)

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from sklearn.metrics import brier_score_loss, f1_score, log_loss
 
-from models.training.evaluating.metrics import (
+from graspd.models.training.evaluating.metrics import (
     accuracy_at,
     coverage_curve,
     cross_fitted_p_slip,

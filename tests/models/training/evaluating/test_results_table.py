@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.training.data.protocols import EvalProtocol, splits
-from models.training.evaluating.jobs import Job, JobResult
-from models.training.evaluating.results_table import ONE_ROW, Made, difference, results_table
-from models.training.evaluating.summaries import (
+from graspd.models.training.data.protocols import EvalProtocol, splits
+from graspd.models.training.evaluating.jobs import Job, JobResult
+from graspd.models.training.evaluating.results_table import ONE_ROW, Made, difference, results_table
+from graspd.models.training.evaluating.summaries import (
     SystemSummary,
     read_summaries,
     read_summary,
     summarise,
     write_summary,
 )
-from models.training.fitting.standards import SESSION_VARIANTS
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import digest
+from graspd.models.training.fitting.standards import SESSION_VARIANTS
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import digest
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(200)
@@ -238,7 +238,7 @@ def test_every_row_has_as_many_cells_as_its_header() -> None:
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Plots of two protocols. Matplotlib keeps fonts open for the life of the process."""
     pytest.importorskip("matplotlib", reason="no extra: report")
-    from models.training.evaluating import plots
+    from graspd.models.training.evaluating import plots
 
     session = summary_of("svm-session", "session", 0.2)
     every = dict.fromkeys(SESSION_VARIANTS, session.variants["n50"])

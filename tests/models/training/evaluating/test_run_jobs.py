@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.contract import VectorInput
-from models.training.data.datasets import Grasps
-from models.training.estimators.configs import ForestConfig
-from models.training.evaluating import jobs
-from models.training.evaluating.jobs import Job, JobResult
-from models.training.evaluating.run_jobs import ClusterError, run_jobs
-from models.training.systems.system import System
+from graspd.models.contract import VectorInput
+from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.estimators.configs import ForestConfig
+from graspd.models.training.evaluating import jobs
+from graspd.models.training.evaluating.jobs import Job, JobResult
+from graspd.models.training.evaluating.run_jobs import ClusterError, run_jobs
+from graspd.models.training.systems.system import System
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(120)

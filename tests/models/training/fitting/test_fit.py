@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.contract import VectorInput
-from models.inputs import SessionBuilder, builder, raw_features
-from models.tactile_image import TactileImager
-from models.training.data.augmentation import Augmentation
-from models.training.estimators.configs import (
+from graspd.models.contract import VectorInput
+from graspd.models.inputs import SessionBuilder, builder, raw_features
+from graspd.models.tactile_image import TactileImager
+from graspd.models.training.data.augmentation import Augmentation
+from graspd.models.training.estimators.configs import (
     BoostingConfig,
     ForestConfig,
     NetworkConfig,
     Recipe,
     SvmConfig,
 )
-from models.training.fitting.fit import Fitted, FittedBlend, FittedNetwork, fit
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import (
+from graspd.models.training.fitting.fit import Fitted, FittedBlend, FittedNetwork, fit
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import (
     BlendConfig,
     Member,
     SessionFeatures,

@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.electrodes import NoveltyCheck
-from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen, seen_counts
+from graspd.models.electrodes import NoveltyCheck
+from graspd.models.training.fitting.novelty import (
+    held_out_never_seen,
+    made_up_never_seen,
+    seen_counts,
+)
 
 
 def random_counts(number: int) -> NDArray[np.uint16]:

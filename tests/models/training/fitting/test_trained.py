@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
-from models.training.fitting.trained import SensorMapping
+from graspd.models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
+from graspd.models.training.fitting.trained import SensorMapping
 from tests.models.training.evaluation_samples import sessions
 
 

@@ -13,8 +13,8 @@ import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
-from models.bts3 import FINGERS
-from models.contract import (
+from graspd.models.bts3 import FINGERS
+from graspd.models.contract import (
     CLASSES,
     CountsInput,
     Dataset,
@@ -27,9 +27,9 @@ from models.contract import (
     Sharpness,
     VectorInput,
 )
-from models.inputs import builder, raw_features
-from models.runtime import TactileModel
-from models.training.estimators.configs import (
+from graspd.models.inputs import builder, raw_features
+from graspd.models.runtime import TactileModel
+from graspd.models.training.estimators.configs import (
     BoostingConfig,
     ForestConfig,
     MlpConfig,
@@ -38,11 +38,11 @@ from models.training.estimators.configs import (
     SecondConvolution,
     SvmConfig,
 )
-from models.training.fitting.fit import Fitted, fit
-from models.training.fitting.standards import Standards
-from models.training.making.export import ExportError, export
-from models.training.systems.registry import SESSION
-from models.training.systems.system import BlendConfig, Estimator, Member, System
+from graspd.models.training.fitting.fit import Fitted, fit
+from graspd.models.training.fitting.standards import Standards
+from graspd.models.training.making.export import ExportError, export
+from graspd.models.training.systems.registry import SESSION
+from graspd.models.training.systems.system import BlendConfig, Estimator, Member, System
 from tests.models.training.training_samples import separable_counts
 
 COUNTS, SLIPPED = separable_counts(90)

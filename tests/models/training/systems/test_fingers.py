@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.assembly.assembly import build_pipeline, load_model
-from daemon.scene import parse
-from drivers.base import TactileReading
-from models.training.evaluating import jobs
-from models.training.evaluating.jobs import Job
-from models.training.making.make_model import make_model
-from models.training.making.plan import TrainingPlan
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import digest, with_recipes
+from graspd.daemon.assembly.assembly import build_pipeline, load_model
+from graspd.daemon.scene import parse
+from graspd.drivers.base import TactileReading
+from graspd.models.training.evaluating import jobs
+from graspd.models.training.evaluating.jobs import Job
+from graspd.models.training.making.make_model import make_model
+from graspd.models.training.making.plan import TrainingPlan
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import digest, with_recipes
 from tests.models.training.evaluation_samples import sessions
 
 FORMS = {

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from models import zoo
-from models.contract import CountsInput, ImageInput, VectorInput
-from models.training.estimators.configs import (
+from graspd.models import zoo
+from graspd.models.contract import CountsInput, ImageInput, VectorInput
+from graspd.models.training.estimators.configs import (
     CNN1,
     ForestConfig,
     MlpConfig,
@@ -17,8 +17,8 @@ from models.training.estimators.configs import (
     Recipe,
     SvmConfig,
 )
-from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import (
+from graspd.models.training.systems.registry import SYSTEMS
+from graspd.models.training.systems.system import (
     BlendConfig,
     Member,
     SessionFeatures,
