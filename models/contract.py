@@ -53,7 +53,7 @@ class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the training counts look like; `graspd.models.electrodes` says what follows for a reading."""
+    """What the training counts look like; `electrodes` says what follows for a reading."""
 
     low: tuple[tuple[Count, ...], ...]
     """Smallest count of each electrode, shape (fingers, 24)."""

@@ -167,8 +167,8 @@ def make_decoder(
     sound sample counts until the link is lost, which is for bring-up only.
 
     For `syntouch` only: `sensors`, the fingers in the order of the board's words, three at most, by
-    default `fingers`; `sequence`, a key of `graspd.drivers.biotac.SEQUENCES`; `data_length`, bytes of a
-    frame that the board pads.
+    default `fingers`; `sequence`, a key of `graspd.drivers.biotac.SEQUENCES`; `data_length`, bytes
+    of a frame that the board pads.
     """
     check_fingers(fingers)
     if arbitration_id is not None and not 0 <= arbitration_id <= EXTENDED_ID_MAX:

@@ -1,8 +1,8 @@
 """The link log of a serial line: its bytes with their times, and what the bridge says in them.
 
-Each record is a frame of `graspd.drivers.spi.messages`: type 1 for bytes from the device, 2 for bytes to
-it, 3 for the port having been opened; payload `t: u64` (monotonic ns) and the bytes. So a reader
-finds the next record after any damage.
+Each record is a frame of `graspd.drivers.spi.messages`: type 1 for bytes from the device, 2 for
+bytes to it, 3 for the port having been opened; payload `t: u64` (monotonic ns) and the bytes. So a
+reader finds the next record after any damage.
 """
 
 from __future__ import annotations
