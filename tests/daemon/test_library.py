@@ -48,7 +48,7 @@ def test_each_name_of_the_library_is_there_and_told() -> None:
         assert getattr(graspd, name) is not None
         assert name in PAGE
     with pytest.raises(AttributeError, match="no attribute 'loads'"):
-        graspd.loads  # type: ignore[attr-defined]  # noqa: B018
+        graspd.loads  # noqa: B018
 
 
 def test_probabilities_are_those_of_a_replay(counts: NDArray[np.float64]) -> None:
