@@ -126,7 +126,7 @@ def test_the_library_reads_counts_and_angles_of_a_recording(lab: Lab) -> None:
     counts = [reading["counts"] for reading in readings]
     assert table.filter(like="_biotac_").to_numpy().tolist() == counts
     joints = of_kind(lab.files[0], "joints")
-    assert len(table.columns) == 1 + 72 + len(joints[0]["joints"])
+    assert len(table.columns) == 1 + 72 + len(joints[0]["names"])
     steps = [reading["t_mono_ns"] - readings[0]["t_mono_ns"] for reading in readings]
     assert ((table["t"] - table["t"][0]) * 1e9).tolist() == pytest.approx(steps, abs=1000)
 
