@@ -262,15 +262,26 @@ environment() {
     chmod 755 "$new"
     "$python" -I -m venv "$new" || fail "no virtual environment; nothing has changed"
     packages || fail "pip failed; nothing has changed"
-    "$new/bin/python" -I -m graspd --version >/dev/null ||
+    version=$(version_of "$new") ||
         fail "the new graspd does not start; nothing has changed"
+    former=$(version_of "$current" 2>/dev/null || true)
     settle
     printf '%s\n' "$digest" >"$new/inputs.sha256"
     printf '%s\n' "$extras" >"$new/extras"
     ln -sfn "${new##*/}" "$root$prefix/venv.new"
     mv -T "$root$prefix/venv.new" "$current"
     new=''
-    did "$prefix/venv is new"
+    case $former in
+        '') did "$prefix/venv is new: $version" ;;
+        "$version") did "$prefix/venv is new: $version again, made anew" ;;
+        *) did "$prefix/venv is new: from $former to $version" ;;
+    esac
+}
+
+# The first line of graspd --version, such as "graspd 0.1.0".
+version_of() {
+    "$1/bin/python" -I -m graspd --version >"$scratch/version" || return 1
+    sed -n 1p "$scratch/version"
 }
 
 # All that the environment is made of: while this is the same, so is the environment.

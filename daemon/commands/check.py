@@ -16,6 +16,7 @@ import numpy as np
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.commands.models import f1_percent
+from graspd.daemon.doctor.computer import NETWORK
 from graspd.daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
 from graspd.daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
 from graspd.daemon.process.text import (
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check the scenes, their models and files; 0 if all are right, 1 if only a cost is not known.
-    Whether devices and socket are there is for `graspd doctor`."""
+    Whether sockets can be had and devices work is for `graspd doctor`."""
     costs: list[tuple[Path, Footprint]] = []
     codes = [_check(path, args, costs) for path in args.scene]
     if len(codes) > 1 and costs and not args.json:
@@ -122,7 +123,7 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _warnings(wanted: scene.Scene) -> list[str]:
-    warnings = []
+    warnings = [] if (absent := _absent(wanted.tactile)) is None else [absent]
     for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
         if not isinstance(section, scene_drivers.PalmTactile | scene_drivers.StreamJoints):
             continue
@@ -133,6 +134,27 @@ def _warnings(wanted: scene.Scene) -> list[str]:
                 "taken for the hand: name its sender with only_from, or listen on one address"
             )
     return warnings
+
+
+def _absent(tactile: scene_drivers.Tactile) -> str | None:
+    """Return which port or interface is not there yet; None if it is, or if that is not known."""
+    match tactile:
+        case (
+            scene_drivers.SpiTactile(port=port)
+            | scene_drivers.CanTactile(interface="slcan", channel=port)
+        ):
+            path, what = Path(port), "port"
+            if not path.is_absolute():  # a pyserial URL
+                return None
+        case scene_drivers.CanTactile(interface="socketcan", channel=port):
+            path, what = NETWORK / port, "CAN interface"
+        case _:
+            return None
+    if path.exists():
+        return None
+    return (
+        f"the {what} {port} is not there yet; graspd run waits for it, graspd doctor lists others"
+    )
 
 
 def _try_drivers(wanted: scene.Scene) -> int | None:
@@ -248,8 +270,8 @@ def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
         f"after {after} fast motion is excluded, {soon.counts_per_s:.0f} counts/s and more, after "
         f"{again} slow slides, {sure.counts_per_s:.0f} and more (mean of the electrodes that is "
         f"seen in half of the readings; {1e9 / period_ns:.0f}/s{usual}, "
-        f"typical noise); a hand that holds may be said to move {100 * gate.false_alarms:g} % of "
-        f"the time; {judged}"
+        f"typical noise); a settled hand that holds may be said to move "
+        f"{100 * gate.false_alarms:g} % of the time; {judged}"
     )
 
 

@@ -35,6 +35,8 @@ SHOWN = {
     "each other day": ("days",),
 }
 """Columns of the list: the first of these protocols that a card has."""
+LEFT_COLUMNS = 2
+"""Columns of the list that begin at the left: name and fingers."""
 ADD, REMOVE = "add", "remove"
 WRONG, FAILED = 2, 1
 
@@ -207,17 +209,22 @@ def _folder(args: argparse.Namespace) -> Path:
 
 
 def _listing(cards: dict[str, _ShownCard], added: dict[str, Path]) -> Iterator[str]:
-    titles = "".join(f"{title:>16}" for title in SHOWN)
-    yield f"{'F1, %':26}{'fingers':10}{'MB':>6}{'numbers':>10}{titles}"
+    rows = [["F1, %", "fingers", "MB", "numbers", *SHOWN]]
     for name, card in cards.items():
         contract = card.contract
         f1 = {measured.protocol: f1_percent(measured) for measured in contract.measured}
         mark = " (default)" if name == DEFAULT_MODEL else " (own)" if name in added else ""
         chosen = (next(filter(None, map(f1.get, group)), "-") for group in SHOWN.values())
-        figures = "".join(f"{text:>16}" for text in chosen)
         size = f"{card.file.size_bytes / 1e6:.1f}"
-        fingers = " ".join(contract.fingers)
-        yield f"{name + mark:26}{fingers:10}{size:>6}{card.parameters or '-':>10}{figures}"
+        parameters = str(card.parameters or "-")
+        rows.append([name + mark, " ".join(contract.fingers), size, parameters, *chosen])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [
+            f"{text:{'<' if place < LEFT_COLUMNS else '>'}{width}}"
+            for place, (text, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        yield "  ".join(cells).rstrip()
     yield ""
     for name, card in cards.items():
         where = f" ({added[name]})" if name in added else ""

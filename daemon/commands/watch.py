@@ -8,6 +8,7 @@ import os
 import select
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import zmq
 
@@ -31,8 +32,18 @@ HANDS_MAX = 8
 """Most hands in one page or terminal."""
 FAILED, WRONG = 1, 2
 
-Target = tuple[str, str | None, Path | None]
-"""Endpoint, hand and the daemon's key of what is watched."""
+SCENES, SOCKETS = Path("/etc/graspd"), Path("/run/graspd")
+"""Folders of the service's scenes and sockets (deploy/systemd)."""
+
+
+class Target(NamedTuple):
+    """One daemon to watch."""
+
+    endpoint: str
+    hand: str | None
+    server_key: Path | None
+    look: str
+    """Where a person looks when it is silent."""
 
 
 class UsageError(Exception):
@@ -84,9 +95,10 @@ def run(args: argparse.Namespace) -> int:
     try:
         with contextlib.ExitStack() as stack:
             hands = []
-            for endpoint, hand, server_key in _targets(args):
-                feed = stack.enter_context(_feed(endpoint, _keys(args, server_key)))
-                hands.append(HandFeed(feed, View(endpoint, hand)))
+            for target in _targets(args):
+                keys = _keys(args, target.server_key)
+                feed = stack.enter_context(_feed(target.endpoint, keys))
+                hands.append(HandFeed(feed, View(target.endpoint, target.hand, target.look)))
             if args.foxglove:
                 return _foxglove(hands, args.port or FOXGLOVE_PORT)
             return _page(hands, args.port or PORT) if args.web else _terminal(hands)
@@ -111,16 +123,35 @@ def _port(text: str) -> int:
 
 def _targets(args: argparse.Namespace) -> list[Target]:
     endpoints = args.connect or ([] if args.scenes else [ENDPOINT])
-    targets: list[Target] = [(endpoint, None, args.server_key) for endpoint in endpoints]
+    targets = [
+        Target(endpoint, None, args.server_key, where_to_look(endpoint)) for endpoint in endpoints
+    ]
     for path in args.scenes:
         wanted = scene.load(path)
         server = args.server_key
         if server is None and wanted.curve is not None:
             server = wanted.curve.secret_key.with_suffix(".key")
-        targets.append((wanted.endpoint, wanted.hand.name, server))
+        look = where_to_look(wanted.endpoint, path)
+        targets.append(Target(wanted.endpoint, wanted.hand.name, server, look))
     if len(targets) > HANDS_MAX:
         raise UsageError(f"{len(targets)} hands are more than the {HANDS_MAX} that can be watched")
     return targets
+
+
+def where_to_look(endpoint: str, scene_path: Path | None = None) -> str:
+    """Return the commands that show why the daemon of an endpoint is silent."""
+    socket = Path(endpoint.removeprefix("ipc://"))
+    if scene_path is not None and scene_path.absolute().parent == SCENES:
+        name = scene_path.stem
+    elif scene_path is not None:
+        return f"is it started? graspd run {scene_path}"
+    elif socket.parent == SOCKETS:
+        name = socket.stem
+    elif endpoint.startswith("tcp://"):
+        return "on the daemon's computer: systemctl status 'graspd@*'"
+    else:
+        return "is it started? graspd run SCENE"
+    return f"systemctl status graspd@{name}; journalctl -u graspd@{name}"
 
 
 def _keys(args: argparse.Namespace, server_key: Path | None) -> tuple[bytes, bytes, bytes] | None:

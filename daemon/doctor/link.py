@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
 from graspd.drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
 """Share of the nominal rate below which the link is slow."""
+TOO_MUCH = {Cause.DAMAGED: 0.05, Cause.FRAMES_LOST: 0.1}
+"""Share of frames from which damage or loss is an error. Each loss hides motion for 240 ms, so at a
+tenth of 100 readings/s hardly a grasp is ever known to be still."""
+BAD_MIN = 5
+"""With fewer bad frames their share is not known."""
+WHOLES = "frames", "packets", "readings"
+"""Counters of what comes, by link."""
+OF_VALUES = frozenset({"not_counts"})
+"""Counters of values: a frame has many."""
+OF_READINGS = frozenset(
+    {"missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
+)
+"""Counters of readings, to which a link may need many frames."""
 JOINING, JOINING_MAX = "unsynchronised", 108
 """A listener that joins in mid-sweep loses up to two sweeps of 54 samples: no trouble."""
 
@@ -55,11 +70,14 @@ NOT_OURS = {
     ),
 }
 """Why a link brings no readings although something comes, by counters."""
+LOSSES = ("link_losses",)
+FLAPS_MIN = 3
+"""Losses of a link while the doctor listens from which they are an error."""
+BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
+"""What a link that comes and goes may be at any one moment; its loss is the cause of each."""
 COUNTERS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
-    ("link_losses",): Trouble(
-        Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"
-    ),
+    LOSSES: Trouble(Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"),
     ("restarts",): Trouble(
         Cause.RESTARTED, f"the board began anew: {AGAIN}, its supply and reset line"
     ),
@@ -200,7 +218,12 @@ def device_findings(
         what = f"{driver}: link {link.text}"
         if "why" in facts:
             what = f"{what}: {facts['why'].text}"
-        return [_of_link(what, TROUBLES[link.fault], counters or {})]
+        counters, trouble = counters or {}, TROUBLES[link.fault]
+        losses = counters.get("link_losses", 0)
+        if losses and link.fault in BETWEEN:
+            what += f"; it was up and was lost {losses} {'time' if losses == 1 else 'times'}"
+            trouble = TROUBLES[LinkCause.DISCONNECTED]
+        return [_of_link(what, trouble, counters)]
     found = [] if link is None else [fine(f"{driver}: link up")]
     for key, fact in facts.items():
         what = f"{driver}: {key} {fact.text}"
@@ -209,12 +232,15 @@ def device_findings(
 
 
 def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
-    """A warning for everything that counters of a link that is up say is going wrong."""
-    return [
-        trouble.finding(f"{driver}: {counted}")
-        for names, trouble in COUNTERS.items()
-        if (counted := _counted(names, counters))
-    ]
+    """Return a finding for each trouble that the counters of a link that is up show."""
+    found = []
+    for names, trouble in COUNTERS.items():
+        if counted := _counted(names, counters):
+            finding = trouble.finding(f"{driver}: {counted}")
+            if _is_too_much(trouble.cause, names, counters) or _flaps(trouble.cause, counters):
+                finding = replace(finding, level=Level.ERROR)
+            found.append(finding)
+    return found
 
 
 def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | None) -> Finding:
@@ -232,6 +258,27 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
         advice = "none was lost on the way: the board is late, or this computer is busy (top)"
         return warning(what, Cause.SLOW, advice)
     return fine(what)
+
+
+def _flaps(cause: Cause, counters: Mapping[str, int]) -> bool:
+    return cause is Cause.LINK_LOST and counters["link_losses"] >= FLAPS_MIN
+
+
+def _is_too_much(cause: Cause, names: Sequence[str], counters: Mapping[str, int]) -> bool:
+    """Return True if the share of damaged or lost frames may be one of `TOO_MUCH`."""
+    frames = next(filter(None, (counters.get(name, 0) for name in WHOLES)), 0)
+    pairs = [
+        (
+            sum(counters.get(name, 0) for name in names if name not in OF_VALUES | OF_READINGS),
+            frames,
+        ),
+        (counters.get("missed_readings", 0), counters.get("readings", 0)),
+    ]
+    share = TOO_MUCH.get(cause)
+    return share is not None and any(
+        bad >= BAD_MIN and bad + 2.0 * math.sqrt(bad) >= share * (bad + sound)
+        for bad, sound in (pairs if "missed_readings" in names else pairs[:1])
+    )
 
 
 def _of_link(what: str, trouble: Trouble, counters: Mapping[str, int]) -> Finding:

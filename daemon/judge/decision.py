@@ -41,8 +41,9 @@ class GateLimits:
     """When a grasp has settled, and when it is another one. Times in ns, counts raw."""
 
     false_alarms: float = 0.03
-    """Share of the sweeps of a hand that holds in which it may be said to move. The larger, the
-    slower the slides that are seen: deploy/JUDGING.md."""
+    """Share of the sweeps of a settled hand that holds in which it may be said to move. Until it
+    has settled the limit is stricter. The larger, the slower the slides that are seen:
+    deploy/JUDGING.md."""
     early: bool = False
     """True if a grasp is judged as soon as fast motion is excluded, and again when slow slides
     are."""

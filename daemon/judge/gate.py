@@ -6,9 +6,11 @@
     closing, settled, judged -> released -> idle   (or, touched at once again, -> closing)
 
 A grasp lasts from the first touch until nothing touches. It is judged when all fingers touch and
-have kept still until nothing can slide unseen; with `early`, first when nothing moves fast. From
-then on the verdict is refreshed many times a second and when the controller asks. Times are those
-of the readings, so a stall or a burst of old readings settles nothing.
+have kept still until nothing can slide unseen; with `early`, first when nothing moves fast. It
+settles by the strict limit of motion and goes on by the loose one, so that the verdict on a hand
+that holds does not come and go. From then on it is refreshed many times a second and when the
+controller asks. Times are those of the readings, so a stall or a burst of old readings settles
+nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 
 from graspd.daemon.judge.decision import HandLimits
 from graspd.daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
-from graspd.daemon.judge.stillness import ONES, Motion
+from graspd.daemon.judge.stillness import ONES, Motion, MotionLimits
 from graspd.daemon.judge.windows import LONG_NS, SHORT_NS
 from graspd.drivers.base import ELECTRODES
 from graspd.models.contract import Finger
@@ -50,6 +52,8 @@ class GateMemory:
     """Time since which touch and stillness have lasted. None: something moves."""
     moved_since_ns: int | None = None
     """Time since which a judged grasp has moved. None: it does not move."""
+    sure: bool = False
+    """True if it has settled with slow slides excluded: the loose limit holds from then on."""
     early: bool = False
     """True if it was judged while something might slide slowly: it is judged again, unasked."""
     released_ns: int = 0
@@ -126,12 +130,17 @@ class Gate:
         reasons = self._disturbances(objections)
         self._follow_stillness(t_ns, bool(reasons))
         self._follow_contact(t_ns, bool(touching))
-        if memory.state is GateState.JUDGED:
+        state = memory.state
+        if state is GateState.JUDGED:
             reasons += self._follow_judged(t_ns, median.astype(np.float32), usable)
-        elif memory.state is GateState.SETTLED and (reasons or not self._is_still):
+        elif state is GateState.SETTLED and (reasons or not self._is_still):
             cause = GateCause.MOVED if memory.in_contact else GateCause.CONTACT_LOST
             self._enter(GateState.CLOSING, t_ns, cause)
-        memory.objections = (*reasons, *self._settle(t_ns, bool(reasons)))
+        elif state is GateState.CLOSING and not reasons and self._is_still:
+            self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
+        if memory.state is GateState.CLOSING and not reasons:
+            reasons = (Reason.MOVING if self.motion.slides else Reason.SETTLING,)
+        memory.objections = reasons
         if in_time and self._wants_judgement(fresh=fresh):
             return self._judge(t_ns, median, touching)
         return self.moment(touching)
@@ -158,6 +167,7 @@ class Gate:
             changes=tuple(changes),
             still_ms=self._still_ns / 1e6,
             early=is_judged and memory.early,
+            steady=self._keeps_to(self.motion.strict),
             motion=motion,
             motion_limits=motion_limits,
         )
@@ -193,6 +203,15 @@ class Gate:
         """True if the hand has kept still for long enough to be judged."""
         return self._still_ns >= (SHORT_NS if self._limits.early else LONG_NS)
 
+    @property
+    def _motion_limits(self) -> MotionLimits:
+        """What fingers may move now."""
+        return self.motion.loose if self.memory.sure else self.motion.strict
+
+    def _keeps_to(self, limits: MotionLimits) -> bool:
+        """Return True if nothing moves by which a judged grasp would not stand."""
+        return limits.early if self.memory.early else limits.sure
+
     def _wants_judgement(self, *, fresh: bool) -> bool:
         """Return True if this reading is the one to judge."""
         memory = self.memory
@@ -221,10 +240,10 @@ class Gate:
         """Per finger: motion in the window closer to its limit, and that limit."""
         motion: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
-        now = self.motion
+        now, most = self.motion, self._motion_limits
         if not now.looked:
             return self._not_looked
-        windows = now.fast, now.fast_limits, now.slow, now.slow_limits
+        windows = now.fast, most.fast, now.slow, most.slow
         for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * slide_limit:
                 moves, limit = slides, slide_limit
@@ -247,7 +266,7 @@ class Gate:
             return (*not_tared, Reason.NO_CONTACT)
         if not self.motion.known:
             return (*objections, Reason.SEQUENCE_GAP)
-        return objections if self.motion.early else (*objections, Reason.MOVING)
+        return objections if self._motion_limits.early else (*objections, Reason.MOVING)
 
     def _follow_stillness(self, t_ns: int, disturbed: bool) -> None:
         """The windows say for how long nothing has moved; the touch must have lasted as long."""
@@ -258,7 +277,7 @@ class Gate:
         since_ns = memory.still_since_ns
         if since_ns is None:
             since_ns = max(t_ns - SHORT_NS, memory.touched_ns)
-        if self.motion.sure:
+        if self._motion_limits.sure:
             since_ns = min(since_ns, max(t_ns - LONG_NS, memory.touched_ns))
         else:
             since_ns = max(since_ns, t_ns - LONG_NS + 1_000_000)  # a ms short of it
@@ -287,7 +306,8 @@ class Gate:
         if max(distance.tolist()) > self._limits.change_counts:
             self._enter(GateState.CLOSING, t_ns, GateCause.CHANGED)
             return ()
-        if self.motion.early if memory.early else self.motion.sure:
+        limits = self._motion_limits
+        if self._keeps_to(limits):
             memory.moved_since_ns = None
             if memory.early and self._still_ns >= LONG_NS:
                 self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
@@ -296,23 +316,16 @@ class Gate:
             memory.moved_since_ns = t_ns
         elif t_ns - memory.moved_since_ns >= 2 * LONG_NS:
             self._enter(GateState.CLOSING, t_ns, GateCause.MOVED)
-        return (Reason.MOVING,) if self.motion.early else ()
-
-    def _settle(self, t_ns: int, disturbed: bool) -> tuple[Reason, ...]:
-        """Settle once everything is still; return what is against it besides what disturbs."""
-        if disturbed or self.memory.state is not GateState.CLOSING:
-            return ()
-        if not self._is_still:
-            return (Reason.MOVING if self.motion.slides else Reason.SETTLING,)
-        self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
-        return ()
+        return (Reason.MOVING,) if limits.early else ()
 
     def _enter(self, state: GateState, t_ns: int, cause: GateCause) -> None:
         memory = self.memory
         self._changes.append(GateChange(t_ns, memory.grasp, memory.state, state, cause))
         memory.state = state
-        if state not in (GateState.SETTLED, GateState.JUDGED):
-            memory.early, memory.moved_since_ns = False, None
+        if state in (GateState.SETTLED, GateState.JUDGED):
+            memory.sure = memory.sure or self._still_ns >= LONG_NS
+        else:
+            memory.early, memory.sure, memory.moved_since_ns = False, False, None
 
 
 def _mean_distance(

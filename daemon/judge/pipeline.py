@@ -249,7 +249,8 @@ class Pipeline:
         judgement = self._decide(
             reading.t_ns, checked.reasons, moment, memory.opinion, assessment, counts
         )
-        if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
+        learns = self._learns and moment.steady and Reason.STALE not in judgement.reasons
+        if grasp is not None and learns:
             self._keep_to_learn(grasp, moment.grasp)
         stable = judgement.decision is Decision.STABLE
         if stable or moment.judges or moment.judged:
@@ -321,6 +322,11 @@ class Pipeline:
             return trust.review(grasp, None)
         return memory.assessment
 
+    def _is_told(self, moment: Moment) -> bool:
+        """Return True if the hand still holds a grasp whose outcome is known."""
+        over = moment.state in (GateState.IDLE, GateState.RELEASED)
+        return not over and self.lifts.is_told(GraspId(self.boot_id, moment.grasp))
+
     def _note(self, grasp: GraspId, assessment: Assessment | None, *, stable: bool) -> None:
         """Enter in the book what was said of a grasp."""
         if self.trust is None or assessment is None:
@@ -348,6 +354,8 @@ class Pipeline:
         """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
         calibrated = None if self._session is None else self._session.now.calibrated
         objections = (*unusable, *opinion.reasons)
+        if self._is_told(moment):
+            objections = (*objections, Reason.OUTCOME_TOLD)
         if calibrated is False and (self._needs_session or self.memory.needs_session):
             objections = (*objections, Reason.NOT_CALIBRATED)
         p_slip, withheld = opinion.p_slip, None

@@ -7,6 +7,7 @@ A new reason needs a member of `Reason`, a line of `ADVICE`, a row in deploy/wir
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -52,6 +53,7 @@ class Reason(StrEnum):
     LOW_CONFIDENCE = "low-confidence"
     UNPROVEN = "unproven"
     RISK_EXCEEDED = "risk-exceeded"
+    OUTCOME_TOLD = "outcome-told"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
 
@@ -86,13 +88,44 @@ ADVICE: dict[Reason, str] = {
     "supervision, tell outcomes",
     Reason.RISK_EXCEEDED: "more `stable` lifts slipped than [risk] can make good: find out why, "
     "then `graspd session reset`",
+    Reason.OUTCOME_TOLD: "the outcome of its lift is known: release the object, then grasp again",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
 }
 
 
+OF_THE_HAND = frozenset(
+    {Reason.NO_CONTACT, Reason.MOVING, Reason.SETTLING, Reason.NOT_TARED, Reason.NOT_ASKED}
+)
+"""Reasons of an open hand, or of a grasp that settles."""
+UNREADABLE = frozenset(
+    {
+        Reason.STALE,
+        Reason.SENSOR_MISSING,
+        Reason.NOT_A_COUNT,
+        Reason.CUT_OFF,
+        Reason.PARITY,
+        Reason.ERROR_WORD,
+        Reason.HELD,
+        Reason.FROZEN,
+        Reason.SATURATED,
+        Reason.ELECTRODES_BROKEN,
+        Reason.MODEL_MISMATCH,
+    }
+)
+"""Reasons with which a reading says nothing of the hand now."""
 WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
 """Reasons with which a grasp may still be lifted under supervision; with any other it may not."""
+
+
+def to_act_on(reasons: Sequence[Reason]) -> list[Reason]:
+    """Return the reasons that tell a person what to do.
+
+    Where the sensors cannot be read, what is said of the hand is old: closing it helps nothing.
+    """
+    if UNREADABLE.isdisjoint(reasons):
+        return list(reasons)
+    return [reason for reason in reasons if reason not in OF_THE_HAND]
 
 
 class GateState(StrEnum):
@@ -161,6 +194,8 @@ class Moment(NamedTuple):
     """Time for which the hand has touched and kept still, ms."""
     early: bool = False
     """True if it was judged while something might still slide slowly."""
+    steady: bool = True
+    """True if motion keeps to the strict limit: else a session learns nothing from the reading."""
     motion: dict[Finger, float | None] | None = None
     """How each finger moves, in units of its noise; None where that is not known."""
     motion_limits: dict[Finger, float] | None = None

@@ -52,8 +52,13 @@ its logarithm. With the noise it is what 44 held touches of one sensor showed, i
 240 ms."""
 FAST_SHARE = 0.1
 """Share of the false alarms that the short window may have where the long one decides."""
+LOOSE_SHARE = 0.1
+"""Share of `false_alarms` by which the loose limit is laid, as noise and creep alone pass it. The
+pressure of a real hold wanders as well: together they pass it in `false_alarms` of the time."""
 
 Times = NDArray[np.float64]
+SlowNoise = tuple[float, list[float], list[float]]
+"""What `slow_limit` takes besides a tail."""
 
 
 class Tails(NamedTuple):
@@ -76,22 +81,37 @@ class Tails(NamedTuple):
         return cls(slow, fast, slow if early else fast)
 
 
+class MotionLimits(NamedTuple):
+    """What each finger that is still moves at most, in units of its noise; do all keep to it?"""
+
+    fast: list[float]
+    """In the short window."""
+    slow: list[float]
+    """In the long one."""
+    early: bool = False
+    """True if fast motion is excluded."""
+    sure: bool = False
+    """True if slow slides that noise does not hide are excluded as well."""
+
+
 class Motion:
     """How each finger moves, in units of its own noise; constant memory, no clock.
 
     Fast motion shows in a short window, as the mean of the electrodes' absolute slopes. Slow slides
     stop and turn; they show in a long one, as the root mean square of the electrodes' deviations
-    from their means. Each is divided by what noise alone makes of it.
+    from their means. Each is divided by what noise alone makes of it. There are two limits of it: a
+    hand settles by the strict one, and goes on by the loose one.
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
-        """`false_alarms`: share of a holding hand's sweeps that may be called moving, 0..0.5.
+        """`false_alarms`: share of a settled hand's sweeps that may pass the loose limit, 0..0.5.
 
         With `early` the short window may have as large a share itself. Raises `ValueError` for
         another share.
         """
         shape = (fingers, ELECTRODES)
-        self._tails = Tails.of(fingers, false_alarms, early=early)
+        self._strict = Tails.of(fingers, false_alarms, early=early)
+        self._loose = Tails.of(fingers, LOOSE_SHARE * false_alarms, early=early)
         self._noise: Noise | None = None
         """Worked out when it is needed, once for each new block."""
         self.memory = MotionMemory(
@@ -108,28 +128,23 @@ class Motion:
             blocks=np.zeros((BLOCKS, APART, fingers)),
         )
         self._jumps = np.zeros(shape, dtype=np.float32)
-        self._unknown, self._no_limits = [math.inf] * fingers, [1.0] * fingers
+        self._unknown = [math.inf] * fingers
+        self._no_limits = MotionLimits([1.0] * fingers, [1.0] * fingers)
         self.fast = self.slow = self._unknown
         """How each finger moves over the short and over the long window, in units of its noise;
         infinite where that is not known."""
-        self.fast_limits = self.slow_limits = self._no_limits
-        """What it may be at most for a finger that is still, in the same units."""
+        self.strict = self.loose = self._no_limits
+        """What that may be at most until a hand has settled, and from then on."""
         self.looked = False
         """True if that was worked out for the last step; else it was not wanted."""
         self.known = False
         """True if it is known of all fingers how they moved in the short window."""
-        self.early = False
-        """True if fast motion is excluded."""
-        self.sure = False
-        """True if slow slides that noise does not hide are excluded as well."""
 
     @property
     def slides(self) -> bool:
         """True if a finger is known to move slowly, or to have moved within the long window."""
-        return any(
-            limit < moves < math.inf
-            for moves, limit in zip(self.slow, self.slow_limits, strict=True)
-        )
+        limits = self.strict.slow
+        return any(limit < move < math.inf for move, limit in zip(self.slow, limits, strict=True))
 
     def reset(self) -> None:
         """Forget the motion: what comes next does not continue what came before."""
@@ -298,17 +313,16 @@ class Motion:
         if self._noise is None:
             self._noise = self._known_noise()
         times_s = (times_ns[long:] - now_ns) / 1e9
-        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], self._noise)
+        first, noise, is_full = memory.first, self._noise, age_ns >= LONG_NS
+        fast_noise = self._follow_fast(first + short, end, times_s[short - long :], noise)
         self.known = max(self.fast) < math.inf
-        self.early = _within(self.fast, self.fast_limits)
-        if age_ns >= LONG_NS:
-            self._follow_slow(memory.first + long, end, times_s, self._noise)
-            self.sure = _within(self.slow, self.slow_limits) and _within(self.fast, beside)
+        of_slow = self._follow_slow(first + long, end, times_s, noise) if is_full else None
+        self.strict = self._limits(self._strict, fast_noise, of_slow)
+        self.loose = self._limits(self._loose, fast_noise, of_slow)
 
     def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
-        """Find how steps moved; return the limit for where the long window decides, too."""
-        memory, tails = self.memory, self._tails
-        line = centred(times_s)
+        """Find how steps moved; return the mean absolute slopes that noise makes, counts/s."""
+        memory, line = self.memory, centred(times_s)
         extent = float(line.dot(line))
         root = math.sqrt(extent)
         by_noise = [each / root for each in noise.slope[len(line)].tolist()]
@@ -316,27 +330,36 @@ class Motion:
         slopes = np.abs(weights.dot(memory.steps[begin:end].reshape(len(line), -1)))
         means = self._mean(slopes.reshape(memory.clean.shape), begin)
         self.fast = [mean / usual for mean, usual in zip(means, by_noise, strict=True)]
-        self.fast_limits = fast_limit(tails.alone, by_noise)
-        if tails.fast == tails.alone:
-            return self.fast_limits
-        return fast_limit(tails.fast, by_noise)
+        return by_noise
 
-    def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> None:
-        """Find how far steps have spread, and the limit of it."""
+    def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> SlowNoise:
+        """Find how far steps have spread; return what noise makes of that."""
         steps, number, line = self.memory.steps[begin:end], end - begin, centred(times_s)
         middle = np.add.reduce(steps, axis=0)
         middle /= number
         squares = np.add.reduce(np.square(steps - middle), axis=0)
         means = self._mean(squares, begin)
         by_noise = [each * (number - 1) for each in noise.variance[number].tolist()]
-        extent, spreads = float(line.dot(line)), noise.spread[number].tolist()
         self.slow = [math.sqrt(mean / usual) for mean, usual in zip(means, by_noise, strict=True)]
-        self.slow_limits = slow_limit(self._tails.slow, extent, by_noise, spreads)
+        return float(line.dot(line)), by_noise, noise.spread[number].tolist()
+
+    def _limits(
+        self, tails: Tails, fast_noise: list[float], of_slow: SlowNoise | None
+    ) -> MotionLimits:
+        """Return the limits of the steps at hand, and whether the fingers keep to them."""
+        fast = fast_limit(tails.alone, fast_noise)
+        early = _within(self.fast, fast)
+        if of_slow is None:
+            return MotionLimits(fast, self._no_limits.slow, early)
+        slow = slow_limit(tails.slow, *of_slow)
+        beside = fast if tails.fast == tails.alone else fast_limit(tails.fast, fast_noise)
+        sure = _within(self.slow, slow) and _within(self.fast, beside)
+        return MotionLimits(fast, slow, early, sure)
 
     def _say_unknown(self) -> None:
         self.fast = self.slow = self._unknown
-        self.fast_limits = self.slow_limits = self._no_limits
-        self.looked = self.known = self.early = self.sure = False
+        self.strict = self.loose = self._no_limits
+        self.looked = self.known = False
 
 
 def fast_limit(tail: float, by_noise: Sequence[float]) -> list[float]:

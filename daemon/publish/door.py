@@ -14,12 +14,13 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import zmq
 
 from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.lookout import EVENTS, Lookout, Seldom
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
@@ -67,12 +68,14 @@ class Admission:
     secret: bytes
     admitted: Mapping[bytes, str]
     """Names of peers, by public key; may be replaced at any time."""
+    _seldom: Seldom = field(default_factory=Seldom)
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Return True if the key may connect; called in pyzmq's thread."""
         name = self.admitted.get(key)
         if name is None:
-            log.warning("turned away a peer: its key %s is not on the list", key.decode())
+            if self._seldom.is_due(key):
+                log.warning("turned away a peer: its key %s is not on the list", key.decode())
             return False
         log.info("admitted a peer with the key of %s", name)
         return True
@@ -152,6 +155,8 @@ class Door:
         self._context: zmq.Context[Socket] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
         self._proxies: list[Proxy] = []
+        self._watched: list[Socket] = []
+        """Monitors of the sockets that want keys."""
         self._unheard = b""
         """Last status, until it comes back."""
         self._out = self._socket(zmq.PUSH, sent=high_water_mark)
@@ -172,6 +177,8 @@ class Door:
             raise
         for proxy in self._proxies:
             proxy.start()
+        if self._watched:
+            Lookout(self._watched).start()
 
     def _socket(self, kind: int, sent: int = 1, received: int = 1) -> Socket:
         """Return a socket that queues at most this many messages of each peer."""
@@ -224,6 +231,8 @@ class Door:
                 made.curve_secretkey = self._admission.secret
                 made.curve_server = True
                 made.zap_domain = ZAP_DOMAIN.encode()
+                if made is not self._subscribers or self._monitor is None:  # a socket has one
+                    self._watched.append(made.get_monitor_socket(EVENTS))
         try:
             made.bind(listener.endpoint)
         except zmq.ZMQError as error:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.reasons import ADVICE, Decision, GateState, Reason
+from graspd.daemon.judge.reasons import ADVICE, Decision, GateState, Reason, to_act_on
 from graspd.daemon.publish.messages import (
     MESSAGES,
     Count,
@@ -139,7 +139,7 @@ class Viewer:
         if verdict == self._verdict:
             return []
         self._verdict = verdict
-        why = "; ".join(f"{reason}: {ADVICE[reason]}" for reason in message.reasons)
+        why = "; ".join(f"{reason}: {ADVICE[reason]}" for reason in to_act_on(message.reasons))
         if message.p_slip is not None:
             why = f"slips with a probability of {message.p_slip:.1%}"
         level = WARNING if message.verdict is Decision.SLIP else INFO

@@ -104,5 +104,6 @@ def in_a_line(status: Status) -> str:
         parts.append(f"{status.late_readings} late")
     parts += [f"{part} {reason}" for part, reason in list(status.health.items())[:4]]
     if len(status.health) > 4:
-        parts.append(f"{len(status.health) - 4} more not well")
+        more = len(status.health) - 4
+        parts.append(f"{more} more {'part is' if more == 1 else 'parts are'} not well")
     return ", ".join(parts)

@@ -145,8 +145,9 @@ class GateSection(Section):
     contact_sigmas: Annotated[float, Field(ge=3, le=100), unit("sigma")] = ContactLimits.sigmas
     """The same in standard deviations of the finger's noise: both must be reached."""
     false_alarms: Annotated[float, Field(ge=0.001, le=0.3), unit()] = GateLimits.false_alarms
-    """Share of the time in which a still hand may be taken for moving. A smaller share lets more
-    slow slides pass for stillness (deploy/JUDGING.md)."""
+    """Share of the time in which a settled hand that holds may be taken for moving; until it has
+    settled the limit is stricter. A smaller share lets more slow slides pass for stillness
+    (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
     """True: judge as soon as nothing moves fast, marked `early`, and again when nothing slides
     slowly either."""

@@ -92,7 +92,7 @@ class Trust:
             raise ValueError(f"{p_slip} is no probability")
         report = self.report()
         log_odds, features = self._judging.judge(margin, inputs)
-        permission = self._permission(grasp, log_odds)
+        permission = self.risk.decide(log_odds, self.lifts.awaited)
         return Assessment(
             outcomes=self._judging.outcomes,
             report=report,
@@ -114,17 +114,10 @@ class Trust:
             return Assessment(self._judging.outcomes, report)
         permission = former.permission
         if permission is Permission.ALLOWED and not self.lifts.is_stable(grasp):
-            permission = self._permission(grasp, former.log_odds)
+            permission = self.risk.decide(former.log_odds, self.lifts.awaited)
         if permission is former.permission and report is former.report:
             return former
         return replace(former, permission=permission, report=report)
-
-    def _permission(self, grasp: GraspId, log_odds: float) -> Permission:
-        permission = self.risk.decide(log_odds, self.lifts.awaited)
-        has_rule = self.risk.limits.max_slip_when_stable is not None
-        if has_rule and permission is Permission.ALLOWED and self.lifts.is_told(grasp):
-            return Permission.WITHHELD  # its outcome is known: a second lift would not be counted
-        return permission
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
         """Enter the verdict on a grasp in the book. Raises `ValueError` if it was not allowed."""

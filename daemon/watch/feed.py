@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Self
@@ -26,10 +27,12 @@ HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Heartbeats on TCP, as the daemon's, ms."""
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 """Shortest and longest time before connecting again, ms."""
+CONNECTED: Final = "connected"
 NOT_CONNECTED: Final = "not connected"
+NOT_ALLOWED: Final = ": this user may not open the socket; is it in the group graspd?"
 WANTS_KEY: Final = "turned away: the daemon wants a key (--keys)"
 EVENTS: Final = {
-    int(zmq.EVENT_HANDSHAKE_SUCCEEDED): "connected",
+    int(zmq.EVENT_HANDSHAKE_SUCCEEDED): CONNECTED,
     int(zmq.EVENT_DISCONNECTED): NOT_CONNECTED,
     int(zmq.EVENT_CONNECT_RETRIED): NOT_CONNECTED,
     int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "turned away: the daemon does not know this key",
@@ -62,6 +65,10 @@ class Feed:
         self._taken_ns = self._opened_ns = clock()
         self.empty_ns = self._opened_ns
         """When no message waited last; those that `take` gives may be as old."""
+        self.looked_ns = self._opened_ns
+        """When the last message was looked for; it came before."""
+        self.stood_still = 0, 0
+        """When this process last stopped looking for longer than `PAUSE_NS`, and went on, ns."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._events = EVENTS if keys is None else EVENTS_WITH_KEYS
         self._follow = 0
@@ -94,11 +101,11 @@ class Feed:
         self._reconnect_if_needed()
         self._update_link()
         for _ in range(TAKEN_MAX):
-            before_ns = self._clock()
+            self.looked_ns = self._clock()
             try:
                 frames = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
-                self.empty_ns = before_ns
+                self.empty_ns = self.looked_ns
                 return
             if len(frames) == 2:
                 yield frames[0], frames[1]
@@ -106,6 +113,8 @@ class Feed:
     def _reconnect_if_needed(self) -> None:
         now_ns = self._clock()
         paused = now_ns - self._taken_ns > PAUSE_NS
+        if paused:
+            self.stood_still = self._taken_ns, now_ns
         self._taken_ns = now_ns
         if paused or (self.is_turned_away and now_ns - self._opened_ns > RETRY_NS):
             self._opened_ns = self.empty_ns = now_ns
@@ -123,8 +132,23 @@ class Feed:
             if link == NOT_CONNECTED and self._follow:
                 self._follow -= 1
                 continue
-            self.link = link
+            self.link = link + self._obstacle() if link == NOT_CONNECTED else link
             self._follow = FOLLOW if self.is_turned_away else 0
+
+    def _obstacle(self) -> str:
+        """Return what is known of the socket file, in words; "" over TCP."""
+        if not self._endpoint.startswith("ipc:///"):
+            return ""
+        path = Path(self._endpoint.removeprefix("ipc://"))
+        try:
+            path.stat()
+        except FileNotFoundError:
+            return ": there is no such socket, so no daemon serves it"
+        except PermissionError:
+            return NOT_ALLOWED
+        except OSError as error:
+            return f": {error.strerror}"
+        return ": no daemon serves this socket" if os.access(path, os.W_OK) else NOT_ALLOWED
 
     def close(self) -> None:
         self._close_sockets()

@@ -194,7 +194,7 @@ class Hand {
     });
     const ago = newest === null ? 0 : newest.ago_s + quiet / 1000;
     this.say("judged", newest === null ? "-" :
-      `${called(newest)}, ${ago.toFixed(0)} s ago${newest.held && !none ? "" : ", past"}; its lift ${newest.lift}`);
+      `${called(newest)}, ${ago.toFixed(0)} s ago${newest.held && !none ? "" : ", past"}${newest.lift === "-" ? "" : `; lift: ${newest.lift}`}`);
     this.say("still", none ? "-" : seen.still);
   }
 

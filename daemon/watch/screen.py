@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.live import Live
 
 from graspd.daemon.process.signals import StopSignal
-from graspd.daemon.watch.terminal import draw
+from graspd.daemon.watch.terminal import Screen, draw
 from graspd.daemon.watch.view import TICK_S, HandFeed, snapshots
 
 SIGNALS_MAX = 64
@@ -41,7 +41,13 @@ def show(hands: Sequence[HandFeed]) -> None:
                 Live(console=console, screen=True, auto_refresh=False) as live,
             ):
                 for seen in snapshots(hands, lambda: keyboard.wait() or suspension.asked):
-                    live.update(draw(seen, console.width, keyboard.tabs % len(hands)), refresh=True)
+                    screen = Screen(
+                        console.width,
+                        console.height,
+                        chosen=keyboard.tabs % len(hands),
+                        page=keyboard.spaces,
+                    )
+                    live.update(draw(seen, screen), refresh=True)
             if stop.received is not None or not suspension.asked:
                 return
             now = time.strftime("%H:%M:%S")
@@ -77,12 +83,14 @@ class Suspension:
 
 
 class Keyboard:
-    """Typed keys: `q` ends, Tab shows the next hand."""
+    """Typed keys: `q` ends, Tab shows the next hand, space what does not fit."""
 
     def __init__(self, stop: StopSignal) -> None:
         """Wait for `stop` too."""
         self.tabs = 0
         """How often Tab was typed."""
+        self.spaces = 0
+        """How often space was typed since then."""
         self._stop = stop
         self._waited = [stop.fileno()]
         """Descriptors of signals and, while keys are read, of the keyboard."""
@@ -97,7 +105,9 @@ class Keyboard:
         for keyboard in ready:
             if keyboard != self._stop.fileno():
                 typed = os.read(keyboard, 64)
-                self.tabs += typed.count(b"\t")
+                if b"\t" in typed:
+                    self.tabs, self.spaces = self.tabs + typed.count(b"\t"), 0
+                self.spaces += typed.count(b" ")
                 return typed[:1] in {b"q", b"Q", b""}
         return False
 

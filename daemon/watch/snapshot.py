@@ -82,6 +82,8 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """rad."""
     health: list[Line]
     """What is wrong, and what to do."""
+    not_well: str
+    """The same in a few words; empty if all is well, or if that is not known."""
     state: str | None
     """`running`, `silent` or `stopping`."""
     model: str | None

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -31,46 +33,107 @@ HALF_BAR = 10
 """Columns of a bar up to its mark."""
 NAME_MAX = 40
 """Most characters of a received name."""
+NAMES_MAX = 1000
+"""Most characters of several received names: a hand's 120 electrodes have 840."""
+LABEL_COLUMNS = 12
+"""Columns of the longest label, `grasps seen` or `last message`."""
 
 Row = tuple[str, str]
 """Label and text."""
 
 
-def draw(hands: Sequence[Snapshot], width: int, chosen: int = 0) -> RenderableType:
-    """Return tables of all hands, or of the `chosen` one where `width` is small."""
+@dataclass(frozen=True)
+class Screen:
+    """What is drawn, and where."""
+
+    width: int
+    """Columns."""
+    height: int | None = None
+    """Lines; None: as many as there are."""
+    chosen: int = 0
+    """The hand that is shown where there is no room for all."""
+    page: int = 0
+    """Screens that were skipped, by typing space."""
+
+
+def draw(hands: Sequence[Snapshot], screen: Screen) -> RenderableType:
+    """Return tables of all hands, or of the chosen one where there is no room."""
     if len(hands) == 1:
-        return _hand(hands[0], "q ends")
-    if width // len(hands) >= HAND_COLUMNS:
+        return _hand(hands[0], screen, "q ends")
+    if screen.width // len(hands) >= HAND_COLUMNS:
         beside = Table.grid(expand=True, padding=(0, 2))
         for _ in hands:
             beside.add_column(ratio=1)
-        beside.add_row(*[_hand(hand, "q ends") for hand in hands])
+        beside.add_row(*[_hand(hand, screen, "q ends") for hand in hands])
         return beside
-    others = [_verdict(hand) for hand in hands if hand is not hands[chosen]]
-    return Group(*others, _hand(hands[chosen], "q ends, tab shows the next hand"))
+    chosen = hands[screen.chosen]
+    others = [_verdict(hand, wraps=True) for hand in hands if hand is not chosen]
+    return _hand(chosen, screen, "q ends, tab shows the next hand", others)
 
 
-def _hand(seen: Snapshot, keys: str) -> RenderableType:
-    table = Table.grid(padding=(0, 2, 0, 0))
-    table.add_column(style="dim", no_wrap=True)
-    for label, text in [*_verdict_rows(seen), *_health(seen)]:
-        table.add_row(label, Text(text))
+class Fitted:
+    """A head that stays, and below it one page of the rest; the last line counts what is cut."""
+
+    def __init__(
+        self, head: RenderableType, wrong: RenderableType, rest: RenderableType, screen: Screen
+    ) -> None:
+        """`wrong` says what is wrong; its lines are counted apart."""
+        self._parts = head, wrong, rest
+        self._screen = screen
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        free = options.update(height=None)
+        head, wrong, rest = (console.render_lines(part, free, pad=False) for part in self._parts)
+        height, body = self._screen.height, wrong + rest
+        if height is not None and len(head) + len(body) > height:
+            room = max(height - len(head) - 1, 1)
+            pages = math.ceil(len(body) / room)
+            first = min(self._screen.page % pages * room, len(body) - room)
+            hidden = [*range(first), *range(first + room, len(body))]
+            troubles = sum(line < len(wrong) for line in hidden)
+            body = body[first : first + room]
+            body += console.render_lines(_cut(len(hidden), troubles), free, pad=False)
+        for line in head + body:
+            yield from line
+            yield Segment.line()
+
+
+def _cut(lines: int, troubles: int) -> Text:
+    wrong = f", {troubles} of them on what is wrong" if troubles else ""
+    return Text(f"{lines} more lines{wrong}: space shows them", style="reverse", no_wrap=True)
+
+
+def _hand(seen: Snapshot, screen: Screen, keys: str, others: Sequence[Text] = ()) -> RenderableType:
+    wrong, figures = _table(), _table()
+    for label, text in [*_labelled("why", seen.why), *_health(seen)]:
+        wrong.add_row(label, Text(text))
+    for label, text in _verdict_rows(seen):
+        figures.add_row(label, Text(text))
     for label, text in _figures(seen):
-        table.add_row(label, Text(text), style=OLD if seen.tone is Tone.SILENT else None)
+        figures.add_row(label, Text(text), style=OLD if seen.tone is Tone.SILENT else None)
     # An operator sees this clock stand still when nothing is drawn any more.
     clock = time.strftime("%H:%M:%S", time.localtime(seen.t))
     model = printable(seen.model or "no model yet", NAME_MAX)
     header = Text(f"graspd {clock} ({keys})  {seen.state or '-'}  {model}")
-    return Group(_verdict(seen), header, table)
+    return Fitted(Group(*others, _verdict(seen), header), wrong, figures, screen)
 
 
-def _verdict(seen: Snapshot) -> Text:
+def _table() -> Table:
+    table = Table.grid(padding=(0, 2, 0, 0))
+    table.add_column(style="dim", no_wrap=True, min_width=LABEL_COLUMNS)
+    return table
+
+
+def _verdict(seen: Snapshot, *, wraps: bool = False) -> Text:
+    """Return the verdict and what is not well. `wraps`: no other line says it."""
     name = printable(seen.hand or "-", NAME_MAX)
     why = seen.why[0].what if seen.why else ""
+    if seen.not_well:
+        why += f"; {printable(seen.not_well, 2 * NAME_MAX)}"
     word = f" {seen.headline.upper()} "
     probability = "" if seen.p_slip is None else f" slip probability {100 * seen.p_slip:.0f} %,"
     return Text.assemble(
-        (f"{name} ", "bold"), (word, STYLES[seen.tone]), f"{probability} {why}", no_wrap=True
+        (f"{name} ", "bold"), (word, STYLES[seen.tone]), f"{probability} {why}", no_wrap=not wraps
     )
 
 
@@ -79,8 +142,7 @@ def _verdict_rows(seen: Snapshot) -> list[Row]:
     number = "-" if seen.grasp is None else seen.grasp
     grasp = f"{number}, gate {seen.gate or '-'}, touches {touches}, still {seen.still}"
     return [
-        *_labelled("why", seen.why),
-        ("evidence", seen.evidence),
+        *([("evidence", seen.evidence)] if seen.evidence else []),
         ("grasp", grasp),
         *[(finger.name, _finger(finger)) for finger in seen.fingers],
     ]
@@ -94,7 +156,7 @@ def _health(seen: Snapshot) -> list[Row]:
 
 def _labelled(label: str, lines: Sequence[Line]) -> list[Row]:
     """Return a row for each line; the first one has the label."""
-    texts = [f"{printable(line.what, NAME_MAX)}: {line.advice}" for line in lines]
+    texts = [f"{printable(line.what, NAMES_MAX)}: {line.advice}" for line in lines]
     labels = [label] + [""] * len(texts)
     return list(zip(labels, texts, strict=False))
 

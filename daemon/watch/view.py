@@ -9,7 +9,15 @@ from typing import NamedTuple
 
 import msgspec
 
-from graspd.daemon.judge.reasons import ADVICE, WATCHED_LIFT, Decision, GateState, Reason
+from graspd.daemon.judge.reasons import (
+    ADVICE,
+    OF_THE_HAND,
+    WATCHED_LIFT,
+    Decision,
+    GateState,
+    Reason,
+    to_act_on,
+)
 from graspd.daemon.process.sleep import boottime_ns
 from graspd.daemon.publish.messages import (
     MESSAGES,
@@ -20,7 +28,7 @@ from graspd.daemon.publish.messages import (
     Verdict,
 )
 from graspd.daemon.watch import figures
-from graspd.daemon.watch.feed import Feed
+from graspd.daemon.watch.feed import CONNECTED, Feed
 from graspd.daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
 from graspd.daemon.watch.fingers import Fingers
 from graspd.daemon.watch.grasps import OPEN, GraspLog
@@ -30,18 +38,18 @@ TICK_S = 0.02
 """Time between two looks at the feeds, s: silence is timed this exactly."""
 SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
-EXPECTED = {
-    Reason.NO_CONTACT,
-    Reason.MOVING,
-    Reason.SETTLING,
-    Reason.NOT_TARED,
-    Reason.NOT_ASKED,
-}
-"""Reasons of an open hand, or of a grasp that settles."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
+LATE = "the daemon is there and says nothing: top shows whether this computer is too busy"
 SECONDS = 300
 SECOND_NS = 1_000_000_000
+LATE_UNKNOWNS = 3
+"""An `unknown` stands for this many times its `silence_ms`. It promises nothing, and a daemon
+without readings sends the next one only after `silence_ms`."""
+PROMPT_NS = 50_000_000
+"""A message that was taken this soon after it came, ns, tells how the clocks differ."""
+CATCHING_UP_NS = 1_000_000_000
+"""Time to connect again after the viewer stood still, ns."""
 NO_SHARE = -1
 """A second without a probability of slip."""
 TONE_CODE = {
@@ -72,28 +80,39 @@ class History:
             del self._seconds[next(iter(self._seconds))]
 
     def seconds(self) -> list[tuple[str, int]]:
-        """Return five minutes, the oldest second first; one without a call was silent."""
+        """Return five minutes, the oldest second first; "" for one without a call."""
         if not self._seconds:
             return []
         newest = max(self._seconds)
         oldest = max(min(self._seconds), newest - SECONDS + 1)
-        silent = TONE_CODE[Tone.SILENT], NO_SHARE
-        return [self._seconds.get(second, silent) for second in range(oldest, newest + 1)]
+        not_seen = "", NO_SHARE
+        return [self._seconds.get(second, not_seen) for second in range(oldest, newest + 1)]
 
 
 class View:
     """Takes messages and gives a `Snapshot` at any time, in constant memory."""
 
     def __init__(
-        self, endpoint: str, hand: str | None = None, wall: Callable[[], float] = time.time
+        self,
+        endpoint: str,
+        hand: str | None = None,
+        look: str = "",
+        wall: Callable[[], float] = time.time,
     ) -> None:
-        """Show one `hand`; None: the first whose message arrives."""
+        """Show one `hand`; None: the first whose message arrives. `look`: where a person looks
+        when no message comes, such as commands."""
         self.link = "connecting"
+        self.stood_still = 0, 0
+        """When the viewer itself last stopped and went on, ns."""
         self._endpoint = endpoint
         self._hand = hand
+        self._look = look
         self._wall = wall
         self._verdict: Verdict | None = None
         self._verdict_ns = 0
+        """When the last verdict came."""
+        self._clocks_ns: int | None = None
+        """Least time from the sending of a verdict, on the daemon's clock, to its arrival."""
         self._gate: GateState | None = None
         self._status: Status | None = None
         self._grasps = GraspLog()
@@ -102,8 +121,11 @@ class View:
         self._rate_marks: deque[tuple[int, int]] = deque(maxlen=SNAPSHOTS_HZ + 1)
         self._history = History()
 
-    def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
-        """Take a message that arrived at `now_ns`, monotonic."""
+    def take(
+        self, topic: bytes, payload: bytes, earliest_ns: int, latest_ns: int | None = None
+    ) -> None:
+        """Take a message that arrived between these times, monotonic; None: at `earliest_ns`."""
+        now_ns = earliest_ns
         kind, _, hand = topic.decode("ascii", "replace").partition(".")
         if kind not in MESSAGES or (self._hand is not None and hand != self._hand):
             return
@@ -115,7 +137,7 @@ class View:
         self._hand = hand
         match message:
             case Verdict():
-                self._take_verdict(message, now_ns)
+                self._take_verdict(message, earliest_ns, latest_ns or earliest_ns)
             case GateMessage():
                 self._gate = message.state
             case Tactile():
@@ -126,15 +148,30 @@ class View:
             case Status():
                 self._status = message
 
-    def _take_verdict(self, verdict: Verdict, now_ns: int) -> None:
+    def _take_verdict(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> None:
         last = self._verdict
         if last is not None and verdict.boot_id == last.boot_id:
             if verdict.seq <= last.seq:
                 return  # old or repeated: no sign of life
             self._lost += verdict.seq - last.seq - 1
+        elif last is not None:
+            self._clocks_ns = None
         self._received += 1
+        now_ns = self._arrival_ns(verdict, earliest_ns, latest_ns)
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
         self._grasps.take(verdict, now_ns)
+
+    def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
+        """Return when a verdict came, by its own time: it may have waited for this viewer."""
+        sent_ns = verdict.t_mono_ns + round(verdict.age_ms * 1e6)
+        if self._verdict_ns < self.stood_still[1]:
+            self._clocks_ns = None  # the computer may have slept, with one of the clocks
+        if latest_ns - earliest_ns <= PROMPT_NS:
+            way_ns = latest_ns - sent_ns
+            self._clocks_ns = way_ns if self._clocks_ns is None else min(self._clocks_ns, way_ns)
+        if self._clocks_ns is None:
+            return earliest_ns
+        return min(max(sent_ns + self._clocks_ns, earliest_ns), latest_ns)
 
     def snapshot(self, now_ns: int) -> Snapshot:
         """Return what is to be seen. Call it `SNAPSHOTS_HZ` times a second."""
@@ -145,11 +182,13 @@ class View:
         judged = verdict if tone in {Tone.STABLE, Tone.LEANS, Tone.SLIP} else None
         p_slip = None if judged is None else judged.p_slip
         word = "unknown" if judged is None else judged.verdict.value
-        self._history.add(now_ns, tone, p_slip)
+        if not (silent and self._is_catching_up(now_ns)):
+            self._history.add(now_ns, tone, p_slip)
         if not silent:
             self._rate_marks.append((now_ns, self._received))
         seconds = self._history.seconds()
         wall_t = self._wall()
+        health = [] if status is None or silent else _health(status)
         return Snapshot(
             endpoint=self._endpoint,
             link=self.link,
@@ -170,7 +209,8 @@ class View:
             counts=self._grasps.counts(),
             fingers=[] if verdict is None else self._fingers.images(verdict, now_ns),
             joints={} if silent else self._fingers.joints,
-            health=[] if status is None or silent else _health(status),
+            health=health,
+            not_well=_not_well(health),
             state=None if status is None or silent else status.state.value,
             model=None if last is None else f"{last.model} {last.model_sha}",
             learning=figures.learning(last, status),
@@ -185,17 +225,16 @@ class View:
         """Return the current verdict and its reasons. Silence means unknown."""
         verdict = self._verdict
         if verdict is None:
-            return Tone.SILENT, [Line("silent", NO_MESSAGE), Line("link", self.link)]
-        silent_ms = (now_ns - self._verdict_ns) / 1e6
-        if silent_ms > verdict.silence_ms:
-            duration = f"{silent_ms:.0f} ms" if silent_ms < 1e4 else f"{silent_ms / 1e3:.0f} s"
-            silence = Line("silent", f"no message for {duration}")
-            return Tone.SILENT, [silence, Line("link", self.link)]
+            return Tone.SILENT, [Line("silent", NO_MESSAGE), *self._where_to_look()]
+        if now_ns - self._verdict_ns > verdict.silence_ms * 1e6 * (
+            1 if verdict.valid else LATE_UNKNOWNS
+        ):
+            return Tone.SILENT, [self._silence(now_ns), *self._where_to_look()]
         if verdict.verdict is Decision.UNKNOWN:
-            why = [Line(reason.value, ADVICE[reason]) for reason in verdict.reasons]
+            why = [Line(reason.value, ADVICE[reason]) for reason in to_act_on(verdict.reasons)]
             if verdict.supervised and WATCHED_LIFT.issuperset(verdict.reasons):
                 return Tone.LEARNING, [SUPERVISED, *why]
-            is_expected = EXPECTED.issuperset(verdict.reasons)
+            is_expected = OF_THE_HAND.issuperset(verdict.reasons)
             return Tone.WAITING if is_expected else Tone.TROUBLE, why
         also = [SUPERVISED] if verdict.supervised else []
         if verdict.session_calibrated is False:
@@ -207,6 +246,28 @@ class View:
         if why_not is not None or verdict.supervised:
             return Tone.LEANS, [Line("leans to stable", why_not or "supervised"), *also]
         return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
+
+    def _silence(self, now_ns: int) -> Line:
+        stopped_ns, went_on_ns = self.stood_still
+        stood_ns = went_on_ns - max(stopped_ns, self._verdict_ns)
+        if stood_ns <= 0:
+            return Line("silent", f"no message for {_duration(now_ns - self._verdict_ns)}")
+        held_up = f"this viewer itself stood still for {_duration(stood_ns)}"
+        if self._is_catching_up(now_ns):
+            return Line("held up", f"{held_up} and connects again")
+        return Line("silent", f"no message since; {held_up}")
+
+    def _is_catching_up(self, now_ns: int) -> bool:
+        _, went_on_ns = self.stood_still
+        return self._verdict_ns < went_on_ns and now_ns - went_on_ns < CATCHING_UP_NS
+
+    def _where_to_look(self) -> list[Line]:
+        lines = [Line("link", self.link)]
+        if self.link == CONNECTED:
+            return [*lines, Line("look", LATE)]
+        if self._look and not self.link.startswith("turned away"):
+            lines.append(Line("look", self._look))
+        return lines
 
     def _resting(self) -> Sequence[str]:
         """Return the tared fingers, while the gate says that nothing touches."""
@@ -227,10 +288,29 @@ class View:
 
 
 def _health(status: Status) -> list[Line]:
+    """Return a line for each reason, with all parts that it is said of."""
     lines = [Line("overloaded", OVERLOADED)] if status.overloaded else []
+    parts: dict[Reason, list[str]] = {}
+    for part, reason in status.health.items():
+        parts.setdefault(reason, []).append(part)
+    if Reason.NOT_CALIBRATED in parts:  # which each session begins with
+        parts[Reason.NOT_CALIBRATED] = parts.pop(Reason.NOT_CALIBRATED)
     return lines + [
-        Line(f"{part} {reason.value}", ADVICE[reason]) for part, reason in status.health.items()
+        Line(f"{', '.join(names)} {reason.value}", ADVICE[reason])
+        for reason, names in parts.items()
     ]
+
+
+def _not_well(health: Sequence[Line]) -> str:
+    if not health:
+        return ""
+    more = f" and {len(health) - 1} more" if len(health) > 1 else ""
+    return f"not well: {health[0].what}{more}"
+
+
+def _duration(span_ns: int) -> str:
+    span_ms = span_ns / 1e6
+    return f"{span_ms:.0f} ms" if span_ms < 1e4 else f"{span_ms / 1e3:.0f} s"
 
 
 class HandFeed(NamedTuple):
@@ -246,8 +326,8 @@ def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterato
     while not is_over():
         for feed, view in hands:
             for topic, payload in feed.take():
-                view.take(topic, payload, feed.empty_ns)  # what has waited is old
-            view.link = feed.link
+                view.take(topic, payload, feed.empty_ns, feed.looked_ns)
+            view.link, view.stood_still = feed.link, feed.stood_still
         if time.monotonic() >= due_s:
             due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)
             yield [view.snapshot(boottime_ns()) for _, view in hands]

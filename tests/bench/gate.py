@@ -1,7 +1,13 @@
-"""Whole grasps made from real end points, through the judge behind its gate."""
+"""Whole grasps made from real end points, through the judge behind its gate; holds and slides.
+
+`python -m tests.bench.gate [EPISODES [SHARE ...]]` tells how often a hand that holds is said to
+hold, how often one along which the object slides, and how soon a slide that begins is told, for
+each share of `false_alarms`.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,25 +16,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
+from graspd.daemon.judge.hand import HandTracker
+from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
-from graspd.daemon.judge.reasons import Decision
-from graspd.drivers.base import JointReading, TactileReading
+from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import (
+    FreshSampler,
     GraspRow,
+    HeldSampler,
     Sampling,
     WholeGrasps,
     rest_above,
 )
+from graspd.models.contract import Finger
 from graspd.models.runtime import TactileModel
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
+from tests.drivers.twins.slides import HeldNoise, Hold
 
 TABLES = ("palm_down", "palm_side")
 MAX_AGE_NS = 100_000_000
 STILL_COUNTS_PER_S = 20.0
 """A hand is still when its electrodes move no faster, in the mean: so does a held touch of a real
 sensor, which relaxes."""
+FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
+REST_S, CLOSES_S, HOLDS_S = 1.5, 0.25, 3.0
+"""A hand of holds rests, closes and then holds for these times, s."""
+SLIDE_AFTER_S = (1.0, 1.3)
+"""When a slide begins that a held hand does not expect, s after the hand has closed."""
+REST_COUNTS, PRESSED_COUNTS = 2500.0, 600.0
+"""Where its electrodes rest, and by how much the most pressed one falls, counts."""
+SHARES = (0.03, 0.01, 0.001)
+"""Of `false_alarms`, as in the table of real holds."""
 
 
 @dataclass(slots=True)
@@ -50,6 +71,36 @@ class Seen:
     def still_s(self) -> float:
         """When everything is still."""
         return crept_s(self.truth, STILL_COUNTS_PER_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What the gate said of one hand that holds, or along which the object slides."""
+
+    stands: NDArray[np.bool_]
+    """Of each reading since the hand has closed: did a verdict stand?"""
+    settles: int
+    """How often the grasp settled."""
+    slides_at: int
+    """The reading at which the object begins to slide."""
+
+    @property
+    def comes(self) -> int:
+        """How often the verdict began to stand."""
+        return int(self.stands[0]) + int((self.stands[1:] & ~self.stands[:-1]).sum())
+
+    @property
+    def since(self) -> NDArray[np.bool_]:
+        """The readings since the verdict stood first."""
+        return self.stands[int(self.stands.argmax()) :] if self.stands.any() else self.stands[:0]
+
+    @property
+    def revoked_ms(self) -> float | None:
+        """How long the verdict stood after the slide began, ms; None: it did not stand then."""
+        if not self.stands[self.slides_at - 1]:
+            return None
+        stands = self.stands[self.slides_at :]
+        return 10.0 * (len(stands) if stands.all() else int(stands.argmin()))
 
 
 @dataclass(slots=True)
@@ -150,3 +201,94 @@ def streams(
         ),
         "100 Hz fresh": WholeGrasps(rest, points, noise=played(noise), seed=seed),
     }
+
+
+class Closing:
+    """A hand that closes at `REST_S`, and then holds as `hold` does."""
+
+    def __init__(self, hold: Hold, rng: np.random.Generator) -> None:
+        self._hold = hold
+        self._pressed = rng.uniform(0.0, PRESSED_COUNTS, (len(FINGERS), ELECTRODES))
+
+    def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Course`."""
+        share = np.clip((t_s - REST_S) / CLOSES_S, 0.0, 1.0)
+        ramp = share**3 * (10.0 + share * (6.0 * share - 15.0))  # minimum jerk
+        return self._hold.deviation(t_s) - ramp * self._pressed
+
+
+def follow(
+    false_alarms: float,
+    seed: int,
+    *,
+    slides: bool = False,
+    begins: bool = False,
+    sampling: Sampling = Sampling.FRESH,
+) -> Held:
+    """Say what the gate makes of a hand that holds; of one of which three fingers slide from the
+    start, or of one along which the object `begins` to slide."""
+    rng = np.random.default_rng([seed, 4])
+    closed_s = REST_S + CLOSES_S
+    slide_s = closed_s + rng.uniform(*SLIDE_AFTER_S)
+    sliding = [slides or begins] * len(FINGERS)
+    hold = Hold(sliding, rng, closed_s + HOLDS_S, closed_s, slide_s if begins else None)
+    rest = np.full((len(FINGERS), ELECTRODES), REST_COUNTS)
+    sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler
+    sample, course = sampler(rest, HeldNoise(len(FINGERS), rng)).sample, Closing(hold, rng)
+    hand = HandTracker(FINGERS, HandLimits(gate=GateLimits(false_alarms=false_alarms)))
+    stands, settles = [], 0
+    for row in range(round(100 * (closed_s + HOLDS_S))):
+        counts = sample(course, row / 100.0)
+        moment, _ = hand.step(row * 10_000_000, counts, Checked((), None))
+        settles += GateState.SETTLED in [change.state for change in moment.changes]
+        stands.append(moment.settled)
+    first = round(100 * closed_s)
+    return Held(np.array(stands[first:]), settles, round(100 * slide_s) - first)
+
+
+def tell(episodes: int, false_alarms: float, sampling: Sampling) -> str:
+    """One row of the table."""
+    seeds = range(episodes)
+    return row(
+        false_alarms,
+        [follow(false_alarms, seed, sampling=sampling) for seed in seeds],
+        [follow(false_alarms, seed, slides=True, sampling=sampling) for seed in seeds],
+        [follow(false_alarms, seed, begins=True, sampling=sampling) for seed in seeds],
+    )
+
+
+def row(false_alarms: float, holds: list[Held], slides: list[Held], begun: list[Held]) -> str:
+    """The cells of hands that hold, of slides, and of slides that begin."""
+    since = np.concatenate([hold.since for hold in holds])
+    revoked = [each.revoked_ms for each in begun if each.revoked_ms is not None]
+    waits = 10 * np.array([hold.stands.argmax() for hold in holds if hold.stands.any()])
+    cells = (
+        f"{false_alarms:g}",
+        f"{100 * np.mean([hold.stands.mean() for hold in holds]):.1f} %",
+        f"{100 * since.mean():.1f} %",
+        f"{np.mean([hold.settles for hold in holds]):.2f}",
+        f"{np.mean([hold.comes for hold in holds]):.2f}",
+        f"{np.median(waits):.0f} / {np.quantile(waits, 0.99):.0f} ms",
+        f"{100 * np.mean([slide.stands.mean() for slide in slides]):.1f} %",
+        f"{100 * np.mean([slide.stands.any() for slide in slides]):.0f} %",
+        f"{np.median(revoked):.0f} / {np.quantile(revoked, 0.9):.0f} ms",
+    )
+    return " | ".join(cells)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the table."""
+    episodes = int(arguments[0]) if arguments else 60
+    shares = [float(share) for share in arguments[1:]] or SHARES
+    sys.stdout.write(
+        "false_alarms | hold stands | of the time since it did | settles | verdict comes | first "
+        "after, p50 / p99 | slide stands | slides that ever do | revoked, p50 / p90\n"
+    )
+    for sampling in Sampling:
+        for share in shares:
+            sys.stdout.write(f"{sampling} {tell(episodes, share, sampling)}\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

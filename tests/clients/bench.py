@@ -28,10 +28,12 @@ class Daemon:
         more: str = "",
         *,
         whole_grasps: bool = False,
+        recording: Path | None = None,
         endpoint: str | None = None,
         publish: str = "",
     ) -> None:
-        """Judges each row of the demo table; with `whole_grasps`, one from touch to lift.
+        """Judges each row of the demo table; with `whole_grasps`, one from touch to lift; or
+        what the `recording` has.
 
         `more` is what else there is in the scene, from `[tactile]` on, `publish` in `[publish]`.
         """
@@ -39,7 +41,8 @@ class Daemon:
         self.ask_endpoint = f"ipc://{folder}/ask"
         self._folder = folder
         self._scene = folder / "scene.toml"
-        recording = _one_grasp(folder / "grasp.csv") if whole_grasps else DEMO_TABLE
+        if recording is None:
+            recording = _one_grasp(folder / "grasp.csv") if whole_grasps else DEMO_TABLE
         self._scene.write_text(
             f'[publish]\nendpoint = "{self.endpoint}"\n{publish}\n'
             f'[ask]\nendpoint = "{self.ask_endpoint}"\n'

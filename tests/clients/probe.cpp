@@ -1,8 +1,10 @@
 // The C++ client's rules, line by line, for comparison with the Python client's.
 //
 // `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
-// takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift`
-// asks it and answers with a line, `tell` tells it that the lift held.
+// takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `end BOOT_ID GRASP` tells an outcome;
+// `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift` asks it and
+// answers with a line (`watch DEADLINE_S`: under supervision), `tell` tells it that the lift held
+// (`slipped`: that it did not), `wait DEADLINE_S SUPERVISED` waits for a grasp.
 #include "graspd_client.hpp"
 
 #include <iostream>
@@ -69,6 +71,10 @@ int main() {
             graspd::Nanoseconds asked_ns = 0, told_ns = 0;
             words >> asked_ns >> told_ns;
             newest.compare_clocks(asked_ns, told_ns);
+        } else if (order == "end") {
+            graspd::detail::Key grasp;
+            words >> grasp.first >> grasp.second;
+            newest.end(grasp);
         } else if (order == "client") {
             graspd::Options options;
             words >> options.endpoint >> options.ask_endpoint;
@@ -76,12 +82,21 @@ int main() {
                 std::cout << "warn " << text << std::endl;
             };
             client.emplace(options);
-        } else if (order == "lift") {
-            answer = client.value().may_i_lift(30.0);
+        } else if (order == "wait") {
+            double deadline_s = 0.0;
+            bool supervised = false;
+            words >> deadline_s >> supervised;
+            const auto found = client.value().wait_for_grasp(deadline_s, supervised);
+            std::cout << (found ? found->grasp.value_or(0) : -1) << std::endl;
+        } else if (order == "lift" || order == "watch") {
+            double deadline_s = 30.0;
+            words >> deadline_s;
+            answer = client.value().may_i_lift(order == "lift" ? 30.0 : deadline_s, order == "watch");
             std::cout << static_cast<bool>(answer) << ' ' << answer.verdict.grasp.value_or(0) << ' '
                       << client->unreported() << std::endl;
-        } else if (order == "tell") {
-            const bool taken{client.value().tell(answer.verdict, graspd::Outcome::held, {}, 30.0)};
+        } else if (order == "tell" || order == "slipped") {
+            const auto how = order == "tell" ? graspd::Outcome::held : graspd::Outcome::slipped;
+            const bool taken{client.value().tell(answer.verdict, how, {}, 30.0)};
             std::cout << (taken ? "told" : "not taken") << std::endl;
         } else {
             graspd::Nanoseconds now_ns = 0;

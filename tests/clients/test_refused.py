@@ -3,11 +3,13 @@
 A case is what comes after one another, each as a verdict that all is well with but for its
 `change`, for the field that it is `without`, or for the time of its reading, `later_ms`. Its
 `frames` after the topic are that payload, changed as text (Latin-1: each character is a byte).
+Before it, the outcomes of the grasps were `told` of whose `boot_id` and number it has a list.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,17 +65,25 @@ PADDED = [TOPIC, json.dumps(well(START_NS)).encode().ljust(1 << 16)]
 """As long as a message may be."""
 
 
-def told(messages: list[list[bytes]], max_p_slip: float = 0.5) -> Newest:
-    """The Python client's rules after these have come."""
+Grasps = Sequence[tuple[str, int]]
+"""By `boot_id` and number."""
+
+
+def told(messages: list[list[bytes]], max_p_slip: float = 0.5, ended: Grasps = ()) -> Newest:
+    """The Python client's rules after these have come, with outcomes of these grasps told."""
     newest = Newest(TOPIC, MAX_AGE_NS, True, max_p_slip)
+    for boot_id, grasp in ended:
+        newest.end((boot_id, grasp))
     for frames in messages:
         newest.take(frames, START_NS, NOW_NS)
     return newest
 
 
-def told_to(probe: Probe, messages: list[list[bytes]]) -> str:
+def told_to(probe: Probe, messages: list[list[bytes]], ended: Grasps = ()) -> str:
     """What the C++ client's rules say after these have come."""
     probe.tell("new", MAX_AGE_NS, 1)
+    for grasp in ended:
+        probe.tell("end", *grasp)
     for frames in messages:
         probe.tell("take", START_NS, NOW_NS, *map(as_hex, frames))
     return probe.at(NOW_NS)
@@ -81,21 +91,36 @@ def told_to(probe: Probe, messages: list[list[bytes]]) -> str:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case["name"]))
 def test_python_does_not_lift_on_it(case: dict[str, Any]) -> None:
-    found = told(came(case, START_NS)).at(NOW_NS)
+    found = told(came(case, START_NS), ended=case.get("told", ())).at(NOW_NS)
     assert (bool(found), found.supervised) == (False, False)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case["name"]))
 def test_cpp_says_of_it_what_python_says(probe: Probe, case: dict[str, Any]) -> None:
-    messages = came(case, START_NS)
-    answer = told_to(probe, messages)
+    messages, ended = came(case, START_NS), case.get("told", ())
+    answer = told_to(probe, messages, ended)
     assert not answer.startswith("stable")
-    assert answer == said(told(messages), NOW_NS)
+    assert answer == said(told(messages, ended=ended), NOW_NS)
 
 
 def test_what_the_cases_begin_with_is_lifted_on_in_both(probe: Probe) -> None:
     assert told([PADDED]).at(NOW_NS)
     assert told_to(probe, [PADDED]) == said(told([PADDED]), NOW_NS)
+
+
+def test_only_the_grasp_that_was_told_is_refused_in_both(probe: Probe) -> None:
+    others = [("a", 2), ("b", 1)]
+    assert told([PADDED], ended=others).at(NOW_NS)
+    assert told_to(probe, [PADDED], others) == said(told([PADDED]), NOW_NS)
+
+
+def test_told_grasps_are_remembered_in_bounded_memory(probe: Probe) -> None:
+    many = [("a", 1), *(("a", grasp) for grasp in range(2, 258))]
+    assert told([PADDED], ended=many).at(NOW_NS), "the 257th before"
+    assert not told([PADDED], ended=many[:-1]).at(NOW_NS)
+    for ended in (many, many[:-1], [*many, ("a", 1)]):
+        expected = said(told([PADDED], ended=ended), NOW_NS)
+        assert told_to(probe, [PADDED], ended) == expected
 
 
 def test_a_daemon_with_a_higher_threshold_is_believed_as_far_as_the_client_is_told() -> None:

@@ -114,7 +114,9 @@ def test_a_newer_graspd_takes_the_place_of_the_former_once_that_has_ended(
     former = folder / (folder / "venv").readlink()
     newer = wheelhouse(tmp_path / "second", "0.2.0")
     with something_that_uses(former):
-        assert f"kept /opt/graspd/{former.name}" in install(staged, newer)
+        said = install(staged, newer)
+        assert "venv is new: from graspd 0.1.0 to graspd 0.2.0\n" in said
+        assert f"kept /opt/graspd/{former.name}" in said
         assert former.is_dir()
         assert version_below(staged) == "graspd 0.2.0"
     assert f"removed the former /opt/graspd/{former.name}" in install(staged, newer)

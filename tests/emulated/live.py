@@ -19,7 +19,12 @@ from pathlib import Path
 from tests.drivers.spi.bridge_c import START, STOP, frame
 from tests.emulated.board import MS, Board
 from tests.emulated.build import image
+from tests.emulated.tools import missing
 
+NEEDS = (
+    "It needs node, npm, cc, cmake, ninja, gcc-arm-none-eabi, and the pico-sdk and boot ROM in "
+    "shared/pico beside the checkout (deploy/bridge/README.md); npm fetches the emulator once"
+)
 WARM_MS = 1500.0
 """Emulated time in which the emulator is compiled by its own machine, before anybody listens."""
 STEP_S = 0.001
@@ -63,6 +68,7 @@ class LiveBoard:
         """Run until a signal or the end of standard input."""
         self._began_ns = time.monotonic_ns() - round(self._board.now_ns)
         self._link.symlink_to(self._path)
+        sys.stderr.write(f"a board on {self._link}; Ctrl-C ends\n")
         try:
             while not select.select([sys.stdin], [], [], 0)[0]:
                 self._catch_up()
@@ -99,12 +105,17 @@ class LiveBoard:
 
 
 def main() -> None:
-    """Run one board."""
-    parser = argparse.ArgumentParser(prog="python -m tests.emulated.live", description=__doc__)
+    """Run one board; exit code 2 and what is missing if it cannot be built here."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.emulated.live", description=__doc__, epilog=NEEDS
+    )
     parser.add_argument("--link", type=Path, required=True, help="made when the board is ready")
     parser.add_argument("--counts", type=Path, help="what the sensors feel, five in each line")
     parser.add_argument("--port", choices=("pico", "sketch"), default="pico")
     options = parser.parse_args()
+    if (lacking := missing()) is not None:
+        parser.error(f"{lacking}. {NEEDS}")
+    sys.stderr.write("building the firmware and the emulator, the first time some minutes\n")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with Board() as board:
         live = LiveBoard(board.power(image(options.port), options.counts), options.link)

@@ -21,6 +21,7 @@ from tests.bench.live import Subscriber
 from tests.daemon.processes import TIMEOUT_S, graspd, put_first, start, wait_for
 from tests.emulated.board import BOARD_ID
 from tests.emulated.conftest import Image
+from tests.emulated.live import main
 from tests.emulated.test_driver import grasps, write_counts
 from tests.kit.messages import decode_status, decode_tactile
 
@@ -43,6 +44,18 @@ class Live:
         output, _ = self.process.communicate(timeout=TIMEOUT_S)
         assert self.process.returncode == 0
         return float(output.split()[0])
+
+
+def test_a_board_that_cannot_be_built_says_what_it_needs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(sys, "argv", ["live", "--link", "/tmp/any"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert "error: no node, npm, cc for the emulated chip. It needs node, npm, cc, cmake," in said
 
 
 @pytest.fixture

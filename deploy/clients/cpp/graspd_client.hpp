@@ -9,8 +9,8 @@
 //         client.tell(answer.verdict, lift() ? graspd::Outcome::held : graspd::Outcome::slipped);
 //
 // Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that
-// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `tell(..., wait_s)` wait, and no
-// longer than told.
+// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)` and
+// `tell(..., wait_s)` wait, and no longer than told.
 #pragma once
 
 #include <algorithm>
@@ -224,6 +224,10 @@ inline bool is_same_computer(std::string_view endpoint) {
         if (endpoint.substr(0, local.size()) == local) return true;
     return false;
 }
+
+using Key = std::pair<std::string, std::int64_t>;  // names a grasp
+
+inline Key key(const Verdict& said) { return {said.boot_id, said.grasp.value_or(0)}; }
 
 // What matters of a verdict message.
 struct Message {
@@ -496,17 +500,31 @@ public:
         if (age_ns < -CLOCK_SLACK_NS || may_have_crept) return said.unknown({"clock"});
         if (age_ns > message_->silence_ns) return said.unknown({"silent"});
         if (counts_on_it && reading_age_ns > max_age_ns_) return said.unknown({"stale"});
-        return said;
+        return if_open(std::move(said));
+    }
+
+    // The outcome of a grasp was told: nothing of it is to be lifted again.
+    void end(const Key& grasp) {
+        ended_.erase(std::remove(ended_.begin(), ended_.end(), grasp), ended_.end());
+        ended_.push_back(grasp);
+        if (ended_.size() > LIFTS_MAX) ended_.pop_front();
     }
 
     // An answer; none if it is not understood.
     std::optional<Verdict> answered(std::string_view payload) {
-        if (auto found = read(payload, max_p_slip_).first) return found->verdict;
+        if (auto found = read(payload, max_p_slip_).first) return if_open(found->verdict);
         ++counts.malformed;
         return std::nullopt;
     }
 
 private:
+    // A verdict, unknown if it is known of a grasp whose outcome was told.
+    Verdict if_open(Verdict said) const {
+        const bool is_offered = said.decision != Decision::unknown || said.supervised;
+        const bool ended = std::find(ended_.begin(), ended_.end(), key(said)) != ended_.end();
+        return is_offered && ended ? said.unknown({"outcome-told"}) : said;
+    }
+
     bool is_former(const std::string& boot_id) const {
         return std::find(former_.begin(), former_.end(), boot_id) != former_.end();
     }
@@ -575,6 +593,7 @@ private:
     std::optional<std::string> boot_id_;
     std::int64_t seq_ = -1;
     std::deque<std::string> former_;
+    std::deque<Key> ended_;  // grasps whose outcome was told, the oldest first
     std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;  // of the clocks, and when
     Nanoseconds least_ns_ = 0;  // of these differences
     // What the clocks differ by at least, as the daemon told its own, and when.
@@ -783,10 +802,7 @@ public:
 
     // The newest verdict; waits at most `wait_s` seconds for a new message.
     Verdict verdict(double wait_s = 0.0) {
-        const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
-        while (!drain() && wait(due_ns)) {}
-        if (behind_) return Verdict{}.unknown({"behind"});
-        return newest_.at(detail::now_ns());
+        return next_verdict(detail::now_ns() + duration_ns(wait_s));
     }
 
     // Whether the current grasp is stable, known within `deadline_s` seconds from now.
@@ -815,12 +831,32 @@ public:
         decided = question.at_the_end(std::move(decided));
         const auto waited_ns = static_cast<double>(detail::now_ns() - began_ns);
         const LiftAnswer answer{decided, waited_ns / 1e9, supervised && decided.supervised};
-        if (answer) allow(key(decided));
+        if (answer) allow(detail::key(decided));
         return answer;
     }
 
     // A time in the place of `supervised` would be taken for true.
     LiftAnswer may_i_lift(double deadline_s, double still_ms) = delete;
+
+    // The verdict on the next grasp that is surely judged; none if there is none in time.
+    //
+    // Waits at most `deadline_s` seconds for a `stable` or a `slip` that is not `early`, of a grasp
+    // that this method has not returned before. With `supervised` it also returns what a person who
+    // watches may lift. It asks nothing: before the lift, ask `may_i_lift`. Throws
+    // `std::invalid_argument` for a time that is none.
+    std::optional<Verdict> wait_for_grasp(double deadline_s, bool supervised = false) {
+        const Nanoseconds due_ns = detail::now_ns() + duration_ns(deadline_s);
+        do {
+            const Verdict said = next_verdict(due_ns);
+            const bool is_judged = (said.decision != Decision::unknown && !said.early) ||
+                                   (supervised && said.supervised);
+            if (is_judged && detail::key(said) != returned_) {
+                returned_ = detail::key(said);
+                return said;
+            }
+        } while (detail::now_ns() < due_ns);
+        return std::nullopt;
+    }
 
     // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
     //
@@ -837,13 +873,21 @@ public:
         link_.telling.hang_up();
         link_.ask(link_.telling, telling);
         told_.reset();
-        telling_ = key(lifted_on);
+        telling_ = detail::key(lifted_on);
+        newest_.end(telling_);
         drain();
         while (!told_ && wait(due_ns)) drain();
         return told_.value_or(OutcomeAnswer{"no-answer"});
     }
 
 private:
+    // The newest verdict; waits for a new message until then at most.
+    Verdict next_verdict(Nanoseconds due_ns) {
+        while (!drain() && wait(due_ns)) {}
+        if (behind_) return Verdict{}.unknown({"behind"});
+        return newest_.at(detail::now_ns());
+    }
+
     static Nanoseconds age_ns(double max_age_ms) {
         if (!(max_age_ms > 0.0)) throw std::invalid_argument("max_age_ms must be above 0");
         return duration_ns(max_age_ms / 1e3);
@@ -861,9 +905,7 @@ private:
         return std::llrint(seconds * 1e9);
     }
 
-    using Key = std::pair<std::string, std::int64_t>;  // names a grasp
-
-    static Key key(const Verdict& said) { return {said.boot_id, said.grasp.value_or(0)}; }
+    using Key = detail::Key;
 
     // The hand lifts this grasp; what was lifted before is over, and should have been told.
     void allow(const Key& lift) {
@@ -980,6 +1022,7 @@ private:
     std::function<void(const std::string&)> warn_;
     std::deque<std::pair<Key, bool>> lifts_;  // that were allowed, and whether graspd has it
     Key last_, telling_;                      // of them, and that is being told
+    Key returned_;                            // the grasp that `wait_for_grasp` returned last
     std::optional<OutcomeAnswer> told_;
     std::int64_t forgotten_ = 0, warn_at_ = 1;
     bool behind_ = false;

@@ -8,8 +8,8 @@ messages are those of deploy/wire/README.md, version 1.
             client.tell(answer.verdict, Outcome.HELD if lift() else Outcome.SLIPPED)
 
 Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that made
-it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `tell(..., wait_s)` wait, and no longer
-than they are told.
+it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)` and
+`tell(..., wait_s)` wait, and no longer than they are told. `AsyncClient` has the same for asyncio.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from numbers import Real
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import zmq
 from zmq.auth import load_certificate
 
 __all__ = [
+    "AsyncClient",
     "Client",
     "Counts",
     "Decision",
@@ -81,6 +82,10 @@ _WITHHELD = {"unproven", "low-confidence"}
 # Name of an object, as the daemon takes it.
 _OBJECT = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{OBJECT_MAX - 1}}}")
 _OBJECT_IS = f"1 to {OBJECT_MAX} ASCII letters, digits, _, -, ., the first no - and no ."
+
+_T = TypeVar("_T")
+Waits = Generator[int, None, _T]
+"""A call, step by step: it yields for how long to wait for a message, ms, before the next step."""
 
 log = logging.getLogger("graspd_client")
 
@@ -218,8 +223,8 @@ class Keys(NamedTuple):
         return cls(load_certificate(server)[0], public, secret)
 
 
-class Client:
-    """Subscribes to the verdicts of one hand. Use it in one thread, and close it."""
+class _Hand:
+    """Subscribes to the verdicts of one hand. Calls do not wait themselves: see `Waits`."""
 
     def __init__(
         self,
@@ -260,6 +265,8 @@ class Client:
         """The one that was allowed last, and the one that is being told."""
         self._told = OutcomeAnswer("no-answer")
         self._forgotten, self._warn_at = 0, 1
+        self._returned = "", 0
+        """Grasp that `wait_for_grasp` returned last."""
         self._link = _Link(endpoint, topic, ask_endpoint, keys)
         self._compares_clocks = self._asks and not same_computer
         self._clock_asked_ns: int | None = None
@@ -282,44 +289,28 @@ class Client:
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)
 
-    def verdict(self, wait_s: float = 0.0) -> Verdict:
-        """The newest verdict; waits at most `wait_s` seconds for a new message.
-
-        Raises `ValueError` for a time that is none.
-        """
-        due_ns = time.monotonic_ns() + _duration_ns("wait_s", wait_s)
+    def _verdict(self, due_ns: int) -> Waits[Verdict]:
         if self._closed:
             return Verdict(Decision.UNKNOWN, ("closed",))
-        while not self._drain() and self._wait(due_ns):
+        while not self._drain() and (yield from self._wait(due_ns)):
             pass
         if self._behind:
             return Verdict(Decision.UNKNOWN, ("behind",))
         return self._newest.at(time.monotonic_ns())
 
-    def may_i_lift(
-        self, deadline_s: float, *, supervised: bool = False, still_ms: float | None = None
-    ) -> LiftAnswer:
-        """Whether the current grasp is stable, known within `deadline_s` seconds from now.
-
-        Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
-        answer and the newest message of the same grasp must both say so; an unknown answer is asked
-        for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
-        person watches: then what graspd wants to learn from (in the warm-up, and now and then
-        after it) may be lifted too, and the answer says that it is such a lift. With `still_ms`
-        the hand must have been still for so long as well, ms, and a daemon that does not say so
-        gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
-        Raises `ValueError` for a time that is none.
-        """
+    def _may_i_lift(
+        self, deadline_s: float, supervised: bool, still_ms: float | None
+    ) -> Waits[LiftAnswer]:
         if still_ms is not None and not _is_amount(still_ms):
             raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms!r}")
         began_ns = time.monotonic_ns()
-        due_ns = began_ns + _duration_ns("deadline_s", deadline_s)
+        due_ns = _due_ns("deadline_s", deadline_s)
         asking = self._link.asking if self._asks and not self._closed else None
         question = _Question(self._newest, asking, supervised is True, still_ms)
         try:
-            decided = question.decided(self.verdict())
-            while not question.is_over(decided) and not self._closed and self._wait(due_ns):
-                decided = question.decided(self.verdict())
+            decided = question.decided((yield from self._verdict(0)))
+            while not question.is_over(decided) and (yield from self._wait(due_ns)):
+                decided = question.decided((yield from self._verdict(0)))
                 if time.monotonic_ns() > due_ns and question.permits(decided):
                     decided = decided.unknown("late")
         finally:
@@ -331,32 +322,33 @@ class Client:
             self._allow(_key(decided))
         return answer
 
-    def tell(
-        self,
-        lifted_on: Verdict,
-        how: Outcome | str,
-        object_name: str | None = None,
-        wait_s: float = 2.0,
-    ) -> OutcomeAnswer:
-        """Tell how the lift ended that was made on a verdict, and what was lifted.
+    def _wait_for_grasp(self, deadline_s: float, supervised: bool) -> Waits[Verdict | None]:
+        due_ns = _due_ns("deadline_s", deadline_s)
+        while True:
+            said = yield from self._verdict(due_ns)
+            is_judged = said.decision != Decision.UNKNOWN and not said.early
+            is_judged |= supervised is True and said.supervised
+            if is_judged and _key(said) != self._returned:
+                self._returned = _key(said)
+                return said
+            if self._closed or time.monotonic_ns() >= due_ns:
+                return None
 
-        Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
-        comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
-        without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` or a time that
-        is none, and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins
-        with one of the last two.
-        """
+    def _tell(
+        self, lifted_on: Verdict, how: Outcome | str, object_name: str | None, wait_s: float
+    ) -> Waits[OutcomeAnswer]:
         telling = _telling(lifted_on, Outcome(how), object_name)
         if not self._asks:
             raise ValueError("an outcome needs an ask_endpoint")
-        due_ns = time.monotonic_ns() + _duration_ns("wait_s", wait_s)
+        due_ns = _due_ns("wait_s", wait_s)
         if self._closed:
             return OutcomeAnswer("closed")
         self._link.telling.hang_up()
         self._link.telling.ask(telling)
         self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
+        self._newest.end(self._telling)
         self._drain()
-        while self._telling[1] and self._wait(due_ns):
+        while self._telling[1] and (yield from self._wait(due_ns)):
             self._drain()
         return self._told
 
@@ -366,12 +358,6 @@ class Client:
             self._closed = True
             self._link.close()
             self._allow(("", 0))
-
-    def __enter__(self) -> Client:
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def _allow(self, lift: tuple[str, int]) -> None:
         """The hand lifts this grasp; what was lifted before is over, and should have been told."""
@@ -457,13 +443,144 @@ class Client:
         self._clock_asked_ns, self._clock_due_ns = None, 0
         self._empty_ns = self._heard_ns = time.monotonic_ns()
 
-    def _wait(self, due_ns: int) -> bool:
+    def _wait(self, due_ns: int) -> Waits[bool]:
         """Wait for a message, but not for long; False when it is time to end."""
         left_ns = due_ns - time.monotonic_ns()
-        if left_ns <= 0:
+        if left_ns <= 0 or self._closed:
             return False
-        self._link.wait(min(left_ns // 1_000_000, SLICE_MS))
+        yield min(left_ns // 1_000_000, SLICE_MS)
         return True
+
+
+class Client(_Hand):
+    """Subscribes to the verdicts of one hand. Use it in one thread, and close it."""
+
+    def verdict(self, wait_s: float = 0.0) -> Verdict:
+        """The newest verdict; waits at most `wait_s` seconds for a new message.
+
+        Raises `ValueError` for a time that is none.
+        """
+        return self._finish(self._verdict(_due_ns("wait_s", wait_s)))
+
+    def may_i_lift(
+        self, deadline_s: float, *, supervised: bool = False, still_ms: float | None = None
+    ) -> LiftAnswer:
+        """Whether the current grasp is stable, known within `deadline_s` seconds from now.
+
+        Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
+        answer and the newest message of the same grasp must both say so; an unknown answer is asked
+        for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
+        person watches: then what graspd wants to learn from (in the warm-up, and now and then
+        after it) may be lifted too, and the answer says that it is such a lift. With `still_ms`
+        the hand must have been still for so long as well, ms, and a daemon that does not say so
+        gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
+        Raises `ValueError` for a time that is none.
+        """
+        return self._finish(self._may_i_lift(deadline_s, supervised, still_ms))
+
+    def wait_for_grasp(self, deadline_s: float, *, supervised: bool = False) -> Verdict | None:
+        """The verdict on the next grasp that is surely judged; None if there is none in time.
+
+        Waits at most `deadline_s` seconds for a `stable` or a `slip` that is not `early`, of a
+        grasp that this method has not returned before. With `supervised` it also returns what a
+        person who watches may lift. It asks nothing: before the lift, ask `may_i_lift`. Raises
+        `ValueError` for a time that is none.
+        """
+        return self._finish(self._wait_for_grasp(deadline_s, supervised))
+
+    def tell(
+        self,
+        lifted_on: Verdict,
+        how: Outcome | str,
+        object_name: str | None = None,
+        wait_s: float = 2.0,
+    ) -> OutcomeAnswer:
+        """Tell how the lift ended that was made on a verdict, and what was lifted.
+
+        Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
+        comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
+        without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` or a time that
+        is none, and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins
+        with one of the last two.
+        """
+        return self._finish(self._tell(lifted_on, how, object_name, wait_s))
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()
+
+    def _finish(self, steps: Waits[_T]) -> _T:
+        while True:
+            try:
+                timeout_ms = next(steps)
+            except StopIteration as end:
+                result: _T = end.value
+                return result
+            self._link.wait(timeout_ms)
+
+
+class AsyncClient(_Hand):
+    """`Client` for asyncio: the same rules, and what waits there is awaited here.
+
+    One call at a time: another one meanwhile raises `RuntimeError`. A call may be cancelled.
+    """
+
+    _is_busy = False
+
+    async def verdict(self, wait_s: float = 0.0) -> Verdict:
+        """As `Client.verdict`."""
+        return await self._finish(self._verdict(_due_ns("wait_s", wait_s)))
+
+    async def may_i_lift(
+        self, deadline_s: float, *, supervised: bool = False, still_ms: float | None = None
+    ) -> LiftAnswer:
+        """As `Client.may_i_lift`."""
+        return await self._finish(self._may_i_lift(deadline_s, supervised, still_ms))
+
+    async def wait_for_grasp(
+        self, deadline_s: float, *, supervised: bool = False
+    ) -> Verdict | None:
+        """As `Client.wait_for_grasp`."""
+        return await self._finish(self._wait_for_grasp(deadline_s, supervised))
+
+    async def tell(
+        self,
+        lifted_on: Verdict,
+        how: Outcome | str,
+        object_name: str | None = None,
+        wait_s: float = 2.0,
+    ) -> OutcomeAnswer:
+        """As `Client.tell`."""
+        return await self._finish(self._tell(lifted_on, how, object_name, wait_s))
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *_details: object) -> None:
+        self.close()
+
+    async def _finish(self, steps: Waits[_T]) -> _T:
+        from zmq.asyncio import Poller  # only here: it loads asyncio
+
+        if self._is_busy:
+            raise RuntimeError("another call is under way: one call at a time, or two clients")
+        self._is_busy = True
+        try:
+            while True:
+                try:
+                    timeout_ms = next(steps)
+                except StopIteration as end:
+                    result: _T = end.value
+                    return result
+                poller = Poller()
+                for each in self._link.sockets:
+                    poller.register(each, zmq.POLLIN)
+                await poller.poll(max(timeout_ms, 1))
+        finally:
+            steps.close()
+            self._is_busy = False
 
 
 class _Message(NamedTuple):
@@ -493,6 +610,8 @@ class Newest:
         self._boot_id: str | None = None
         self._seq = -1
         self._former: deque[str] = deque(maxlen=FORMER_MAX)
+        self._ended: dict[tuple[str, int], None] = {}
+        """Grasps whose outcome was told, the oldest first, at most `LIFTS_MAX`."""
         self._best: tuple[int, int] | None = None
         """The fastest way of a message so far, as the difference of the clocks, and when, ns."""
         self._least_ns = 0
@@ -559,7 +678,20 @@ class Newest:
         counts_on_it = said.decision != Decision.UNKNOWN or said.supervised
         if counts_on_it and reading_age_ns > self._max_age_ns:
             return said.unknown("stale")
-        return said
+        return self.if_open(said)
+
+    def end(self, grasp: tuple[str, int]) -> None:
+        """The outcome of a grasp was told: nothing of it is to be lifted again."""
+        self._ended.pop(grasp, None)
+        self._ended[grasp] = None
+        if len(self._ended) > LIFTS_MAX:
+            del self._ended[next(iter(self._ended))]
+
+    def if_open(self, said: Verdict) -> Verdict:
+        """A verdict, unknown if it is known of a grasp whose outcome was told."""
+        is_offered = said.decision != Decision.UNKNOWN or said.supervised
+        ended = is_offered and _key(said) in self._ended
+        return said.unknown("outcome-told") if ended else said
 
     def read(self, payload: bytes) -> _Message | str:
         """A message or an answer; `malformed` or `version` for what is not understood, counted."""
@@ -661,7 +793,7 @@ class _Question:
             answer = self._newest.read(payload)
             said = Verdict(Decision.UNKNOWN)
             if not isinstance(answer, str):
-                said = self._if_still(answer.verdict)
+                said = self._if_still(self._newest.if_open(answer.verdict))
             if said.decision == Decision.SLIP and not self.permits(said):
                 return said
             self._answer = said if self.permits(said) else None
@@ -720,10 +852,15 @@ class _Link:
         except zmq.Again:
             return None
 
+    @property
+    def sockets(self) -> list[zmq.Socket[bytes]]:
+        """Those on which a message or an answer may come."""
+        sockets = (self._socket, self.asking.socket, self.telling.socket)
+        return [each for each in sockets if each is not None]
+
     def wait(self, timeout_ms: int) -> None:
         """Until a message or an answer waits, so long at most."""
-        sockets = (self._socket, self.asking.socket, self.telling.socket)
-        zmq.zmq_poll([(each, zmq.POLLIN) for each in sockets if each is not None], timeout_ms)
+        zmq.zmq_poll([(each, zmq.POLLIN) for each in self.sockets], timeout_ms)
 
     def renew(self) -> None:
         """Connect anew, and forget what waits."""
@@ -783,10 +920,11 @@ def is_same_computer(endpoint: str) -> bool:
     return endpoint.startswith(("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"))
 
 
-def _duration_ns(name: str, seconds: float) -> int:
+def _due_ns(name: str, seconds: float) -> int:
+    """When a wait of so many seconds ends. Raises `ValueError`."""
     if not _is_amount(seconds):
         raise ValueError(f"{name} must be 0 or more and finite, not {seconds!r}")
-    return round(seconds * 1e9)
+    return time.monotonic_ns() + round(seconds * 1e9)
 
 
 def _is_amount(value: object) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from graspd.models.training.commands.common import exit_code, whole
+from graspd.models.training.commands.common import EXIT_INPUT, exit_code, say, whole
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS
 from graspd.models.training.systems.registry import SYSTEMS
 
@@ -24,11 +24,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--protocol",
         action="append",
         choices=PROTOCOLS,
-        help="may be repeated (default: the first six). "
+        help="may be repeated (default: the first six, of own tables alone cv and objects). "
         + "; ".join(f"{name}: {text}" for name, text in ABOUT.items()),
     )
     parser.add_argument(
-        "--data", type=Path, required=True, metavar="DIR", help="folder with the grasp tables"
+        "--data", type=Path, metavar="DIR", help="folder with the published grasp tables"
+    )
+    parser.add_argument(
+        "--own",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a grasp table of your own, as `graspd export-grasps` writes it. May be given several "
+        "times. Beside the tables of --data, or, without --data, alone: by cv and objects",
     )
     parser.add_argument(
         "--out",
@@ -61,7 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--grid", action="store_true", help="try the grids of classical systems and name the best"
     )
     parser.add_argument(
-        "--table", type=Path, metavar="FILE", help="write the table of all results in --out"
+        "--table",
+        type=Path,
+        metavar="FILE",
+        help="write the table of all results in --out beside the paper's; needs --data",
     )
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw them into this folder")
     parser.add_argument("--json", action="store_true", help="print the summaries as JSON")
@@ -74,4 +86,7 @@ def run(args: argparse.Namespace) -> int:
     from graspd.models.training.commands.evaluation import evaluate
     from graspd.models.training.evaluating.run_jobs import ClusterError
 
+    if args.data is None and not args.own:
+        say("evaluate", "needs --data DIR, --own FILE, or both")
+        return EXIT_INPUT
     return exit_code("evaluate", args.out, lambda: evaluate(args), ClusterError)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import difflib
+import itertools
+import shlex
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -16,10 +18,12 @@ from sklearn.model_selection import ParameterGrid
 from graspd.models.training.commands.common import (
     WrongInputError,
     progress_bar,
+    say,
     warn_of_unpublished,
 )
-from graspd.models.training.data.datasets import Grasps, read_all, unpublished
-from graspd.models.training.data.protocols import FOLDS, STANDARD
+from graspd.models.training.data.datasets import Grasps, lab_table_names, unpublished
+from graspd.models.training.data.lab_tables import read_with_lab_tables
+from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
 from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
 from graspd.models.training.evaluating.files import to_json, write_whole
 from graspd.models.training.evaluating.jobs import Job, JobResult, jobs_of
@@ -32,6 +36,8 @@ from graspd.models.training.evaluating.summaries import (
     summarise,
     write_summary,
 )
+from graspd.models.training.making.plan import TrainingPlan
+from graspd.models.training.making.preflight import with_enough_folds
 from graspd.models.training.systems.registry import SYSTEMS
 from graspd.models.training.systems.system import BlendConfig, System, digest, with_recipes
 
@@ -46,14 +52,19 @@ def evaluate(args: argparse.Namespace) -> None:
     started_s = time.monotonic()
     systems = _systems(args.names, grid=args.grid)
     _check_extras(args)
-    grasps = read_all(args.data)
-    warn_of_unpublished("evaluate", unpublished(grasps.files))
+    grasps = read_with_lab_tables(args.data, args.own)
+    own = lab_table_names(grasps.files)
+    warn_of_unpublished("evaluate", (name for name in unpublished(grasps.files) if name not in own))
     if args.quick:
         systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
         chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]
         grasps = grasps.rows(np.sort(chosen).astype(np.int64))
     tried = [point for system in systems for point in grid_of(system)] if args.grid else systems
-    summaries = _summaries(tried, grasps, args)
+    protocols = _protocols(args, grasps)
+    folds = QUICK_FOLDS if args.quick else FOLDS
+    if args.data is None:
+        folds = _enough_folds(tried, protocols, folds, grasps, _seeds(args))
+    summaries = _summaries(tried, protocols, folds, grasps, args)
     if args.json:
         sys.stdout.buffer.write(to_json(summaries))
     if args.grid:
@@ -95,6 +106,8 @@ def _systems(names: Sequence[str], *, grid: bool) -> list[System]:
 
 def _check_extras(args: argparse.Namespace) -> None:
     """Now, not after hours of training."""
+    if args.table and args.data is None:
+        raise WrongInputError("--table compares with the paper's figures: it needs --data")
     for option, package, extra in (
         (args.dask, "distributed", "cluster"),
         (args.plots, "matplotlib", "report"),
@@ -103,16 +116,49 @@ def _check_extras(args: argparse.Namespace) -> None:
             raise WrongInputError(f"needs the package '{package}': pip install '.[{extra}]'")
 
 
+def _protocols(args: argparse.Namespace, grasps: Grasps) -> list[EvalProtocol]:
+    """Return those that are asked for, or those that the tables are there for."""
+    if args.protocol or args.data is not None:
+        return list(dict.fromkeys(args.protocol or STANDARD))
+    if len(set(grasps.objects)) > 1:
+        return ["cv", "objects"]
+    say("evaluate", "all grasps are of one object: measured by cv, of known objects, alone")
+    return ["cv"]
+
+
+def _seeds(args: argparse.Namespace) -> range:
+    return range(args.seeds or (1 if args.quick else SEEDS))
+
+
+def _enough_folds(
+    systems: Sequence[System],
+    protocols: Sequence[EvalProtocol],
+    folds: int,
+    grasps: Grasps,
+    seeds: range,
+) -> int:
+    """Return the most folds, up to `folds`, that own grasps are enough for in every training.
+    Raises `TooFewGraspsError` if there are none."""
+    for system, protocol, seed in itertools.product(systems, protocols, seeds):
+        plan, why = with_enough_folds(TrainingPlan(system, folds, seed, only=protocol), grasps)
+        if why:
+            say("evaluate", f"takes {plan.folds} folds: {why}")
+        folds = plan.folds
+    return folds
+
+
 def _summaries(
-    systems: Sequence[System], grasps: Grasps, args: argparse.Namespace
+    systems: Sequence[System],
+    protocols: Sequence[EvalProtocol],
+    folds: int,
+    grasps: Grasps,
+    args: argparse.Namespace,
 ) -> list[SystemSummary]:
     """Run all jobs. Each summary is stored and printed as soon as its jobs are done."""
-    seeds = range(args.seeds or (1 if args.quick else SEEDS))
-    folds = QUICK_FOLDS if args.quick else FOLDS
     groups = {
-        (system.name, protocol): jobs_of(system, protocol, grasps, seeds, folds)
+        (system.name, protocol): jobs_of(system, protocol, grasps, _seeds(args), folds)
         for system in systems
-        for protocol in dict.fromkeys(args.protocol or STANDARD)
+        for protocol in protocols
     }
     wanted = [job for group in groups.values() for job in group]
     found: dict[Job, JobResult] = {}
@@ -172,7 +218,11 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
     yield from args.names
     for protocol in args.protocol or ():
         yield f"--protocol {protocol}"
-    yield "--data DIR --out DIR"
+    if args.data is not None:
+        yield "--data DIR"
+    for path in args.own:
+        yield f"--own {shlex.quote(path.name)}"
+    yield "--out DIR"
     if args.seeds:
         yield f"--seeds {args.seeds}"
     if args.quick:

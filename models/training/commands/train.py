@@ -21,7 +21,7 @@ from graspd.models.training.commands.common import (
 )
 from graspd.models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
 from graspd.models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
-from graspd.models.training.data.protocols import TooFewGraspsError
+from graspd.models.training.data.protocols import FOLDS, TooFewGraspsError
 from graspd.models.training.systems.registry import SYSTEMS
 
 if TYPE_CHECKING:
@@ -78,9 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--folds",
         type=whole(2, 1000),
-        default=10,
         metavar="N",
-        help="default: 10. Needs as many objects, and as many grasps that slipped and that stayed",
+        help="needs as many objects, and as many grasps that slipped and that stayed (default: 10, "
+        "or as many as these are enough for)",
     )
     parser.add_argument(
         "--only",
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
 def _train(args: argparse.Namespace, out: Path) -> None:
     from graspd.models.training.commands.common import progress_bar
     from graspd.models.training.making.make_model import EXTRA_TRAININGS, make_model
-    from graspd.models.training.making.preflight import limits, preflight
+    from graspd.models.training.making.preflight import limits, preflight, with_enough_folds
 
     started_s = time.monotonic()
     grasps = read_with_lab_tables(args.data, args.own)
@@ -124,6 +124,10 @@ def _train(args: argparse.Namespace, out: Path) -> None:
     for sentence in limits(plan, grasps):
         say("train", f"warning: {sentence}")
     try:
+        if args.folds is None:
+            plan, why = with_enough_folds(plan, grasps)
+            if why:
+                say("train", f"takes {plan.folds} folds: {why}")
         preflight(plan, grasps)
         # Now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
@@ -160,7 +164,8 @@ def _plan(args: argparse.Namespace) -> TrainingPlan:
         published = () if args.data is None else system.tables
         system = dataclasses.replace(system, tables=(*published, *lab))
     files = tuple(path.name for path in args.own)
-    return TrainingPlan(system, args.folds, args.seed, args.jobs, args.only, files, args.name)
+    folds = args.folds or FOLDS
+    return TrainingPlan(system, folds, args.seed, args.jobs, args.only, files, args.name)
 
 
 def _name(text: str) -> str:

@@ -187,8 +187,7 @@ def _own_data(
     objects, tables = len(set(grasps.objects)), sum(file.rows > 0 for file in grasps.files)
     yield (
         f"The data is of {objects} {'object' if objects == 1 else 'objects'} in {tables} "
-        f"{'table' if tables == 1 else 'tables'}, of which {', '.join(own)} "
-        f"{'is' if len(own) == 1 else 'are'} not published."
+        f"{'table' if tables == 1 else 'tables'}. Not published: {', '.join(own)}."
     )
     if any(summary.protocol == "session" for summary in summaries):
         yield "The figures of another day are of the published tables alone."

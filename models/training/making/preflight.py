@@ -55,6 +55,19 @@ def enough_folds(plan: TrainingPlan, grasps: Grasps) -> int | None:
     return None
 
 
+def with_enough_folds(plan: TrainingPlan, grasps: Grasps) -> tuple[TrainingPlan, str]:
+    """Return the plan with the most folds, up to its own, that these grasps are enough for, and
+    why they are fewer: "" if they are not. Raises `TooFewGraspsError` if there are none."""
+    try:
+        preflight(plan, grasps)
+    except TooFewGraspsError as error:
+        folds = enough_folds(plan, grasps)
+        if folds is None:
+            raise
+        return dataclasses.replace(plan, folds=folds), str(error)
+    return plan, ""
+
+
 def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
     """What a model of these grasps will not be able to do, one sentence each."""
     grasps = plan.chosen(grasps)

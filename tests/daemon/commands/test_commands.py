@@ -172,6 +172,30 @@ def test_check_warns_of_udp_that_anybody_can_send_to(
     assert result.stderr.count("name its sender with only_from") == len(told)
 
 
+@pytest.mark.parametrize(
+    ("tactile", "absent"),
+    [
+        ('driver = "spi"\nport = "{folder}/bridge"\n', "the port {folder}/bridge"),
+        ('driver = "spi"\nport = "{folder}/there"\n', None),
+        ('driver = "spi"\nport = "socket://localhost:1"\n', None),
+        ('driver = "can"\nchannel = "can77"\n', "the CAN interface can77"),
+        ('driver = "can"\ninterface = "virtual"\nchannel = "can77"\n', None),
+    ],
+)
+def test_check_says_that_a_port_is_not_there_yet(
+    tmp_path: Path, tactile: str, absent: str | None
+) -> None:
+    (tmp_path / "there").touch()
+    scene = tmp_path / "scene.toml"
+    scene.write_text("[tactile]\n" + tactile.format(folder=tmp_path))
+    result = graspd("check", scene, "--json")
+    assert result.returncode == 0
+    said = "" if absent is None else f"{absent.format(folder=tmp_path)} is not there yet; "
+    assert [warning.startswith(said) for warning in json.loads(result.stdout)["warnings"]] == (
+        [True] * (absent is not None)
+    )
+
+
 WRONG_PARTS = {
     '[tactile]\ndriver = "can"\nbitrate = 500000\n': "[tactile] bit rates of socketcan are set by",
     PALM + 'source = "udp://127.0.0.1:9870"\n[joints]\ndriver = "palm"\n'

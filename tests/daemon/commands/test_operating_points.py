@@ -41,7 +41,7 @@ def seen(counts_per_s: float, rate_hz: float, *, early: bool, false_alarms: floa
             motion.add(round(index / rate_hz * 1e9), counts, FINGER)
             if index / rate_hz > rest_s + 0.3 and index % 5 == 0:
                 found.append(
-                    (motion.fast[0] > motion.fast_limits[0], motion.slow[0] > motion.slow_limits[0])
+                    (motion.fast[0] > motion.strict.fast[0], motion.slow[0] > motion.strict.slow[0])
                 )
     shares: list[float] = np.mean(found, axis=0).tolist()
     return shares

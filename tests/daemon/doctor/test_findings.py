@@ -256,3 +256,33 @@ def test_counters_that_are_told_exist_and_have_a_cause_and_advice() -> None:
             assert finding.cause
             assert finding.advice
             assert finding.what == f"x: 1000 {name.replace('_', ' ')}"
+
+
+@pytest.mark.parametrize(
+    ("counters", "level"),
+    [
+        ({"frames": 300, "bad_crc": 15}, Level.ERROR),  # 5 %
+        ({"frames": 300, "bad_crc": 3}, Level.WARNING),
+        ({"frames": 20, "bad_crc": 4}, Level.WARNING),  # too few to know a share
+        ({"packets": 3000, "lost_packets": 300}, Level.ERROR),  # 10 %
+        ({"packets": 3000, "lost_packets": 150}, Level.WARNING),
+        ({"frames": 300, "readings": 270, "missed_readings": 30}, Level.ERROR),
+        ({"frames": 300, "readings": 295, "missed_readings": 6}, Level.WARNING),
+        ({"frames": 7200, "readings": 300, "cut_sweeps": 90, "lost_frames": 90}, Level.WARNING),
+        ({"packets": 3000, "not_counts": 900}, Level.WARNING),  # values, of which each has many
+        ({"link_losses": 2}, Level.WARNING),
+        ({"link_losses": 3}, Level.ERROR),
+    ],
+)
+def test_many_damaged_or_lost_frames_are_an_error(counters: dict[str, int], level: Level) -> None:
+    (finding,) = counter_findings("x", counters)
+    assert finding.level is level
+
+
+@pytest.mark.parametrize("now", [LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.DISCONNECTED])
+def test_a_link_that_comes_and_goes_is_one_cause(now: LinkCause) -> None:
+    (finding,) = device_findings("spi", {"link": Fact("waiting", now)}, {"link_losses": 4})
+    assert (finding.level, finding.cause) == (Level.ERROR, Cause.LINK_LOST)
+    denied = Fact("waiting", LinkCause.DENIED)
+    (finding,) = device_findings("spi", {"link": denied}, {"link_losses": 4})
+    assert finding.cause is Cause.PORT_DENIED

@@ -39,7 +39,10 @@ def moves(motion: Motion) -> NDArray[np.float64]:
 
 
 def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
-    """Sweeps of generated streams called still, early and surely; without a slide's standstill."""
+    """Sweeps of generated streams called still, early and surely; without a slide's standstill.
+
+    Hands that hold have settled: the loose limit holds.
+    """
     standstill_s = STANDSTILL_S[1] if any(sliding) else 0.0
     early, sure = [], []
     for seed in range(STREAMS):
@@ -54,17 +57,18 @@ def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
         for t_s, counts in stream:
             motion.add(round(t_s * 1e9), counts, HAND)
             if t_s >= REST_S + 0.24 + standstill_s:
-                early.append(motion.early)
-                sure.append(motion.sure)
+                limits = motion.strict if any(sliding) else motion.loose
+                early.append(limits.early)
+                sure.append(limits.sure)
     return float(np.mean(early)), float(np.mean(sure))
 
 
 @pytest.mark.parametrize("sampling", Sampling)
 def test_held_hands_are_still_and_slides_are_not(sampling: Sampling) -> None:
     early, sure = shares([False] * 3, sampling)
-    # 5 % are wanted; of a dozen streams' windows, which overlap, it is more or less.
-    assert early > 0.93
-    assert 0.90 < sure < 0.995
+    # 5 % are wanted, within a factor of two.
+    assert early > 0.9
+    assert 0.90 < sure < 0.975
     # Measured on real slides at 5 % of false alarms: 59 % at 80 ms and 35 % at 240 ms; a fifth more
     # for a dozen generated ones. Of three fingers that slide, the third power is left, and some.
     early, sure = shares([True, False, False], sampling)
@@ -97,8 +101,8 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
     # Four blocks of 24 differences over three sweeps.
     assert known.index(True) == 4 * 24 + 3 - 1
     motion.reset()
-    assert not motion.early
-    assert not motion.sure
+    assert not motion.strict.early
+    assert not motion.strict.sure
     fast = []
     for index in range(30):
         motion.add(10**10 + index * 10_000_000, np.rint(counts[index]).astype(np.uint16), FINGER)
@@ -114,18 +118,18 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
 def test_fast_motion_is_no_noise_and_is_excluded_soon_after_it_ends() -> None:
     motion, rate_hz = Motion(1, 0.05, early=True), 100.0
     begin_ns = fed(motion, wavering(2.0, rate_hz, 3.5, 5), rate_hz)
-    before = motion.fast_limits, motion.slow_limits
+    before = motion.strict.fast, motion.strict.slow
     closing = wavering(0.5, rate_hz, 3.5, 6) - 900.0 * np.linspace(0, 1, 50)[:, None, None]
     begin_ns = fed(motion, closing, rate_hz, begin_ns)
-    assert not motion.early
-    assert not motion.sure
+    assert not motion.strict.early
+    assert not motion.strict.sure
     assert min(motion.fast[0], motion.slow[0]) > 20.0
-    np.testing.assert_allclose((motion.fast_limits, motion.slow_limits), before, rtol=0.1)
+    np.testing.assert_allclose((motion.strict.fast, motion.strict.slow), before, rtol=0.1)
     begin_ns = fed(motion, wavering(0.09, rate_hz, 3.5, 7) - 900.0, rate_hz, begin_ns)
-    assert motion.early
-    assert not motion.sure
+    assert motion.strict.early
+    assert not motion.strict.sure
     fed(motion, wavering(0.17, rate_hz, 3.5, 8) - 900.0, rate_hz, begin_ns)
-    assert motion.sure
+    assert motion.strict.sure
 
 
 @pytest.mark.parametrize("repeats", [1, 2])
@@ -165,8 +169,8 @@ def test_an_electrode_that_jumps_and_stays_has_moved_however_constant_it_is() ->
     motion, counts = Motion(1, 0.05, early=True), wavering(2.5, 100.0, 3.5, 11)
     counts[-8:, 0, 0] = counts[-9, 0, 0] - 1000.0
     fed(motion, counts, 100.0)
-    assert not motion.early
-    assert not motion.sure
+    assert not motion.strict.early
+    assert not motion.strict.sure
 
 
 def test_electrodes_that_are_lost_for_longer_tell_nothing_until_a_window_has_passed() -> None:
@@ -200,7 +204,7 @@ def test_a_finger_that_is_lost_as_a_whole_is_not_known_and_no_error() -> None:
     for index, sweep in enumerate(counts):
         motion.add(index * 10_000_000, sweep, FINGER if index < 150 else ~FINGER)
     assert np.isinf(moves(motion)).all()
-    assert not motion.sure
+    assert not motion.strict.sure
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, -1.0, float("nan")])
@@ -214,7 +218,7 @@ def test_no_finger_may_waver_so_much_that_motion_passes_for_noise() -> None:
     fed(motion, wavering(4.0, 100.0, 20.0, 16), 100.0)
     # Twice the 10 counts that are believed to be noise.
     assert motion.slow[0] == pytest.approx(2.0, rel=0.15)
-    assert not motion.sure
+    assert not motion.strict.sure
 
 
 def test_where_sweeps_come_slowly_a_line_has_three_of_them_and_one_lies_before() -> None:
@@ -239,6 +243,9 @@ def test_who_looks_late_sees_what_who_always_looked_sees(rate_hz: float) -> None
         if looked:
             assert late.known
             assert (late.fast, late.slow) == (always.fast, always.slow)
-            assert (late.early, late.sure) == (always.early, always.sure)
+            assert (late.strict.early, late.strict.sure) == (
+                always.strict.early,
+                always.strict.sure,
+            )
         elif rate_hz < 200.0:  # else it is what it was at the last step
-            assert (late.known, late.early, late.sure) == (False, False, False)
+            assert (late.known, late.strict.early, late.strict.sure) == (False, False, False)

@@ -145,11 +145,11 @@ def test_motion_is_that_of_a_second_implementation(
         wanted = found_in(times_ns[: index + 1], counts[: index + 1], early=early)
         np.testing.assert_allclose(motion.fast, wanted.fast, rtol=2e-3, atol=1e-3)
         np.testing.assert_allclose(motion.slow, wanted.slow, rtol=2e-3, atol=1e-3)
-        np.testing.assert_allclose(motion.fast_limits, wanted.fast_limit, rtol=1e-3)
-        np.testing.assert_allclose(motion.slow_limits, wanted.slow_limit, rtol=1e-3)
+        np.testing.assert_allclose(motion.strict.fast, wanted.fast_limit, rtol=1e-3)
+        np.testing.assert_allclose(motion.strict.slow, wanted.slow_limit, rtol=1e-3)
         is_early = (wanted.fast <= wanted.fast_limit).all()
         is_slow = (wanted.slow <= wanted.slow_limit).all()
         is_sure = is_slow and (wanted.fast <= wanted.beside_limit).all()
         settled.append((bool(is_early), bool(is_sure)))
-        assert (motion.early, motion.sure) == settled[-1]
+        assert (motion.strict.early, motion.strict.sure) == settled[-1]
     assert len(settled) > 8

@@ -131,21 +131,6 @@ def test_the_bound_holds_for_what_is_said(
         assert slips <= report.bound + 1e-9
 
 
-def test_a_lift_after_the_outcome_was_told_is_counted_or_not_permitted() -> None:
-    """The same contact goes on: a second lift of it would be in no bound."""
-    grasp = GraspId(BOOT, 7)
-    trust = Trust("model", 0, RiskLimits(0.5), learns=False)
-    first = trust.judge(grasp, 0.1, -2.0, NONE)
-    trust.note(grasp, first, stable=True)
-    trust.outcome(grasp, slipped=False)
-    assert trust.review(grasp, first).permission is Permission.ALLOWED, "it was counted"
-    assert trust.judge(grasp, 0.1, -2.0, NONE).permission is Permission.WITHHELD
-    free = Trust("model", 0)
-    free.note(grasp, free.judge(grasp, 0.1, -2.0, NONE), stable=True)
-    free.outcome(grasp, slipped=False)
-    assert free.judge(grasp, 0.1, -2.0, NONE).permission is Permission.ALLOWED, "no risk is set"
-
-
 def test_what_was_permitted_and_not_said_is_asked_again() -> None:
     trust = Trust("model", 0, RiskLimits(0.05), learns=False)
     grasps = [GraspId(BOOT, number) for number in range(30)]

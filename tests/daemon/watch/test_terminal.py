@@ -13,7 +13,7 @@ from rich.console import Console
 from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
 from graspd.daemon.watch.fingers import FingerMotion
 from graspd.daemon.watch.snapshot import Snapshot, Tone
-from graspd.daemon.watch.terminal import STYLES, draw
+from graspd.daemon.watch.terminal import STYLES, Screen, draw
 from tests.daemon.watch.watch_fakes import (
     ENDPOINT,
     MS,
@@ -62,7 +62,7 @@ def test_only_the_verdict_has_the_colour_of_its_tone(tone: Tone) -> None:
     seen = structs.replace(a_full_hand(), tone=tone, headline="word")
     file = io.StringIO()
     Console(file=file, width=80, force_terminal=True, color_system="truecolor").print(
-        draw([seen], 80)
+        draw([seen], Screen(80))
     )
     background = "48;2;" in file.getvalue()
     assert background == (tone is not Tone.LEANS)  # hollow
@@ -106,7 +106,7 @@ def test_the_figures_of_a_dead_daemon_have_their_time_and_are_dim(width: int) ->
     for seen, dims in ((alive, False), (dead, True)):
         file = io.StringIO()
         console = Console(file=file, width=width, force_terminal=True, color_system="truecolor")
-        console.print(draw([seen], width))
+        console.print(draw([seen], Screen(width)))
         styles = re.search(r"(\x1b\[[0-9;]*m)readings 100 /s", file.getvalue())
         assert bool(styles and styles[1] == "\x1b[2;3m") is dims  # dim and italic (ECMA-48)
 
@@ -139,11 +139,37 @@ def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     assert r"\x1b[2J" in text
 
 
+def test_lines_that_do_not_fit_are_counted_and_shown_by_space() -> None:
+    places = [f"{finger}_{place}" for finger in ("ff", "mf", "th") for place in range(1, 25)]
+    health = dict(zip(places, [*Reason, *Reason, *Reason], strict=False))
+    view = after((b"status.right", status(0, health=health)), (b"verdict.right", verdict(0)))
+    seen = view.snapshot(0)
+    whole = text_of(seen, 80)
+    pages = [text_of(seen, 80, height=24, page=page) for page in range(5)]
+    assert [len(page) <= 24 for page in pages] == [True] * 5
+    wrong = next(at for at, line in enumerate(whole) if line.startswith("evidence")) - 2
+    assert pages[0][-1].rstrip() == (
+        f"{len(whole) - 23} more lines, {wrong - 21} of them on what is wrong: space shows them"
+    )
+    assert all(page[:2] == whole[:2] for page in pages)  # verdict and clock stay
+    assert pages[0][2:-1] + pages[1][2:-1] == whole[2:44]
+    assert pages[3][2:-1] == whole[-21:]
+    assert pages[4] == pages[0]
+
+
+def test_another_hand_shows_its_dead_electrode_beside_its_verdict() -> None:
+    hands = [a_full_hand(Decision.STABLE, "left"), a_full_hand(Decision.SLIP, "right")]
+    assert text_of(hands, 80)[0].rstrip() == (
+        "right  SLIP  slip probability 75 %, do not lift; not well: ff_7 electrode-dead"
+    )
+    assert "ff_7 electrode-dead" in " ".join(" ".join(text_of(hands, 60)[:2]).split())
+
+
 def test_several_hands_all_show_their_verdicts() -> None:
     hands = [a_full_hand(Decision.STABLE, "left"), a_full_hand(Decision.SLIP, "right")]
     beside = text_of(hands, 200)
     assert re.fullmatch(
-        r"left  STABLE  .*25 %, lift +right  SLIP  .*75 %, do not lift *", beside[0]
+        r"left  STABLE  .*25 %, lift; .* right  SLIP  .*75 %, do not lift; .*", beside[0]
     )
     first = text_of(hands, 100)
     assert first[0].startswith("right  SLIP  slip probability 75 %, do not lift")

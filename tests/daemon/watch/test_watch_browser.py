@@ -164,7 +164,7 @@ def test_the_last_verdict_stays_until_the_next_grasp_and_then_in_the_list(
     talker.decision = Decision.UNKNOWN
     see(browser, "waiting")
     assert text(browser, "was") == "past: stable 25 %"
-    assert ", past; its lift not told" in text(browser, "judged")
+    assert ", past; lift: not told" in text(browser, "judged")
     talker.more = {"grasp": 8}
     browser.wait_for("document.querySelector('.was').innerText == ''")
     talker.more = {"grasp": 8, "supervised": True}

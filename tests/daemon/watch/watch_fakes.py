@@ -23,7 +23,7 @@ from graspd.daemon.publish.messages import (
 from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.risk import RiskReport
 from graspd.daemon.watch.snapshot import Snapshot
-from graspd.daemon.watch.terminal import draw
+from graspd.daemon.watch.terminal import Screen, draw
 from graspd.daemon.watch.view import View
 from tests.daemon.publish.doors import Publisher
 
@@ -153,11 +153,19 @@ def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snaps
     return view.snapshot(0)
 
 
-def text_of(seen: Snapshot | list[Snapshot], width: int = 80, chosen: int = 0) -> list[str]:
+def text_of(
+    seen: Snapshot | list[Snapshot],
+    width: int = 80,
+    chosen: int = 0,
+    height: int | None = None,
+    page: int = 0,
+) -> list[str]:
     """The lines of a terminal without colours."""
     hands = seen if isinstance(seen, list) else [seen]
     file = io.StringIO()
-    Console(file=file, width=width, color_system=None).print(draw(hands, width, chosen))
+    Console(file=file, width=width, color_system=None).print(
+        draw(hands, Screen(width, height, chosen, page))
+    )
     return file.getvalue().splitlines()
 
 

@@ -17,9 +17,9 @@ from graspd.drivers.base import ELECTRODES
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, FreshSampler, HeldSampler, Sampling
 
-NOISE_COUNTS = (3.3, 5.0)
-"""Standard deviation of an electrode, another one for each finger, counts: successive sweeps were
-2.9 to 4.2 times the square root of two apart, which the correlation makes so much."""
+NOISE_COUNTS = (3.0, 4.5)
+"""Standard deviation of an electrode, another one for each finger, counts. With the wander,
+successive sweeps differ by 2.9 to 4.2 times the square root of two."""
 ECHO = 0.36
 """Share of a sweep's noise that comes again in the next one: correlations of 0.32 at one sweep and
 of 0 at two (measured: 0.32 and 0.03)."""
@@ -27,21 +27,33 @@ SPIKE_PROBABILITY = 0.0017
 """Chance per electrode and sweep of a downward spike of more than 25 counts."""
 SPIKE_COUNTS = (25.0, 60.0)
 """Depth of one, counts."""
-RELAXATION_COUNTS_PER_S = 20.0
+RELAXATION_COUNTS_PER_S = 12.0
 """How fast an electrode moves (root mean square) when a hold begins, counts/s ..."""
 RELAXATION_SPREAD = 0.6
 """... and by which factor that differs: standard deviation of its logarithm."""
 RELAXATION_TAU_S = 0.7
 """Time constant of this motion, s. Not measured; it fits the quantiles of held touches."""
-RELAXATION_DIRECTIONS = (0.68, 0.32)
-"""Shares of the variance along one direction of the 24 electrodes, and along others."""
+HOLD_DIRECTIONS = (0.68, 0.32)
+"""Shares of a hold's variance along one direction of the 24 electrodes, and along others."""
+WANDER_COUNTS_PER_S = 66.0
+"""The pressure of a hold wanders: root mean square of an electrode's speed, counts/s ..."""
+WANDER_SPREAD, WANDER_MOMENT_SPREAD = 0.3, 0.25
+"""... and by which factor holds, and moments of a hold, differ: standard deviations of the
+logarithm. These and the times fit the quantiles of held touches, and for how long the gate of one
+limit took real ones for moving."""
+WANDER_TURN_TAU_S = 0.02
+"""The wander has another direction after this time, s ..."""
+WANDER_TAU_S = 0.06
+"""... and has gone back after this time, s."""
 SLIDE_DIRECTIONS = (0.81, 0.14, 0.05)
 """The same of a slide: along one, along a second, and along others."""
 STANDSTILL_S = (0.0, 0.2)
 """For so long nothing slides at the beginning, and again at the end, s."""
-SPEED_COUNTS_PER_S = 88.0
+SLIDE_WANDER = 1.5
+"""The pressure of a slide wanders faster than that of a hold by this factor."""
+SPEED_COUNTS_PER_S = 76.0
 """Root mean square of an electrode's speed in the median slide, counts/s ..."""
-SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.45
+SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.5
 """... and by which factor slides, and moments of a slide, differ: standard deviations of the
 logarithm. These and the times fit the quantiles of slides."""
 MOMENT_TAU_S = 0.2
@@ -65,16 +77,19 @@ class Hold:
         rng: np.random.Generator,
         seconds: float = SECONDS,
         rest_s: float = 0.0,
+        slide_s: float | None = None,
     ) -> None:
         """`sliding` says of each finger whether the object slides along it, or is held.
 
-        For the first `rest_s` nothing has begun: all stand still.
+        For the first `rest_s` nothing has begun: all stand still. Slides begin at `slide_s`, until
+        which the object is held; unless given, after a standstill.
         """
         self._times = np.arange(0.0, seconds + STEP_S, STEP_S)
         ways = [
             (
                 *_relaxation(self._times - rest_s, rng),
-                *(_slide(self._times, rest_s, rng) if slides else ()),
+                *_wander(self._times, rest_s, slide_s, rng, slides=slides),
+                *(_slide(self._times, rest_s, slide_s, rng) if slides else ()),
             )
             for slides in sliding
         ]
@@ -137,18 +152,44 @@ def _relaxation(times: NDArray[np.float64], rng: np.random.Generator) -> Iterato
     factor = np.exp(rng.normal(0.0, RELAXATION_SPREAD))
     along = RELAXATION_COUNTS_PER_S * factor * RELAXATION_TAU_S
     along = along * (1.0 - np.exp(-np.maximum(times, 0.0) / RELAXATION_TAU_S))
-    for share in RELAXATION_DIRECTIONS:
+    for share in HOLD_DIRECTIONS:
         yield np.sqrt(share) * along, _direction(rng)
 
 
-def _slide(times: NDArray[np.float64], rest_s: float, rng: np.random.Generator) -> Iterator[Way]:
+def _wander(
+    times: NDArray[np.float64],
+    rest_s: float,
+    slide_s: float | None,
+    rng: np.random.Generator,
+    *,
+    slides: bool,
+) -> Iterator[Way]:
+    speed = WANDER_COUNTS_PER_S * np.exp(
+        rng.normal(0.0, WANDER_SPREAD)
+        + WANDER_MOMENT_SPREAD * _noise(len(times), MOMENT_TAU_S, rng)
+    )
+    if slides:
+        speed[times >= (rest_s if slide_s is None else slide_s)] *= SLIDE_WANDER
+    keeps = np.exp(-STEP_S / WANDER_TAU_S)
+    for share in HOLD_DIRECTIONS:
+        along = np.sqrt(share) * (times >= rest_s) * speed * STEP_S
+        along *= _noise(len(times), WANDER_TURN_TAU_S, rng)
+        for index in range(1, len(along)):
+            along[index] += keeps * along[index - 1]
+        yield along, _direction(rng)
+
+
+def _slide(
+    times: NDArray[np.float64], rest_s: float, slide_s: float | None, rng: np.random.Generator
+) -> Iterator[Way]:
     begins_s, ends_s = rng.uniform(*STANDSTILL_S, 2)
-    slides = (times >= rest_s + begins_s) & (times < times[-1] - ends_s)
+    begins_s = rest_s + begins_s if slide_s is None else slide_s
+    slides = (times >= begins_s) & (times < times[-1] - ends_s)
     speed = SPEED_COUNTS_PER_S * np.exp(
-        rng.normal(0.0, SLIDE_SPREAD) + MOMENT_SPREAD * _wander(len(times), MOMENT_TAU_S, rng)
+        rng.normal(0.0, SLIDE_SPREAD) + MOMENT_SPREAD * _noise(len(times), MOMENT_TAU_S, rng)
     )
     for share in SLIDE_DIRECTIONS:
-        velocity = np.sqrt(share) * slides * speed * _wander(len(times), TURN_TAU_S, rng)
+        velocity = np.sqrt(share) * slides * speed * _noise(len(times), TURN_TAU_S, rng)
         yield np.cumsum(velocity) * STEP_S, _direction(rng)
 
 
@@ -158,7 +199,7 @@ def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.asarray(direction / np.sqrt((direction**2).mean()), dtype=np.float64)
 
 
-def _wander(number: int, tau_s: float, rng: np.random.Generator) -> NDArray[np.float64]:
+def _noise(number: int, tau_s: float, rng: np.random.Generator) -> NDArray[np.float64]:
     """Standard Gaussian numbers `STEP_S` apart, correlated over `tau_s`, shape (number,)."""
     keeps = np.exp(-STEP_S / tau_s)
     values = rng.normal(size=number)

@@ -57,7 +57,10 @@ def test_slopes_of_held_touches_are_those_of_real_ones(
     touches: list[NDArray[np.float64]], sweeps: int
 ) -> None:
     slopes = np.concatenate([mean_slopes(counts, sweeps) for counts in touches])
-    np.testing.assert_allclose(np.quantile(slopes, TOUCH_QUANTILES), TOUCHES[sweeps], rtol=0.2)
+    quantiles = np.quantile(slopes, TOUCH_QUANTILES)
+    np.testing.assert_allclose(quantiles[:-1], TOUCHES[sweeps][:-1], rtol=0.27)
+    # One window of a hundred is of a stream or two.
+    assert quantiles[-1] == pytest.approx(TOUCHES[sweeps][-1], rel=0.35)
 
 
 @pytest.mark.parametrize("sweeps", SLIDES)
@@ -66,9 +69,17 @@ def test_slopes_of_slides_are_those_of_real_ones(
 ) -> None:
     slopes = np.concatenate([mean_slopes(counts, sweeps) for counts in slides])
     quantiles = np.quantile(slopes, SLIDE_QUANTILES)
-    np.testing.assert_allclose(quantiles[:-1], SLIDES[sweeps][:-1], rtol=0.2)
+    np.testing.assert_allclose(quantiles[:-1], SLIDES[sweeps][:-1], rtol=0.27)
     # One window of a hundred is of a stream or two.
     assert quantiles[-1] == pytest.approx(SLIDES[sweeps][-1], rel=0.35)
+
+
+def test_electrodes_of_a_held_touch_range_as_far_as_real_ones(
+    touches: list[NDArray[np.float64]],
+) -> None:
+    # Real ones range over 32 to 44 counts in three seconds.
+    ranges = [np.ptp(counts, axis=0).mean() for counts in touches]
+    np.testing.assert_allclose(np.quantile(ranges, (0.05, 0.95)), (32.0, 44.0), rtol=0.15)
 
 
 def test_noise_is_correlated_and_spikes_go_down_alone() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import signal
@@ -21,7 +22,7 @@ from graspd.models.training.estimators.configs import GRIDS, ForestConfig, SvmCo
 from graspd.models.training.evaluating import jobs, run_jobs
 from graspd.models.training.evaluating.jobs import Job
 from graspd.models.training.systems.registry import SYSTEMS
-from tests.models.training.evaluation_samples import write_sessions
+from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
 
 ROOT = Path(__file__).parents[4]
 
@@ -37,6 +38,30 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     write_sessions(folder, 160)
     return folder
+
+
+def test_a_table_of_ones_own_is_measured_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, out = tmp_path / "monday.csv", tmp_path / "out"
+    made = table("monday", 80, 0)
+    objects = tuple(OBJECTS[grasp % 4] for grasp in range(80))
+    write(own, dataclasses.replace(made, objects=objects))
+    options = ["--own", str(own), "--out", str(out), "--seeds", "1", "--quiet"]
+    assert graspd_evaluate("svm-session", *options) == 0
+    printed = capsys.readouterr()
+    assert [line.split()[:2] for line in printed.out.splitlines()] == [
+        ["svm-session", "cv"],
+        ["svm-session", "objects"],
+    ]
+    assert printed.err == (
+        "graspd evaluate: takes 4 folds: 10 folds need 10 objects, there are 4\n"
+    )
+    assert len(list((out / "jobs").iterdir())) == 2 * 4
+    assert graspd_evaluate("svm-session", *options, "--table", "x.md") == 2
+    assert "it needs --data" in capsys.readouterr().err
+    assert graspd_evaluate("svm-session") == 2
+    assert "needs --data DIR, --own FILE, or both" in capsys.readouterr().err
 
 
 def test_a_quick_run_writes_summaries_and_table(

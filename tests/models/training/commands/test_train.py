@@ -154,7 +154,7 @@ def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
     assert card["data"]["licence"].startswith("MIT")
     assert "lab 1" in card["data"]["not_published"]
     assert {
-        "The data is of 20 objects in 3 tables, of which lab 1 is not published.",
+        "The data is of 20 objects in 3 tables. Not published: lab 1.",
         "The figures of another day are of the published tables alone.",
     } < set(card["weak_points"])
     assert "lab 1.csv is not" not in capsys.readouterr().err
@@ -182,7 +182,7 @@ def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
         "not_published": ["lab"],
     }
     assert card["weak_points"][1:3] == [
-        "The data is of 2 objects in 1 table, of which lab is not published.",
+        "The data is of 2 objects in 1 table. Not published: lab.",
         "What it is worth on another day than those of its data was not measured.",
     ]
     assert card["weak_points"][3].startswith("20 grasps, 10 of which slipped, are few: the daemon")
@@ -268,26 +268,33 @@ def test_what_a_model_will_not_be_able_to_do_is_said_before_it_is_trained(
 
 
 @pytest.mark.parametrize(
-    ("options", "proposal"),
+    ("options", "folds", "why"),
     [
-        ([], "--folds 2"),
-        (["--only", "cv"], "--folds 9 --only cv"),
+        ([], 2, "10 folds need 10 grasps of each class, one has 9"),
+        (["--only", "cv"], 9, "10 folds need 10 grasps of each class, one has 9"),
     ],
 )
-def test_fewer_folds_are_proposed_where_grasps_are_few(
-    options: list[str], proposal: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_as_many_folds_are_taken_as_grasps_are_enough_for(
+    options: list[str],
+    folds: int,
+    why: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     made, lab = smallest(), tmp_path / "lab.csv"
     slipped = made.slipped.copy()
     slipped[np.flatnonzero(slipped)[0]] = False  # nine slipped, so ten folds are too many
     write(lab, dataclasses.replace(made, slipped=slipped))
     words = ["--own", str(lab), "--out", str(tmp_path / "out"), *options]
-    assert graspd_train(*words) == 2
+    assert graspd_train(*words, "--folds", "10") == 2
     *_, said, reason = capsys.readouterr().err.splitlines()
+    proposal = " ".join([f"--folds {folds}", *options])
     assert said == f"graspd train: these grasps are enough for {proposal}"
     assert "(see --folds and --only)" in reason
-    assert graspd_train(*words, *proposal.split(), "--quiet") == 0
-    assert (tmp_path / "out" / f"{SYSTEM}-lab.onnx").exists()
+    assert graspd_train(*words, "--quiet") == 0
+    assert f"graspd train: takes {folds} folds: {why}\n" in capsys.readouterr().err
+    card = json.loads((tmp_path / "out" / f"{SYSTEM}-lab.json").read_text())
+    assert f"--folds {folds}" in card["command"]
 
 
 def test_a_model_is_named_and_its_end_says_how_a_scene_gets_it(

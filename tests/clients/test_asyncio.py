@@ -1,0 +1,95 @@
+"""The client for asyncio: the same answers, while other tasks go on."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from pathlib import Path
+
+import pytest
+
+from deploy.clients.python.graspd_client import AsyncClient, Client, Decision
+from tests.clients.test_both_ask import DEADLINE_S, PATIENT_MS, false_daemon, of, told
+
+PATIENT_S = PATIENT_MS / 1e3
+SHORT_S = 0.05
+
+
+def made(folder: Path, *, ask: bool = True) -> AsyncClient:
+    return AsyncClient(f"ipc://{folder}/out", ask_endpoint=f"ipc://{folder}/ask" if ask else None)
+
+
+def test_it_takes_what_the_client_takes() -> None:
+    for name, call in vars(Client).items():
+        if inspect.isfunction(call) and not name.startswith("_"):
+            other = inspect.signature(getattr(AsyncClient, name))
+            assert inspect.signature(call) == other
+    assert inspect.signature(Client) == inspect.signature(AsyncClient)
+
+
+def test_a_lift_is_allowed_and_told_once(tmp_path: Path) -> None:
+    async def lifts() -> None:
+        async with made(tmp_path) as graspd:
+            answer = await graspd.may_i_lift(PATIENT_S)
+            assert answer
+            assert (await graspd.verdict()).decision is Decision.STABLE
+            assert await graspd.tell(answer.verdict, "slipped", "mug", PATIENT_S)
+            again = await graspd.may_i_lift(SHORT_S, supervised=True)
+            assert (bool(again), again.verdict.reasons) == (False, ("outcome-told",))
+            assert graspd.unreported == 0
+        assert (await graspd.verdict()).reasons == ("closed",)
+
+    with false_daemon(tmp_path, told()):
+        asyncio.run(lifts())
+
+
+def test_without_a_daemon_it_is_no_in_time(tmp_path: Path) -> None:
+    async def asks() -> None:
+        async with made(tmp_path) as graspd:
+            answer = await graspd.may_i_lift(DEADLINE_S)
+            assert (bool(answer), answer.verdict.reasons) == (False, ("no-message",))
+            assert answer.waited_s >= DEADLINE_S
+            assert await graspd.wait_for_grasp(SHORT_S) is None
+
+    asyncio.run(asks())
+
+
+def test_other_tasks_go_on_while_it_waits(tmp_path: Path) -> None:
+    async def counts() -> int:
+        turns = 0
+        async with made(tmp_path, ask=False) as graspd:
+            waiting = asyncio.create_task(graspd.wait_for_grasp(DEADLINE_S))
+            while not waiting.done():
+                turns += 1
+                await asyncio.sleep(DEADLINE_S / 100)
+        return turns
+
+    with false_daemon(tmp_path, told(), "unknown"):
+        assert asyncio.run(counts()) >= 5
+
+
+def test_a_call_meanwhile_is_refused_and_a_cancelled_one_ends(tmp_path: Path) -> None:
+    async def overlaps() -> None:
+        async with made(tmp_path) as graspd:
+            waiting = asyncio.create_task(graspd.may_i_lift(PATIENT_S))
+            await asyncio.sleep(SHORT_S)
+            with pytest.raises(RuntimeError, match="one call at a time"):
+                await graspd.verdict()
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            assert not await graspd.may_i_lift(SHORT_S)
+
+    with false_daemon(tmp_path, of("unknown")):
+        asyncio.run(overlaps())
+
+
+def test_a_wrong_call_is_refused(tmp_path: Path) -> None:
+    async def asks() -> None:
+        async with made(tmp_path) as graspd:
+            with pytest.raises(ValueError, match="deadline_s"):
+                await graspd.may_i_lift(-1.0)
+            with pytest.raises(ValueError, match="no grasp"):
+                await graspd.tell(await graspd.verdict(), "held")
+
+    asyncio.run(asks())

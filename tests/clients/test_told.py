@@ -1,0 +1,156 @@
+"""A grasp whose outcome was told is offered no more: over the real sockets, in both languages."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from deploy.clients.python.graspd_client import Client, Outcome
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
+from tests.clients.bench import Daemon, until
+from tests.daemon.processes import TIMEOUT_S
+
+WARM_UP = "[risk]\nmax_slip_when_stable = 0.2\nwarm_up = 50\n"
+"""Each grasp is to be lifted under supervision."""
+LIFT_S, AGAIN_S = 1.0, 0.05
+"""How long to wait for a first lift of a grasp, and for another one that must not be allowed."""
+HELD_S = 8.0
+"""A busy machine needs seconds to ask and to tell."""
+ENOUGH = 20
+"""Verdicts of a grasp that is held after its outcome, four refreshes long."""
+
+
+class InCpp:
+    """The C++ client, in a process of its own."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def may_i_lift(self, deadline_s: float) -> int | None:
+        may, grasp, _ = self._told(f"watch {deadline_s}").split()
+        return int(grasp) if may == "1" else None
+
+    def slipped(self) -> bool:
+        return self._told("slipped") == "told"
+
+    def _told(self, order: str) -> str:
+        process = self._process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(f"{order}\n")
+        process.stdin.flush()
+        return process.stdout.readline().strip()
+
+
+@contextmanager
+def in_cpp(binary: Path, daemon: Daemon) -> Iterator[InCpp]:
+    with subprocess.Popen(
+        [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdin is not None
+        process.stdin.write(f"client {daemon.endpoint} {daemon.ask_endpoint}\n")
+        yield InCpp(process)
+        process.communicate(timeout=TIMEOUT_S)
+        assert process.returncode == 0, "the sanitizers found something"
+
+
+class InPython:
+    """The Python client."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._lifted_on = client.verdict()
+
+    def may_i_lift(self, deadline_s: float) -> int | None:
+        answer = self._client.may_i_lift(deadline_s, supervised=True)
+        if not answer:
+            return None
+        self._lifted_on = answer.verdict
+        return answer.verdict.grasp
+
+    def slipped(self) -> bool:
+        return bool(self._client.tell(self._lifted_on, Outcome.SLIPPED, wait_s=10.0))
+
+
+class Listener:
+    """Hears outcomes and verdicts in the order in which they were published."""
+
+    def __init__(self, socket: zmq.Socket[bytes], daemon: Daemon) -> None:
+        socket.linger = 0
+        socket.connect(daemon.endpoint)
+        socket.subscribe("outcome.right")
+        socket.subscribe("verdict.right")
+        self._socket = socket
+        self.told: set[int] = set()
+        self.held_on = 0
+        """Verdicts that say of a grasp that it is held after its outcome."""
+        self.is_held = False
+
+    def listen(self) -> None:
+        """Take in a message, and all that wait: no grasp is offered after its outcome."""
+        assert self._socket.poll(round(TIMEOUT_S * 1e3))
+        while self._socket.poll(0):
+            topic, payload = self._socket.recv_multipart()
+            message: dict[str, Any] = json.loads(payload)
+            if topic == b"outcome.right":
+                self.told.add(message["grasp"])
+                continue
+            is_told = message["grasp"] in self.told
+            self.is_held = is_told and message["gate"] not in ("idle", "released")
+            if is_told:
+                assert (message["verdict"], message["supervised"]) == ("unknown", False)
+                assert ("outcome-told" in message["reasons"]) is self.is_held
+                self.held_on += self.is_held
+
+
+def test_a_told_grasp_is_offered_no_more_in_either_language(binary: Path, tmp_path: Path) -> None:
+    with (
+        Daemon(tmp_path, WARM_UP, recording=long_holds(tmp_path / "held.csv")) as daemon,
+        zmq.Context() as context,
+        context.socket(zmq.SUB) as socket,
+        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as python,
+        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as nobody,
+        in_cpp(binary, daemon) as cpp,
+    ):
+        listener = Listener(socket, daemon)
+        for lifts, asks_too in ((InPython(python), cpp), (cpp, InPython(nobody))):
+            told_while_held(listener, lifts, asks_too)
+
+
+def long_holds(path: Path) -> Path:
+    """Write a recording of grasps that are held for longer than telling an outcome takes."""
+    durations = Durations(first_rest_s=(1.5, 1.5), settle_s=(HELD_S, HELD_S))
+    with path.open("w") as file:
+        write_stream(synthetic_grasps(2, durations=durations), file, t_decimals=2)
+    return path
+
+
+def told_while_held(
+    listener: Listener, lifts: InPython | InCpp, asks_too: InPython | InCpp
+) -> None:
+    """Lift grasps, and tell their outcomes, until one is held for long after it was told."""
+    enough = listener.held_on + ENOUGH
+
+    def is_enough() -> bool:
+        grasp = lifts.may_i_lift(LIFT_S)
+        listener.listen()
+        if grasp is None:
+            return False
+        assert grasp not in listener.told
+        assert lifts.slipped()
+        while grasp not in listener.told:
+            listener.listen()
+        while listener.is_held and listener.held_on < enough:
+            for each in (lifts, asks_too):
+                assert each.may_i_lift(AGAIN_S) != grasp
+            listener.listen()
+        return listener.held_on >= enough
+
+    until(is_enough)

@@ -1,0 +1,97 @@
+"""What an operator is told: a dead link, a silent daemon, a viewer held up, parts not well."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from graspd.daemon.commands.watch import where_to_look
+from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
+from graspd.daemon.watch.snapshot import Line, Tone
+from graspd.daemon.watch.view import View
+from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, verdict
+
+
+@pytest.mark.parametrize(
+    "unreadable", [Reason.STALE, Reason.FROZEN, Reason.ELECTRODES_BROKEN, Reason.SENSOR_MISSING]
+)
+def test_a_dead_link_never_asks_to_close_the_hand(unreadable: Reason) -> None:
+    reasons = [unreadable, Reason.NOT_TARED, Reason.NO_CONTACT]
+    seen = after((b"verdict.right", verdict(0, reasons=reasons))).snapshot(0)
+    assert (seen.tone, seen.why) == (Tone.TROUBLE, [Line(unreadable.value, ADVICE[unreadable])])
+
+
+def test_a_dead_link_does_not_look_like_a_dead_daemon() -> None:
+    """Without readings the daemon sends an `unknown` each `silence_ms`, here 100."""
+    view = after((b"verdict.right", verdict(0, reasons=[Reason.STALE])))
+    assert view.snapshot(120 * MS).why[0].what == "stale"
+    assert view.snapshot(301 * MS).why[0].what == "silent"
+
+
+def test_a_viewer_held_up_goes_by_the_times_in_messages() -> None:
+    """For 800 ms nothing was taken; the newest of 80 messages is 10 ms old, or 600."""
+    for sent_ms, tone in ((790, Tone.STABLE), (200, Tone.SILENT)):
+        view = a_view()
+        sent = verdict(0, Decision.STABLE, t_mono_ns=5 * MS, age_ms=0.0)
+        view.take(b"verdict.right", sent, 0, 1 * MS)
+        for seq in range(1, 80):
+            at_ns = 5 * MS + sent_ms * MS * seq // 79
+            late = verdict(seq, Decision.STABLE, t_mono_ns=at_ns, age_ms=0.0)
+            view.take(b"verdict.right", late, 10 * MS, 801 * MS)
+        assert view.snapshot(801 * MS).tone is tone
+
+
+def test_a_viewer_that_stood_still_says_so_itself() -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE)))
+    view.snapshot(0)
+    view.stood_still = 20 * MS, 5020 * MS
+    seen = view.snapshot(5100 * MS)
+    stood = "this viewer itself stood still for 5000 ms"
+    assert seen.why[0] == Line("held up", f"{stood} and connects again")
+    assert (seen.verdict, seen.history) == ("unknown", ["s"])
+    seen = view.snapshot(6100 * MS)
+    assert seen.why[0] == Line("silent", f"no message since; {stood}")
+    assert seen.history == ["s", "", "", "", "", "", "."]
+
+
+def test_a_silent_daemon_has_the_commands_to_look_with() -> None:
+    look = "systemctl status graspd@right; journalctl -u graspd@right"
+    view = View(ENDPOINT, look=look)
+    assert view.snapshot(0).why[-1] == Line("look", look)
+    view.link = "connected"
+    assert "the daemon is there" in view.snapshot(0).why[-1].advice
+    view.link = "turned away: the daemon wants a key (--keys)"
+    assert [line.what for line in view.snapshot(0).why] == ["silent", "link"]
+
+
+def test_health_names_all_parts_of_a_reason_at_once() -> None:
+    dead, loose = Reason.ELECTRODE_DEAD, Reason.ELECTRODE_JUMPS
+    health = {"session": Reason.NOT_CALIBRATED, "ff_7": dead, "th_2": loose, "mf_24": dead}
+    view = after((b"status.right", status(0, health=health)), (b"verdict.right", verdict(0)))
+    seen = view.snapshot(0)
+    assert seen.health == [
+        Line("ff_7, mf_24 electrode-dead", ADVICE[dead]),
+        Line("th_2 electrode-jumps", ADVICE[loose]),
+        Line("session not-calibrated", ADVICE[Reason.NOT_CALIBRATED]),
+    ]
+    assert seen.not_well == "not well: ff_7, mf_24 electrode-dead and 2 more"
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "scene", "look"),
+    [
+        ("ipc:///tmp/x.ipc", "/etc/graspd/left.toml", "systemctl status graspd@left; "),
+        ("ipc:///run/graspd/right.ipc", None, "systemctl status graspd@right; "),
+        ("ipc:///tmp/x.ipc", "deploy/scenes/demo.toml", "is it started? graspd run deploy/"),
+        ("tcp://10.0.0.2:5556", None, "on the daemon's computer: systemctl status 'graspd@*'"),
+        ("ipc:///tmp/x.ipc", None, "is it started? graspd run SCENE"),
+    ],
+)
+def test_where_to_look_is_a_command_of_this_daemon(
+    endpoint: str, scene: str | None, look: str
+) -> None:
+    said = where_to_look(endpoint, None if scene is None else Path(scene))
+    assert said.startswith(look)
+    if "graspd@" in look:
+        assert "graspd@*" in said or f"journalctl -u {look.split()[2].rstrip(';')}" in said
