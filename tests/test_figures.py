@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 
 from graspd.models import zoo
+from graspd.models.training.evaluating.findings import FINDINGS
 
 ROOT = Path(__file__).parents[1]
 PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "deploy/MEASURED.md")}
@@ -32,7 +33,7 @@ CALIBRATED_BY = {
     "running-sorted": "running, sorted",
 }
 """Titles of the columns of RESULTS.md, section 3, by their name on a card."""
-METRICS = ("accuracy", "precision", "recall", "f1")
+METRICS = ("accuracy", "precision", "recall")
 FIGURE = r"(\d+(?:\.\d+)?)(?: \+- (\d+(?:\.\d+)?))?"
 Cells = Mapping[str, str]
 Spread = Mapping[str, float]
@@ -164,7 +165,7 @@ def test_results_of_the_same_splits_are_those_of_the_cards() -> None:
         for model, protocol, row in rows
         for metric in METRICS
         if not agrees(
-            said := row["F1" if metric == "f1" else metric],
+            said := row[metric],
             CARDS[model]["protocols"][protocol]["spreads"][metric],
         )
     ]
@@ -188,18 +189,61 @@ def test_results_of_other_days_and_sessions_are_those_of_the_cards() -> None:
             assert row[group] == said
 
 
+def test_results_of_a_protocol_are_those_of_the_cards() -> None:
+    """F1 of the same splits; a card is of one seed."""
+    seeds = {(row[""], row["protocol"]): row["seeds"] for row in section(6)[0]}
+    compared = [
+        (model, protocol, said)
+        for row in section(2)[0]
+        if (model := model_of(row[""])) is not None
+        for protocol, figures in CARDS[model]["protocols"].items()
+        if (said := row.get(f"`{protocol}`", "-")) != "-"
+        and int(seeds[row[""], f"`{protocol}`"]) == figures["spreads"]["f1"]["seeds"]
+    ]
+    assert len(compared) >= 8
+    wrong = [
+        (model, protocol, said)
+        for model, protocol, said in compared
+        if not agrees(said, CARDS[model]["protocols"][protocol]["spreads"]["f1"])
+    ]
+    assert wrong == []
+
+
 def test_results_say_each_figure_once() -> None:
-    """All sections of RESULTS.md have the F1 of a system in a protocol as its last one has it."""
-    (last,) = section(6)
-    every = {(row[""], row["protocol"]): row["F1"] for row in last}
-    (paper,), (systems,) = section(1), section(2)
-    assert all(
-        every[row[""], row["protocol"]] == row["ours"] for row in paper if row["figure"] == "F1"
-    )
-    for row in systems:
-        for title, said in row.items():
-            if title.startswith("`") and said != "-":
-                assert every[row[""], title] == said.partition(" (s.e.")[0]
+    """The first sections and the findings have F1 as the table of all systems has it."""
+    (paper,), (systems,), (differences,) = section(1), section(2), section(5)
+    every = {
+        (row[""], title): said.partition(" (s.e.")[0]
+        for row in systems
+        for title, said in row.items()
+        if title.startswith("`") and said != "-"
+    }
+    for row in paper:
+        ours, figure = row["ours"], row["paper"]
+        if row["figure"] == "F1":
+            assert every[row[""], row["protocol"]] == ours
+        mean = float(ours.split(" ")[0])
+        # Both are rounded, and the difference once more.
+        assert float(row["difference"]) == pytest.approx(
+            mean - float(figure.split(" ")[0]), abs=0.101
+        )
+    figures = {(key[0].strip("`"), key[1].strip("`")): said for key, said in every.items()}
+    shown = {f"{system}/{protocol}": said for (system, protocol), said in figures.items()}
+    shown |= {
+        f"{row[''].strip('`')}/{row['protocol'].strip('`')}/difference": row["to `cnn1`"]
+        for row in differences
+    }
+    shown |= {
+        f"{row[''].strip('`')}/{row['protocol'].strip('`')}/paper": row["paper"]
+        for row in paper
+        if row["figure"] == "F1"
+    }
+    shown |= {
+        f"{row[''].strip('`')}/{row['protocol'].strip('`')}/auc": f"{float(row['AUC']):.2f}"
+        for row in section(6)[0]
+    }
+    said = [line[2:] for line in RESULTS.splitlines() if line.startswith("- **")]
+    assert said == [finding.format_map(shown) for finding in FINDINGS]
 
 
 def test_a_wrong_figure_is_noticed() -> None:

@@ -263,8 +263,11 @@ def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     if is_mcap(options):
         return _replay_mcap(scene, options, clock)
     from graspd.drivers.recordings.csv_player import ReplayDriver
+    from graspd.drivers.recordings.csv_rows import SLIPPED
     from graspd.drivers.recordings.faults import ReplayFaults
 
+    if options.outcomes and not all(columns.has_labels for columns in _columns(scene, options)):
+        raise ValueError(f"outcomes needs the column `{SLIPPED}` in every recording")
     return ReplayDriver(
         options.recordings,
         scene.hand.fingers,
@@ -280,6 +283,8 @@ def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
 def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     if options.loop or options.strict or options.faults != ReplayFaultsSection():
         raise ValueError("MCAP files are replayed as they are: no loop, strict or faults")
+    if options.outcomes:
+        raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
     try:
         from graspd.daemon.record.player import McapReplayDriver
     except ModuleNotFoundError as error:

@@ -216,7 +216,11 @@ def _what_is_in(
     if isinstance(contract.input, SessionInput):
         parts["session"] = _session(wanted, contract.input)
     if wanted.learn.enabled:
-        told = "" if wanted.ask_endpoint else "; without [ask] nobody can tell any"
+        tactile = wanted.tactile
+        if isinstance(tactile, scene_drivers.ReplayTactile) and tactile.outcomes:
+            told = " by the recording"
+        else:
+            told = "" if wanted.ask_endpoint else "; without [ask] nobody can tell any"
         parts["learn"] = f"from the outcomes of lifts that are told{told}"
     if wanted.risk is not None:
         parts["risk"] = _risk(wanted.risk)

@@ -18,15 +18,15 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.extras import needs
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.sleep import Sleep
-from graspd.daemon.process.text import complain
+from graspd.daemon.process.text import complain, printable
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets
-from graspd.daemon.run.demo import PUBLISHED, Demo
+from graspd.daemon.run.day_table import PUBLISHED, DayTable
 from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.run.printer import Printer
 from graspd.daemon.run.replaying import Comparison, Controller, trained_on
-from graspd.daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSummary
+from graspd.daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSummary, trained_on_line
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.scene.scene import Hand
@@ -51,6 +51,7 @@ NO_SILENCE_NS = 3_600_000_000_000
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
+DEMO_TITLE = "A day on which the sensors drift. All grasps are synthetic: nobody ever grasped them."
 RISK_OPTIONS = ("max_slip_when_stable", "warm_up", "explore")
 
 
@@ -148,7 +149,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", action="store_true", help="verdict messages on stdout, summary on stderr"
     )
     parser.add_argument(
-        "--verbose", action="store_true", help="of the demo: each verdict, as of other recordings"
+        "--verbose",
+        action="store_true",
+        help="of grasp tables with outcomes: a line for each verdict and all scores, in place of "
+        "a line for 25 grasps",
     )
 
 
@@ -186,9 +190,9 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     source = _source(args)
     parts = _parts(args, source)
     model, pipeline = parts.model, parts.pipeline
-    shown: Printer | Demo
-    if is_demo and not (args.json or args.verbose) and model.contract.fingers == FINGERS:
-        shown = Demo(TactileModel(zoo.find(PUBLISHED)))
+    shown: Printer | DayTable
+    if _shows_table(args, source, parts):
+        shown = _day_table(args, model)
         told: list[Companion] = [shown]
     else:
         shown = Printer(as_json=args.json)
@@ -223,6 +227,27 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         stack.callback(controller.tell)
         loop.run()
     return 0 if stop.received is None else 128 + stop.received
+
+
+def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:
+    """Return True if each reading is a grasp whose outcome both methods can be held against."""
+    fingers = parts.model.contract.fingers
+    if args.json or args.verbose or not isinstance(source, _Tables) or fingers != FINGERS:
+        return False
+    if assembly.gate_mode(parts.scene) != "every":
+        return False
+    return all(columns_of(path, fingers).has_labels for path in args.recordings)
+
+
+def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
+    published = TactileModel(zoo.find(PUBLISHED))
+    names = ", ".join(path.name for path in args.recordings)
+    title = DEMO_TITLE if args.recordings == [DEMO_DAY] else f"Grasps of {printable(names)}."
+    warnings = []
+    for which, judge in (("the model", model), ("the published network", published)):
+        if known := trained_on(args.recordings, judge):
+            warnings.append(trained_on_line(which, known))
+    return DayTable(title, published, model.contract.name, warnings)
 
 
 class _Tables:

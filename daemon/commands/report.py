@@ -64,9 +64,15 @@ def _worth(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("runs/worth"),
         metavar="DIR",
-        help="folder for the picture and the table (runs/worth)",
+        help="folder for the picture, the tables and the figures (runs/worth)",
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="of the object folds")
+    parser.add_argument(
+        "--card",
+        type=Path,
+        metavar="FILE",
+        help="card of a `small-session`, to put the figures on as well",
+    )
     parser.add_argument("--quick", action="store_true", help="few grasps, one epoch: does it run?")
 
 

@@ -6,6 +6,7 @@ Hz. The median of three fresh values takes spikes out, and costs one sweep of de
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress
@@ -19,7 +20,8 @@ from graspd.daemon.judge.contact import Contact
 from graspd.daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from graspd.daemon.judge.gate import Gate
 from graspd.daemon.judge.health import NO_COUNT, Checked
-from graspd.daemon.judge.reasons import Moment, Reason
+from graspd.daemon.judge.reasons import FingerState, Moment, Reason
+from graspd.daemon.judge.stillness import Motion
 from graspd.drivers.base import ELECTRODES, JointReading
 from graspd.models.contract import Finger
 
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
 
 OUTAGE_NS = 1_000_000_000
 """After this long without a usable reading the sensors may have been exchanged or powered again."""
+SLIDE_AFTER_NS = 20_000_000
+"""How long a finger that was still must move before it says `slide`, ns: a quarter of the moments
+in which the wander of a real hold passes the limit are over by then."""
 
 
 @dataclass(slots=True, eq=False)
@@ -113,8 +118,40 @@ class FreshMedian:
 
 
 @dataclass(slots=True)
+class FingerMemory:
+    """How a finger has touched; without a touch, or after a gap, as at the start."""
+
+    was_still: bool = False
+    """True if it has kept still since it touches."""
+    moves_since_ns: int | None = None
+    """Since when it moves. None: it does not."""
+
+    def touch(self, t_ns: int, moves: bool | None) -> FingerState | None:
+        """Return in a word what the finger, which touches, feels at `t_ns`.
+
+        `moves` says whether it moves more than one that holds; None: not known.
+        """
+        if moves is None:
+            self.let_go()
+            return None
+        if not moves:
+            self.was_still, self.moves_since_ns = True, None
+            return FingerState.TOUCH
+        if self.moves_since_ns is None:
+            self.moves_since_ns = t_ns
+        is_short = 0 <= t_ns - self.moves_since_ns < SLIDE_AFTER_NS
+        return FingerState.TOUCH if self.was_still and is_short else FingerState.SLIDE
+
+    def let_go(self) -> None:
+        """Forget the touch."""
+        self.was_still, self.moves_since_ns = False, None
+
+
+@dataclass(slots=True)
 class HandMemory:
     """What the hand's parts do not remember themselves."""
+
+    fingers: list[FingerMemory]
 
     last_ns: int | None = None
     """Time of the last usable reading."""
@@ -137,7 +174,7 @@ class HandTracker:
 
             self._joints = JointMotion(limits.joints)
         self.gate = Gate(fingers, limits)
-        self.memory = HandMemory()
+        self.memory = HandMemory([FingerMemory() for _ in fingers])
 
     @property
     def tared(self) -> tuple[Finger, ...]:
@@ -225,13 +262,29 @@ class HandTracker:
         moment = self.gate.step(
             t_ns, counts, median, usable, touching, objections, in_time=in_time, fresh=fresh
         )
+        moment = moment._replace(fingers=self._feel(t_ns))
         if not moment.judges:
             return moment, None
         return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else counts
 
     def moment(self) -> Moment:
         """Return where in a grasp the hand is without a new reading; it is not to be judged."""
-        return self.gate.moment(self._named(self._contact.memory.touching))
+        moment = self.gate.moment(self._named(self._contact.memory.touching))
+        return moment._replace(fingers=dict.fromkeys(self._fingers))
+
+    def _feel(self, t_ns: int) -> dict[Finger, FingerState | None]:
+        """Return what each finger feels by the reading at hand."""
+        contact, motion = self._contact.memory, self.gate.motion
+        tared, touching = contact.tared.tolist(), contact.touching.tolist()
+        feelings: dict[Finger, FingerState | None] = {}
+        for place, finger in enumerate(self._fingers):
+            memory = self.memory.fingers[place]
+            if touching[place]:
+                feelings[finger] = memory.touch(t_ns, _moves(motion, place))
+            else:
+                memory.let_go()
+                feelings[finger] = FingerState.FREE if tared[place] else None
+        return feelings
 
     def _follow_time(self, t_ns: int) -> None:
         """Forget what does not continue at the time of a usable reading."""
@@ -248,3 +301,14 @@ class HandTracker:
 
     def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
         return tuple(compress(self._fingers, which.tolist()))
+
+
+def _moves(motion: Motion, finger: int) -> bool | None:
+    """Return True if a finger moves beyond a loose limit.
+
+    None: that is not known of both windows, and what is known keeps to its limit.
+    """
+    fast, slow, loose = motion.fast[finger], motion.slow[finger], motion.loose
+    if loose.fast[finger] < fast < math.inf or loose.slow[finger] < slow < math.inf:
+        return True
+    return False if fast < math.inf and slow < math.inf else None

@@ -371,6 +371,8 @@ class Pipeline:
             recent=self._recent(p_slip, objections, withheld, moment),
         )
         supervised = assessment is not None and assessment.supervised
+        if moment.fingers is not None and Reason.STALE in reasons:
+            moment = moment._replace(fingers=dict.fromkeys(moment.fingers))
         return Judgement(
             t_ns=t_ns,
             decision=decision,

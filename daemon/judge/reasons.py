@@ -143,6 +143,17 @@ class GateState(StrEnum):
     """Nothing touches any more, for a moment."""
 
 
+class FingerState(StrEnum):
+    """What a finger feels, in a word."""
+
+    FREE = "free"
+    """It does not touch."""
+    TOUCH = "touch"
+    """It touches, and nothing moves along it more than along a finger that holds."""
+    SLIDE = "slide"
+    """It touches and something moves: the object slides, or the finger presses or lets go."""
+
+
 class GateCause(StrEnum):
     """Why the gate changed its state."""
 
@@ -200,3 +211,5 @@ class Moment(NamedTuple):
     """How each finger moves, in units of its noise; None where that is not known."""
     motion_limits: dict[Finger, float] | None = None
     """Largest motion of a finger that is still."""
+    fingers: dict[Finger, FingerState | None] | None = None
+    """What each finger feels; None where that is not known."""

@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-
 from graspd.daemon.measure.candidates import candidates
 from graspd.daemon.measure.picture import DEFAULT, PANELS, Report, Row, draw, error_of
 from graspd.daemon.measure.timing import measure
@@ -22,11 +20,10 @@ from graspd.daemon.process.text import complain, markdown_table, progress, write
 from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.training.data.datasets import DatasetError, Grasps, read_all
+from graspd.models.training.evaluating.style import QUICK
 
 READINGS, PACED = 2000, 300
 QUICK_READINGS, QUICK_PACED = 100, 5
-QUICK_EVERY = 20
-"""With `--quick`, one of this many grasps is used."""
 COLUMNS = (
     "model",
     "fingers",
@@ -47,11 +44,12 @@ def run(args: argparse.Namespace) -> int:
         grasps = read_all(args.data)
         measured = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
         args.out.mkdir(parents=True, exist_ok=True)
-        text, figures = table(measured), json.dumps(measured)
+        lines, figures = table(measured), json.dumps(measured)
+        text = "\n".join(lines)
         base = args.out / "error-vs-time"
         base.with_suffix(".json").write_text(figures + "\n")
         base.with_suffix(".md").write_text(text + "\n")
-        base.with_suffix(".svg").write_text(draw(measured))
+        base.with_suffix(".svg").write_text(draw(measured, lines))
     except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2
@@ -62,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> Report:
     """Return the figures of all models in these folders. Raises `ModelError`."""
     if quick:
-        grasps = grasps.rows(np.arange(0, len(grasps), QUICK_EVERY))
+        grasps = grasps.few()
     several = candidates(folders, grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
     times = measure({row["name"]: step for row, step in several}, readings, paced)
@@ -82,16 +80,16 @@ def _rank(row: Row) -> tuple[str, float]:
     return row["kind"], -error_of(row, PANELS[0][0]).get("f1", 0.0)
 
 
-def table(measured: Report) -> str:
-    """Return a Markdown table of all rows, with a line on how it was made."""
+def table(measured: Report) -> list[str]:
+    """Return the lines of a Markdown table of all rows, with a line on how it was made."""
     machine = ", ".join(f"{name} {value}" for name, value in measured["machine"].items())
-    rough = " (--quick: rough)" if measured["quick"] else ""
     made = (
         f"{machine}; {measured['readings']['hot']} readings hot, {measured['readings']['paced']} "
-        f"paced{rough}; `graspd report error-vs-time`"
+        f"paced; `graspd report error-vs-time`"
     )
     rows = (_cells(row) for row in measured["rows"])
-    return "\n".join([*markdown_table(COLUMNS, rows), "", made])
+    mark = [f"**{QUICK}**", ""] if measured["quick"] else []
+    return [*mark, *markdown_table(COLUMNS, rows), "", made]
 
 
 def _cells(row: Row) -> list[str]:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from graspd.models.training.evaluating.style import (
+    BLUE,
+    ORANGE,
+    PAPER,
+    QUIET,
+    mark_quick,
+    style,
+    to_svg,
+)
 
 Report = dict[str, Any]
 """Figures in `error-vs-time.json`."""
@@ -26,11 +34,15 @@ PANELS = (
 )
 """Protocols and their question; a model has at most one of a group.
 Without the first it was measured on two palm poses only, and is drawn hollow."""
-COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
+COLOURS = {"model": BLUE, "peer": ORANGE}
 MARKERS = {"model": "o", "peer": "s"}
 SIZE_IN = (9.5, 9.6)
 ERROR_MAX = 104.0
 """Upper end of an axis, %: a point at 100 is seen whole."""
+KEY = (
+    "circles: graspd's models, squares: peers, line: the front, bars: 95 %, "
+    "hollow: two palm poses only"
+)
 FONT_PT = 8.5
 MARKER_PT = 8.0
 
@@ -81,32 +93,23 @@ def front(several: Sequence[Point]) -> list[Point]:
     return best
 
 
-def draw(report: Report) -> str:
-    """Return the picture, as SVG."""
-    mpl.rcParams["svg.hashsalt"] = "graspd"
-    figure = Figure(figsize=SIZE_IN, dpi=72, layout="constrained")
-    panels = figure.subplots(len(PANELS), 1, sharex=True)
-    drawn = [list(points(report["rows"], protocols)) for protocols, _ in PANELS]
-    times = [point.us for point in itertools.chain(*drawn)]
-    panels[-1].set_xscale("log")
-    panels[-1].set_xlim(min(times) / 1.5, max(times) * 1.5)
-    for axes, several, (_, asked) in zip(panels, drawn, PANELS, strict=True):
-        _draw_panel(axes, several, asked)
-    panels[-1].set_xlabel("time of a reading, input and network, paced at 100 Hz, p50, us")
-    figure.suptitle(_title(report), fontsize=11)
-    text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    return text.getvalue()
-
-
-def _title(report: Report) -> str:
-    said = f"Error against run time, on {report['machine']['processor']}"
-    few = " - from few readings (--quick): the times are rough" if report["quick"] else ""
-    key = (
-        "circles: graspd's models, squares: peers, line: the front, bars: 95 %, "
-        "hollow: two palm poses only"
-    )
-    return f"{said}{few}\n{key}"
+def draw(report: Report, figures: Sequence[str]) -> str:
+    """Return the picture, as SVG; `figures` are the report's table."""
+    with style():
+        figure = Figure(figsize=SIZE_IN, dpi=72, layout="constrained")
+        panels = figure.subplots(len(PANELS), 1, sharex=True)
+        drawn = [list(points(report["rows"], protocols)) for protocols, _ in PANELS]
+        times = [point.us for point in itertools.chain(*drawn)]
+        panels[-1].set_xscale("log")
+        panels[-1].set_xlim(min(times) / 1.5, max(times) * 1.5)
+        for axes, several, (_, asked) in zip(panels, drawn, PANELS, strict=True):
+            _draw_panel(axes, several, asked)
+        panels[-1].set_xlabel("time of a reading, input and network, paced at 100 Hz, p50, us")
+        title = f"Error against run time, on {report['machine']['processor']}"
+        figure.suptitle(f"{title}\n{KEY}", fontsize=11)
+        if report["quick"]:
+            mark_quick(figure)
+        return to_svg(figure, title, figures)
 
 
 def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
@@ -120,7 +123,7 @@ def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
         axes.plot(
             point.us, point.error, marker, color=colour,
             markersize=MARKER_PT * (2.0 if marker == "*" else 1.0),
-            markerfacecolor="white" if point.hollow else colour, zorder=5,
+            markerfacecolor=PAPER if point.hollow else colour, zorder=5,
         )  # fmt: skip
     best = front(several)
     axes.plot(
@@ -133,7 +136,6 @@ def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
         margin = 0.08 * (high - low)
         axes.set_ylim(max(low - margin, 0.0), min(high + margin, ERROR_MAX))
     axes.set_ylabel(f"{asked}\n1 - F1, %")
-    axes.grid(alpha=0.25)
     name_points(axes, several)
 
 
@@ -148,5 +150,5 @@ def name_points(axes: Axes, several: Sequence[Point]) -> None:
             fontsize=FONT_PT, color=COLOURS[point.kind],
             fontweight="bold" if is_default else "normal", va="center",
             xytext=(1.02, height), textcoords="axes fraction",
-            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": "#999", "relpos": (0.0, 0.5)},
+            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": QUIET, "relpos": (0.0, 0.5)},
         )  # fmt: skip

@@ -1,16 +1,21 @@
-"""How honest `p_slip` is: of the grasps with a probability of 0.1 a tenth should slip."""
+"""How honest `p_slip` is: of the grasps with a probability of 0.1 a tenth should slip.
+
+The learner's scale is fitted on the sessions of some objects and judged on those of the others.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.measure.streams import Life, Stream
+from graspd.daemon.measure.streams import Group, Life, Stream
 from graspd.daemon.process.text import markdown_table
+from graspd.daemon.trust.learner import SCALE
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
 """Ends of the parts in which `p_slip` is compared with what slipped."""
@@ -19,6 +24,36 @@ STEPS: Final = 50
 SLOPE_MAX: Final = 20.0
 CONFIDENT: Final = 1e-12
 """A probability nearer to 0 or 1 is taken for this one."""
+SPREAD: Final = (0.05, 0.5, 0.95)
+"""Quantiles of the sessions' slopes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Grasps whose `p_slip` is between two edges."""
+
+    low: float
+    high: float
+    grasps: int
+    said: float
+    """Mean `p_slip`."""
+    slipped: float
+    """Fraction."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reliability:
+    """What `p_slip` is worth after outcomes, with scales that its own objects did not fit."""
+
+    parts: list[Part]
+    slope: float
+    """Of outcomes on log-odds; 1 is honest."""
+    sessions: tuple[float, ...]
+    """The same of single sessions, at the quantiles `SPREAD`."""
+    scales: list[float]
+    """Scale of each group of objects, fitted on the sessions of the others of its split."""
+    shipped: float
+    """Scale of the learner as it is shipped."""
 
 
 def slope(p_slip: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
@@ -39,7 +74,26 @@ def slope(p_slip: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
     return factor
 
 
-def reliability(
+def fitted_scales(several: Sequence[Stream], unscaled: Sequence[Life]) -> dict[Group, float]:
+    """Return the scale of each group of objects, fitted on the other groups of its split.
+
+    `unscaled` are the streams' lives with a scale of 1. A group without others has the learner's.
+    """
+    scales = {}
+    for group in dict.fromkeys(one.group for one in several):
+        others = [
+            index
+            for index, one in enumerate(several)
+            if one.group[0] == group[0] and one.group != group
+        ]
+        scales[group] = SCALE
+        if others:
+            lives = [unscaled[index] for index in others]
+            scales[group] = slope(*outcomes_of([several[index] for index in others], lives))
+    return scales
+
+
+def outcomes_of(
     several: Sequence[Stream], lives: Sequence[Life]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return `p_slip` of all judged grasps that rest on an outcome, and whether each slipped."""
@@ -49,17 +103,40 @@ def reliability(
     return np.concatenate(p_slip), np.concatenate(slipped)
 
 
-def reliability_table(several: Sequence[Stream], lives: Sequence[Life]) -> list[str]:
-    """Return said and actual share of slips by part of `p_slip`, and the slope of each session."""
-    p_slip, slipped = reliability(several, lives)
-    rows = []
+def reliability(
+    several: Sequence[Stream], lives: Sequence[Life], scales: dict[Group, float]
+) -> Reliability:
+    """Return what `p_slip` of these lives is worth; they were lived with these scales."""
+    p_slip, slipped = outcomes_of(several, lives)
+    parts = []
     for low, high in itertools.pairwise(EDGES):
         inside = (p_slip >= low) & (p_slip < high)
         if inside.any():
-            said, actual = 100 * p_slip[inside].mean(), 100 * slipped[inside].mean()
-            rows.append([f"{low:g} to {high:g}", str(inside.sum()), f"{said:.1f}", f"{actual:.1f}"])
+            said, actual = float(p_slip[inside].mean()), float(slipped[inside].mean())
+            parts.append(Part(low, high, int(inside.sum()), said, actual))
+    each = [slope(*outcomes_of([one], [life])) for one, life in zip(several, lives, strict=True)]
+    spread = tuple(np.quantile(each, SPREAD).tolist())
+    return Reliability(parts, slope(p_slip, slipped), spread, list(scales.values()), SCALE)
+
+
+def reliability_lines(figures: Reliability) -> list[str]:
+    """Return said and actual share of slips by part of `p_slip`, and the slopes."""
+    rows = [
+        [
+            f"{part.low:g} to {part.high:g}",
+            str(part.grasps),
+            f"{100 * part.said:.1f}",
+            f"{100 * part.slipped:.1f}",
+        ]
+        for part in figures.parts
+    ]
     lines = list(markdown_table(("`p_slip`", "grasps", "said, %", "slipped, %"), rows))
-    each = [slope(*reliability([one], [life])) for one, life in zip(several, lives, strict=True)]
-    low, middle, high = np.quantile(each, (0.05, 0.5, 0.95))
-    spread = f"of a session {middle:.2f}, from {low:.2f} to {high:.2f} (5 to 95 %)"
-    return [*lines, "", f"Slope of outcomes on log-odds: {slope(p_slip, slipped):.2f}; {spread}."]
+    low, middle, high = figures.sessions
+    return [
+        *lines,
+        "",
+        f"Slope of outcomes on log-odds: {figures.slope:.2f}; of a session {middle:.2f}, from "
+        f"{low:.2f} to {high:.2f} (5 to 95 %). Scale of each group of objects, fitted on the "
+        f"others: {min(figures.scales):.2f} to {max(figures.scales):.2f}; shipped "
+        f"{figures.shipped:g}.",
+    ]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.process.text import progress
-from graspd.daemon.trust.learner import sigmoid
+from graspd.daemon.trust.learner import SCALE, sigmoid
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.risk import Permission, RiskLimits
 from graspd.daemon.trust.trust import Trust
@@ -33,12 +33,15 @@ DRAWS: Final = 2
 """Streams of each table, fold and order."""
 Order = Literal["random", "by object"]
 ORDERS: Final[tuple[Order, ...]] = ("random", "by object")
+Group = tuple[int, int]
+"""Objects of a stream: seed of the split, and fold. Folds of one split share no object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
     """The grasps of one table and fold."""
 
+    group: Group
     protocol: str
     table: str
     order: Order
@@ -60,6 +63,8 @@ class Life:
     p_slip: NDArray[np.float64]
     """NaN: refused."""
     stable: NDArray[np.bool_]
+    supervised: NDArray[np.bool_]
+    """Grasps whose lift under supervision was asked for."""
     outcomes: NDArray[np.int64]
     """Number of outcomes that each verdict rests on."""
     within: bool
@@ -92,7 +97,10 @@ def streams(
                 margins, features, refused = judged(own, grasps, rows)
                 theirs = published.margins(grasps.counts[rows], grasps.table_of[rows])
                 slipped = grasps.slipped[rows]
-                yield Stream(protocol, table, order, margins, features, refused, theirs, slipped)
+                yield Stream(
+                    (seed, fold), protocol, table, order,
+                    margins, features, refused, theirs, slipped,
+                )  # fmt: skip
 
 
 def judged(
@@ -108,23 +116,25 @@ def judged(
     return margins, inputs, refused
 
 
-def live(stream: Stream, limits: RiskLimits, *, every: bool) -> Life:
+def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCALE) -> Life:
     """Judge, lift and tell one grasp after the other; refused ones are left alone.
 
-    Without `every`, only stable and supervised grasps are lifted and their outcomes told.
+    Without `every`, only stable and supervised grasps are lifted and their outcomes told. `scale`
+    takes the place of the learner's own.
     """
     trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
+    trust.learner.scale = scale
     p_slip, stable = np.full(count, np.nan), np.zeros(count, np.bool_)
-    outcomes, within = np.zeros(count, np.int64), True
+    supervised, outcomes, within = np.zeros(count, np.bool_), np.zeros(count, np.int64), True
     for index in np.flatnonzero(~stream.refused).tolist():
         grasp = GraspId(f"{stream.table} {stream.order}", index)
         margin, slipped = float(stream.margins[index]), bool(stream.slipped[index])
         assessed = trust.judge(grasp, sigmoid(margin), margin, stream.features[index])
         p_slip[index] = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
-        outcomes[index] = assessed.outcomes
+        supervised[index], outcomes[index] = assessed.supervised, assessed.outcomes
         stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5
         trust.note(grasp, assessed, stable=bool(stable[index]))
         if every or stable[index] or assessed.supervised:
             trust.outcome(grasp, slipped=slipped)
         within &= trust.risk.bound is None or trust.risk.slips <= trust.risk.bound + 1e-9
-    return Life(p_slip, stable, outcomes, within)
+    return Life(p_slip, stable, supervised, outcomes, within)

@@ -7,41 +7,64 @@ of other objects, each after the outcomes of those before it.
 from __future__ import annotations
 
 import argparse
-import io
 import itertools
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from graspd.daemon.measure.reliability import reliability_table
+from graspd.daemon.measure.reliability import (
+    Reliability,
+    fitted_scales,
+    reliability,
+    reliability_lines,
+)
 from graspd.daemon.measure.streams import Life, Stream, live, streams
 from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
 from graspd.daemon.trust.risk import RiskLimits
+from graspd.models.contract import ModelError
 from graspd.models.training.data.datasets import DatasetError, read_all
+from graspd.models.training.evaluating.day_figures import VerdictFigures
+from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.evaluating.style import (
+    BLUE,
+    NAVY,
+    OLIVE,
+    ORANGE,
+    QUICK,
+    QUIET,
+    mark_quick,
+    style,
+    to_svg,
+)
+from graspd.models.zoo import read_card
 
 ALLOWED: Final = 0.05
-TARGETS: Final = (ALLOWED, 0.1)
+TARGETS: Final = (0.02, ALLOWED, 0.1, 0.2)
 WARM_UP, EXPLORE = 50, 0.05
 """Of the scene's `[risk]`, as it is unless it is set."""
+WARM_UPS: Final = (0, 20, WARM_UP, 100)
+"""Lengths of the warm-up that are compared, outcomes."""
+ALL_DAYS: Final = "all"
 GRASPS: Final = (0, 10, 25, 50, 75, 100, 150, 200, 250, 300)
 """Ends of the parts that the figures are means of, grasps of the day."""
 LEAST: Final = 100
 """Parts with fewer grasps in all streams are left out."""
-QUICK_EVERY: Final = 20
-"""With `--quick`, one of this many grasps is used."""
 PUBLISHED, ALONE, LEARNING, RISK = (
     "the published method (cnn1)",
     "graspd, nothing told",
     "graspd, learning",
     f"graspd, at most {100 * ALLOWED:g} % slips allowed",
 )
-COLOURS: Final = {PUBLISHED: "#c65d21", ALONE: "#9a8f2f", LEARNING: "#1f6f8b", RISK: "#123f50"}
-STYLES: Final = {PUBLISHED: "s-", ALONE: "o:", LEARNING: "o-", RISK: "o-"}
+COLOURS: Final = {PUBLISHED: ORANGE, ALONE: OLIVE, LEARNING: BLUE, RISK: NAVY}
+STYLES: Final = {PUBLISHED: "s-", ALONE: "o:", LEARNING: "o-", RISK: "D-"}
+BY_GRASP: Final = "slips among `stable` / good lifts kept, %, by grasp of the day"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,39 +79,115 @@ class WorthPoint:
     """Fraction of the grasps that held which were called stable."""
 
 
+Curves = dict[str, list[WorthPoint]]
+
+
+@dataclass(frozen=True, slots=True)
+class RiskFigures:
+    """What became of a target in the sessions of one day, as fractions."""
+
+    target: float
+    warm_up: int
+    """Outcomes."""
+    day: str
+    sessions: int
+    kept: float
+    """Of all grasps that held, mean of the sessions."""
+    slips: float
+    """Of all that was called stable."""
+    above: float
+    """Of the sessions: those of which more than the target slipped."""
+    supervised: float
+    """Lifts under supervision that a session asks for, mean of the sessions; no fraction."""
+
+
+@dataclass(frozen=True, slots=True)
+class DayF1:
+    """F1 of the judged grasps of one day, slip positive, as fractions."""
+
+    day: str
+    sessions: int
+    alone: float
+    """Without outcomes."""
+    learning: float
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """All that the report measures."""
+
+    command: str
+    sessions: int
+    curves: Curves
+    risk: list[RiskFigures]
+    """By target and day."""
+    warm_up: list[RiskFigures]
+    """Of `ALLOWED` by length of the warm-up, all days together."""
+    days: list[DayF1]
+    reliability: Reliability
+
+
 def run(args: argparse.Namespace) -> int:
-    """Measure, draw and print; 2 if data or folder are wrong."""
+    """Measure, draw and print; 2 if data, card or folder are wrong."""
     try:
         grasps = read_all(args.data)
         args.out.mkdir(parents=True, exist_ok=True)
         if args.quick:
-            grasps = grasps.rows(np.arange(0, len(grasps), QUICK_EVERY))
-            several = list(streams(grasps, seeds=1, folds=1, epochs=1))
+            several = list(streams(grasps.few(), seeds=1, folds=1, epochs=1))
         else:
             several = list(streams(grasps, args.seeds))
         progress("")
-        learning = [live(one, RiskLimits(), every=True) for one in several]
-        lives = {
-            share: [live(one, limits(share), every=False) for one in several] for share in TARGETS
-        }
-        curves = measured(several, learning, lives[ALLOWED])
-        tables = (table(curves), risk_table(several, lives), reliability_table(several, learning))
-        text = "\n".join("\n".join(lines) + "\n" for lines in tables)
-        (args.out / "worth.md").write_text(text)
-        (args.out / "worth.svg").write_text(draw(curves))
-    except (DatasetError, OSError) as error:
+        quick = " --quick" if args.quick else ""
+        worth = worth_of(several, f"graspd report worth --data DIR --seeds {args.seeds}{quick}")
+        text = "\n".join([*([f"**{QUICK}**", ""] if quick else []), *lines(worth)])
+        write_whole(args.out / "worth.json", to_json(worth))
+        write_whole(args.out / "worth.md", f"{text}\n".encode())
+        write_whole(args.out / "worth.svg", draw(worth.curves, quick=args.quick).encode())
+        if args.card is not None:
+            _put_on(args.card, worth)
+    except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2
     write_lines(text)
     return 0
 
 
-Curves = dict[str, list[WorthPoint]]
+def _put_on(card: Path, worth: Worth) -> None:
+    content: dict[str, Any] = read_card(card) | {"worth": json.loads(to_json(worth))}
+    write_whole(card, to_json(content))
 
 
-def limits(share: float) -> RiskLimits:
-    """Return the limits of a scene that sets this share and nothing else."""
-    return RiskLimits(share, WARM_UP, EXPLORE)
+def worth_of(several: Sequence[Stream], command: str) -> Worth:
+    """Live all streams, with scales that were fitted on other objects, and measure them."""
+    unscaled = [live(one, RiskLimits(), every=True, scale=1.0) for one in several]
+    scales = fitted_scales(several, unscaled)
+
+    def lives(chosen: RiskLimits, *, every: bool) -> list[Life]:
+        return [live(one, chosen, every=every, scale=scales[one.group]) for one in several]
+
+    learning = lives(RiskLimits(), every=True)
+    risks = {target: lives(limits(target), every=False) for target in TARGETS}
+    warm_ups = {
+        count: risks[ALLOWED] if count == WARM_UP else lives(limits(ALLOWED, count), every=False)
+        for count in WARM_UPS
+    }
+    return Worth(
+        command,
+        len(several),
+        measured(several, learning, risks[ALLOWED]),
+        list(_risks(several, risks)),
+        [
+            risk_figures(several, lived, ALLOWED, ALL_DAYS, count)
+            for count, lived in warm_ups.items()
+        ],
+        list(_days(several, learning)),
+        reliability(several, learning, scales),
+    )
+
+
+def limits(share: float, warm_up: int = WARM_UP) -> RiskLimits:
+    """Return the limits of a scene that sets this share and this warm-up."""
+    return RiskLimits(share, warm_up, EXPLORE)
 
 
 def measured(several: Sequence[Stream], learning: Sequence[Life], risk: Sequence[Life]) -> Curves:
@@ -117,30 +216,13 @@ def _curve(
     return points
 
 
-def table(curves: Curves) -> list[str]:
-    """Return a table of slips among stable / good lifts kept, in %."""
-    grasps = [point.grasps for point in curves[PUBLISHED]]
-    rows = [
-        [name, *(f"{100 * p.slips_among_stable:.0f} / {100 * p.coverage:.0f}" for p in points)]
-        for name, points in curves.items()
-    ]
-    titles = ("slips among `stable` / good lifts kept, %, by grasp of the day", *map(str, grasps))
-    return list(markdown_table(titles, rows))
-
-
-@dataclass(frozen=True, slots=True)
-class RiskFigures:
-    """What became of a target in some streams, as fractions."""
-
-    kept: float
-    """Of all grasps that held, mean of the streams."""
-    slips: float
-    """Of all that was called stable."""
-    above: float
-    """Of the streams: those of which more than the target slipped."""
-
-
-def risk_figures(several: Sequence[Stream], lives: Sequence[Life], target: float) -> RiskFigures:
+def risk_figures(
+    several: Sequence[Stream],
+    lives: Sequence[Life],
+    target: float,
+    day: str,
+    warm_up: int = WARM_UP,
+) -> RiskFigures:
     """Return what a target kept; every life must be of its stream."""
     kept, stable, slips, above = [], 0, 0, 0
     for one, life in zip(several, lives, strict=True):
@@ -148,53 +230,108 @@ def risk_figures(several: Sequence[Stream], lives: Sequence[Life], target: float
         kept.append((called - slipped) / max(int((~one.slipped).sum()), 1))
         stable, slips = stable + called, slips + slipped
         above += slipped > target * called
-    return RiskFigures(float(np.mean(kept)), slips / max(stable, 1), above / max(len(kept), 1))
+    return RiskFigures(
+        target,
+        warm_up,
+        day,
+        len(lives),
+        float(np.mean(kept)),
+        slips / max(stable, 1),
+        above / len(lives),
+        float(np.mean([life.supervised.sum() for life in lives])),
+    )
 
 
-def risk_table(several: Sequence[Stream], lives: dict[float, list[Life]]) -> list[str]:
-    """Return what each target kept on each day, in %."""
-    rows = []
-    days = sorted({one.protocol for one in several})
+def _risks(several: Sequence[Stream], lives: dict[float, list[Life]]) -> Iterator[RiskFigures]:
     for target, of_target in lives.items():
-        for day in days:
-            chosen = [index for index, one in enumerate(several) if one.protocol == day]
-            figures = risk_figures(
-                [several[index] for index in chosen], [of_target[index] for index in chosen], target
-            )
-            shares = (figures.kept, figures.slips, figures.above)
-            sessions = str(len(chosen))
-            rows.append([f"{target:g}", day, sessions, *(f"{100 * share:.1f}" for share in shares)])
-    titles = ("target", "day", "sessions", "good lifts kept, %", "slips among `stable`, %",
-              "sessions above the target, %")  # fmt: skip
-    return list(markdown_table(titles, rows))
+        for day, chosen in _by_day(several).items():
+            these = [of_target[index] for index in chosen]
+            yield risk_figures([several[index] for index in chosen], these, target, day)
 
 
-def draw(curves: Curves) -> str:
-    """Draw both figures against outcomes told, as SVG."""
-    mpl.rcParams["svg.hashsalt"] = "graspd"
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for name, points in curves.items():
-        grasps = [point.grasps for point in points]
-        slips = [100 * point.slips_among_stable for point in points]
-        kept = [100 * point.coverage for point in points]
-        for axes, values in ((left, slips), (right, kept)):
-            axes.plot(grasps, values, STYLES[name], color=COLOURS[name], label=name, markersize=5)
-    left.axhline(100 * ALLOWED, color="#888", ls=":", lw=1)
-    left.text(1.0, 100 * ALLOWED, "allowed ", transform=left.get_yaxis_transform(), ha="right",
-              va="bottom", fontsize=8, color="#666")  # fmt: skip
-    _dress(left, "slips among 'stable', %")
-    _dress(right, "good lifts that are called 'stable', %")
-    right.set_ylim(0, 100)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4,
-                  frameon=False, fontsize=9)  # fmt: skip
-    text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    return text.getvalue()
+def _days(several: Sequence[Stream], learning: Sequence[Life]) -> Iterator[DayF1]:
+    for day, chosen in _by_day(several).items():
+        here = [(several[index], learning[index]) for index in chosen]
+        slipped = np.concatenate([one.slipped[~one.refused] for one, _ in here])
+        alone = np.concatenate([one.margins[~one.refused] >= 0.0 for one, _ in here])
+        after = np.concatenate([life.p_slip[~one.refused] >= 0.5 for one, life in here])
+        f1 = (VerdictFigures.of(called, slipped).f1 for called in (alone, after))
+        yield DayF1(day, len(chosen), *f1)
 
 
-def _dress(axes: Any, title: str) -> None:  # noqa: ANN401 - matplotlib's own
+def _by_day(several: Sequence[Stream]) -> dict[str, list[int]]:
+    """Return the places of each day's streams."""
+    days = sorted({one.protocol for one in several})
+    return {
+        day: [index for index, one in enumerate(several) if one.protocol == day] for day in days
+    }
+
+
+def lines(worth: Worth) -> Iterator[str]:
+    """Yield the report in Markdown, figures in %."""
+    yield from curve_lines(worth.curves)
+    yield ""
+    shown = ["sessions", "good lifts kept, %", "slips among `stable`, %",
+             "sessions above the target, %", "supervised lifts of a session"]  # fmt: skip
+    risk = ([f"{one.target:g}", one.day, *_risk_cells(one)] for one in worth.risk)
+    yield from markdown_table(["target", "day", *shown], risk)
+    yield ""
+    warm_ups = ([str(one.warm_up), *_risk_cells(one)] for one in worth.warm_up)
+    yield from markdown_table([f"warm-up, target {ALLOWED:g}", *shown], warm_ups)
+    yield ""
+    titles = ["day", "sessions", "F1 of judged, nothing told, %", "F1 of judged, learning, %"]
+    days = ([one.day, str(one.sessions), *_percents(one.alone, one.learning)] for one in worth.days)
+    yield from markdown_table(titles, days)
+    yield ""
+    yield from reliability_lines(worth.reliability)
+    yield ""
+    yield f"{worth.sessions} sessions, each from nothing; `{worth.command}`."
+
+
+def _risk_cells(one: RiskFigures) -> list[str]:
+    shares = _percents(one.kept, one.slips, one.above)
+    return [str(one.sessions), *shares, f"{one.supervised:.0f}"]
+
+
+def _percents(*fractions: float) -> list[str]:
+    return [f"{100 * fraction:.1f}" for fraction in fractions]
+
+
+def curve_lines(curves: Curves) -> list[str]:
+    """Return a table of slips among stable / good lifts kept, in %."""
+    grasps = [point.grasps for point in curves[PUBLISHED]]
+    rows = [
+        [name, *(f"{100 * p.slips_among_stable:.0f} / {100 * p.coverage:.0f}" for p in points)]
+        for name, points in curves.items()
+    ]
+    return list(markdown_table((BY_GRASP, *map(str, grasps)), rows))
+
+
+def draw(curves: Curves, *, quick: bool = False) -> str:
+    """Draw both figures by grasp of the day, as SVG."""
+    with style():
+        figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for name, points in curves.items():
+            grasps = [point.grasps for point in points]
+            slips = [100 * point.slips_among_stable for point in points]
+            kept = [100 * point.coverage for point in points]
+            for axes, values in ((left, slips), (right, kept)):
+                axes.plot(grasps, values, STYLES[name], color=COLOURS[name], label=name, ms=5)
+        left.axhline(100 * ALLOWED, color=QUIET, ls=":", lw=1)
+        left.text(1.0, 100 * ALLOWED, "allowed ", transform=left.get_yaxis_transform(),
+                  ha="right", va="bottom", fontsize=8, color=QUIET)  # fmt: skip
+        _dress(left, "slips among 'stable', %")
+        _dress(right, "good lifts that are called 'stable', %")
+        right.set_ylim(0, 100)
+        figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4,
+                      fontsize=9)  # fmt: skip
+        if quick:
+            mark_quick(figure)
+        return to_svg(figure, "What `stable` is worth on another day", curve_lines(curves))
+
+
+def _dress(axes: Axes, title: str) -> None:
     axes.set_xlabel("grasps of a day and of objects that were not trained on")
     axes.set_ylabel(title)
     axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.25)

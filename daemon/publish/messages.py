@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
-from graspd.daemon.judge.reasons import Decision, GateCause, GateState, Reason
+from graspd.daemon.judge.reasons import Decision, FingerState, GateCause, GateState, Reason
 from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.risk import RiskReport
 from graspd.models.contract import Finger
@@ -104,6 +104,8 @@ class Verdict(_Message, frozen=True, kw_only=True):
     """Of each finger, in units of its own noise; null where it is not known, or nothing touches."""
     motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
     """Most motion of a finger that is still."""
+    fingers: Annotated[dict[Finger, FingerState | None], _HAND] | None = None
+    """What each finger feels; null where that is not known. Null with a null `gate`."""
 
 
 class GateMessage(_Message, frozen=True, kw_only=True):

@@ -196,6 +196,7 @@ class Outbox:
             still_ms=moment.still_ms,
             motion=moment.motion,
             motion_limits=moment.motion_limits,
+            fingers=moment.fingers,
         )
         payload = encode(message)
         self._send("verdict", payload)

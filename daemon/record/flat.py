@@ -15,15 +15,23 @@ TABLE: Final = (
     f"Shape (fingers, {ELECTRODES}), row by row: finger f's electrode e is at "
     f"{ELECTRODES} * f + e - 1, with f from 0 and e from 1."
 )
+UNKNOWN: Final = "unknown"
+"""State of a finger that is not known. A viewer draws the last state on where there is none."""
 
 
 def flat(value: object) -> object:
     """Return a message without null, each table as one list, row by row."""
     if isinstance(value, dict):
-        return {name: flat(one) for name, one in value.items() if one is not None}
+        return {name: _part(name, one) for name, one in value.items() if one is not None}
     if isinstance(value, list) and value and isinstance(value[0], list):
         return list(chain.from_iterable(value))
     return value
+
+
+def _part(name: str, value: object) -> object:
+    if name == "fingers" and isinstance(value, dict):  # of a verdict
+        return {finger: UNKNOWN if state is None else state for finger, state in value.items()}
+    return flat(value)
 
 
 def table(values: object) -> object:
@@ -50,8 +58,10 @@ def _schema(kind: inspect.Type) -> JsonSchema:
         case inspect.StructType():
             return _object(kind)
         case inspect.DictType():
-            named = {name: _schema(kind.value_type) for name in _values(kind.key_type)}
             more = _schema(kind.value_type)
+            if isinstance(kind.value_type, inspect.UnionType) and "enum" in more:
+                more["enum"] = [*more["enum"], UNKNOWN]
+            named = dict.fromkeys(_values(kind.key_type), more)
             return {"type": "object", "properties": named, "additionalProperties": more}
         case inspect.ListType(item_type=inspect.ListType(item_type=count)):
             return {"type": "array", "description": TABLE, "items": _schema(count)}

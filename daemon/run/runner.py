@@ -17,12 +17,14 @@ from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets, plan
 from graspd.daemon.run.loop import Ended, Loop, LoopTiming
 from graspd.daemon.run.reload import Reload
+from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.drivers.base import DriverError
 from graspd.models.contract import ModelError
 
 if TYPE_CHECKING:
     from graspd.daemon.run.printer import Printer
     from graspd.daemon.run.realtime import RealtimeMode
+    from graspd.daemon.run.replaying import Controller
     from graspd.daemon.run.systemd import Systemd
     from graspd.daemon.trust.trust import Trust
 
@@ -62,6 +64,15 @@ def enter_realtime(wanted: scene.Scene, stack: ExitStack) -> RealtimeMode | None
     from graspd.daemon.run.realtime import RealtimeMode  # only where a scene wants realtime
 
     return stack.enter_context(RealtimeMode(wanted.realtime))
+
+
+def _controller(wanted: scene.Scene) -> Controller | None:
+    """Return what tells recorded outcomes, if the scene wants it."""
+    if not isinstance(wanted.tactile, ReplayTactile) or not wanted.tactile.outcomes:
+        return None
+    from graspd.daemon.run.replaying import Controller  # only where a scene wants it
+
+    return Controller(only_lifted=True)
 
 
 class Runner:
@@ -157,8 +168,10 @@ class Runner:
             around.keep_session()
             realtime = enter_realtime(wanted, stack)
             around.record()
+            controller = _controller(wanted)
             companions = [
-                *(self._reload, self._manager, *around.companions, self._printer, realtime)
+                *(self._reload, self._manager, *around.companions),
+                *(self._printer, realtime, controller),
             ]
             loop = Loop(
                 parts.drivers,

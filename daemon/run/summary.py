@@ -243,15 +243,17 @@ class RunSummary:
             lines += [f"  {line}" for line in tally.lines()]
         lines += _learned(trust)
         if self.trained_on:
-            lines.append(
-                f"the model was trained on {', '.join(self.trained_on)}: it judges other grasps "
-                "worse than these"
-            )
+            lines.append(trained_on_line("the model", self.trained_on))
         lines.append(
             f"reading to verdict: p50 {self.latency.quantile_us(0.5):.0f} us, "
             f"p99 {self.latency.quantile_us(0.99):.0f} us, max {self.latency.max_us:.0f} us"
         )
         return lines
+
+
+def trained_on_line(which: str, names: Sequence[str]) -> str:
+    """Return the warning for recordings that a model was trained on."""
+    return f"{which} was trained on {', '.join(names)}: it judges other grasps worse than these"
 
 
 def _learned(trust: Trust | None) -> Iterator[str]:

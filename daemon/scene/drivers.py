@@ -110,6 +110,8 @@ class ReplayTactile(Section):
     """Readings per second of a grasp table, which has no times of its own."""
     loop: bool = False
     """Begin again at the end, for ever."""
+    outcomes: bool = False
+    """Tell the recorded outcome of each lift that the verdict allows, as a controller would."""
     strict: bool = False
     """Stop at the first value that is not a 12-bit count."""
     faults: ReplayFaultsSection = ReplayFaultsSection()

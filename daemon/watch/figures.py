@@ -39,7 +39,7 @@ def doubt(verdict: Verdict) -> str | None:
 def rests_on(verdict: Verdict) -> str:
     """Return in one line what the verdict rests on."""
     network, risk = verdict.p_slip_model, verdict.risk
-    said = "" if network is None else f"network {percent(network)}, "
+    said = "" if network is None else f"slip probability by the network alone {percent(network)}, "
     if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
         return said + NO_OUTCOME
     said += f"rests on {counted(verdict.outcomes, 'lift')}; "

@@ -7,6 +7,7 @@ from collections.abc import Collection
 import msgspec
 import numpy as np
 
+from graspd.daemon.judge.reasons import FingerState
 from graspd.daemon.publish.messages import Tactile, Verdict
 from graspd.models.contract import Finger
 from graspd.models.layout import ELECTRODES
@@ -41,6 +42,8 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     """Pixels of electrodes that are faulty or repaired."""
     motion: FingerMotion | None
     """None if each reading is a grasp."""
+    state: FingerState | None = None
+    """None: not known."""
 
 
 class Fingers:
@@ -88,6 +91,7 @@ class Fingers:
             deepest=round(float(fall.max())),
             marked=sorted(PIXELS[electrode] for electrode in np.flatnonzero(~sound | repaired)),
             motion=_motion(verdict, name),
+            state=(verdict.fingers or {}).get(name),
         )
 
     @property

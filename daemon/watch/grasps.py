@@ -72,6 +72,7 @@ class GraspLog:
             JudgedGrasp(
                 verdict=verdict.verdict.value,
                 p_slip=verdict.p_slip,
+                boot_id=verdict.boot_id,
                 grasp=verdict.grasp,
                 ago_s=(now_ns - judged_ns) / 1e9,
                 ended=self._ended.get(key),

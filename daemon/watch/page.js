@@ -3,8 +3,10 @@ const STATES = ["idle", "closing", "settled", "judged", "released"];
 const TONES = {s: "stable", l: "leans", x: "slip", u: "learning", w: "waiting", t: "trouble", ".": "silent"};
 const LANES = [["x", "slip"], ["s", "stable"], ["l", "leans"], ["u", "watched"], ["t", "wrong"], ["w", "waiting"], [".", "silent"]];
 const MARKS = {slip: "\u2715", stable: "\u25cf", unknown: "?"};
+const LEFT = 62, RIGHT = 4;  // of the timeline, px
 const ROWS = 12, COLUMNS = 11, FULL = 100, MOMENTS = 300, MINUTES = 5;
 const QUIET_MS = 1000;  // the server sends ten times a second
+const FRESH_S = .2;  // an image is of the judged grasp if the verdict is not older
 const LOOK_MS = 100, AGAIN_MS = 1000;  // between two looks at the clock; between two tries
 const PRESSED = [[11, "#6b3a78"], [30, "#a8326a"], [55, "#e2582e"], [80, "#f9b01c"], [100, "#fdf7a8"]];
 const hands = [];
@@ -16,7 +18,9 @@ let fastest = Infinity;  // way of a snapshot on this connection, with the diffe
 function text(node, value) { if (node.textContent !== value) node.textContent = value; }
 function percent(share) { return `${(100 * share).toFixed(0)} %`; }
 function clock(seconds) { return new Date(1000 * seconds).toTimeString().slice(0, 8); }
-function called(grasp) { return grasp.verdict + (grasp.p_slip === null ? "" : " " + percent(grasp.p_slip)); }
+function likely(grasp) { return grasp.p_slip === null ? "" : `slip probability ${percent(grasp.p_slip)}`; }
+function called(grasp) { return grasp.verdict + (grasp.p_slip === null ? "" : `, ${likely(grasp)}`); }
+function keyOf(grasp) { return `${grasp.boot_id} ${grasp.grasp}`; }
 function rgb(hex) { return [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 16)); }
 function mix(one, other, share) {
   return `rgb(${one.map((value, at) => Math.round(value + (other[at] - value) * share)).join()})`;
@@ -84,26 +88,39 @@ function drawFinger(canvas, finger) {
 }
 
 // Up to the mark in the middle a finger is still; at the right end it moves twice as much.
-function drawMotion(bar, words, motion) {
+function drawMotion(bar, words, motion, state) {
   bar.hidden = words.hidden = motion === null;
   if (motion === null) return;
   const {now, limit} = motion;
   bar.dataset.motion = now === null ? "unknown" : now > limit ? "moving" : "still";
   bar.style.setProperty("--share", `${now === null ? 0 : Math.min(50 * now / limit, 100)}%`);
-  text(words, now === null ? "motion unknown" : `moves ${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`);
+  words.dataset.state = state ?? "unknown";
+  const figures = now === null ? "" : ` ${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`;
+  text(words, (state ?? (now === null ? "motion unknown" : "moves")) + figures);
 }
 
-// A lane for each kind of verdict, below it the probability of slip, and the minutes before now.
-function drawTimeline(canvas, history, probability) {
+// A second of the timeline in words; `ago` counts from the end of the history.
+function momentOf(minutes, ago) {
+  const at = minutes.history.length - 1 - ago;
+  if (at < 0) return "no second here: watch began later";
+  const codes = minutes.history[at], names = LANES.filter(([code]) => codes.includes(code)).map(([, name]) => name);
+  const share = minutes.probability[at];
+  const probability = share < 0 ? "no slip probability" : `highest slip probability ${share} %`;
+  return `${clock(minutes.t - ago)}: ${names.join(", ")}; ${probability}`;
+}
+
+// A lane for each kind of verdict, below it the probability of slip, and the minutes before the end.
+function drawTimeline(canvas, minutes, end, pointed) {
+  const {history, probability} = minutes;
   const context = sized(canvas), ratio = window.devicePixelRatio || 1;
-  const left = 62 * ratio, lane = 12 * ratio, bottom = canvas.height - 16 * ratio, top = LANES.length * lane + 10 * ratio;
-  const step = (canvas.width - left - 4 * ratio) / MOMENTS, start = MOMENTS - history.length;
+  const left = LEFT * ratio, lane = 12 * ratio, bottom = canvas.height - 16 * ratio, top = LANES.length * lane + 10 * ratio;
+  const step = (canvas.width - left - RIGHT * ratio) / MOMENTS, start = MOMENTS - history.length;
   const size = 2.8 * ratio, level = share => bottom - (bottom - top) * share / 100;
   context.font = `${11 * ratio}px system-ui, sans-serif`; context.textBaseline = "middle";
   for (let minute = 0; minute <= MINUTES; minute++) {
     const x = left + minute * MOMENTS / MINUTES * step;
     const unit = minute && canvas.width < 560 * ratio ? "" : " min";
-    const label = minute === MINUTES ? "now" : `\u2212${MINUTES - minute}${unit}`;
+    const label = minute === MINUTES ? end : `\u2212${MINUTES - minute}${unit}`;
     context.fillStyle = colours.track; context.fillRect(x, 0, ratio, bottom + 4 * ratio);
     context.fillStyle = colours.faint; context.textAlign = minute === MINUTES ? "right" : minute ? "center" : "left";
     context.fillText(label, x, canvas.height - 6 * ratio);
@@ -132,6 +149,10 @@ function drawTimeline(canvas, history, probability) {
     } else context.arc(x, y, size, 0, 2 * Math.PI);
     if (history[at].includes("s")) context.fill(); else context.stroke();
   });
+  if (pointed !== null) {
+    context.fillStyle = colours.text;
+    context.fillRect(left + (MOMENTS - 1 - pointed + .5) * step, 0, ratio, bottom);
+  }
   const seconds = LANES.map(([code, name]) => [name, history.filter(each => each.includes(code)).length]);
   canvas.ariaLabel = "verdicts by second: " + seconds.filter(([, count]) => count).map(([name, count]) => `${name} ${count} s`).join(", ");
 }
@@ -141,18 +162,57 @@ class Hand {
     this.seen = null;
     this.root = document.getElementById("hand").content.firstElementChild.cloneNode(true);
     this.parts = {};
+    this.images = new Map();  // of each grasp in the list that this page saw judged
+    this.chosen = null;  // key of the grasp whose image is shown; null: the image of now
+    this.paused = null;  // the minutes that are shown while paused
+    this.pointed = null;  // second of the timeline below the pointer, counted from its end
     document.getElementById("hands").append(this.root);
+    this.listen();
+  }
+  listen() {
+    const line = this.part("timeline");
+    this.part("pause").onclick = () => { if (this.seen !== null) this.paused = this.paused === null ? this.minutes(0) : null; draw(); };
+    this.part("live").onclick = () => { this.chosen = null; draw(); };
+    this.part("grasps").onclick = event => {
+      const row = event.target.closest("tr"), at = [...this.part("grasps").children].indexOf(row);
+      if (at < 0 || this.seen === null) return;
+      const key = keyOf(this.seen.grasps[at]);
+      this.chosen = this.chosen === key ? null : key;
+      draw();
+    };
+    line.onpointermove = line.onpointerdown = event => {
+      const share = (event.offsetX - LEFT) / (line.clientWidth - LEFT - RIGHT);
+      this.pointed = share < 0 || share >= 1 ? null : MOMENTS - 1 - Math.floor(share * MOMENTS);
+      draw();
+    };
+    line.onpointerleave = () => { this.pointed = null; draw(); };
+  }
+  take(snapshot) {
+    this.seen = snapshot;
+    const newest = snapshot.grasps[0], keys = snapshot.grasps.map(keyOf);
+    if (newest !== undefined && newest.held && newest.ago_s < FRESH_S && snapshot.fingers.length)
+      this.images.set(keyOf(newest), snapshot.fingers);
+    for (const key of this.images.keys()) if (!keys.includes(key)) this.images.delete(key);
+    if (!keys.includes(this.chosen)) this.chosen = null;
+  }
+  // The last five minutes; where nothing comes, they move on.
+  minutes(quiet) {
+    const missed = Math.min(Math.floor(quiet / 1000), MOMENTS), seen = this.seen;
+    return {
+      t: seen.t + missed, history: [...seen.history, ...Array(missed).fill(".")].slice(-MOMENTS),
+      probability: [...seen.history_p, ...Array(missed).fill(-1)].slice(-MOMENTS),
+    };
   }
   part(name) { return this.parts[name] ??= this.root.querySelector("." + name); }
   say(name, value) { text(this.part(name), value); }
 
   draw(quiet) {
-    const seen = this.seen, none = gone || seen === null, tone = none ? "silent" : seen.tone;
+    const seen = this.seen, none = gone || seen === null, tone = this.tone();
     this.say("clock", clock(Date.now() / 1000));
     this.part("banner").dataset.tone = tone;
     this.say("verdict", this.headline());
     const p = none ? null : seen.p_slip, last = none ? null : seen.grasps[0] ?? null;
-    const was = last !== null && tone !== "silent" && seen.verdict === "unknown" && last.verdict !== "unknown";
+    const was = last !== null && (tone === "waiting" || tone === "learning") && last.verdict !== "unknown";
     this.say("was", was && last.grasp === seen.grasp ? `${last.held ? "judged" : "past:"} ${called(last)}` : "");
     this.say("evidence", none ? "" : seen.evidence);
     this.say("p", p === null ? "no probability" : `slip probability ${percent(p)}`);
@@ -170,10 +230,8 @@ class Hand {
     this.say("model", seen.model ?? "no model yet");
     this.say("where", none ? seen.endpoint : `${seen.endpoint} ${seen.link}`);
     this.drawGrasp(none, quiet);
-    this.drawFingers(none ? [] : seen.fingers);
-    const missed = Math.min(Math.floor(quiet / 1000), MOMENTS);  // it moves on where nothing comes
-    drawTimeline(this.part("timeline"), [...seen.history, ...Array(missed).fill(".")].slice(-MOMENTS),
-      [...seen.history_p, ...Array(missed).fill(-1)].slice(-MOMENTS));
+    this.drawImages(none);
+    this.drawMinutes(quiet);
     const joints = Object.entries(none ? {} : seen.joints).sort();
     this.say("joints-title", joints.length ? "Joints" : "No joints");
     children(this.part("joints"), joints, () => element("div", element("span"), element("b")), (node, [name, angle]) => {
@@ -183,6 +241,28 @@ class Hand {
       [{what: seen.state === null ? "not known" : "well", advice: seen.state === null ? "no status comes" : "nothing to be done"}]);
     this.drawTables();
   }
+  drawMinutes(quiet) {
+    const minutes = this.paused ?? this.minutes(quiet), paused = this.paused !== null;
+    drawTimeline(this.part("timeline"), minutes, paused ? clock(minutes.t) : "now", this.pointed);
+    this.part("time").classList.toggle("paused", paused);
+    this.say("minutes", paused ? `Paused: five minutes until ${clock(minutes.t)}` : "Last five minutes: verdicts of each second");
+    this.say("pause", paused ? "go on" : "pause");
+    this.say("at", this.pointed === null ? "" : momentOf(minutes, this.pointed));
+    this.part("at").hidden = this.pointed === null;
+    this.part("key").hidden = this.pointed !== null;
+  }
+  drawImages(none) {
+    const past = this.seen.grasps.find(grasp => keyOf(grasp) === this.chosen);
+    const images = past === undefined ? none ? [] : this.seen.fingers : this.images.get(this.chosen) ?? [];
+    this.part("tactile").classList.toggle("past", past !== undefined);
+    this.part("live").hidden = past === undefined;
+    this.part("stillness").hidden = past !== undefined;
+    const of = past === undefined ? "" : `Grasp ${past.grasp} as it was judged: ${called(past)}`;
+    this.say("images", past === undefined ? "Tactile images and motion" :
+      images.length ? of : `${of}; this page has no image of it`);
+    this.drawFingers(images);
+  }
+  tone() { return gone || this.seen === null ? "silent" : this.seen.tone; }
   headline() { return gone || this.seen === null ? "unknown" : this.seen.headline; }
 
   drawGrasp(none, quiet) {
@@ -193,8 +273,8 @@ class Hand {
       node.ariaCurrent = state === gate ? "step" : null;
     });
     const ago = newest === null ? 0 : newest.ago_s + quiet / 1000;
-    this.say("judged", newest === null ? "-" :
-      `${called(newest)}, ${ago.toFixed(0)} s ago${newest.held && !none ? "" : ", past"}${newest.lift === "-" ? "" : `; lift: ${newest.lift}`}`);
+    this.say("judged", newest === null || none || seen.tone === "silent" ? "-" :
+      `${called(newest)}, ${ago.toFixed(0)} s ago${newest.held ? "" : ", past"}${newest.lift === "-" ? "" : `; lift: ${newest.lift}`}`);
     this.say("still", none ? "-" : seen.still);
   }
 
@@ -210,7 +290,7 @@ class Hand {
         canvas.role = "img"; canvas.ariaLabel = `tactile image of ${finger.name}: ${touch.textContent} ${depth.textContent}`;
         drawFinger(canvas, finger);
         bar.className = "moves"; words.className = "faint";
-        drawMotion(bar, words, finger.motion);
+        drawMotion(bar, words, finger.motion, finger.state);
       });
     const canvas = this.part("legend").querySelector("canvas"), context = sized(canvas);
     for (let x = 0; x < canvas.width; x++) {
@@ -226,14 +306,15 @@ class Hand {
     const {counts} = this.seen;
     this.say("counts", Object.entries(counts).map(([name, count]) => `${count} ${name}`).join(", "));
     children(this.part("grasps"), this.seen.grasps,
-      () => element("tr", element("td"), element("td", element("i"), element("span")), element("td"), element("td")),
+      () => element("tr", element("td", element("button")), element("td", element("i"), element("span")), element("td"), element("td")),
       (node, grasp) => {
-        text(node.children[0], String(grasp.grasp));
+        text(node.children[0].firstChild, String(grasp.grasp));
+        node.className = keyOf(grasp) === this.chosen ? "chosen" : "";
         const [mark, word] = node.children[1].children;
         mark.dataset.verdict = grasp.verdict; text(mark, MARKS[grasp.verdict]);
-        text(word, called(grasp));
-        text(node.children[2], grasp.supervised ? "supervised" : "");
-        text(node.children[3], grasp.lift);
+        text(word, grasp.verdict);
+        text(node.children[2], likely(grasp)); node.children[2].className = "likely";
+        text(node.children[3], grasp.lift + (grasp.supervised ? ", supervised" : ""));
         node.children[3].className = grasp.ended === null ? "faint" : grasp.verdict === "stable" && grasp.ended === "slip" ? "bad" : "";
       });
     for (const name of ["learning", "timing", "session", "drivers"]) rows(this.part(name), this.seen[name]);
@@ -253,8 +334,20 @@ function draw() {
   const quiet = since(came);
   gone = lost !== null || document.hidden || quiet > QUIET_MS;
   for (const hand of hands) hand.draw(quiet);
-  const said = hands.map(hand => (hands.length > 1 ? `${hand.seen.hand ?? "?"} ` : "") + hand.headline());
+  drawStrip();
+  const said = hands.map(hand => (hands.length > 1 ? `${hand.seen?.hand ?? "?"} ` : "") + hand.headline());
   document.title = `${said.join(", ")} - graspd`;
+}
+
+function drawStrip() {
+  const strip = document.getElementById("strip");
+  strip.hidden = hands.length < 2;
+  document.getElementById("hands").classList.toggle("several", hands.length > 1);
+  children(strip, hands, () => element("a", element("span"), element("b")), (node, hand) => {
+    const id = `hand-${hands.indexOf(hand)}`;
+    hand.root.id = id; node.href = `#${id}`; node.dataset.tone = hand.tone();
+    text(node.children[0], hand.seen?.hand ?? "?"); text(node.children[1], hand.headline());
+  });
 }
 
 function lose(why) {
@@ -276,7 +369,7 @@ function connect() {
     fastest = Math.min(fastest, way);
     if (way - fastest > QUIET_MS) { lose("old messages come"); connect(); return; }
     while (hands.length > snapshots.length) hands.pop().root.remove();
-    snapshots.forEach((snapshot, at) => { (hands[at] ??= new Hand()).seen = snapshot; });
+    snapshots.forEach((snapshot, at) => { (hands[at] ??= new Hand()).take(snapshot); });
     came = now(); lost = null;
     draw();
   };

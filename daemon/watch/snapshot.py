@@ -38,6 +38,8 @@ class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
 
     verdict: str
     p_slip: float | None
+    boot_id: str
+    """Start of the daemon that numbered it."""
     grasp: int
     ago_s: float
     ended: str | None

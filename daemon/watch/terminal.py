@@ -163,7 +163,8 @@ def _labelled(label: str, lines: Sequence[Line]) -> list[Row]:
 
 def _finger(finger: FingerImage) -> str:
     depth = f", fall {finger.deepest} counts" if finger.from_rest else ""
-    return ("-" if finger.motion is None else _motion(finger.motion)) + depth
+    state = "" if finger.state is None else f", {finger.state}"
+    return ("-" if finger.motion is None else _motion(finger.motion)) + state + depth
 
 
 def _motion(motion: FingerMotion) -> str:

@@ -39,6 +39,11 @@ TICK_S = 0.02
 SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
+HALF = 0.5
+"""From this probability on a slip is likelier than not."""
+HELD_NS = 1_000_000_000
+"""Time for which `slip` stands after its probability has fallen, ns; as the judge has it."""
+HELD = Line("slip, held", "for a second: a moment ago its probability was 50 % or more")
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
 LATE = "the daemon is there and says nothing: top shows whether this computer is too busy"
 SECONDS = 300
@@ -113,6 +118,8 @@ class View:
         """When the last verdict came."""
         self._clocks_ns: int | None = None
         """Least time from the sending of a verdict, on the daemon's clock, to its arrival."""
+        self._likely: tuple[str, int, int] | None = None
+        """Start, grasp and time, ns, of the last verdict by which a slip was likely."""
         self._gate: GateState | None = None
         self._status: Status | None = None
         self._grasps = GraspLog()
@@ -159,6 +166,8 @@ class View:
         self._received += 1
         now_ns = self._arrival_ns(verdict, earliest_ns, latest_ns)
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
+        if verdict.p_slip is not None and verdict.p_slip >= HALF:
+            self._likely = verdict.boot_id, verdict.grasp, now_ns
         self._grasps.take(verdict, now_ns)
 
     def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
@@ -241,11 +250,20 @@ class View:
             also.append(Line("less sure", ADVICE[Reason.NOT_CALIBRATED]))
         if verdict.verdict is Decision.SLIP:
             what = "do not lift unwatched" if verdict.supervised else "do not lift"
-            return Tone.SLIP, [Line(what, "it is judged to slip; grasp again"), *also]
+            held = [HELD] if self._is_held_slip(verdict, now_ns) else []
+            return Tone.SLIP, [Line(what, "it is judged to slip; grasp again"), *held, *also]
         why_not = doubt(verdict)
         if why_not is not None or verdict.supervised:
             return Tone.LEANS, [Line("leans to stable", why_not or "supervised"), *also]
         return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
+
+    def _is_held_slip(self, verdict: Verdict, now_ns: int) -> bool:
+        """Return True if a slip was likely a moment ago and is not now."""
+        if self._likely is None or verdict.p_slip is None or verdict.p_slip >= HALF:
+            return False
+        boot_id, grasp, likely_ns = self._likely
+        is_same = (boot_id, grasp) == (verdict.boot_id, verdict.grasp)
+        return is_same and now_ns - likely_ns <= HELD_NS
 
     def _silence(self, now_ns: int) -> Line:
         stopped_ns, went_on_ns = self.stood_still

@@ -37,7 +37,7 @@ _shtab_graspd_train_option_strings=(-h --help --data --own --name --out --result
 _shtab_graspd_evaluate_option_strings=(-h --help --protocol --data --own --out --seeds --jobs --dask --quick --grid --table --plots --json --quiet)
 _shtab_graspd_report_error_vs_time_option_strings=(-h --help --data --models --out --quick --json)
 _shtab_graspd_report_stability_option_strings=(-h --help --data --quick --json)
-_shtab_graspd_report_worth_option_strings=(-h --help --data --out --seeds --quick)
+_shtab_graspd_report_worth_option_strings=(-h --help --data --out --seeds --card --quick)
 _shtab_graspd_report_option_strings=(-h --help)
 _shtab_graspd_completion_option_strings=(-h --help)
 _shtab_graspd_manual_option_strings=(-h --help)
@@ -146,6 +146,7 @@ _shtab_graspd_report_stability___data_COMPGEN=_shtab_compgen_files
 _shtab_graspd_report_worth___data_COMPGEN=_shtab_compgen_files
 _shtab_graspd_report_worth___out_COMPGEN=_shtab_compgen_files
 _shtab_graspd_report_worth___seeds_COMPGEN=_shtab_compgen_files
+_shtab_graspd_report_worth___card_COMPGEN=_shtab_compgen_files
 
 _shtab_graspd_replay___model_choices=(cnn1 cnn1-session mlp rf small-electrodes small-session small-session-ff small-session-ff-mf small-session-ff-th small-session-mf small-session-mf-th small-session-th svm)
 _shtab_graspd_replay___gate_choices=(settled every)

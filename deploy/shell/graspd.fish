@@ -51,7 +51,7 @@ function _shtab_graspd_using
 end
 
 set -g _shtab_graspd_commands run replay watch scene check doctor twin 'twin spi' 'twin can' 'twin palm' 'twin joints' data schema models session 'session show' 'session reset' 'session seed' export-grasps keys 'keys make' 'keys list' train evaluate report 'report error-vs-time' 'report stability' 'report worth' completion manual
-set -g _shtab_graspd_opts_with_value --arbitration-id --bit-flip --burst --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --format --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
+set -g _shtab_graspd_opts_with_value --arbitration-id --bit-flip --burst --card --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --format --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
 
 complete -c graspd -e
 complete -c graspd -f
@@ -81,7 +81,7 @@ complete -c graspd -n '_shtab_graspd_using replay' -l gate -xka "settled every" 
 complete -c graspd -n '_shtab_graspd_using replay' -l publish -xka "(__fish_complete_path (commandline -ct))" -d 'publish too, as `graspd run` does'
 complete -c graspd -n '_shtab_graspd_using replay' -l wait -xka "(__fish_complete_path (commandline -ct))" -d 'with --publish: start when somebody has subscribed, fail after S seconds'
 complete -c graspd -n '_shtab_graspd_using replay' -l json -d 'verdict messages on stdout, summary on stderr'
-complete -c graspd -n '_shtab_graspd_using replay' -l verbose -d 'of the demo: each verdict, as of other recordings'
+complete -c graspd -n '_shtab_graspd_using replay' -l verbose -d 'of grasp tables with outcomes: a line for each verdict and all scores, in place of a line for 25 grasps'
 complete -c graspd -n '_shtab_graspd_using replay; and test $_shtab_graspd_npos -ge 0' -ka "(__fish_complete_path (commandline -ct))" -d 'grasp tables or streams (CSV); what `graspd run` has recorded (.mcap); what came over a link (candump text .log, serial bytes .serial); without any, the demo: a synthetic day, with --outcomes and --max-slip-when-stable 0.05'
 complete -c graspd -n '_shtab_graspd_using; and test $_shtab_graspd_npos -eq 0' -a watch -d 'See it live, in a terminal (extra: watch) or a browser.'
 complete -c graspd -n '_shtab_graspd_using watch' -s h -l help -d 'show this help message and exit'
@@ -276,8 +276,9 @@ complete -c graspd -n '_shtab_graspd_using report stability; and test $_shtab_gr
 complete -c graspd -n '_shtab_graspd_using report; and test $_shtab_graspd_npos -eq 0' -a worth -d 'What `stable` is worth on another day, by how many outcomes were told.'
 complete -c graspd -n '_shtab_graspd_using report worth' -s h -l help -d 'show this help message and exit'
 complete -c graspd -n '_shtab_graspd_using report worth' -l data -xka "(__fish_complete_path (commandline -ct))" -d 'folder with the grasp tables'
-complete -c graspd -n '_shtab_graspd_using report worth' -l out -xka "(__fish_complete_path (commandline -ct))" -d 'folder for the picture and the table (runs/worth)'
+complete -c graspd -n '_shtab_graspd_using report worth' -l out -xka "(__fish_complete_path (commandline -ct))" -d 'folder for the picture, the tables and the figures (runs/worth)'
 complete -c graspd -n '_shtab_graspd_using report worth' -l seeds -xka "(__fish_complete_path (commandline -ct))" -d 'of the object folds'
+complete -c graspd -n '_shtab_graspd_using report worth' -l card -xka "(__fish_complete_path (commandline -ct))" -d 'card of a `small-session`, to put the figures on as well'
 complete -c graspd -n '_shtab_graspd_using report worth' -l quick -d 'few grasps, one epoch: does it run?'
 complete -c graspd -n '_shtab_graspd_using; and test $_shtab_graspd_npos -eq 0' -a completion -d 'Print what makes a shell complete commands.'
 complete -c graspd -n '_shtab_graspd_using completion' -s h -l help -d 'show this help message and exit'

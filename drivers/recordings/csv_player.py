@@ -27,6 +27,8 @@ DEMO_DAY = Path(__file__).parent / "demo" / "synthetic_day.csv"
 """Synthetic grasps of sensors that drift, drawn by the same."""
 DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
 """Whole synthetic grasps, made by `graspd.drivers.twins.grasps.whole_grasps`."""
+SHOW_RECORDING = Path(__file__).parent / "demo" / "synthetic_show.csv"
+"""Synthetic grasps that are each held for two seconds, made by the same: for people to watch."""
 IGNORED_COLUMNS_LOGGED = 10
 """Names of ignored columns in the log line; the rest only as a number."""
 

@@ -2,11 +2,12 @@
 
 `python -m tests.bench.gate [EPISODES [SHARE ...]]` tells how often a hand that holds is said to
 hold, how often one along which the object slides, and how soon a slide that begins is told, for
-each share of `false_alarms`.
+each share of `false_alarms`; then the same of each finger's word, with slides at median speed.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Li
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
-from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.daemon.judge.reasons import Decision, FingerState, GateState, Moment
 from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.grasps import recorded_counts
@@ -34,7 +35,7 @@ from graspd.drivers.twins.grasps.whole_grasps import (
 from graspd.models.contract import Finger
 from graspd.models.runtime import TactileModel
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
-from tests.drivers.twins.slides import HeldNoise, Hold
+from tests.drivers.twins.slides import SLIDE_SPREAD, HeldNoise, Hold
 
 TABLES = ("palm_down", "palm_side")
 MAX_AGE_NS = 100_000_000
@@ -217,6 +218,37 @@ class Closing:
         return self._hold.deviation(t_s) - ramp * self._pressed
 
 
+def moments(
+    false_alarms: float,
+    seed: int,
+    sliding: Sequence[bool],
+    *,
+    begins: bool = False,
+    slide_spread: float = SLIDE_SPREAD,
+    sampling: Sampling = Sampling.FRESH,
+) -> tuple[list[Moment], int]:
+    """Return the moments since a hand has closed, and which one is the first with a slide.
+
+    The object slides along the fingers that are `sliding`, from the start or from when it `begins`.
+    """
+    rng = np.random.default_rng([seed, 4])
+    closed_s = REST_S + CLOSES_S
+    slide_s = closed_s + rng.uniform(*SLIDE_AFTER_S)
+    begins_s = slide_s if begins else None
+    hold = Hold(sliding, rng, closed_s + HOLDS_S, closed_s, begins_s, slide_spread)
+    rest = np.full((len(FINGERS), ELECTRODES), REST_COUNTS)
+    sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler
+    sample, course = sampler(rest, HeldNoise(len(FINGERS), rng)).sample, Closing(hold, rng)
+    hand = HandTracker(FINGERS, HandLimits(gate=GateLimits(false_alarms=false_alarms)))
+    felt = []
+    for row in range(round(100 * (closed_s + HOLDS_S))):
+        counts = sample(course, row / 100.0)
+        moment, _ = hand.step(row * 10_000_000, counts, Checked((), None))
+        felt.append(moment)
+    first = round(100 * closed_s)
+    return felt[first:], round(100 * slide_s) - first
+
+
 def follow(
     false_alarms: float,
     seed: int,
@@ -227,23 +259,11 @@ def follow(
 ) -> Held:
     """Say what the gate makes of a hand that holds; of one of which three fingers slide from the
     start, or of one along which the object `begins` to slide."""
-    rng = np.random.default_rng([seed, 4])
-    closed_s = REST_S + CLOSES_S
-    slide_s = closed_s + rng.uniform(*SLIDE_AFTER_S)
     sliding = [slides or begins] * len(FINGERS)
-    hold = Hold(sliding, rng, closed_s + HOLDS_S, closed_s, slide_s if begins else None)
-    rest = np.full((len(FINGERS), ELECTRODES), REST_COUNTS)
-    sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler
-    sample, course = sampler(rest, HeldNoise(len(FINGERS), rng)).sample, Closing(hold, rng)
-    hand = HandTracker(FINGERS, HandLimits(gate=GateLimits(false_alarms=false_alarms)))
-    stands, settles = [], 0
-    for row in range(round(100 * (closed_s + HOLDS_S))):
-        counts = sample(course, row / 100.0)
-        moment, _ = hand.step(row * 10_000_000, counts, Checked((), None))
-        settles += GateState.SETTLED in [change.state for change in moment.changes]
-        stands.append(moment.settled)
-    first = round(100 * closed_s)
-    return Held(np.array(stands[first:]), settles, round(100 * slide_s) - first)
+    felt, slides_at = moments(false_alarms, seed, sliding, begins=begins, sampling=sampling)
+    changes = [[change.state for change in moment.changes] for moment in felt]
+    settles = sum(GateState.SETTLED in states for states in changes)
+    return Held(np.array([moment.settled for moment in felt]), settles, slides_at)
 
 
 def tell(episodes: int, false_alarms: float, sampling: Sampling) -> str:
@@ -276,6 +296,48 @@ def row(false_alarms: float, holds: list[Held], slides: list[Held], begun: list[
     return " | ".join(cells)
 
 
+def tell_words(episodes: int, false_alarms: float, sampling: Sampling) -> str:
+    """Return a row of the table of the fingers' words."""
+
+    def feel(sliding: Sequence[bool]) -> Iterator[tuple[list[Moment], int]]:
+        for seed in range(episodes):
+            yield moments(
+                *(false_alarms, seed, sliding),
+                begins=True,
+                slide_spread=0.0,
+                sampling=sampling,
+            )
+
+    held = [slides(felt, settled_at(felt)) for felt, _ in feel([False] * len(FINGERS))]
+    changes = np.mean([np.abs(np.diff(each, axis=0)).sum(axis=0) for each in held])
+    three = [late_ms(slides(felt, at).max(axis=1)) for felt, at in feel([True] * len(FINGERS))]
+    one = [late_ms(slides(felt, at)[:, 0]) for felt, at in feel([True, False, False])]
+    cells = (
+        f"{false_alarms:g}",
+        f"{100 * np.concatenate(held).mean():.2f} %",
+        f"{changes:.2f}",
+        f"{np.median(three):.0f} / {np.quantile(three, 0.9):.0f} ms",
+        f"{np.median(one):.0f} / {np.quantile(one, 0.9):.0f} ms",
+    )
+    return " | ".join(cells)
+
+
+def settled_at(felt: Sequence[Moment]) -> int:
+    """Return the first moment at which a verdict stood; where none did, the last."""
+    return next((at for at, moment in enumerate(felt) if moment.settled), len(felt) - 1)
+
+
+def slides(felt: Sequence[Moment], begin: int) -> NDArray[np.int8]:
+    """Return 1 where a finger says `slide`, from a moment on; shape (moments, fingers)."""
+    words = [(moment.fingers or {}).values() for moment in felt[begin:]]
+    return np.array([[word is FingerState.SLIDE for word in each] for each in words], dtype=np.int8)
+
+
+def late_ms(says_slide: NDArray[np.int8]) -> float:
+    """Return after how long it is said first, ms; infinite where it never is."""
+    return 10.0 * int(says_slide.argmax()) if says_slide.any() else math.inf
+
+
 def main(arguments: Sequence[str]) -> None:
     """Print the table."""
     episodes = int(arguments[0]) if arguments else 60
@@ -287,6 +349,14 @@ def main(arguments: Sequence[str]) -> None:
     for sampling in Sampling:
         for share in shares:
             sys.stdout.write(f"{sampling} {tell(episodes, share, sampling)}\n")
+            sys.stdout.flush()
+    sys.stdout.write(
+        "false_alarms | a finger that holds says `slide` | changes of its word | slide along three "
+        "fingers named after, p50 / p90 | along one\n"
+    )
+    for sampling in Sampling:
+        for share in shares:
+            sys.stdout.write(f"{sampling} {tell_words(episodes, share, sampling)}\n")
             sys.stdout.flush()
 
 

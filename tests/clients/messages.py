@@ -23,7 +23,7 @@ RISK = {
 ADDED: dict[str, Any] = {
     "p_slip_model": 0.3, "outcomes": 57, "supervised": False, "risk": RISK,
     "early": False, "still_ms": 250.0, "motion": {"ff": 0.9, "th": None},
-    "motion_limits": {"ff": 1.5, "th": 1.0},
+    "motion_limits": {"ff": 1.5, "th": 1.0}, "fingers": {"ff": "touch", "th": None},
 }  # fmt: skip
 """What older daemons leave out, as it is of a known grasp."""
 
@@ -111,6 +111,7 @@ def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
         "still_ms": draw(st.sampled_from([None, 0, 99.9, 100.0, 239.999999, 240, 500.5])),
         "motion": draw(st.sampled_from([None, {}, {"ff": 0.5}, {"mf": None, "ff": 3, "": 0.0}])),
         "motion_limits": draw(st.sampled_from([None, {}, {"ff": 1.5, "th": 2}])),
+        "fingers": draw(st.sampled_from([None, {}, {"ff": "slide", "th": None}, {"": "free"}])),
     }
     if not known:
         reasons = [["moving"], ["unproven"], ["low-confidence"], ["unproven", "moving"]]

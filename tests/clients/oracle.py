@@ -70,6 +70,7 @@ class Told(Former):
     still_ms: Duration | None = None
     motion: dict[str, Duration | None] | None = None
     motion_limits: dict[str, Duration] | None = None
+    fingers: dict[str, Literal["free", "touch", "slide"] | None] | None = None
 
     @property
     def teaches(self) -> bool:

@@ -2,9 +2,10 @@
 //
 // `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
 // takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `end BOOT_ID GRASP` tells an outcome;
-// `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift` asks it and
+// `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT [MAX_AGE_MS]` makes one, `lift` asks it and
 // answers with a line (`watch DEADLINE_S`: under supervision), `tell` tells it that the lift held
-// (`slipped`: that it did not), `wait DEADLINE_S SUPERVISED` waits for a grasp.
+// (`slipped`: that it did not), `wait DEADLINE_S SUPERVISED` waits for a grasp,
+// `slide TIMEOUT_S` watches over a lift.
 #include "graspd_client.hpp"
 
 #include <iostream>
@@ -39,6 +40,8 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
         std::cout << finger << '=' << std::llrint(moves.value_or(-1) * 1e3) << ' ';
     for (const auto& [finger, limit] : verdict.motion_limits)
         std::cout << finger << '<' << std::llrint(limit * 1e3) << ' ';
+    for (const auto& [finger, felt] : verdict.fingers)
+        std::cout << finger << '-' << (felt ? graspd::name(*felt) : "unknown") << ' ';
     std::cout << counts.messages << ' '
               << counts.lost << ' ' << counts.repeats << ' ' << counts.malformed << ' '
               << counts.restarts << ' ' << counts.former << std::endl;
@@ -78,6 +81,8 @@ int main() {
         } else if (order == "client") {
             graspd::Options options;
             words >> options.endpoint >> options.ask_endpoint;
+            double max_age_ms = 0.0;
+            if (words >> max_age_ms) options.max_age_ms = max_age_ms;
             options.warn = [](const std::string& text) {
                 std::cout << "warn " << text << std::endl;
             };
@@ -94,6 +99,13 @@ int main() {
             answer = client.value().may_i_lift(order == "lift" ? 30.0 : deadline_s, order == "watch");
             std::cout << static_cast<bool>(answer) << ' ' << answer.verdict.grasp.value_or(0) << ' '
                       << client->unreported() << std::endl;
+        } else if (order == "slide") {
+            double timeout_s = 0.0;
+            words >> timeout_s;
+            const graspd::SlideAnswer slide = client.value().wait_for_slide(timeout_s);
+            std::cout << static_cast<bool>(slide) << ' ' << slide.held;
+            for (const std::string& finger : slide.sliding) std::cout << ' ' << finger;
+            std::cout << std::endl;
         } else if (order == "tell" || order == "slipped") {
             const auto how = order == "tell" ? graspd::Outcome::held : graspd::Outcome::slipped;
             const bool taken{client.value().tell(answer.verdict, how, {}, 30.0)};

@@ -72,6 +72,8 @@ def said(newest: Newest, now_ns: int) -> str:
         f"{name}<{round(most * 1e3)}"
         for name, most in sorted((verdict.motion_limits or {}).items())
     ]
+    felt = sorted((verdict.fingers or {}).items())
+    words += [f"{finger}-{'unknown' if state is None else state}" for finger, state in felt]
     return " ".join(map(str, [*words, *astuple(newest.counts)]))
 
 

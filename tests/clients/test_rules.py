@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import (
     Decision,
+    FingerState,
     Newest,
     Risk,
     Verdict,
@@ -80,6 +81,7 @@ def test_what_a_verdict_rests_on_is_told() -> None:
     assert (found.early, found.still_ms) == (False, 250.0)
     assert found.motion == {"ff": 0.9, "th": None}
     assert found.motion_limits == {"ff": 1.5, "th": 1.0}
+    assert found.fingers == {"ff": FingerState.TOUCH, "th": None}
     assert hash(found) == hash(said(verdict(0, START_NS, **ADDED)))
 
 

@@ -81,7 +81,6 @@ STREAMS: dict[str, Callable[[Random], Iterator[Outcome]]] = {
 }
 
 
-@pytest.mark.timeout(900)  # a million outcomes take a minute, on a busy machine more
 def test_the_learner_stays_bounded_and_positive_definite(
     note: Note, request: pytest.FixtureRequest
 ) -> None:

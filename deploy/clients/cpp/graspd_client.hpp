@@ -9,8 +9,8 @@
 //         client.tell(answer.verdict, lift() ? graspd::Outcome::held : graspd::Outcome::slipped);
 //
 // Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that
-// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)` and
-// `tell(..., wait_s)` wait, and no longer than told.
+// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
+// `wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, and no longer than told.
 #pragma once
 
 #include <algorithm>
@@ -83,6 +83,15 @@ inline const char* name(Decision decision) {
     return names[static_cast<int>(decision)];
 }
 
+// What a finger feels.
+enum class FingerState { free, touch, slide };
+
+// The wire's word for it.
+inline const char* name(FingerState state) {
+    constexpr const char* names[] = {"free", "touch", "slide"};
+    return names[static_cast<int>(state)];
+}
+
 // How a lift ended.
 enum class Outcome { held, slipped };
 
@@ -120,6 +129,9 @@ struct Verdict {
     // is at most while it is still.
     std::map<std::string, std::optional<double>> motion;
     std::map<std::string, double> motion_limits;
+    // What each finger feels, none where that is not known, and always where the reading is older
+    // than `max_age_ms`.
+    std::map<std::string, std::optional<FingerState>> fingers;
 
     explicit operator bool() const { return decision == Decision::stable && !supervised; }
 
@@ -142,6 +154,17 @@ struct LiftAnswer {
     bool supervised = false;
 
     explicit operator bool() const { return static_cast<bool>(verdict) || supervised; }
+};
+
+// What the fingers felt during a lift. True in an `if` exactly when it is to be stopped.
+struct SlideAnswer {
+    Verdict verdict;  // the newest; its `fingers` and `reasons` say what is known
+    double waited_s = 0.0;
+    std::vector<std::string> sliding = {};  // fingers along which something slides
+    // All fingers that touched still did when the time was over, and nothing slid.
+    bool held = false;
+
+    explicit operator bool() const { return !held; }
 };
 
 // Whether graspd has taken how a lift ended. True in an `if` exactly when it has.
@@ -305,6 +328,23 @@ inline void trust(const json& told, Verdict& found) {
         });
 }
 
+// What a finger feels; none where that is not known.
+inline std::optional<FingerState> finger_state(const json& told) {
+    if (told.is_null()) return std::nullopt;
+    const std::string word = text(told);
+    for (const auto state : {FingerState::free, FingerState::touch, FingerState::slide})
+        if (word == name(state)) return state;
+    throw Malformed{};
+}
+
+// The fingers that feel it.
+inline std::vector<std::string> feeling(const Verdict& said, FingerState state) {
+    std::vector<std::string> found;
+    for (const auto& [finger, felt] : said.fingers)
+        if (felt == state) found.push_back(finger);
+    return found;
+}
+
 // What daemons that know nothing of stillness leave out.
 inline void stillness(const json& told, Verdict& found) {
     const auto early = told.find("early");
@@ -321,6 +361,8 @@ inline void stillness(const json& told, Verdict& found) {
         return *moves;
     };
     const json &motion = by_finger("motion"), &limits = by_finger("motion_limits");
+    const json& felt = by_finger("fingers");
+    for (const auto& each : felt.items()) found.fingers[each.key()] = finger_state(each.value());
     for (const auto& each : motion.items())
         found.motion[each.key()] = maybe(motion, each.key(), REAL_MAX);
     for (const auto& each : limits.items())
@@ -495,9 +537,14 @@ public:
         Verdict said = message_->verdict;
         said.age_ms = static_cast<double>(reading_age_ns) / 1e6;
         const bool counts_on_it = said.decision != Decision::unknown || said.supervised;
-        if (!published_ns_) return said.unknown({"joining"});
         const bool may_have_crept = !bound_ && best_ && best_->first - least_ns_ > DRIFT_MAX_NS;
-        if (age_ns < -CLOCK_SLACK_NS || may_have_crept) return said.unknown({"clock"});
+        const bool is_clock_known = age_ns >= -CLOCK_SLACK_NS && !may_have_crept;
+        const bool is_fresh = age_ns <= message_->silence_ns && reading_age_ns <= max_age_ns_;
+        // What a finger feels now is not known by what is old.
+        if (!published_ns_ || !is_clock_known || !is_fresh)
+            for (auto& [finger, felt] : said.fingers) felt.reset();
+        if (!published_ns_) return said.unknown({"joining"});
+        if (!is_clock_known) return said.unknown({"clock"});
         if (age_ns > message_->silence_ns) return said.unknown({"silent"});
         if (counts_on_it && reading_age_ns > max_age_ns_) return said.unknown({"stale"});
         return if_open(std::move(said));
@@ -785,7 +832,8 @@ public:
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
                   options.same_computer.value_or(detail::is_same_computer(options.endpoint)),
                   probability(options.max_p_slip)),
-          link_(options), asks_(!options.ask_endpoint.empty()),
+          link_(options), max_age_ns_(age_ns(options.max_age_ms)),
+          asks_(!options.ask_endpoint.empty()),
           compares_clocks_(asks_ && !options.same_computer.value_or(
                                         detail::is_same_computer(options.endpoint))),
           warn_(options.warn) {}
@@ -856,6 +904,44 @@ public:
             }
         } while (detail::now_ns() < due_ns);
         return std::nullopt;
+    }
+
+    // Watch over a lift: wait until something slides, at most `timeout_s` seconds.
+    //
+    // It ends at once when a finger says `slide`, when one that touched at first is `free`, and when
+    // another grasp is at hand. It ends too when for `max_age_ms` no reading said that all that
+    // touched at first still do: what is not known may slide. Throws `std::invalid_argument` for a
+    // time that is none.
+    SlideAnswer wait_for_slide(double timeout_s) {
+        const Nanoseconds began_ns = detail::now_ns();
+        const Nanoseconds due_ns = began_ns + duration_ns(timeout_s);
+        Nanoseconds sure_ns = began_ns;
+        std::vector<std::string> touched;
+        Key grasp;
+        while (true) {
+            const Verdict newest = verdict();
+            const Nanoseconds now_ns = detail::now_ns();
+            const auto touching = detail::feeling(newest, FingerState::touch);
+            const auto sliding = detail::feeling(newest, FingerState::slide);
+            if (touched.empty()) {
+                touched = touching;
+                grasp = detail::key(newest);
+            }
+            const auto is_free = [&](const std::string& finger) {
+                const auto felt = newest.fingers.find(finger);
+                return felt != newest.fingers.end() && felt->second == FingerState::free;
+            };
+            const bool lost = std::any_of(touched.begin(), touched.end(), is_free) ||
+                              (!touching.empty() && detail::key(newest) != grasp);
+            if (!touched.empty() && std::includes(touching.begin(), touching.end(),
+                                                  touched.begin(), touched.end()))
+                sure_ns = now_ns - std::llrint(newest.age_ms.value_or(0.0) * 1e6);
+            const bool is_old = now_ns - sure_ns > max_age_ns_;
+            const bool ends = !sliding.empty() || lost || is_old;
+            if (ends || !wait(due_ns))
+                return {newest, static_cast<double>(now_ns - began_ns) / 1e9, sliding,
+                        !touched.empty() && !ends};
+        }
     }
 
     // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
@@ -1016,6 +1102,7 @@ private:
 
     detail::Newest newest_;
     detail::Link link_;
+    Nanoseconds max_age_ns_;
     bool asks_, compares_clocks_;
     std::optional<Nanoseconds> clock_asked_ns_;
     Nanoseconds clock_due_ns_ = 0;

@@ -8,8 +8,9 @@ messages are those of deploy/wire/README.md, version 1.
             client.tell(answer.verdict, Outcome.HELD if lift() else Outcome.SLIPPED)
 
 Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that made
-it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)` and
-`tell(..., wait_s)` wait, and no longer than they are told. `AsyncClient` has the same for asyncio.
+it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
+`wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, and no longer than they are told.
+`AsyncClient` has the same for asyncio.
 """
 
 from __future__ import annotations
@@ -36,11 +37,13 @@ __all__ = [
     "Client",
     "Counts",
     "Decision",
+    "FingerState",
     "Keys",
     "LiftAnswer",
     "Outcome",
     "OutcomeAnswer",
     "Risk",
+    "SlideAnswer",
     "Verdict",
 ]
 
@@ -101,6 +104,17 @@ class Decision(str, Enum):  # noqa: UP042 - StrEnum needs Python 3.11
         return str(self.value)
 
 
+class FingerState(str, Enum):  # noqa: UP042 - StrEnum needs Python 3.11
+    """What a finger feels; equal to the wire's word and printed as it."""
+
+    FREE = "free"
+    TOUCH = "touch"
+    SLIDE = "slide"
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
 class Outcome(Enum):
     """How a lift ended; `Outcome("held")` is understood as `Outcome("stable")`, a bool is not."""
 
@@ -138,8 +152,9 @@ class Verdict:
     nothing moved fast, but something might still slide slowly. `still_ms` is for how long the hand
     has been still, ms: from 100 on nothing moves fast, from 240 on nothing slides slowly either.
     `motion` is how each finger moves, in units of its own noise, and None where that is not known;
-    `motion_limits` what that is at most while it is still. What is not known before the first
-    message, or not told by the daemon, is None.
+    `motion_limits` what that is at most while it is still. `fingers` is what each one feels, None
+    where that is not known, and always where the reading is older than `max_age_ms`. What is not
+    known before the first message, or not told by the daemon, is None.
     """
 
     decision: Decision
@@ -157,6 +172,7 @@ class Verdict:
     still_ms: float | None = None
     motion: dict[str, float | None] | None = field(default=None, hash=False)
     motion_limits: dict[str, float] | None = field(default=None, hash=False)
+    fingers: dict[str, FingerState | None] | None = field(default=None, hash=False)
 
     def __bool__(self) -> bool:
         return self.decision == Decision.STABLE and not self.supervised
@@ -179,6 +195,22 @@ class LiftAnswer:
 
     def __bool__(self) -> bool:
         return bool(self.verdict) or self.supervised
+
+
+@dataclass(frozen=True)
+class SlideAnswer:
+    """What the fingers felt during a lift. True in an `if` exactly when it is to be stopped."""
+
+    verdict: Verdict
+    """The newest; its `fingers` and `reasons` say what is known."""
+    waited_s: float
+    sliding: tuple[str, ...] = ()
+    """Fingers along which something slides."""
+    held: bool = False
+    """All fingers that touched still did when the time was over, and nothing slid."""
+
+    def __bool__(self) -> bool:
+        return not self.held
 
 
 @dataclass(frozen=True)
@@ -257,6 +289,7 @@ class _Hand:
             same_computer = is_same_computer(endpoint)
         topic = f"verdict.{hand}".encode()
         self._newest = Newest(topic, round(max_age_ms * 1e6), same_computer, max_p_slip)
+        self._max_age_ns = round(max_age_ms * 1e6)
         self._asks = ask_endpoint is not None
         self._closed = self._behind = False
         self._lifts: dict[tuple[str, int], bool] = {}
@@ -333,6 +366,28 @@ class _Hand:
                 return said
             if self._closed or time.monotonic_ns() >= due_ns:
                 return None
+
+    def _wait_for_slide(self, timeout_s: float) -> Waits[SlideAnswer]:
+        began_ns = sure_ns = time.monotonic_ns()
+        due_ns = _due_ns("timeout_s", timeout_s)
+        touched: set[str] = set()
+        grasp = "", 0
+        while True:
+            newest = yield from self._verdict(0)
+            now_ns = time.monotonic_ns()
+            touching = _feeling(newest, FingerState.TOUCH)
+            sliding = _feeling(newest, FingerState.SLIDE)
+            free = _feeling(newest, FingerState.FREE)
+            if not touched:
+                touched, grasp = set(touching), _key(newest)
+            lost = not touched.isdisjoint(free) or (touching and _key(newest) != grasp)
+            if touched and touched.issubset(touching):
+                sure_ns = now_ns - round((newest.age_ms or 0.0) * 1e6)
+            is_old = now_ns - sure_ns > self._max_age_ns
+            ends = bool(sliding or lost or is_old or self._closed)
+            if ends or not (yield from self._wait(due_ns)):
+                waited_s = (now_ns - began_ns) / 1e9
+                return SlideAnswer(newest, waited_s, sliding, held=bool(touched) and not ends)
 
     def _tell(
         self, lifted_on: Verdict, how: Outcome | str, object_name: str | None, wait_s: float
@@ -488,6 +543,16 @@ class Client(_Hand):
         """
         return self._finish(self._wait_for_grasp(deadline_s, supervised))
 
+    def wait_for_slide(self, timeout_s: float) -> SlideAnswer:
+        """Watch over a lift: wait until something slides, at most `timeout_s` seconds.
+
+        It ends at once when a finger says `slide`, when one that touched at first is `free`, and
+        when another grasp is at hand. It ends too when for `max_age_ms` no reading said that all
+        that touched at first still do: what is not known may slide. Raises `ValueError` for a time
+        that is none.
+        """
+        return self._finish(self._wait_for_slide(timeout_s))
+
     def tell(
         self,
         lifted_on: Verdict,
@@ -544,6 +609,10 @@ class AsyncClient(_Hand):
     ) -> Verdict | None:
         """As `Client.wait_for_grasp`."""
         return await self._finish(self._wait_for_grasp(deadline_s, supervised))
+
+    async def wait_for_slide(self, timeout_s: float) -> SlideAnswer:
+        """As `Client.wait_for_slide`."""
+        return await self._finish(self._wait_for_slide(timeout_s))
 
     async def tell(
         self,
@@ -670,14 +739,15 @@ class Newest:
         reading_age_ns = age_ns + message.published_ns - message.read_ns
         said = replace(message.verdict, age_ms=reading_age_ns / 1e6)
         if self._published_ns is None:
-            return said.unknown("joining")
+            return _unfelt(said).unknown("joining")
         if age_ns < -CLOCK_SLACK_NS or self._may_have_crept():
-            return said.unknown("clock")
+            return _unfelt(said).unknown("clock")
         if age_ns > message.silence_ns:
-            return said.unknown("silent")
-        counts_on_it = said.decision != Decision.UNKNOWN or said.supervised
-        if counts_on_it and reading_age_ns > self._max_age_ns:
-            return said.unknown("stale")
+            return _unfelt(said).unknown("silent")
+        if reading_age_ns > self._max_age_ns:
+            said = _unfelt(said)
+            counts_on_it = said.decision != Decision.UNKNOWN or said.supervised
+            return said.unknown("stale") if counts_on_it else said
         return self.if_open(said)
 
     def end(self, grasp: tuple[str, int]) -> None:
@@ -992,6 +1062,7 @@ def _message(told: dict[str, Any]) -> _Message:
 def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
     """With what is told of it; older daemons tell nothing."""
     told = {"early": False, "still_ms": None, "motion": None, "motion_limits": None, **told}
+    told = {"fingers": None, **told}
     if not isinstance(told["early"], bool):
         raise ValueError
     return replace(
@@ -1000,6 +1071,7 @@ def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
         still_ms=_maybe(told, "still_ms"),
         motion=_by_finger(told["motion"], _maybe),
         motion_limits=_by_finger(told["motion_limits"], _real),
+        fingers=_by_finger(told["fingers"], _finger_state),
     )
 
 
@@ -1010,6 +1082,20 @@ def _by_finger(told: Any, read: Callable[[dict[str, Any], str], Any]) -> Any:  #
     if not isinstance(told, dict):
         raise ValueError
     return {finger: read(told, finger) for finger in told}
+
+
+def _finger_state(told: dict[str, Any], finger: str) -> FingerState | None:
+    return None if told[finger] is None else FingerState(told[finger])
+
+
+def _feeling(said: Verdict, state: FingerState) -> tuple[str, ...]:
+    """The fingers that feel it."""
+    return tuple(finger for finger, felt in (said.fingers or {}).items() if felt == state)
+
+
+def _unfelt(said: Verdict) -> Verdict:
+    """A verdict by which it is not known what the fingers feel now."""
+    return replace(said, fingers=None if said.fingers is None else dict.fromkeys(said.fingers))
 
 
 def _risk(told: Any) -> Risk:  # noqa: ANN401

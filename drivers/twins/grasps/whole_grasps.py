@@ -3,7 +3,8 @@
 End points are rows of a grasp table or drawn; what lies between is made up, with measured noise.
 Contact lowers counts, so a believable end point lies at or below the rest; see `rest_above`.
 
-`python -m graspd.drivers.twins.grasps.whole_grasps` writes the demo recording again, byte for byte.
+`python -m graspd.drivers.twins.grasps.whole_grasps` writes both demo recordings again, byte for
+byte.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.drivers.base import COUNT_MAX, ELECTRODES
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
 from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
 from graspd.drivers.twins.grasps import synthetic
 from graspd.drivers.twins.grasps.grasp_script import (
@@ -53,6 +54,16 @@ DEMO_DURATIONS = Durations(
     rest_s=(0.15, 0.25),
 )
 """Shorter than by default, so that the demo is a small file."""
+SHOW_GRASPS = 10
+SHOW_DURATIONS = Durations(
+    first_rest_s=(1.2, 1.2),
+    approach_s=(0.25, 0.35),
+    settle_s=(2.0, 2.0),
+    lift_s=(0.35, 0.45),
+    rest_s=(1.0, 1.0),
+)
+"""Held for two seconds, so that a person can read the verdict. In a rest of less than a second the
+gate may lose the resting level of a finger."""
 REST_DRAWS = 1000
 """Synthetic grasps whose upper quantile is the rest of synthetic fingers."""
 LOOPED_DRAWS = 200
@@ -268,11 +279,13 @@ def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> Non
         file.write(",".join(cells) + "\n")
 
 
-def main(path: Path = DEMO_RECORDING) -> None:
-    """Write the demo recording."""
+def main(path: Path = DEMO_RECORDING, show: Path = SHOW_RECORDING) -> None:
+    """Write the recordings of the demo: a short one, and one to watch."""
     stream = synthetic_grasps(DEMO_GRASPS, sampling=Sampling.HELD, durations=DEMO_DURATIONS)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        write_stream(stream, file, t_decimals=2)
+    watched = synthetic_grasps(SHOW_GRASPS, rate_hz=PALM_RATE_HZ, durations=SHOW_DURATIONS)
+    for grasps, file_path, t_decimals in ((stream, path, 2), (watched, show, 3)):
+        with file_path.open("w", encoding="utf-8", newline="") as file:
+            write_stream(grasps, file, t_decimals)
 
 
 if __name__ == "__main__":

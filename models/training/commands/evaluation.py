@@ -8,7 +8,6 @@ import difflib
 import itertools
 import shlex
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 
@@ -49,7 +48,6 @@ QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 400, 2, 1
 
 def evaluate(args: argparse.Namespace) -> None:
     """Evaluate what the command line asks for. Raises what `exit_code` knows."""
-    started_s = time.monotonic()
     systems = _systems(args.names, grid=args.grid)
     _check_extras(args)
     grasps = read_with_lab_tables(args.data, args.own)
@@ -70,7 +68,7 @@ def evaluate(args: argparse.Namespace) -> None:
     if args.grid:
         _report_grids(systems, summaries, args)
     if args.table or args.plots:
-        _report(grasps.digest(), args, time.monotonic() - started_s)
+        _report(grasps.digest(), args)
 
 
 def grid_of(system: System) -> list[System]:
@@ -194,7 +192,7 @@ def _line(summary: SystemSummary) -> str:
     )
 
 
-def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
+def _report(data: str, args: argparse.Namespace) -> None:
     """Write table and plots of all summaries in the folder that are of this data (a digest)."""
     digests = {
         name: digest(with_recipes(system, epochs=QUICK_EPOCHS) if args.quick else system)
@@ -203,13 +201,13 @@ def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
     summaries = read_summaries(args.out, data, digests)
     if args.table:
         command = "graspd " + " ".join(_command(args))
-        made = Made(command, seconds, made_with(), quick=args.quick)
+        made = Made(command, made_with(), quick=args.quick)
         args.table.parent.mkdir(parents=True, exist_ok=True)
         write_whole(args.table, results_table(summaries, made).encode())
     if args.plots:
         from graspd.models.training.evaluating.plots import draw
 
-        draw(summaries, args.plots)
+        draw(summaries, args.plots, quick=args.quick)
 
 
 def _command(args: argparse.Namespace) -> Iterator[str]:

@@ -26,6 +26,8 @@ COUNT_MAX = 4095
 """Largest 12-bit count."""
 MAX_TABLE_BYTES = 64 * 2**20
 """A larger file is no table of this kind: 2133 grasps take 0.8 MB."""
+QUICK_EVERY = 20
+"""A report with `--quick` uses one of this many grasps: enough to see that it runs."""
 COUNT_COLUMNS = tuple(
     f"{finger}_biotac_{electrode}" for finger in FINGERS for electrode in range(1, ELECTRODES + 1)
 )
@@ -74,6 +76,10 @@ class Grasps:
                 for file, rows in zip(self.files, kept, strict=True)
             ),
         )
+
+    def few(self) -> Grasps:
+        """Return one of `QUICK_EVERY` grasps."""
+        return self.rows(np.arange(0, len(self), QUICK_EVERY))
 
     def rows_of(self, tables: Collection[str]) -> Ints:
         """Indices, ascending, of the grasps of the tables with these names."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -10,6 +10,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from graspd.models.training.data.protocols import PROTOCOLS
+from graspd.models.training.evaluating.style import (
+    BLUE,
+    NAVY,
+    ORANGE,
+    QUIET,
+    mark_quick,
+    style,
+    to_svg,
+)
 from graspd.models.training.evaluating.summaries import SystemSummary
 from graspd.models.training.fitting.standards import SESSION_VARIANTS
 
@@ -17,37 +26,46 @@ FORMATS = ("png", "svg")
 DPI = 130
 MOST_CURVES = 8
 """Curves in one picture that can still be told apart."""
-SLIP, STABLE, LINE, GREY = "#b5402a", "#2a6f97", "#1d3557", "#999999"
 
 
-def draw(summaries: Sequence[SystemSummary], folder: Path) -> list[Path]:
-    """Write the pictures into the folder and return their paths.
+def draw(summaries: Sequence[SystemSummary], folder: Path, *, quick: bool = False) -> list[Path]:
+    """Write the pictures into the folder and return their paths; `quick` marks them as such.
 
     One of each system in each protocol; one per protocol that compares the best of them; one of
     session calibration, if there is such a system. Raises `OSError`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
+    with style():
+        return [
+            path
+            for name, figure in _figures(summaries)
+            for path in _save(figure, folder / name, quick=quick)
+        ]
+
+
+def _figures(summaries: Sequence[SystemSummary]) -> Iterator[tuple[str, Figure]]:
+    """Yield the name and the figure of each picture."""
     for summary in summaries:
-        written += _save(_report(summary), folder / f"{summary.system}.{summary.protocol}")
+        yield f"{summary.system}.{summary.protocol}", _report(summary)
     for protocol in PROTOCOLS:
         here = [summary for summary in summaries if summary.protocol == protocol]
         if len(here) > 1:
-            written += _save(_comparison(here), folder / f"coverage.{protocol}")
+            yield f"coverage.{protocol}", _comparison(here)
     sessions = [summary for summary in summaries if summary.protocol == "session"]
     sessions = [summary for summary in sessions if len(summary.variants) > 1]
     if sessions:
-        written += _save(_calibration(sessions), folder / "session-calibration")
-    return written
+        yield "session-calibration", _calibration(sessions)
 
 
-def _save(figure: Figure, stem: Path) -> list[Path]:
+def _save(figure: Figure, stem: Path, *, quick: bool) -> list[Path]:
     # Without a canvas of its own, a figure would ask for a window system.
     FigureCanvasAgg(figure)
-    paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in FORMATS]
-    for path in paths:
-        figure.savefig(path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
-    return paths
+    if quick:
+        mark_quick(figure)
+    bitmap, drawing = (stem.with_name(f"{stem.name}.{suffix}") for suffix in FORMATS)
+    figure.savefig(bitmap, dpi=DPI)
+    drawing.write_text(to_svg(figure, stem.name, []))
+    return [bitmap, drawing]
 
 
 def _report(summary: SystemSummary) -> Figure:
@@ -69,23 +87,23 @@ def _report(summary: SystemSummary) -> Figure:
 def _reliability(axes: Axes, summary: SystemSummary) -> None:
     bins = summary.main.bins
     total = sum(number for _, _, number in bins)
-    axes.plot((0.0, 1.0), (0.0, 1.0), color=GREY, linewidth=1.0, linestyle="--")
+    axes.plot((0.0, 1.0), (0.0, 1.0), color=QUIET, linewidth=1.0, linestyle="--")
     predicted, seen = [bin_[0] for bin_ in bins], [bin_[1] for bin_ in bins]
-    axes.plot(predicted, seen, color=LINE, linewidth=1.2)
+    axes.plot(predicted, seen, color=NAVY, linewidth=1.2)
     sizes = [10.0 + 300.0 * number / total for _, _, number in bins]
-    axes.scatter(predicted, seen, s=sizes, color=SLIP, zorder=3)
+    axes.scatter(predicted, seen, s=sizes, color=ORANGE, zorder=3)
     ece = summary.main.spreads["ece"].mean
     axes.set_title(f"Reliability (ECE of a fold {100 * ece:.1f} %)", fontsize=10)
     axes.set(xlabel="predicted slip probability (size: grasps)", ylabel="share that slipped")
 
 
 def _coverage(axes: Axes, summary: SystemSummary) -> None:
-    axes.plot(*_curve(summary), color=LINE)
+    axes.plot(*_curve(summary), color=NAVY)
     for wanted, threshold in summary.main.thresholds.items():
         if threshold is not None:
             place = (100.0 * threshold.coverage, 100.0 * threshold.accuracy)
             to_left = place[0] > 30.0
-            axes.plot(*place, "o", color=SLIP, markersize=4)
+            axes.plot(*place, "o", color=ORANGE, markersize=4)
             axes.annotate(
                 f"{100 * float(wanted):g} % from {threshold.confidence:.2f}",
                 place,
@@ -97,7 +115,6 @@ def _coverage(axes: Axes, summary: SystemSummary) -> None:
             )
     axes.set_title("Accuracy of the most confident verdicts, and reject thresholds", fontsize=10)
     axes.set(xlim=(0.0, 103.0), xlabel="coverage, %", ylabel="accuracy, %")
-    axes.grid(alpha=0.3)
 
 
 def _curve(summary: SystemSummary) -> tuple[list[float], list[float]]:
@@ -109,7 +126,8 @@ def _curve(summary: SystemSummary) -> tuple[list[float], list[float]]:
 def _confusion(axes: Axes, summary: SystemSummary) -> None:
     rows = summary.main.confusion
     shares = [[number / max(1, sum(row)) for number in row] for row in rows]
-    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto", alpha=0.4)
+    axes.grid(visible=False)
     for y, row in enumerate(rows):
         for x, number in enumerate(row):
             axes.text(
@@ -118,7 +136,6 @@ def _confusion(axes: Axes, summary: SystemSummary) -> None:
                 f"{100 * shares[y][x]:.1f} %\n{number}",
                 ha="center",
                 va="center",
-                color="white" if shares[y][x] > 0.5 else "black",
             )
     axes.set_xticks((0, 1), ("judged stable", "judged slip"))
     axes.set_yticks((0, 1), ("was stable", "slipped"))
@@ -129,7 +146,7 @@ def _objects(axes: Axes, summary: SystemSummary) -> None:
     """F1 as bars, accuracy with its interval as points: the worst object on top."""
     ranked = sorted(summary.main.objects.items(), key=lambda item: -item[1].f1)
     places = range(len(ranked))
-    axes.barh(places, [100.0 * one.f1 for _, one in ranked], color=STABLE, alpha=0.45, label="F1")
+    axes.barh(places, [100.0 * one.f1 for _, one in ranked], color=BLUE, alpha=0.45, label="F1")
     shares = [one.share for _, one in ranked]
     axes.errorbar(
         [100.0 * share.accuracy for share in shares],
@@ -141,14 +158,14 @@ def _objects(axes: Axes, summary: SystemSummary) -> None:
         fmt="o",
         markersize=3,
         linewidth=0.9,
-        color=LINE,
+        color=NAVY,
         label="accuracy, 95 %",
     )
     axes.set_yticks(places, [f"{name} ({one.share.grasps})" for name, one in ranked], fontsize=7.5)
     axes.set(ylim=(-0.8, len(ranked) - 0.2), xlim=(0.0, 101.0), xlabel="%")
     axes.set_title("Objects (grasps), slip positive", fontsize=10, loc="left")
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.995), ncols=2, fontsize=8, frameon=False)
-    axes.grid(axis="x", alpha=0.3)
+    axes.grid(visible=False, axis="y")
 
 
 def _comparison(summaries: Sequence[SystemSummary]) -> Figure:
@@ -159,11 +176,10 @@ def _comparison(summaries: Sequence[SystemSummary]) -> Figure:
     for summary in ranked:
         right = 100 * summary.main.coverages["0.8"]
         axes.plot(*_curve(summary), label=f"{summary.system} ({right:.1f} % at 80 %)")
-    axes.axvline(80.0, color=GREY, linewidth=0.8, linestyle="--")
+    axes.axvline(80.0, color=QUIET, linewidth=0.8, linestyle="--")
     title = f"Accuracy of the most confident verdicts, protocol {ranked[0].protocol}"
     axes.set(title=title, xlabel="coverage, %", ylabel="accuracy, %")
     axes.legend(fontsize=8, loc="lower left")
-    axes.grid(alpha=0.3)
     return figure
 
 
@@ -185,5 +201,4 @@ def _calibration(summaries: Sequence[SystemSummary]) -> Figure:
         ylabel="F1, %",
     )
     axes.legend(fontsize=8, loc="lower right")
-    axes.grid(alpha=0.3)
     return figure

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from graspd.models.training.evaluating.day_figures import GROUPS, DayFigures
+from graspd.models.training.evaluating.findings import HOW_SURE, findings
 from graspd.models.training.evaluating.metrics import Spread, paired_difference
 from graspd.models.training.evaluating.summaries import HEADLINE, SystemSummary
 from graspd.models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
 from graspd.models.training.systems.registry import SYSTEMS
-from graspd.models.training.systems.system import PaperFigure, SessionFeatures, System
+from graspd.models.training.systems.system import PaperFigure, System
 
 NOT_RUN = "-"
 REFERENCE = "cnn1"
@@ -30,7 +31,6 @@ class Made:
     """How a table was made."""
 
     command: str
-    seconds: float
     made_with: Mapping[str, str]
     quick: bool = False
 
@@ -44,6 +44,7 @@ def results_table(summaries: Sequence[SystemSummary], made: Made) -> str:
     by_group: ByGroup = {(summary.system, summary.protocol): summary for summary in summaries}
     sections = (
         _head(summaries, made),
+        _findings(by_group),
         _paper(by_group),
         _systems(by_group),
         _sessions(by_group),
@@ -69,48 +70,82 @@ def _head(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
     yield "\n".join(f"- `{name}`: {ABOUT[name]}" for name in PROTOCOLS if name in shown)
 
 
+class _Figures(dict[str, str]):
+    """Figures by their key in a finding. Raises `KeyError` for what was not run."""
+
+    def __init__(self, by_group: ByGroup) -> None:
+        super().__init__()
+        self._by_group = by_group
+
+    def __missing__(self, key: str) -> str:
+        system, protocol, *part = key.split("/")
+        summary = next(
+            (each for names, each in self._by_group.items() if names == (system, protocol)), None
+        )
+        if summary is None:
+            raise KeyError(key)
+        match part:
+            case ["paper"]:
+                published = SYSTEMS[system].published or ()
+                paper = next(one.f1 for one in published if one.protocol == protocol)
+                return _of_paper(paper)
+            case ["difference"]:
+                return _difference(summary, self._by_group[REFERENCE, summary.protocol])
+            case ["auc"]:
+                return f"{summary.main.spreads['auc'].mean:.2f}"
+            case _:
+                return _value(summary.main.spreads["f1"])
+
+
+def _findings(by_group: ByGroup) -> Iterator[str]:
+    said = [f"- {finding}" for finding in findings(_Figures(by_group))]
+    if said:
+        yield "## Findings"
+        yield "\n".join(said)
+        yield HOW_SURE
+
+
 def _paper(by_group: ByGroup) -> Iterator[str]:
     yield "## 1. The paper's systems"
     yield _table(
-        ("system", "protocol", "figure", "paper", "ours", "s.e.", "seeds", "difference"),
+        ("system", "protocol", "figure", "paper", "ours", "difference"),
         (
             row
             for system in SYSTEMS.values()
-            if not isinstance(system.input, SessionFeatures)
-            for published in system.published or (None,)
+            for published in system.published or ()
             for row in _published(system, published, by_group)
         ),
     )
 
 
-def _published(system: System, published: PaperFigure | None, by_group: ByGroup) -> Iterator[Row]:
-    """A row for each figure that the paper gives; for F1 alone where it gives none."""
-    protocol: EvalProtocol = published.protocol if published else "cv"
-    summary = by_group.get((system.name, protocol))
+def _published(system: System, published: PaperFigure, by_group: ByGroup) -> Iterator[Row]:
+    """A row for each figure that the paper gives."""
+    summary = by_group.get((system.name, published.protocol))
     for figure in FIGURES:
-        paper = getattr(published, figure) if published else None
-        if paper is None and (published or figure != "f1"):
+        paper = getattr(published, figure)
+        if paper is None:
             continue
         ours = summary.main.spreads[figure] if summary else None
         yield (
             f"`{system.name}`",
-            f"`{protocol}`",
+            f"`{published.protocol}`",
             figure.replace("f1", "F1"),
-            f"{paper[0]:.1f} +- {paper[1]:.1f}" if paper else NOT_RUN,
+            _of_paper(paper),
             _value(ours),
-            _error(ours.error if ours else None),
-            str(ours.seeds) if ours else NOT_RUN,
-            f"{100 * ours.mean - paper[0]:+.1f}" if ours and paper else NOT_RUN,
+            f"{100 * ours.mean - paper[0]:+.1f}" if ours else NOT_RUN,
         )
+
+
+def _of_paper(figure: tuple[float, float]) -> str:
+    return f"{figure[0]:.1f} +- {figure[1]:.1f}"
 
 
 def _systems(by_group: ByGroup) -> Iterator[str]:
     yield "## 2. All systems, all protocols"
     yield (
         f"In `session`, systems with session calibration have seen {HEADLINE[1:]} unlabelled "
-        "grasps of other objects of that session, the others none. `parameters` are those of the "
-        "protocol where they are most: a support vector machine, a forest or boosting has as many "
-        "as its grasps ask for, so a run of fewer protocols may show fewer."
+        "grasps of other objects of that session, the others none. `parameters` are the most of "
+        "any protocol."
     )
     rows = []
     for name in SYSTEMS:
@@ -215,9 +250,10 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
         best = max(here, key=lambda summary: summary.main.spreads["f1"].mean)
         reference = by_group.get((REFERENCE, protocol))
         for summary in here:
-            to_others = (_difference(summary, other) for other in (reference, best))
-            rows.append((f"`{summary.system}`", f"`{protocol}`", *to_others, f"`{best.system}`"))
-    yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best", "best"), rows)
+            to_others = [_difference(summary, other) for other in (reference, best)]
+            if to_others != [NOT_RUN, NOT_RUN]:
+                rows.append((f"`{summary.system}`", f"`{protocol}`", *to_others))
+    yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best"), rows)
 
 
 def difference(ours: SystemSummary, theirs: SystemSummary) -> tuple[float, float | None] | None:
@@ -245,21 +281,21 @@ def _f1_of(summary: SystemSummary, seed: int) -> list[float | None]:
 def _everything(summaries: Sequence[SystemSummary]) -> Iterator[str]:
     yield "## 6. Every figure"
     yield (
-        "Accuracy, precision, recall and F1 in %; AUC, Brier score and expected calibration error "
-        "(ECE) as fractions, probabilities calibrated by a temperature of the other folds; "
-        "accuracy, %, of the 80 % most confident verdicts; seconds of one training."
+        "Means. Accuracy, precision and recall in %; AUC and expected calibration error (ECE) as "
+        "fractions, probabilities calibrated by a temperature of the other folds; accuracy, %, of "
+        "the 80 % most confident verdicts; seconds of one training."
     )
-    percent, fractions = ("accuracy", "precision", "recall", "f1"), ("auc", "brier", "ece")
+    percent, fractions = ("accuracy", "precision", "recall"), ("auc", "ece")
     yield _table(
         (
-            *("system", "protocol", "accuracy", "precision", "recall", "F1"),
-            *("AUC", "Brier", "ECE", "at 80 %", "seeds", "s"),
+            *("system", "protocol", "accuracy", "precision", "recall"),
+            *("AUC", "ECE", "at 80 %", "seeds", "s"),
         ),
         (
             (
                 f"`{summary.system}`",
                 f"`{summary.protocol}`",
-                *(_value(summary.main.spreads[name]) for name in percent),
+                *(_percent(summary.main.spreads[name].mean) for name in percent),
                 *(f"{summary.main.spreads[name].mean:.3f}" for name in fractions),
                 f"{100 * summary.main.coverages['0.8']:.1f}",
                 str(len(summary.seeds)),
@@ -277,10 +313,8 @@ def _how(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
     total = sum(summary.seconds for summary in summaries)
     yield (
         f"{sum(map(_trainings, summaries))} trainings, {_duration(total)} in all on one thread "
-        f"each; this run of the command took {_duration(made.seconds)}, with what was finished "
-        "before taken as it was. Without names, protocols and seeds the same command makes "
-        "everything, what is `-` too: more than a day on two cores, most of it the 300 epochs of "
-        "`cnn1-faithful`."
+        "each. Without names, protocols and seeds the command makes everything, what is `-` too: "
+        "more than a day on two cores."
     )
     yield ", ".join(f"{name} {version}" for name, version in made.made_with.items()) + "."
     files = {file.name: file for summary in summaries for file in summary.files}

@@ -142,6 +142,8 @@ class Card(msgspec.Struct, frozen=True):
     """Makes the file again, byte for byte on a machine of the same kind."""
     made_with: dict[str, str]
     weak_points: tuple[str, ...]
+    worth: dict[str, Any] | None = None
+    """What `graspd report worth --card` measured of networks of this system; None: nothing."""
 
 
 def weak_points(summaries: Sequence[SystemSummary], grasps: Grasps) -> tuple[str, ...]:

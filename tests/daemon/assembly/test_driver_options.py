@@ -11,6 +11,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.scene import Scene, SceneError, parse
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
 from graspd.drivers.palm.calibration import CalibrationError
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.fakes import Clock, FakeDriver
 
 
@@ -94,3 +95,12 @@ def test_only_a_link_is_worth_another_try(raised: Exception, expected: type[Exce
 
     with pytest.raises(expected, match=str(raised)):
         assembly.open_driver(Refusing([], Clock()))
+
+
+def test_outcomes_that_no_recording_has_cannot_be_told(tmp_path: Path) -> None:
+    bare = tmp_path / "bare.csv"
+    header, row, *_ = DEMO_TABLE.read_text().splitlines()
+    bare.write_text(header.replace("slipped", "other") + f"\n{row}\n")
+    wanted = scene({"driver": "replay", "recordings": [str(bare)], "outcomes": True})
+    with pytest.raises(SceneError, match="outcomes needs the column `slipped`"):
+        assembly.build_drivers(wanted)

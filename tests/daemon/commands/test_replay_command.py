@@ -78,7 +78,7 @@ def test_the_demo_shows_what_stable_is_worth_by_both_methods_on_a_day_of_drift()
     stable, slips = int(whole["own_stable"]), int(whole["own_slips"])
     assert slips <= 0.05 * stable + 5.0
     most = int(0.05 * stable + 5.0)
-    assert f"at most {most} can, whatever drifts: 5 % of them, and 5.00 more" in text
+    assert f"At most {most} can slip: 5 % of its `stable`, and 5.00 more." in text
     assert max(int(block["kept"]) for block in blocks) > 50
     # The verdicts are those that programs get.
     verdicts = [decode_verdict(line.encode()) for line in program.stdout.splitlines()]
@@ -86,6 +86,25 @@ def test_the_demo_shows_what_stable_is_worth_by_both_methods_on_a_day_of_drift()
         slipped = [row["slipped"] == "1" for row in csv.DictReader(file)]
     said = [verdict.verdict == "stable" for verdict in verdicts]
     assert (stable, slips) == (sum(said), sum(map(and_, said, slipped)))
+    # The three figures, counted here from the messages and the table.
+    held = slipped.count(False)
+    unknown = sum(verdict.verdict == "unknown" for verdict in verdicts)
+    assert f"slips of `stable`  {slips} of {stable} (" in text
+    assert f"good lifts kept    {stable - slips} of {held} (" in text
+    assert f"unknown            {unknown} of 300 grasps, published 0:" in text
+
+
+def test_a_table_with_outcomes_is_counted_by_25_grasps(tmp_path: Path) -> None:
+    table = tmp_path / "lab.csv"
+    table.write_text("".join(DEMO_TABLE.read_text().splitlines(keepends=True)[:61]))
+    text = graspd("replay", table).stdout
+    lines = [match.groupdict() for match in map(DEMO_LINE.fullmatch, text.splitlines()) if match]
+    assert [line["grasps"] for line in lines] == ["1-25", "26-50", "51-60", "all"]
+    assert text.startswith("Grasps of lab.csv.\n")
+    assert "p_slip" not in text
+    verbose = graspd("replay", table, "--verbose").stdout
+    assert verbose.count("p_slip") + verbose.count("never-seen  ") >= 59
+    assert "against " in verbose
 
 
 def test_the_published_method_of_the_demo_is_its_network_on_every_grasp() -> None:

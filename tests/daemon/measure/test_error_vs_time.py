@@ -104,8 +104,9 @@ def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[s
         text = (folder / f"error-vs-time.{suffix}").read_text()
         assert "-quick" in text  # an XML comment has no "--"
         assert found["machine"]["processor"].split("(")[0] in text
-    drawn = picture.draw({**found, "quick": False})
+    drawn = picture.draw({**found, "quick": False}, ["figures of all models"])
     assert "-quick" not in drawn
+    assert "<desc>\nfigures of all models\n </desc>" in drawn
     assert "Error against run time" in drawn
 
 

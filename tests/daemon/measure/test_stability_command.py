@@ -33,6 +33,10 @@ def test_a_case(record_property):
 def test_a_step(record_property):
     record_property("row", json.dumps({"step": "one", "expected": "1", "found": "1"}))
 
+def test_that_takes_its_time(pytestconfig, record_property):
+    record_property("row", json.dumps({"step": "two", "expected": "2", "found": "2"}))
+    assert pytestconfig.getoption("timeout") == 0
+
 def test_that_ends_early():
     raise OSError("nothing noted")
 """
@@ -51,6 +55,7 @@ def run(*arguments: str) -> tuple[int, str]:
 def test_the_cases_of_a_model_become_two_tables() -> None:
     code, text = run("small-session-mf", "--quick")
     assert code == 0
+    assert text.startswith("**made with --quick")
     assert "\n0 of 4" in text
     for case in ("all 0", "demo table", "random 12-bit counts", "next to the threshold"):
         assert f"| small-session-mf | {case} |" in text
@@ -70,7 +75,7 @@ def test_a_broken_bound_makes_the_exit_code_1(
     code, text = run()
     assert code == 1
     assert "| unknown 1, slip 1 | flat 1 | BROKEN p_slip nan, bound 1e-04 |" in text
-    assert "2 of 3 rows break a bound" in text
+    assert "2 of 4 rows break a bound" in text
     assert "OSError: nothing noted | BROKEN |" in text
     code, text = run("--json")
     assert code == 1

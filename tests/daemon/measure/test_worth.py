@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +20,7 @@ pytest.importorskip("matplotlib")
 from graspd.daemon.commands.report import add_arguments
 from graspd.daemon.measure import streams as module
 from graspd.daemon.measure import worth
-from graspd.daemon.measure.reliability import reliability, slope
+from graspd.daemon.measure.reliability import fitted_scales, outcomes_of, slope
 from graspd.daemon.measure.streams import Stream, judged, live, streams
 from graspd.daemon.measure.worth import (
     ALLOWED,
@@ -31,7 +33,9 @@ from graspd.daemon.measure.worth import (
     measured,
     risk_figures,
 )
+from graspd.daemon.trust.learner import SCALE
 from graspd.daemon.trust.risk import RiskLimits
+from graspd.models import zoo
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.data.protocols import object_folds
@@ -52,7 +56,9 @@ def stream(seed: int = 0) -> Stream:
     margins = random.normal(0.0, 1.0, GRASPS)
     refused = np.zeros(GRASPS, np.bool_)
     published = np.full(GRASPS, -1.0)
-    return Stream("A", "palm_45", "random", margins, features, refused, published, slipped)
+    return Stream(
+        (0, seed), "A", "palm_45", "random", margins, features, refused, published, slipped
+    )
 
 
 def curves_of(several: Sequence[Stream]) -> worth.Curves:
@@ -131,7 +137,7 @@ def test_a_refused_grasp_is_neither_judged_nor_told_and_counts_as_not_kept() -> 
     assert np.isnan(life.p_slip[refused]).all()
     assert not life.stable[refused].any()
     assert life.outcomes[-1] == GRASPS // 2 - 1
-    figures = risk_figures([whole], [life], 0.01)
+    figures = risk_figures([whole], [life], 0.01, "A")
     held = ~whole.slipped
     assert figures.kept == pytest.approx((life.stable & held).sum() / held.sum())
     assert figures.slips == pytest.approx((life.stable & ~held).sum() / life.stable.sum())
@@ -149,6 +155,22 @@ def test_probabilities_that_are_timid_or_too_sure_have_that_slope() -> None:
         assert slope(p_slip, slipped) == pytest.approx(factor, abs=0.03 * factor)
 
 
+def test_a_scale_is_fitted_on_the_other_objects_of_its_split() -> None:
+    """Outcomes of the judged objects change the others' scales and not their own."""
+    several = [stream(seed) for seed in range(3)]
+    other_split = replace(stream(3), group=(1, 0))
+    turned = replace(several[0], slipped=~several[0].slipped)
+
+    def scales(streams: Sequence[Stream]) -> dict[tuple[int, int], float]:
+        lives = [live(one, RiskLimits(), every=True, scale=1.0) for one in streams]
+        return fitted_scales(streams, lives)
+
+    former, later = scales([*several, other_split]), scales([turned, *several[1:], other_split])
+    assert former[0, 0] == later[0, 0]
+    assert former[0, 1] != later[0, 1]
+    assert former[1, 0] == later[1, 0] == SCALE
+
+
 def test_p_slip_is_honest_on_a_day_that_was_not_trained_on(bts3_dir: Path) -> None:
     """Over all days and folds nine in ten sessions have a slope from 0.8 to 1.35."""
     grasps = read_all(bts3_dir)
@@ -163,8 +185,8 @@ def test_p_slip_is_honest_on_a_day_that_was_not_trained_on(bts3_dir: Path) -> No
     rows = np.random.default_rng(0).permutation(np.flatnonzero(later & (fold_of == 0)))
     margins, features, refused = judged(trained, grasps, rows)
     slipped = grasps.slipped[rows]
-    one = Stream("A", "palm_45", "random", margins, features, refused, margins, slipped)
-    p_slip, ended = reliability([one], [live(one, RiskLimits(), every=True)])
+    one = Stream((0, 0), "A", "palm_45", "random", margins, features, refused, margins, slipped)
+    p_slip, ended = outcomes_of([one], [live(one, RiskLimits(), every=True)])
     assert 0.7 < slope(p_slip, ended) < 1.4
     surely = p_slip < 0.1
     assert ended[surely].mean() == pytest.approx(p_slip[surely].mean(), abs=0.05)
@@ -183,15 +205,18 @@ def test_the_picture_has_every_method_and_is_drawn_the_same_again(
     first, second = pictures
     assert first == second
     assert first.startswith("<?xml")
-    for colour in ("#c65d21", "#9a8f2f", "#1f6f8b", "#123f50"):
-        assert colour in first
+    for name in (PUBLISHED, ALONE, LEARNING, RISK):
+        assert f"<!-- {name} -->" in first
 
 
 @pytest.fixture(scope="module")
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the report, made in this process: it starts slowly."""
     out = tmp_path_factory.mktemp("worth")
-    assert worth.run(options("--data", str(bts3_dir), "--out", str(out), "--quick")) == 0
+    card = out / "card.json"
+    shutil.copy(zoo.find("small-session").with_suffix(".json"), card)
+    arguments = ("--data", str(bts3_dir), "--out", str(out), "--card", str(card), "--quick")
+    assert worth.run(options(*arguments)) == 0
     return out
 
 
@@ -203,6 +228,17 @@ def options(*arguments: str) -> argparse.Namespace:
 
 def test_from_tables_to_picture(folder: Path) -> None:
     text = (folder / "worth.md").read_text()
+    assert text.startswith("**made with --quick")
     for name in (PUBLISHED, ALONE, LEARNING, RISK):
         assert re.search(rf"\| {re.escape(name)} +\| (\d+|nan) / \d+ ", text)
-    assert (folder / "worth.svg").read_text().count("<svg") == 1
+    drawn = (folder / "worth.svg").read_text()
+    assert drawn.count("<svg") == 1
+    assert "-quick: the figures mean nothing -->" in drawn
+    assert text.partition("\n\n")[2].partition("\n\n")[0] in drawn, "the picture's own figures"
+
+
+def test_the_figures_go_on_a_card(folder: Path) -> None:
+    card = json.loads((folder / "card.json").read_text())
+    assert card["contract"] == zoo.card("small-session")["contract"]
+    assert card["worth"] == json.loads((folder / "worth.json").read_text())
+    assert card["worth"]["command"] == "graspd report worth --data DIR --seeds 1 --quick"

@@ -225,13 +225,16 @@ def recording_of(folder: Path, name: str) -> Path:
 
 def test_an_object_may_have_any_name_on_any_terminal(tmp_path: Path) -> None:
     recording = recording_of(tmp_path, "größe 漢")
-    code, output, errors = redirected("", "replay", recording, PYTHONIOENCODING="latin-1")
+    code, output, errors = redirected(
+        "", "replay", "--verbose", recording, PYTHONIOENCODING="latin-1"
+    )
     assert (code, errors) == (0, "")
     assert "  größe \\u6f22 (was " in output.splitlines()[0]
 
 
 def test_the_name_of_an_object_does_not_move_the_cursor(tmp_path: Path) -> None:
-    result = inside.graspd("replay", recording_of(tmp_path, "\x1b[2J\x07mug\x9b" + "x" * 200))
+    recording = recording_of(tmp_path, "\x1b[2J\x07mug\x9b" + "x" * 200)
+    result = inside.graspd("replay", "--verbose", recording)
     first = result.stdout.splitlines()[0]
     assert "\\x1b[2J\\x07mug\\x9bxxx" in first
     assert first.isprintable()

@@ -25,7 +25,7 @@ NAMES = sorted(path.stem for path in GOLDEN.glob("*.json"))
     ("name", "added"),
     [
         ("verdict_stable", "judged gate contact repaired session_calibrated p_slip_model outcomes"),
-        ("verdict_stable", "supervised risk early still_ms motion motion_limits"),
+        ("verdict_stable", "supervised risk early still_ms motion motion_limits fingers"),
         ("gate", "still_ms motion motion_limits"),
         ("outcome", "object"),
         ("status", "lifts learner"),

@@ -39,8 +39,11 @@ def compared(verdict: dict[str, Any]) -> dict[str, Any]:
 
 
 def without_null(value: Any) -> Any:  # noqa: ANN401
-    """A message as it is recorded, where null is left out."""
+    """A message as it is recorded, where null is left out, but for a finger that is not known."""
     if isinstance(value, dict):
+        if isinstance(fingers := value.get("fingers"), dict):
+            felt = {finger: state or "unknown" for finger, state in fingers.items()}
+            value = value | {"fingers": felt}
         return {name: without_null(one) for name, one in value.items() if one is not None}
     return value
 

@@ -114,6 +114,17 @@ def test_null_is_left_out_and_a_table_is_one_list() -> None:
     assert flat(content) == {"b": {"d": 0}, "e": [1, 2, 3, 4], "f": [], "g": False}
 
 
+def test_a_finger_that_is_not_known_is_a_state_of_its_own() -> None:
+    felt = {"ff": "slide", "mf": None}
+    told = {"fingers": {"ff": "slide", "mf": "unknown"}, "motion": {}}
+    assert flat({"fingers": felt, "motion": {"ff": None}}) == told
+    fields = json.loads(schemas()[Topic.VERDICT][1])["properties"]["fingers"]["properties"]
+    assert set(fields) == {"ff", "mf", "rf", "lf", "th"}
+    assert fields["ff"] == {"type": "string", "enum": ["free", "touch", "slide", "unknown"]}
+    names = {"fingers": ["ff", "mf"]}  # of a reading
+    assert flat(names) == names
+
+
 @pytest.mark.parametrize("rows", [1, 3])
 def test_a_list_of_counts_becomes_the_table_again(rows: int) -> None:
     counts = np.arange(24 * rows).reshape(rows, 24).tolist()

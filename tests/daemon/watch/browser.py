@@ -22,6 +22,7 @@ FLAGS = (
     *("--remote-debugging-pipe", "--hide-scrollbars"),
 )
 Answer = dict[str, Any]
+BANNER = "document.querySelector('.banner')"
 
 
 class Browser:
@@ -134,3 +135,13 @@ class Browser:
             self.complaints.append(json.dumps(details["exceptionDetails"])[:500])
         if message.get("method") == "Log.entryAdded" and details["entry"]["level"] == "error":
             self.complaints.append(details["entry"]["text"])
+
+
+def see(browser: Browser, tone: str) -> None:
+    """Wait until the page of the first hand has a tone."""
+    browser.wait_for(f"{BANNER}.dataset.tone == '{tone}'")
+
+
+def text(browser: Browser, element: str) -> str:
+    """Return the text of the first element of a class."""
+    return str(browser.value(f"document.querySelector('.{element}').innerText"))

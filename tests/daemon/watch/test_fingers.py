@@ -139,3 +139,13 @@ def test_unknown_motion_of_a_finger_is_not_zero(
         for finger in view.snapshot(0).fingers
     }
     assert motions.items() <= shown.items()
+
+
+@pytest.mark.parametrize("told", [{"ff": "slide", "th": None}, {"ff": "slide"}, None])
+def test_a_finger_has_its_word_and_none_where_none_is_told(told: dict[str, Any] | None) -> None:
+    view = after(
+        (b"tactile.right", tactile(0, RESTING, RESTING)),
+        (b"verdict.right", verdict(0, fingers=told)),
+    )
+    shown = {finger.name: finger.state for finger in view.snapshot(0).fingers}
+    assert shown == {"ff": None if told is None else "slide", "th": None}

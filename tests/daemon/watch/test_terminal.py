@@ -10,7 +10,7 @@ import pytest
 from msgspec import structs
 from rich.console import Console
 
-from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
+from graspd.daemon.judge.reasons import ADVICE, Decision, FingerState, Reason
 from graspd.daemon.watch.fingers import FingerMotion
 from graspd.daemon.watch.snapshot import Snapshot, Tone
 from graspd.daemon.watch.terminal import STYLES, Screen, draw
@@ -92,6 +92,17 @@ def test_a_bar_of_motion_has_the_limit_in_its_middle(now: float | None, bar: str
         line for line in text_of(structs.replace(seen, fingers=[first])) if line.startswith("ff ")
     ]
     assert row.split(maxsplit=1)[1].startswith(bar)
+
+
+def test_a_finger_is_shown_in_a_word_if_one_is_known() -> None:
+    seen = a_full_hand()
+    for state in (FingerState.SLIDE, None):
+        first = structs.replace(seen.fingers[0], state=state)
+        (row,) = [
+            line for line in text_of(structs.replace(seen, fingers=[first])) if line[:3] == "ff "
+        ]
+        assert (", slide" in row) is (state is not None)
+        assert "None" not in row
 
 
 @pytest.mark.parametrize("width", [60, 80, 200])

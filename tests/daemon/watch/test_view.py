@@ -161,26 +161,6 @@ def test_stillness_is_told_in_words(still_ms: float | None, words: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "evidence"),
-    [
-        ({}, "network 30 %, rests on 57 lifts; of 41 `stable` ones 2 slipped, target 10 %"),
-        (
-            {"outcomes": 1, "risk": risk(lifts=0, slips=0, target=0.05)},
-            "network 30 %, rests on 1 lift; no `stable` one told yet, target 5 %",
-        ),
-        (
-            {"risk": risk(target=None)},
-            "network 30 %, rests on 57 lifts; of 41 `stable` ones 2 slipped",
-        ),
-        ({"risk": NOTHING_TOLD, "outcomes": 0}, "network 30 %, no outcome told yet"),
-        ({"risk": None, "outcomes": 0, "p_slip_model": None}, "no outcome told yet"),
-    ],
-)
-def test_a_verdict_says_what_it_rests_on(change: dict[str, Any], evidence: str) -> None:
-    assert seen_after(Decision.STABLE, **change).evidence == evidence
-
-
-@pytest.mark.parametrize(
     ("decision", "reasons", "tone"),
     [
         (Decision.UNKNOWN, [Reason.UNPROVEN], Tone.LEARNING),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Literal
 
 import pytest
@@ -13,7 +11,7 @@ import pytest
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.watch.snapshot import Snapshot
 from graspd.daemon.watch.view import View
-from tests.daemon.watch.browser import CHROMIUM, Browser
+from tests.daemon.watch.browser import BANNER, CHROMIUM, Browser, see, text
 from tests.daemon.watch.pages import Page, serving_hands
 from tests.daemon.watch.watch_fakes import Talker, verdict, whole_hand
 
@@ -27,42 +25,6 @@ COLOURS = {
 """Green and red of both themes, as the page's style has them."""
 CARD = "rgb(23, 27, 34)"
 """What is behind the letters in the dark where nothing is promised."""
-BANNER = "document.querySelector('.banner')"
-
-
-@pytest.fixture
-def page(tmp_path: Path) -> Iterator[Page]:
-    made = Page(f"ipc://{tmp_path}/v")
-    made.start()
-    yield made
-    made.stop()
-
-
-@pytest.fixture
-def talker(tmp_path: Path) -> Iterator[Talker]:
-    with Talker(f"ipc://{tmp_path}/v") as made:
-        yield made
-
-
-@pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile")) as made:
-        yield made
-
-
-@pytest.fixture
-def browser(chromium: Browser) -> Iterator[Browser]:
-    with chromium.blank() as made:
-        yield made
-        assert made.complaints == []
-
-
-def see(browser: Browser, tone: str) -> None:
-    browser.wait_for(f"{BANNER}.dataset.tone == '{tone}'")
-
-
-def text(browser: Browser, element: str) -> str:
-    return str(browser.value(f"document.querySelector('.{element}').innerText"))
 
 
 def background(browser: Browser) -> object:
@@ -110,7 +72,10 @@ def test_a_stable_that_lifts_have_not_earned_is_hollow(
     assert text(browser, "verdict") == "LEANS TO STABLE"
     assert browser.value("document.title") == "leans to stable - graspd"
     assert background(browser) == CARD
-    assert text(browser, "evidence") == "network 30 %, no outcome told yet"
+    assert (
+        text(browser, "evidence")
+        == "slip probability by the network alone 30 %, no outcome told yet"
+    )
     assert "slip probability 44 %" in text(browser, "p")
     assert not text(browser, "why").startswith("lift")
     talker.more = {}
@@ -122,11 +87,13 @@ def test_a_stable_that_lifts_have_not_earned_is_hollow(
 def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    def bars() -> object:
-        return browser.value(
+    def bars() -> list[list[object]]:
+        told = browser.value(
             "[...document.querySelectorAll('.moves')].map(bar => [bar.dataset.motion,"
             " bar.style.getPropertyValue('--share'), bar.hidden, bar.nextSibling.innerText])"
         )
+        assert isinstance(told, list)
+        return told
 
     browser.look(1280, 800)
     browser.go(page.address)
@@ -147,6 +114,12 @@ def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
         ["moving", "80%", False, "moves 2.0 / 1.3 \u03c3"],
         ["moving", "100%", False, "moves 9.0 / 1.0 \u03c3"],
     ]
+    talker.more |= {"fingers": {"ff": "slide", "th": None}}
+    browser.wait_for("document.querySelector('.moves').nextSibling.innerText[0] == 's'")
+    assert [words for *_, words in bars()] == ["slide 2.0 / 1.3 \u03c3", "moves 9.0 / 1.0 \u03c3"]
+    talker.more |= {"motion": {"ff": None, "th": 0.5}, "fingers": {"ff": "free", "th": "touch"}}
+    browser.wait_for("document.querySelector('.moves').nextSibling.innerText == 'free'")
+    assert [words for *_, words in bars()] == ["free", "touch 0.5 / 1.0 \u03c3"]
     talker.decision = None
     see(browser, "silent")
     assert text(browser, "still") == "-"
@@ -163,7 +136,7 @@ def test_the_last_verdict_stays_until_the_next_grasp_and_then_in_the_list(
     assert text(browser, "was") == ""
     talker.decision = Decision.UNKNOWN
     see(browser, "waiting")
-    assert text(browser, "was") == "past: stable 25 %"
+    assert text(browser, "was") == "past: stable, slip probability 25 %"
     assert ", past; lift: not told" in text(browser, "judged")
     talker.more = {"grasp": 8}
     browser.wait_for("document.querySelector('.was').innerText == ''")
@@ -171,8 +144,8 @@ def test_the_last_verdict_stays_until_the_next_grasp_and_then_in_the_list(
     talker.decision = Decision.SLIP
     see(browser, "slip")
     assert text(browser, "grasps").split("\n") == [
-        "8\t✕slip 75 %\tsupervised\tnot told",
-        "7\t●stable 25 %\t\tnot told",
+        "8\t✕slip\tslip probability 75 %\tnot told, supervised",
+        "7\t●stable\tslip probability 25 %\tnot told",
     ]
     assert "slips of `stable`\t2 of 41 lifts, at most 9.5" in text(browser, "learning")
 
@@ -196,6 +169,8 @@ def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
     assert browser.value(f"{figure}.fontStyle") == "italic"
     assert browser.value(f"{figure}.color") == "rgb(91, 101, 112)"  # --faint
     assert "250 us" in text(browser, "timing")
+    assert text(browser, "was") == ""
+    assert text(browser, "judged") == "-"
     said = re.fullmatch(r"figures are of (\d\d:\d\d:\d\d), the last message", text(browser, "old"))
     assert said
     assert said[1] in {time.strftime("%H:%M:%S", time.localtime(died - ago)) for ago in range(5)}
@@ -267,6 +242,20 @@ def test_a_whole_hand_fits_one_window_and_several_one_page(
         browser.wait_for(
             f"document.title == '{title}' && [...document.querySelectorAll('.banner')]"
             f".map(b => b.dataset.tone).join(' ') == '{tones}'"
+        )
+        strip = "[...document.querySelectorAll('#strip a')].map(a => a.innerText).join(' ')"
+        several = " ".join(
+            f"{name}\n{said.upper()}" for name, said in zip(names, tones.split(), strict=True)
+        )
+        if len(names) > 1:
+            assert browser.value(strip) == several
+        assert browser.value("document.getElementById('strip').hidden") == (len(names) == 1)
+        assert (
+            browser.value(
+                "scrollTo(0, 1e6), document.getElementById('strip').getBoundingClientRect().top"
+            )
+            == 0
+            or len(names) == 1
         )
         cut = (
             "[...document.querySelectorAll('.verdict, td, .why li, figure span, .joints div,"

@@ -78,18 +78,20 @@ class Hold:
         seconds: float = SECONDS,
         rest_s: float = 0.0,
         slide_s: float | None = None,
+        slide_spread: float = SLIDE_SPREAD,
     ) -> None:
         """`sliding` says of each finger whether the object slides along it, or is held.
 
         For the first `rest_s` nothing has begun: all stand still. Slides begin at `slide_s`, until
-        which the object is held; unless given, after a standstill.
+        which the object is held; unless given, after a standstill. With a `slide_spread` of 0 all
+        have the speed of the median one.
         """
         self._times = np.arange(0.0, seconds + STEP_S, STEP_S)
         ways = [
             (
                 *_relaxation(self._times - rest_s, rng),
                 *_wander(self._times, rest_s, slide_s, rng, slides=slides),
-                *(_slide(self._times, rest_s, slide_s, rng) if slides else ()),
+                *(_slide(self._times, rest_s, slide_s, slide_spread, rng) if slides else ()),
             )
             for slides in sliding
         ]
@@ -180,13 +182,17 @@ def _wander(
 
 
 def _slide(
-    times: NDArray[np.float64], rest_s: float, slide_s: float | None, rng: np.random.Generator
+    times: NDArray[np.float64],
+    rest_s: float,
+    slide_s: float | None,
+    spread: float,
+    rng: np.random.Generator,
 ) -> Iterator[Way]:
     begins_s, ends_s = rng.uniform(*STANDSTILL_S, 2)
     begins_s = rest_s + begins_s if slide_s is None else slide_s
     slides = (times >= begins_s) & (times < times[-1] - ends_s)
     speed = SPEED_COUNTS_PER_S * np.exp(
-        rng.normal(0.0, SLIDE_SPREAD) + MOMENT_SPREAD * _noise(len(times), MOMENT_TAU_S, rng)
+        rng.normal(0.0, spread) + MOMENT_SPREAD * _noise(len(times), MOMENT_TAU_S, rng)
     )
     for share in SLIDE_DIRECTIONS:
         velocity = np.sqrt(share) * slides * speed * _noise(len(times), TURN_TAU_S, rng)

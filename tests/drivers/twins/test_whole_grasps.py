@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
 from graspd.drivers.twins.grasps import whole_grasps
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.whole_grasps import (
@@ -91,9 +91,10 @@ def test_a_looped_stream_goes_on_with_other_numbers() -> None:
 
 
 def test_the_demo_is_made_again_byte_for_byte(tmp_path: Path) -> None:
-    out = tmp_path / "demo.csv"
-    whole_grasps.main(out)
+    out, show = tmp_path / "demo.csv", tmp_path / "show.csv"
+    whole_grasps.main(out, show)
     assert out.read_bytes() == DEMO_RECORDING.read_bytes()
+    assert show.read_bytes() == SHOW_RECORDING.read_bytes()
 
 
 def test_the_demo_is_a_small_stream_of_twelve_synthetic_grasps_half_of_them_slipping() -> None:

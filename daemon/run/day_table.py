@@ -1,0 +1,124 @@
+"""A table of grasps, 25 a line: the published method beside graspd, by how the lifts ended."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from graspd.daemon.judge.network import Examined, Network
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.process.text import Colour, coloured, write_lines
+from graspd.daemon.publish.companion import Companion, PublishedVerdict
+from graspd.daemon.run.summary import Tally
+from graspd.daemon.trust.trust import Trust
+from graspd.models.runtime import TactileModel
+
+GRASPS = 25
+"""Grasps of one line."""
+PUBLISHED = "cnn1"
+"""Name of the published network in the zoo."""
+COLUMNS = f"{'stable':>8}{'slipped':>15}{'good lifts kept':>18}"
+
+
+class DayTable(Companion):
+    """Writes a line for every `GRASPS` grasps, and what they come to at the end."""
+
+    def __init__(
+        self, title: str, published: TactileModel, model: str, warnings: Sequence[str] = ()
+    ) -> None:
+        """`published` judges every grasp without session, outcomes or refusal. `model` is the
+        name of the other one. `warnings` are written last."""
+        self._published = Network(published, 0.5)
+        self._warnings = warnings
+        self._part = Tally(), Tally()
+        self._whole = Tally(), Tally()
+        self._grasps = 0
+        methods = f"the published method ({PUBLISHED})", f"graspd ({model})"
+        heads = "".join(f"{method:>{len(COLUMNS)}}" for method in methods)
+        self._write(
+            title,
+            "",
+            coloured(f"{'':10}{heads}", Colour.BOLD),
+            coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", Colour.BOLD),
+        )
+
+    def on_verdict(self, published: PublishedVerdict) -> None:
+        """Count a grasp."""
+        verdict, reading = published.verdict, published.reading
+        note = None if reading is None else reading.annotation
+        if reading is None or note is None or note.slipped is None:
+            return
+        p_slip = self._published.judge(Examined((), reading.counts)).p_slip
+        if p_slip is None:
+            said = Decision.UNKNOWN
+        else:
+            said = Decision.SLIP if p_slip >= 0.5 else Decision.STABLE
+        for tallies in (self._part, self._whole):
+            tallies[0].add(said, (), note.slipped)
+            tallies[1].add(verdict.verdict, verdict.reasons, note.slipped)
+        self._grasps += 1
+        if self._grasps % GRASPS == 0:
+            self._end_part(None if verdict.risk is None else verdict.risk.target)
+
+    def _end_part(self, allowed: float | None) -> None:
+        first = self._grasps - self._part[0].labelled + 1
+        self._line(f"{first}-{self._grasps}", self._part, allowed)
+        self._part = Tally(), Tally()
+
+    def summary(self, trust: Trust | None) -> None:
+        """Write the last lines; `trust` is what outcomes have taught."""
+        report = None if trust is None else trust.report()
+        allowed = None if report is None else report.target
+        if self._part[0].labelled:
+            self._end_part(allowed)
+        self._line("all", self._whole, allowed)
+        self._write("", *self._figures())
+        if trust is not None and trust.lifts.told:
+            learned = f"graspd learned from {trust.learner.outcomes} outcomes of lifts."
+            if report is not None and report.target is not None and report.bound is not None:
+                share = f"{100 * report.target:g} % of its `stable`"
+                most = int(report.bound)
+                learned += f" At most {most} can slip: {share}, and {report.beyond_share:.2f} more."
+            self._write(learned)
+        self._write(*self._warnings, "Each verdict and all scores: --verbose.")
+
+    def _figures(self) -> list[str]:
+        """Return the three figures that matter, each with what it means."""
+        published, graspd = self._whole
+        return [
+            f"slips of `stable`  {_slips(graspd)}, published {_slips(published)}: "
+            "the risk of a lift on `stable`",
+            f"good lifts kept    {_kept(graspd)}, published {_kept(published)}: "
+            "`stable` of those that hold",
+            f"unknown            {graspd.decisions[Decision.UNKNOWN]} of {self._grasps} grasps, "
+            f"published {published.decisions[Decision.UNKNOWN]}: no answer, so grasp again",
+        ]
+
+    def _line(self, grasps: str, tallies: tuple[Tally, Tally], allowed: float | None) -> None:
+        self._write(f"{grasps:10}{''.join(self._cells(tally, allowed) for tally in tallies)}")
+
+    def _cells(self, tally: Tally, allowed: float | None) -> str:
+        stable, slips = tally.stable
+        worth = tally.worth() or {}
+        share, kept = worth.get("slips_among_stable"), worth.get("coverage")
+        slipped = f"{slips:9}" + (f"{100 * share:4.0f} %" if share is not None else f"{'-':>6}")
+        if share is not None and allowed is not None:
+            slipped = coloured(slipped, Colour.RED if share > allowed else Colour.GREEN)
+        good = f"{100 * kept:.0f} %" if kept is not None else "-"
+        return f"{stable:8}{slipped}{good:>18}"
+
+    def _write(self, *lines: str) -> None:
+        write_lines(*lines)
+        sys.stdout.flush()
+
+
+def _slips(tally: Tally) -> str:
+    stable, slips = tally.stable
+    share = f" ({100 * slips / stable:.0f} %)" if stable else ""
+    return f"{slips} of {stable}{share}"
+
+
+def _kept(tally: Tally) -> str:
+    held = tally.confusion[False, False]
+    share = f" ({100 * held / tally.held:.0f} %)" if tally.held else ""
+    return f"{held} of {tally.held}{share}"

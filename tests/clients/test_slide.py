@@ -1,0 +1,148 @@
+"""A lift is watched over: what slides, lets go or is not known stops it."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deploy.clients.python.graspd_client import SlideAnswer
+from tests.clients.messages import MS, frames, verdict
+from tests.clients.test_both_ask import false_daemon, told
+from tests.clients.test_lift import START_NS, World, client
+
+Words = Mapping[str, str | None]
+
+HELD: Words = {"ff": "touch", "th": "touch"}
+
+
+def lift(
+    *words: Words | None,
+    age_ms: float = 1.0,
+    **more: Any,  # noqa: ANN401
+) -> list[tuple[int, list[bytes]]]:
+    """Messages, one every 10 ms, in which the fingers feel this; None: not told."""
+    sent = []
+    for seq, felt in enumerate(words):
+        at_ns = START_NS + seq * 10 * MS
+        told = {} if felt is None else {"fingers": felt}
+        read_ns = at_ns - round(age_ms * MS)
+        message = verdict(seq, read_ns, "unknown", age_ms=age_ms, **told | more)
+        sent.append((at_ns, frames(message)))
+    return sent
+
+
+def watched(coming: list[tuple[int, list[bytes]]], timeout_s: float = 0.3) -> SlideAnswer:
+    with client(World(coming)) as graspd:
+        return graspd.wait_for_slide(timeout_s)
+
+
+def test_a_slide_stops_the_lift_at_once() -> None:
+    answer = watched(lift(*[HELD] * 5, {"ff": "touch", "th": "slide"}, *[HELD] * 30))
+    assert answer
+    assert (answer.sliding, answer.held) == (("th",), False)
+    assert answer.waited_s == pytest.approx(0.05, abs=0.002)
+
+
+def test_a_lift_that_holds_is_not_stopped_before_the_time_is_over() -> None:
+    answer = watched(lift(*[HELD] * 40))
+    assert (bool(answer), answer.sliding, answer.held) == (False, (), True)
+    assert answer.waited_s == pytest.approx(0.3, abs=0.002)
+    assert answer.verdict.reasons == ("moving",)
+
+
+@pytest.mark.parametrize(
+    ("coming", "after_ms"),
+    [
+        # By the last reading that said so, which was 1 ms old, and 100 ms of age.
+        (lift(*[HELD] * 5), 40 + 99),
+        (lift(*[HELD] * 5, *[{"ff": "touch", "th": None}] * 40), 40 + 99),
+        (lift(*[HELD] * 5, *[None] * 40), 40 + 99),
+        (lift(*[HELD] * 5, *[HELD] * 40, age_ms=60.0), 300),
+        (lift(*[HELD] * 5, *[{"ff": "free", "th": "touch"}] * 40), 50),
+        (lift(*[HELD] * 5) + lift(*[HELD] * 40, boot_id="b")[5:], 50),
+        (lift(*[None] * 40), 100),
+        (lift(*[{"ff": "free", "th": "free"}] * 40), 100),
+        (lift(*[{"ff": None, "th": None}] * 40), 100),
+        ([], 100),
+    ],
+    ids=[
+        *("silence", "not known", "not told", "60 ms old", "let go", "another start"),
+        *("never told", "open", "never known", "nothing comes"),
+    ],
+)
+def test_what_is_not_known_stops_the_lift_within_the_age(
+    coming: list[tuple[int, list[bytes]]], after_ms: int
+) -> None:
+    answer = watched(coming)
+    assert answer.held is (after_ms == 300)
+    assert bool(answer) is not answer.held
+    assert answer.sliding == ()
+    assert answer.waited_s == pytest.approx(after_ms / 1e3, abs=0.012)
+
+
+def test_one_reading_that_cannot_be_used_stops_no_lift() -> None:
+    nothing: Words = {"ff": None, "th": None}
+    assert not watched(lift(*[HELD] * 5, nothing, *[HELD] * 5, nothing, *[HELD] * 30))
+
+
+def test_words_of_an_old_reading_are_not_told() -> None:
+    with client(World(lift(HELD, age_ms=101.0))) as graspd:
+        assert graspd.verdict().fingers == {"ff": None, "th": None}
+    with client(World(lift(HELD, age_ms=90.0))) as graspd:
+        assert graspd.verdict().fingers == HELD
+
+
+def test_a_closed_client_stops_the_lift() -> None:
+    with client(World(lift(*[HELD] * 40))) as graspd:
+        graspd.close()
+        answer = graspd.wait_for_slide(1.0)
+    assert (bool(answer), answer.verdict.reasons) == (True, ("closed",))
+    assert answer.waited_s < 0.01
+
+
+@pytest.mark.parametrize("timeout_s", [-1.0, float("nan"), float("inf")])
+def test_a_time_that_is_none_is_refused(timeout_s: float) -> None:
+    with client(World([])) as graspd, pytest.raises(ValueError, match="timeout_s"):
+        graspd.wait_for_slide(timeout_s)
+
+
+@pytest.mark.parametrize(
+    ("max_age_ms", "timeout_s", "later", "answer"),
+    [
+        (5000, 0.1, {}, "0 1"),
+        (5000, 60.0, {"th": "slide"}, "1 0 th"),
+        (5000, 60.0, {"ff": "free"}, "1 0"),
+        (100, 60.0, {"ff": None}, "1 0"),
+    ],
+    ids=["held", "slide", "let go", "not known"],
+)
+def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
+    binary: Path, tmp_path: Path, max_age_ms: int, timeout_s: float, later: Words, answer: str
+) -> None:
+    fingers = dict(HELD)
+    with (
+        false_daemon(tmp_path, told(), "unknown", fingers=fingers),
+        subprocess.Popen(
+            [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as probe,
+    ):
+        assert probe.stdin is not None
+        assert probe.stdout is not None
+        probe.stdin.write(f"client ipc://{tmp_path}/out ipc://{tmp_path}/ask {max_age_ms}\n")
+        line, deadline_s = "", time.monotonic() + 60.0
+        while line != "0 1\n" and time.monotonic() < deadline_s:  # until it has heard of them
+            probe.stdin.write("slide 0.01\n")
+            probe.stdin.flush()
+            line = probe.stdout.readline()
+        probe.stdin.write(f"slide {timeout_s}\n")
+        probe.stdin.flush()
+        time.sleep(0.1)
+        fingers.update(later)
+        assert probe.stdout.readline() == f"{answer}\n"
+        probe.communicate(timeout=200)
+        assert probe.returncode == 0, "the sanitizers found something"

@@ -1,0 +1,163 @@
+"""Each finger in a word: what is not known is never a touch, and the word does not flicker."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from graspd.daemon.judge.decision import Limits
+from graspd.daemon.judge.hand import FingerMemory, HandTracker
+from graspd.daemon.judge.health import Checked
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import FingerState, GateState, Reason
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.models import zoo
+from graspd.models.contract import Finger
+from graspd.models.runtime import TactileModel
+from tests.daemon.judge.test_gate import ALL, FINGERS, LIMITS, MS, Scenario, readings
+
+FREE, TOUCH, SLIDE = FingerState
+UNKNOWN = dict.fromkeys(FINGERS)
+HELD = dict.fromkeys(FINGERS, TOUCH)
+FIRM = Scenario("firm", ((0.0, 0.0), (0.2, 300.0)), "", seconds=1.5)
+SLIPPING = Scenario(
+    "one finger slips from 1 s to 1.3 s",
+    {
+        "ff": ((0.0, 0.0), (0.2, 300.0), (1.0, 300.0), (1.3, 255.0)),  # 70 counts/s in the mean
+        "mf": ((0.0, 0.0), (0.2, 300.0)),
+        "th": ((0.4, 0.0), (0.6, 300.0), (2.2, 300.0), (2.4, 0.0)),
+    },
+    "",
+    seconds=2.5,
+)
+Feelings = dict[Finger, FingerState | None]
+
+
+def felt(scenario: Scenario, hand: HandTracker) -> list[tuple[float, GateState | None, Feelings]]:
+    """Time, s, state of the gate and words of each reading."""
+    told = []
+    for t_s, reading in readings(scenario):
+        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), None))
+        assert moment.fingers is not None
+        told.append((t_s, moment.state, dict(moment.fingers)))
+    return told
+
+
+def words(told: list[tuple[float, GateState | None, Feelings]], finger: Finger) -> list[str]:
+    """Words of a finger, each one once, in their order."""
+    said = [feelings[finger] or "unknown" for _, _, feelings in told]
+    return [said[0], *(word for former, word in pairwise(said) if word != former)]
+
+
+def test_the_words_follow_a_grasp_from_rest_to_release() -> None:
+    told = felt(SLIPPING, HandTracker(FINGERS, LIMITS))
+    assert words(told, "ff") == ["unknown", "free", "slide", "touch", "slide", "touch"]
+    assert words(told, "mf") == ["unknown", "free", "slide", "touch"]
+    assert words(told, "th") == ["unknown", "free", "slide", "touch", "slide", "free"]
+    slides_s = [t_s for t_s, _, feelings in told if t_s > 0.9 and feelings["ff"] is SLIDE]
+    # It stays until hardly any of the slide is left in the long window.
+    assert 1.0 < slides_s[0] < 1.2
+    assert 1.3 <= slides_s[-1] < 1.3 + 0.24
+    assert {state for t_s, state, _ in told if 1.15 < t_s < 1.3} == {GateState.JUDGED}
+
+
+def test_motion_of_a_still_finger_is_a_slide_once_it_lasts() -> None:
+    finger = FingerMemory()
+    moves = [True, True, False, True, True, True, False, True, None, True]
+    told = [finger.touch(place * 10 * MS, each) for place, each in enumerate(moves)]
+    # While it has not been still at all, it slides from the first reading.
+    first, later, again = [SLIDE, SLIDE, TOUCH], [TOUCH, TOUCH, SLIDE], [TOUCH, TOUCH, None, SLIDE]
+    assert told == first + later + again
+    assert FingerMemory(was_still=True, moves_since_ns=50).touch(49, True) is SLIDE, (
+        "time went back"
+    )
+
+
+def test_a_word_is_told_once_both_windows_are_known() -> None:
+    hand, sweeps = HandTracker(FINGERS, LIMITS), readings(FIRM)
+    known = []
+    for t_s, reading in sweeps:
+        if abs(t_s - 1.0) < 1e-6:
+            hand.restart()
+        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), None))
+        if t_s > 1.0 - 1e-6:
+            known.append(moment.fingers)
+    # The long window is full by the 25th sweep.
+    assert known == [UNKNOWN] * 24 + [HELD] * (len(known) - 24)
+
+
+def test_fast_motion_is_told_before_the_long_window_is_known() -> None:
+    hand = HandTracker(FINGERS, LIMITS)
+    for t_s, reading in readings(SLIPPING):
+        if abs(t_s - 2.15) < 1e-6:
+            hand.restart()
+        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), None))
+        if t_s > 2.28:
+            break
+    assert moment.fingers == {"ff": None, "mf": None, "th": SLIDE}
+
+
+@pytest.mark.parametrize("reason", [Reason.SENSOR_MISSING, Reason.FROZEN, Reason.PARITY])
+def test_a_reading_that_cannot_be_used_tells_nothing(reason: Reason) -> None:
+    hand, told = HandTracker(FINGERS, LIMITS), []
+    for number, (_, reading) in enumerate(readings(FIRM)):
+        reasons = (reason,) if number == 230 else ()
+        moment, _ = hand.step(reading.made_ns, reading.counts, Checked(reasons, None))
+        told.append(moment.fingers)
+    assert told[229:232] == [HELD, UNKNOWN, HELD]
+    assert hand.moment().fingers == UNKNOWN, "and nothing is told without a reading"
+
+
+def test_a_finger_with_too_few_electrodes_is_not_known_and_hides_no_other() -> None:
+    hand = HandTracker(FINGERS, LIMITS)
+    lost = ~ALL
+    lost[1, :13] = True
+    for t_s, reading in readings(FIRM):
+        broken = lost if t_s > 1.0 else None
+        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), broken))
+    assert moment.fingers == {"ff": TOUCH, "mf": None, "th": TOUCH}
+
+
+def test_a_finger_whose_rest_is_not_known_is_not_free() -> None:
+    told = felt(FIRM, HandTracker(FINGERS, LIMITS))
+    assert told[0][2] == UNKNOWN
+    assert {tuple(feelings.values()) for t_s, _, feelings in told if -0.05 < t_s < 0.0} == {
+        (FREE,) * 3
+    }
+
+
+@pytest.mark.parametrize(("late_ms", "is_known"), [(100, True), (101, False)])
+def test_an_old_reading_tells_nothing(late_ms: int, is_known: bool) -> None:
+    now_ns = late_ns = 0
+    model = TactileModel(zoo.find("cnn1"))
+    judge = Pipeline(model, FINGERS, Limits(), lambda: now_ns, hand=LIMITS, learns=False)
+    for t_s, reading in readings(FIRM):
+        late_ns = late_ms * MS if t_s > 1.2 else 0
+        now_ns = reading.t_ns + late_ns
+        judgement = judge.judge(reading)
+    assert (judgement.moment.fingers == HELD) is is_known
+    assert (judgement.moment.fingers == UNKNOWN) is not is_known
+    assert judge.silence(reading.t_ns).moment.fingers == UNKNOWN
+
+
+def test_where_each_reading_is_a_grasp_no_finger_has_a_word() -> None:
+    judge = Pipeline(TactileModel(zoo.find("cnn1")), FINGERS, Limits(), lambda: 0)
+    counts = np.full(ALL.shape, 2000, dtype=np.uint16)
+    reading = TactileReading(0, 0, counts, np.zeros(ALL.shape, dtype=np.uint8))
+    assert judge.judge(reading).moment.fingers is None
+
+
+def test_faults_of_one_finger_leave_no_touch_in_any() -> None:
+    now_ns = 0
+    model = TactileModel(zoo.find("cnn1"))
+    judge = Pipeline(model, FINGERS, Limits(), lambda: now_ns, hand=LIMITS, learns=False)
+    for t_s, reading in readings(FIRM):
+        now_ns = reading.t_ns
+        faults = reading.faults.copy()
+        faults[2] = ElectrodeFault.MISSING if t_s > 1.2 else 0
+        judgement = judge.judge(TactileReading(reading.t_ns, reading.seq, reading.counts, faults))
+        if t_s > 1.2:
+            assert judgement.moment.fingers == UNKNOWN
+    assert Reason.SENSOR_MISSING in judgement.reasons

@@ -1,0 +1,71 @@
+"""The scene of the demo earns its solid `stable` by outcomes that its recording tells."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from pathlib import Path
+
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.companion import PublishedVerdict
+from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.run.printer import Printer
+from graspd.daemon.run.runner import Runner
+from graspd.daemon.watch.figures import doubt
+from graspd.drivers.recordings.csv_player import SHOW_RECORDING
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
+
+SCENE = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
+LOOPS = 2
+"""Times that the recording is played: less than two minutes."""
+
+
+class Heard(Printer):
+    """Keeps the verdicts in place of printing them."""
+
+    def __init__(self, *, as_json: bool) -> None:
+        super().__init__(as_json=as_json)
+        self.verdicts: list[Verdict] = []
+
+    def on_verdict(self, published: PublishedVerdict) -> None:
+        self.verdicts.append(published.verdict)
+
+
+def test_the_demo_turns_solid_green_within_two_minutes(tmp_path: Path) -> None:
+    recordings = ", ".join([f'"{SHOW_RECORDING}"'] * LOOPS)
+    text = SCENE.read_text()
+    for former, instead in (
+        ("loop = true", 'pace = "fast"'),
+        ('"../../drivers/recordings/demo/synthetic_show.csv"', recordings),
+        ("/tmp/graspd-demo.ipc", f"{tmp_path}/v"),
+    ):
+        assert former in text
+        text = text.replace(former, instead)
+    scene = tmp_path / "scene.toml"
+    scene.write_text(text + "[gate]\nmax_age_ms = 10000\n")
+    heard = Heard(as_json=True)
+    with StopSignal() as stop:
+        Runner(scene, stop, printer=heard).run()
+    verdicts = heard.verdicts
+    with SHOW_RECORDING.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(verdicts) == LOOPS * len(rows)
+    assert LOOPS * float(rows[-1]["t"]) < 120.0
+    stable = [verdict for verdict in verdicts if verdict.verdict is Decision.STABLE]
+    assert doubt(stable[0]) is not None  # hollow at first
+    assert doubt(stable[-1]) is None
+    # The outcomes are those of the recording: of `stable` and supervised lifts, each told once.
+    slipped = {}
+    for row, verdict in zip(rows * LOOPS, verdicts, strict=True):
+        if verdict.verdict is Decision.STABLE or verdict.supervised:
+            slipped[verdict.grasp] = row["slipped"] == "1"
+    slipped.pop(verdicts[-1].grasp, None)  # its outcome would be told at the next grasp
+    lifted = {verdict.grasp for verdict in stable} & slipped.keys()
+    last = verdicts[-1]
+    assert last.risk is not None
+    assert last.outcomes == len(slipped)
+    assert last.risk.lifts == len(lifted)
+    assert last.risk.slips == sum(slipped[grasp] for grasp in lifted)
+    held = Counter(verdict.grasp for verdict in verdicts if verdict.contact)
+    assert min(held[grasp] for grasp in slipped) > 2.0 * PALM_RATE_HZ

@@ -1,0 +1,39 @@
+"""The page, who talks to it, and the browser that shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.watch.browser import Browser
+from tests.daemon.watch.pages import Page
+from tests.daemon.watch.watch_fakes import Talker
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    made = Page(f"ipc://{tmp_path}/v")
+    made.start()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def talker(tmp_path: Path) -> Iterator[Talker]:
+    with Talker(f"ipc://{tmp_path}/v") as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as made:
+        yield made
+
+
+@pytest.fixture
+def browser(chromium: Browser) -> Iterator[Browser]:
+    with chromium.blank() as made:
+        yield made
+        assert made.complaints == []

@@ -1,0 +1,91 @@
+"""What a person does with the page: hands beside each other, past grasps, a paused timeline."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.watch.snapshot import Snapshot
+from graspd.daemon.watch.view import View
+from tests.daemon.watch.browser import CHROMIUM, Browser, see, text
+from tests.daemon.watch.pages import Page, serving_hands
+from tests.daemon.watch.watch_fakes import Talker, whole_hand
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
+
+
+def test_panels_of_two_hands_line_up_whatever_they_say(browser: Browser) -> None:
+    views = [View("ipc:///tmp/left"), View("ipc:///tmp/right-with-a-much-longer-name")]
+    said = [Decision.STABLE, Decision.SLIP]
+
+    def seen(seq: int) -> list[Snapshot]:
+        names = ("left", "right")
+        hands = zip(views, names, said, strict=True)
+        return [whole_hand(view, name, decision, seq) for view, name, decision in hands]
+
+    tops = (
+        "[...document.querySelectorAll('.hand')].map(hand => [...hand.querySelectorAll("
+        "'.banner, .card')].map(e => Math.round(e.getBoundingClientRect().top)).join(' '))"
+    )
+    height = "[...document.querySelectorAll('.banner')].map(e => e.offsetHeight)"
+    with serving_hands(seen) as address:
+        browser.look(1280, 800)
+        browser.go(address)
+        browser.wait_for("document.querySelectorAll('.hand .grasps tr').length >= 16")
+        left, right = browser.value(tops)
+        assert left == right
+        before = browser.value(height)
+        said[1] = Decision.UNKNOWN
+        browser.wait_for("document.querySelectorAll('.banner')[1].dataset.tone == 'trouble'")
+        left, right = browser.value(tops)
+        assert left == right
+        assert browser.value(height) == before
+
+
+def test_a_chosen_grasp_shows_its_image_until_the_page_goes_back(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    browser.look(1280, 800)
+    browser.go(page.address)
+    talker.decision = Decision.STABLE
+    see(browser, "stable")
+    browser.wait_for("document.querySelectorAll('figure canvas').length == 2")
+    talker.decision = Decision.UNKNOWN
+    see(browser, "waiting")
+    deepest = "document.querySelector('figcaption :last-child').innerText"
+    browser.wait_for(f"{deepest} == '0 counts'")  # of the open hand
+    browser.value("document.querySelector('.grasps button').click()")
+    past = "Grasp 7 as it was judged: stable, slip probability 25 %"
+    assert text(browser, "images") == past
+    assert browser.value(deepest) != "0 counts"
+    talker.decision = None
+    see(browser, "silent")
+    assert text(browser, "images") == past
+    browser.value("document.querySelector('.live').click()")
+    assert text(browser, "images") == "Tactile images and motion"
+    assert browser.value("document.querySelectorAll('figure').length") == 0
+
+
+def test_the_timeline_is_read_by_pointing_and_can_be_paused(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    browser.look(1280, 800)
+    browser.go(page.address)
+    talker.decision = Decision.SLIP
+    see(browser, "slip")
+    browser.wait_for("/slip [2-9] s/.test(document.querySelector('.timeline').ariaLabel)")
+    browser.value("document.querySelector('.pause').click()")
+    assert re.fullmatch(r"Paused: five minutes until \d\d:\d\d:\d\d", text(browser, "minutes"))
+    talker.decision = Decision.STABLE
+    see(browser, "stable")  # the verdict goes on
+    box = browser.value(
+        "(b => [b.right, b.top])(document.querySelector('.timeline').getBoundingClientRect())"
+    )
+    browser.ask("Input.dispatchMouseEvent", type="mouseMoved", x=box[0] - 6, y=box[1] + 20)
+    said = text(browser, "at")
+    assert re.fullmatch(r"\d\d:\d\d:\d\d: slip.*; highest slip probability 75 %", said)
+    assert "stable" not in browser.value("document.querySelector('.timeline').ariaLabel")
+    browser.value("document.querySelector('.pause').click()")
+    browser.wait_for("document.querySelector('.timeline').ariaLabel.includes('stable')")
