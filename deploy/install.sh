@@ -291,8 +291,8 @@ inputs() {
     if [ -n "$wheelhouse" ]; then
         (cd -- "$wheelhouse" && sha256sum -- *.whl)
     else
-        (cd -- "$source" && find pyproject.toml README.md LICENSE daemon drivers models -type f \
-            ! -path '*/__pycache__/*' -exec sha256sum {} +) >"$scratch/sources"
+        (cd -- "$source" && find pyproject.toml README.md LICENSE daemon drivers models \
+            deploy/package deploy/clients/python -type f ! -path '*/__pycache__/*' -exec sha256sum {} +) >"$scratch/sources"
         sort -k 2 "$scratch/sources"
     fi
 }

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+import tarfile
+import zipfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -27,6 +31,32 @@ def found(name: str, pattern: str) -> list[str]:
 
 def test_the_installed_package_has_the_version() -> None:
     assert version("graspd") == VERSION
+
+
+def names_in_wheel(project: Path, folder: Path) -> list[str]:
+    """Build the wheel of a source tree, and return the names of its files."""
+    build(project, "wheel", folder)
+    (wheel,) = folder.glob("*.whl")
+    with zipfile.ZipFile(wheel) as content:
+        return sorted(content.namelist())
+
+
+def build(project: Path, kind: str, folder: Path) -> None:
+    command = [sys.executable, "-m", "hatchling", "build", "--target", kind, "-d", str(folder)]
+    subprocess.run(command, cwd=project, check=True, capture_output=True)
+
+
+def test_a_wheel_holds_one_package_also_from_an_sdist(tmp_path: Path) -> None:
+    names = names_in_wheel(ROOT, tmp_path / "wheel")
+    tops = {name.partition("/")[0] for name in names}
+    assert tops == {f"graspd-{VERSION}.{kind}" for kind in ("data", "dist-info")} | {"graspd"}
+    assert {"graspd/daemon/cli.py", "graspd/models/zoo/cnn1.onnx", "graspd/py.typed"} <= set(names)
+    build(ROOT, "sdist", tmp_path)
+    (packed,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(packed) as content:
+        content.extractall(tmp_path / "sdist", filter="data")
+    (unpacked,) = (tmp_path / "sdist").iterdir()
+    assert names_in_wheel(unpacked, tmp_path / "second") == names
 
 
 @pytest.mark.parametrize(("name", "pattern"), PLACES.items())

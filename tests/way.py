@@ -31,7 +31,8 @@ from graspd.daemon.run.loop import Loop, LoopTiming
 from tests.conftest import ROOT
 from tests.daemon.processes import start, wait_for
 
-SOURCE: Final = tuple(f"{ROOT}/{room}/" for room in ("daemon", "drivers", "models"))
+SOURCE: Final = f"{ROOT}/deploy/package/graspd/"
+"""Where Python found graspd, with a slash."""
 ROUND: Final = ("daemon/run/loop.py", "Loop._go_round")
 """Begins a round of the loop."""
 READ: Final = ("daemon/judge/pipeline.py", "Pipeline.judge")
@@ -55,7 +56,7 @@ endpoint = "ipc://{folder}/right.ipc"
 """
 
 Call = tuple[str, str]
-"""File, relative to the checkout, and name of a function that was entered."""
+"""File, relative to the package, and name of a function that was entered."""
 
 
 @dataclass(slots=True)
@@ -72,7 +73,7 @@ class Walk:
         path = frame.f_code.co_filename
         if event != "call" or not path.startswith(SOURCE):
             return
-        call = path[len(str(ROOT)) + 1 :], frame.f_code.co_qualname
+        call = path.removeprefix(SOURCE), frame.f_code.co_qualname
         if call == ROUND:
             self.rounds.append([])
         self.judged += call == JUDGED

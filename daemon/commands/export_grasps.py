@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from graspd.daemon.process.extras import needs
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.process.text import complain, write_lines
 from graspd.daemon.publish.messages import OBJECT_PATTERN
@@ -30,6 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="TABLE", help="grasp table (CSV) to write"
+    )
+    parser.add_argument(
+        "--parquet",
+        action="store_true",
+        help="write TABLE as Parquet, for `graspd.read_grasps` (extra: pandas)",
     )
     parser.add_argument("--force", action="store_true", help="replace a TABLE that is there")
     parser.add_argument(
@@ -58,9 +64,18 @@ def run(args: argparse.Namespace) -> int:
         complain("no judged grasp with an outcome: nothing is written")
         return FAILED
     try:
-        table = io.StringIO(newline="")
-        write(table, export, args.object)
-        write_atomically(args.out, table.getvalue().encode(), mode=0o644)
+        if args.parquet:
+            from graspd.daemon.record.frames import grasps_of
+
+            content = bytes(grasps_of(export, args.object).to_parquet())
+        else:
+            table = io.StringIO(newline="")
+            write(table, export, args.object)
+            content = table.getvalue().encode()
+        write_atomically(args.out, content, mode=0o644)
+    except ModuleNotFoundError as error:
+        complain(needs("--parquet", "pandas", error))
+        return WRONG
     except OSError as error:
         complain(f"{args.out}: {error.strerror or error}")
         return FAILED

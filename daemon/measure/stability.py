@@ -28,7 +28,7 @@ from graspd.models import zoo
 from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError
 
-CHECKOUT = Path(__file__).parents[2]
+CHECKOUT = Path(__file__).resolve().parents[2]
 CASES = Path("tests/stability")
 PACKAGES = ("pytest", "hypothesis", "onnx", "torch")
 BROKEN, WRONG = 1, 2

@@ -7,13 +7,11 @@ import shlex
 import sys
 from pathlib import Path
 
-OURS = frozenset({"daemon", "drivers", "models"})
-
 
 def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
     """Return how to install the missing `extra`. Raises `error` for a module of graspd."""
     package = (error.name or "").partition(".")[0]
-    if package in OURS:
+    if package == "graspd":
         raise error
     return (
         f"{what} needs the package '{package}': run {installer(Path(sys.prefix))} '.[{extra}]' in "

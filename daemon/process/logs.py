@@ -7,7 +7,8 @@ import os
 import time
 from collections.abc import Callable, Mapping
 
-LOGGERS = ("graspd", "daemon", "drivers", "models")
+LOGGER = "graspd"
+"""Parent of all loggers of graspd."""
 SYSLOG_LEVELS = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 """Journal priority of each level (sd-daemon(3)); lower levels have 7."""
 JOURNAL_ERROR = "<3>"
@@ -26,8 +27,7 @@ def set_up(environment: Mapping[str, str]) -> None:
     handler.setFormatter(JournalFormatter() if is_journal(environment) else plain)
     handler.addFilter(RateLimit())
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
-    for ours in LOGGERS:
-        logging.getLogger(ours).setLevel(logging.INFO)
+    logging.getLogger(LOGGER).setLevel(logging.INFO)
 
 
 def is_journal(environment: Mapping[str, str]) -> bool:

@@ -215,6 +215,7 @@ complete -c graspd -n '_shtab_graspd_using session seed; and test $_shtab_graspd
 complete -c graspd -n '_shtab_graspd_using; and test $_shtab_graspd_npos -eq 0' -a export-grasps -d 'Make a grasp table of what was recorded, for train (extra: record).'
 complete -c graspd -n '_shtab_graspd_using export-grasps' -s h -l help -d 'show this help message and exit'
 complete -c graspd -n '_shtab_graspd_using export-grasps' -l out -xka "(__fish_complete_path (commandline -ct))" -d 'grasp table (CSV) to write'
+complete -c graspd -n '_shtab_graspd_using export-grasps' -l parquet -d 'write TABLE as Parquet, for `graspd.read_grasps` (extra: pandas)'
 complete -c graspd -n '_shtab_graspd_using export-grasps' -l force -d 'replace a TABLE that is there'
 complete -c graspd -n '_shtab_graspd_using export-grasps' -l object -xka "(__fish_complete_path (commandline -ct))" -d 'what was grasped where the controller told no object'
 complete -c graspd -n '_shtab_graspd_using export-grasps; and test $_shtab_graspd_npos -ge 0' -ka "(__fish_complete_path (commandline -ct))" -d 'what `graspd run` with [record] has written (MCAP), in the order of time'

@@ -139,6 +139,7 @@ _shtab_graspd_evaluate_defaults_added=0
 _shtab_graspd_export_grasps_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--out[grasp table (CSV) to write]:TABLE:_files"
+  "--parquet[write TABLE as Parquet, for \`graspd.read_grasps\` (extra\: pandas)]"
   "--force[replace a TABLE that is there]"
   "--object[what was grasped where the controller told no object]:NAME:_files"
   "(*):what \`graspd run\` with \[record\] has written (MCAP), in the order of time:_files"

@@ -168,9 +168,9 @@ def make_decoder(
     the sweep frames (default 0x5B0); ids above 0x7FF have 29 bits. A decoder of samples without one
     takes the id of the first sound sample until the link is lost; use that for bring-up only.
 
-    The rest is for `syntouch`. `sensors`: the fingers in the order of the board's words, at most
-    three; None: `fingers`. `sequence`: a key of `graspd.drivers.biotac.SEQUENCES`. `data_length`: bytes of
-    a frame, if the board pads its frames.
+    For `syntouch` only: `sensors`, the fingers in the order of the board's words, three at most, by
+    default `fingers`; `sequence`, a key of `graspd.drivers.biotac.SEQUENCES`; `data_length`, bytes
+    of a frame that the board pads.
     """
     check_fingers(fingers)
     if arbitration_id is not None and not 0 <= arbitration_id <= EXTENDED_ID_MAX:

@@ -65,6 +65,8 @@ class Columns:
     has_labels: bool
     ignored: tuple[str, ...]
     """Columns of unknown names; electrodes of other fingers do not count."""
+    fingers: tuple[str, ...]
+    """Fingers that the file has, asked for or not."""
 
     @classmethod
     def of(cls, names: Sequence[str], fingers: Sequence[str]) -> Self:
@@ -81,6 +83,7 @@ class Columns:
             is_stream=is_stream,
             has_labels=SLIPPED in names,
             ignored=tuple(name for name in names if name not in own_columns and name not in joints),
+            fingers=tuple(each for each in FINGERS if electrode_columns(each)[0] in names),
         )
 
 

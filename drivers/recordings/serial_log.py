@@ -1,8 +1,8 @@
 """The link log of a serial line: its bytes with their times.
 
-Each record is a frame of `graspd.drivers.spi.messages`, so a reader finds the next one after any damage.
-Type 1: bytes from the device. Type 2: bytes to it. Type 3: the port was opened. The payload is
-`t: u64` (monotonic ns) and the bytes.
+Each record is a frame of `graspd.drivers.spi.messages`, so a reader finds the next one after any
+damage. Type 1: bytes from the device. Type 2: bytes to it. Type 3: the port was opened. The payload
+is `t: u64` (monotonic ns) and the bytes.
 """
 
 from __future__ import annotations

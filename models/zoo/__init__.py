@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from graspd.models.contract import Finger, ModelError
 
-ZOO = Path(__file__).parent
+ZOO = Path(__file__).resolve().parent
 CARD_MAX_BYTES = 16 << 20
 """A card has 0.1 MB."""
 

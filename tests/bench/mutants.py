@@ -153,7 +153,7 @@ class Workshop:
         self._folder, self._package, self._tests = folder, package, tests
         self._log = folder / "last-run.log"
         ignored = shutil.ignore_patterns(".*", "__pycache__")
-        shutil.copytree(root, folder, ignore=ignored, dirs_exist_ok=True)
+        shutil.copytree(root, folder, symlinks=True, ignore=ignored, dirs_exist_ok=True)
         for module in WARM:
             if importlib.util.find_spec(module) is not None:
                 importlib.import_module(module)
@@ -215,8 +215,9 @@ class Workshop:
     def _pytest(self, arguments: Sequence[str], plugins: Sequence[object]) -> int:
         """Run tests in the copy, as if this process had never seen the original."""
         os.chdir(self._folder)
-        os.environ["PYTHONPATH"] = sys.path[0] = str(self._folder)
-        packages = {path.name for path in self._folder.iterdir()}
+        sys.path[:1] = places = [str(self._folder / "deploy" / "package"), str(self._folder)]
+        os.environ["PYTHONPATH"] = os.pathsep.join(places)
+        packages = {"graspd", *(path.name for path in self._folder.iterdir())}
         for name in [name for name in sys.modules if name.partition(".")[0] in packages]:
             del sys.modules[name]
         # hypothesis, its plugin, is imported already.

@@ -23,11 +23,11 @@ def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
     info = f"graspd-{version}.dist-info"
     answer = f'    print("graspd {version}")\n' if starts else '    raise SystemExit("broken")\n'
     files = {
-        "daemon/__init__.py": "",
-        "daemon/__main__.py": f"def main() -> None:\n{answer}\n\nmain()\n",
+        "graspd/__init__.py": "",
+        "graspd/__main__.py": f"def main() -> None:\n{answer}\n\nmain()\n",
         f"{info}/METADATA": f"Metadata-Version: 2.1\nName: graspd\nVersion: {version}\n",
         f"{info}/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
-        f"{info}/entry_points.txt": "[console_scripts]\ngraspd = graspd.daemon.__main__:main\n",
+        f"{info}/entry_points.txt": "[console_scripts]\ngraspd = graspd.__main__:main\n",
     }
     record = "".join(f"{name},,\n" for name in [*files, f"{info}/RECORD"])
     with zipfile.ZipFile(folder / f"graspd-{version}-py3-none-any.whl", "w") as wheel:

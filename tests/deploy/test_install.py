@@ -81,7 +81,7 @@ def test_nothing_that_is_staged_names_the_stage(pristine: Path) -> None:
 
 
 def test_the_byte_code_is_there_before_the_service_may_not_write_it(pristine: Path) -> None:
-    assert list(pristine.glob("opt/graspd/venv/lib/*/site-packages/daemon/__pycache__/__main__*"))
+    assert list(pristine.glob("opt/graspd/venv/lib/*/site-packages/graspd/__pycache__/__main__*"))
 
 
 def test_a_second_run_changes_nothing_and_says_so(staged: Path, wheels: Path) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from subprocess import CompletedProcess
 
 from graspd.daemon import cli
-from graspd.daemon.process.logs import LOGGERS
+from graspd.daemon.process.logs import LOGGER
 
 
 def graspd(*arguments: object) -> CompletedProcess[str]:
@@ -34,12 +34,11 @@ def _as_it_was() -> Iterator[None]:
     """Let the command set up its log and its limits as in a new process; undo that after it."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     root = logging.getLogger()
-    handlers, levels = root.handlers, [logging.getLogger(name).level for name in LOGGERS]
+    handlers, level = root.handlers, logging.getLogger(LOGGER).level
     root.handlers = []
     try:
         yield
     finally:
         root.handlers = handlers
-        for name, level in zip(LOGGERS, levels, strict=True):
-            logging.getLogger(name).setLevel(level)
+        logging.getLogger(LOGGER).setLevel(level)
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)

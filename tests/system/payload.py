@@ -36,7 +36,7 @@ def make_payload(cache: Path, disk: Path) -> None:
         wheels = content / "wheels"
         shutil.copytree(_dependencies(cache), wheels)
         _wheel(wheels, "--no-deps", str(PROJECT))
-        shutil.copytree(PROJECT / "deploy", content / "deploy")
+        shutil.copytree(PROJECT / "deploy", content / "deploy", symlinks=True)
         write_recording(content / "recording.csv")
         shutil.copytree(GUEST, content / "guest", ignore=shutil.ignore_patterns("__pycache__"))
         bytes_ = sum(path.stat().st_size for path in content.rglob("*"))

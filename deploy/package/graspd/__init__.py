@@ -1,5 +1,41 @@
-"""graspd: says before a hand lifts whether the grasp is stable or will slip."""
+"""graspd: says before a hand lifts whether the grasp is stable or will slip.
+
+What is imported here loads when it is first used: `import graspd` alone takes no time.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from graspd.daemon import __version__
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from graspd import client
+    from graspd.daemon.library import GraspModel, judge, load
+    from graspd.daemon.record.frames import read_grasps, read_recording
+
+__all__ = [
+    "GraspModel",
+    "__version__",
+    "client",
+    "judge",
+    "load",
+    "read_grasps",
+    "read_recording",
+]
+
+_MODULES = {
+    "GraspModel": "graspd.daemon.library",
+    "judge": "graspd.daemon.library",
+    "load": "graspd.daemon.library",
+    "read_grasps": "graspd.daemon.record.frames",
+    "read_recording": "graspd.daemon.record.frames",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load the module of a name."""
+    if name == "client":
+        return import_module("graspd.client")
+    if name in _MODULES:
+        return getattr(import_module(_MODULES[name]), name)
+    raise AttributeError(f"module 'graspd' has no attribute '{name}'")

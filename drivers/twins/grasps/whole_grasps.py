@@ -3,7 +3,8 @@
 End points are rows of a grasp table, or drawn. The way between them is made up, with measured
 noise. Contact lowers counts, so a plausible end point is not above the rest; see `rest_above`.
 
-`python -m graspd.drivers.twins.grasps.whole_grasps` writes both demo recordings again, byte for byte.
+`python -m graspd.drivers.twins.grasps.whole_grasps` writes both demo recordings again, byte for
+byte.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ Flags = NDArray[np.uint8]
 
 
 class Definition:
-    """What is broken, and which finger repeats itself, by the words of `graspd.daemon.judge.health`."""
+    """What is broken, and which finger repeats itself, by the words of `health`."""
 
     def __init__(self) -> None:
         self.before: list[list[int]] | None = None

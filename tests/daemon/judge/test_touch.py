@@ -1,7 +1,7 @@
 """One finger's touch and tare, number by number: each limit from both sides.
 
-The numbers are those of the rule as `graspd.daemon.judge.contact` states it: a touch takes 20 counts, 0.6
-of that or a quarter of how deep it was held keeps it, half of that after a minute.
+The numbers are those of the rule as `graspd.daemon.judge.contact` states it: a touch takes 20
+counts, 0.6 of that or a quarter of how deep it was held keeps it, half of that after a minute.
 """
 
 from __future__ import annotations

@@ -242,8 +242,8 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
 
 def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training() -> None:
     code = (
-        "import json, sys; from graspd.daemon.__main__ import main; sys.argv[1:] = ['replay']; main(); "
-        "sys.stderr.write(json.dumps(sorted(sys.modules)))"
+        "import json, sys; from graspd.daemon.__main__ import main; sys.argv[1:] = ['replay']; "
+        "main(); sys.stderr.write(json.dumps(sorted(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     modules = tuple(json.loads(result.stderr))

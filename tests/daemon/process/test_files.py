@@ -75,8 +75,8 @@ def test_a_missing_package_is_named_with_its_extra_and_a_missing_part_of_graspd_
         "watch needs the package 'rich': run pip install '.[watch]' in the folder of graspd's "
         "source"
     )
-    with pytest.raises(ModuleNotFoundError, match=r"daemon\.nothing"):
-        needs("watch", "watch", ModuleNotFoundError("daemon.nothing", name="daemon.nothing"))
+    with pytest.raises(ModuleNotFoundError, match=r"graspd\.no"):
+        needs("watch", "watch", ModuleNotFoundError("graspd.no", name="graspd.no"))
 
 
 @pytest.mark.parametrize(

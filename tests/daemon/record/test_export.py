@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +18,7 @@ from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.publish.messages import OutcomeMessage, encode
 from graspd.daemon.record.export import collect
+from graspd.daemon.record.frames import read_grasps
 from graspd.daemon.record.header import RecordingHeader
 from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.record.topics import Judged
@@ -190,6 +192,37 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
         table = read_table(out)
         assert table.objects == ("mug", "ball", other, other, "box", other)
         assert table.slipped.tolist() == [True, False, False, True, False, False]
+
+
+def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.mcap")
+    for grasp, counts in enumerate(sweeps(3), 1):
+        writer.judged(grasp, counts)
+        writer.outcome(grasp, "slip" if grasp == 2 else "stable", "mug")
+    writer.close()
+    out = {name: tmp_path / f"t.{name}" for name in ("csv", "parquet")}
+    for name, options in (("csv", ()), ("parquet", ("--parquet",))):
+        words = "export-grasps", tmp_path / "a.mcap", "--out", out[name], *options
+        assert graspd(*words).returncode == 0
+    expected = read_table(out["csv"])
+    for path in (*out.values(), tmp_path / "a.mcap"):
+        table = read_grasps(path)
+        assert table["slipped"].tolist() == expected.slipped.tolist() == [False, True, False]
+        assert table["object"].tolist() == ["mug"] * 3
+        assert np.array_equal(table.iloc[:, 2:], expected.counts.reshape(3, -1))
+
+
+def test_without_pandas_the_option_names_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded(tmp_path / "a.mcap", sweeps(1)[0])
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.delitem(sys.modules, "graspd.daemon.record.frames", raising=False)
+    words = "export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "t.parquet", "--parquet"
+    result = graspd(*words)
+    assert result.returncode == 2
+    assert "needs the package 'pandas'" in result.stderr
+    assert not (tmp_path / "t.parquet").exists()
 
 
 def test_a_table_that_is_there_is_replaced_only_when_that_is_said(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import jsonschema.validators
 import pytest
 from mcap.reader import make_reader
 
+from graspd import judge, read_recording
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.models.training.data.datasets import read_table
@@ -113,6 +114,21 @@ def test_session_and_learning_go_on_in_the_replay_where_they_were(rotated: Lab) 
     assert {verdict["outcomes"] for verdict in now} >= {0, 1, 2}
     assert {verdict["risk"]["warm_up_left"] for verdict in now} == {0, 1, 2}
     assert any(verdict["supervised"] for verdict in now)
+
+
+def test_the_library_judges_a_recording_as_a_replay_does(rotated: Lab) -> None:
+    now = [json.loads(encode(verdict)) for verdict in judge(rotated.files)]
+    assert [compared(v) for v in now] == [compared(v) for v in again(*rotated.files)]
+
+
+def test_the_library_reads_counts_and_angles_of_a_recording(lab: Lab) -> None:
+    table, readings = read_recording(lab.files[0]), of_kind(lab.files[0], "tactile")
+    counts = [reading["counts"] for reading in readings]
+    assert table.filter(like="_biotac_").to_numpy().tolist() == counts
+    joints = of_kind(lab.files[0], "joints")
+    assert len(table.columns) == 1 + 72 + len(joints[0]["names"])
+    steps = [reading["t_mono_ns"] - readings[0]["t_mono_ns"] for reading in readings]
+    assert ((table["t"] - table["t"][0]) * 1e9).tolist() == pytest.approx(steps, abs=1000)
 
 
 def test_the_summary_of_a_replay_counts_the_outcomes_in_the_recording(rotated: Lab) -> None:

@@ -1,0 +1,222 @@
+"""graspd in a program or a notebook: a model that judges grasps, and recordings judged again."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.decision import Limits
+from graspd.daemon.judge.network import Network, Opinion, Plausibility
+from graspd.daemon.scene.scene import Hand
+from graspd.daemon.session import file as session_file
+from graspd.daemon.session.file import SessionFileError, statistics_of
+from graspd.drivers.base import COUNT_MAX, ELECTRODES, JointReading
+from graspd.drivers.recordings.csv_rows import electrode_columns
+from graspd.models import own, trial, zoo
+from graspd.models.contract import ModelError, SessionInput
+from graspd.models.electrodes import Electrodes
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from graspd.daemon.judge.calibration import Calibration
+    from graspd.daemon.publish.messages import Verdict
+    from graspd.models.contract import Finger
+
+NO_SILENCE_NS = 3_600_000_000_000
+"""Time without a reading, ns, that counts as silence: no pause of a recording does."""
+
+
+class GraspModel:
+    """A trained model with the checks that the daemon makes before it asks the network."""
+
+    classes = ("stable", "slip")
+    """Columns of `predict_proba`."""
+
+    def __init__(self, path: Path) -> None:
+        """Load an ONNX file. Raises `ModelError`."""
+        model = trial.load(path)
+        contract = model.contract
+        self.name: str = contract.name
+        self.fingers: tuple[Finger, ...] = contract.fingers
+        """Order of the fingers in the counts."""
+        self._contract = contract
+        self._electrodes = Electrodes(contract.seen)
+        self._plausibility = Plausibility(self.fingers, contract.seen, self._electrodes)
+        self._network = Network(model, Limits.slip_threshold)
+
+    def predict_proba(
+        self,
+        counts: ArrayLike | pd.DataFrame,
+        *,
+        session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the probabilities of `classes`, shape (n, 2), for each of n held grasps.
+
+        `counts`: shape (n, fingers, 24), or a table with columns such as `ff_biotac_1`. NaN is an
+        electrode that is known to be broken. A row is NaN if the daemon would refuse to judge it.
+
+        `session`, for models that need one: grasps of the same sensors on the same day, like
+        `counts` and without outcomes, or the file of a session that a daemon has kept.
+        Raises `ValueError`, `ModelError` or `SessionFileError` for what does not fit.
+        """
+        judged = self._counts(counts)
+        calibration = self._calibration(session)
+        now = None if calibration is None else calibration.now
+        if now is not None and not now.calibrated:
+            warnings.warn(self._without_session(), stacklevel=2)
+        probabilities = np.full((len(judged), 2), np.nan)
+        for row, values in enumerate(judged):
+            p_slip = self._opinion(values, now)[0].p_slip
+            if p_slip is not None:
+                probabilities[row] = 1.0 - p_slip, p_slip
+        return probabilities
+
+    def _opinion(
+        self, values: NDArray[np.float64], now: Calibration | None
+    ) -> tuple[Opinion, NDArray[np.generic] | None]:
+        """Return what the network says, and the counts that a session may take in."""
+        broken = np.isnan(values)
+        counts = np.where(broken, 0.0, values).astype(np.uint16)
+        examined = self._plausibility.examine(counts, broken if broken.any() else None, now)
+        return self._network.judge(examined, now), examined.grasp
+
+    def _calibration(
+        self, session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None
+    ) -> SessionCalibration | None:
+        """Return what is known of today's sensors; None for a model that needs no session."""
+        wanted, electrodes = self._contract.input, self._electrodes
+        if not isinstance(wanted, SessionInput):
+            if session is not None:
+                raise ModelError(f"the model {self.name} keeps no session")
+            return None
+        calibration = SessionCalibration(wanted, electrodes.centre, electrodes.spread)
+        if isinstance(session, str | os.PathLike):
+            self._restore(calibration, Path(session))
+        elif session is not None:
+            for values in self._counts(session):
+                opinion, grasp = self._opinion(values, calibration.now)
+                if grasp is not None:
+                    p_slip = opinion.p_slip
+                    slip = None if p_slip is None else p_slip >= Limits.slip_threshold
+                    calibration.observe(grasp.astype(np.float64), slip=slip)
+        return calibration
+
+    def _restore(self, calibration: SessionCalibration, path: Path) -> None:
+        kept = session_file.load(path)
+        if kept is None:
+            raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
+        try:
+            calibration.restore(statistics_of(kept, self.fingers))
+        except ValueError as error:
+            raise SessionFileError(f"{path}: {error}") from error
+
+    def _without_session(self) -> str:
+        wanted = self._contract.input
+        fewest = wanted.calibrated_from if isinstance(wanted, SessionInput) else 0
+        return (
+            f"{self.name} does not know the sensors of this day: its probabilities mean little on "
+            f"any day but those of its training. Give session= {fewest:g} grasps or more of the "
+            "same sensors; outcomes are not needed."
+        )
+
+    def _counts(self, given: ArrayLike | pd.DataFrame) -> NDArray[np.float64]:
+        """Return counts of shape (n, fingers, 24). Raises `ValueError`."""
+        values = _of_table(given, self.fingers) if hasattr(given, "columns") else given
+        counts = np.asarray(values, dtype=np.float64)
+        fingers = len(self.fingers)
+        if counts.ndim != 3 or counts.shape[1:] != (fingers, ELECTRODES):
+            raise ValueError(
+                f"counts have shape {counts.shape}, {self.name} takes (n, {fingers}, {ELECTRODES})"
+            )
+        sound = counts[~np.isnan(counts)]
+        if ((sound < 0) | (sound > COUNT_MAX) | (sound != np.trunc(sound))).any():
+            raise ValueError(f"counts must be whole numbers in 0..{COUNT_MAX}, or NaN")
+        return counts
+
+
+def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> GraspModel:
+    """Return a model by its name (`graspd models` lists them) or by the path of an ONNX file.
+
+    `fingers`: those of the hand, for the form of the model that judges fewer. Raises `ModelError`.
+    """
+    return GraspModel(_path(model, fingers))
+
+
+def judge(
+    recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    model: str | os.PathLike[str] | None = None,
+) -> Iterator[Verdict]:
+    """Yield the verdict on each reading, as `graspd replay RECORDING...` says it.
+
+    `recordings`: grasp tables or streams (CSV), or the files of one run in order (MCAP). `model`:
+    a name or a path; by default the one that judged then, of CSV files small-session.
+    Raises `SceneError`, `RecordingError` or `ModelError`.
+    """
+    if isinstance(recordings, str | os.PathLike):
+        recordings = [recordings]
+    paths = [Path(path) for path in recordings]
+    parts = _parts(paths, {} if model is None else {"path": _path(model).absolute()})
+    pipeline, driver = parts.pipeline, parts.drivers[0]
+    with ExitStack() as stack:
+        around = Assembly(parts, stack)
+        outbox = around.build_outbox()
+        around.open_drivers()
+        while not driver.exhausted:
+            for reading in driver.read_ready():
+                if isinstance(reading, JointReading):
+                    pipeline.observe_joints(reading)
+                    continue
+                received_ns = time.monotonic_ns()
+                yield outbox.verdict(pipeline.judge(reading), received_ns, NO_SILENCE_NS)[0]
+                pipeline.learn()
+
+
+def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
+    if assembly.MCAP in {path.suffix for path in paths}:
+        from graspd.daemon.assembly.recordings import RecordedRun
+
+        run = RecordedRun(paths)
+        recorded = run.scene({}, model, None)
+        parts = run.parts(recorded, assembly.load_model(recorded), None)
+        run.restore(parts.pipeline)
+        return parts
+    sections = {
+        "tactile": {"driver": "replay", "recordings": [path.absolute() for path in paths]},
+        "model": model,
+        "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS},
+    }
+    sections["tactile"]["pace"] = "fast"
+    wanted = scene.parse(sections, Path("graspd.judge"))
+    loaded = assembly.load_model(wanted)
+    hand = Hand(fingers=loaded.contract.fingers)
+    return Parts.of(wanted.model_copy(update={"hand": hand}), loaded)
+
+
+def _path(model: str | os.PathLike[str], fingers: Sequence[Finger] = ()) -> Path:
+    if isinstance(model, str) and not model.endswith(".onnx"):
+        return own.find(zoo.for_hand(model, fingers) if fingers else model)
+    return Path(model)
+
+
+def _of_table(table: Any, fingers: Sequence[str]) -> NDArray[np.float64]:  # noqa: ANN401
+    """Return the counts of a table of pandas, or of anything that has its columns."""
+    names = [name for finger in fingers for name in electrode_columns(finger)]
+    missing = [name for name in names if name not in table.columns]
+    if missing:
+        raise ValueError(f"the table has no column {missing[0]}")
+    values = np.asarray(table[names].to_numpy(dtype=np.float64, na_value=np.nan))
+    return values.reshape(-1, len(fingers), ELECTRODES)

@@ -1,0 +1,128 @@
+"""Recordings as tables of pandas."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from graspd.drivers.base import JointReading, RecordingError, TactileReading
+from graspd.drivers.recordings.csv_player import ReplayDriver
+from graspd.drivers.recordings.csv_rows import (
+    OBJECT,
+    SLIPPED,
+    TIME,
+    columns_of,
+    electrode_columns,
+)
+
+if TYPE_CHECKING:
+    from graspd.daemon.record.export import Export
+    from graspd.drivers.base import Driver, Reading
+
+MCAP, PARQUET = ".mcap", ".parquet"
+
+
+def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
+    """Return grasps with known outcome: columns `object`, `slipped` and, finger by finger, counts.
+
+    `path`: a grasp table (CSV, or Parquet from `graspd export-grasps`), or a recording (MCAP).
+    Raises `RecordingError`.
+    """
+    path = Path(path)
+    if path.suffix == PARQUET:
+        return pd.read_parquet(path)
+    if path.suffix == MCAP:
+        from graspd.daemon.record.export import collect
+
+        return grasps_of(collect([path]), "unknown")
+    fingers = _fingers(path)
+    columns = columns_of(path, fingers)
+    if columns.is_stream:
+        raise RecordingError(path, "is a stream and no grasp table: read_recording reads it")
+    if not columns.has_labels:
+        raise RecordingError(path, f"has no column `{SLIPPED}`: the outcomes are not known")
+    rows = [each for each in _played(path, fingers) if isinstance(each, TactileReading)]
+    notes = [each.annotation for each in rows if each.annotation is not None]
+    labels = {
+        OBJECT: [note.object_name for note in notes],
+        SLIPPED: [bool(note.slipped) for note in notes],
+    }
+    return pd.concat([pd.DataFrame(labels), _counts(rows, fingers)], axis=1)
+
+
+def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
+    """Return a stream, one row a reading: `t` in seconds, counts, then joint angles in radians.
+
+    `path`: CSV or MCAP. A count that is missing or damaged is NaN; an angle is the newest one.
+    Raises `RecordingError`.
+    """
+    path = Path(path)
+    fingers = _fingers(path)
+    rows: list[TactileReading] = []
+    joints: list[dict[str, float]] = []
+    angles: dict[str, float] = {}
+    for reading in _played(path, fingers):
+        if isinstance(reading, JointReading):
+            angles |= zip(reading.names, reading.position_rad.tolist(), strict=True)
+        else:
+            rows.append(reading)
+            joints.append(dict(angles))
+    times = pd.DataFrame({TIME: [reading.made_ns / 1e9 for reading in rows]})
+    return pd.concat([times, _counts(rows, fingers), pd.DataFrame(joints)], axis=1)
+
+
+def grasps_of(export: Export, object_name: str) -> pd.DataFrame:
+    """Return the grasps of an export; `object_name` is for grasps without one."""
+    grasps = list(export.grasps.values())
+    labels = {
+        OBJECT: [object_name if each.object_name is None else each.object_name for each in grasps],
+        SLIPPED: [each.slipped for each in grasps],
+    }
+    counts = np.array([each.counts for each in grasps], dtype=np.uint16)
+    return pd.concat([pd.DataFrame(labels), _table(counts, export.fingers)], axis=1)
+
+
+def _played(path: Path, fingers: Sequence[str]) -> Iterator[Reading]:
+    """Yield all readings of a file, as fast as it can be read."""
+    driver: Driver
+    if path.suffix == MCAP:
+        from graspd.daemon.record.player import McapReplayDriver
+
+        driver = McapReplayDriver([path], fingers)
+    else:
+        driver = ReplayDriver([path], fingers, speed=None)
+    with closing(driver):
+        driver.open()
+        while not driver.exhausted:
+            yield from driver.read_ready()
+
+
+def _fingers(path: Path) -> tuple[str, ...]:
+    """Return the fingers that a file has."""
+    if path.suffix == MCAP:
+        from graspd.daemon.record.mcap import header_of
+
+        return header_of(path).fingers
+    fingers = columns_of(path, ()).fingers
+    if not fingers:
+        raise RecordingError(path, "has no columns of electrodes, such as ff_biotac_1")
+    return fingers
+
+
+def _counts(rows: Sequence[TactileReading], fingers: Sequence[str]) -> pd.DataFrame:
+    """Return the counts of readings; NaN where an electrode is faulty."""
+    counts: NDArray[np.generic] = np.array([reading.counts for reading in rows])
+    faulty = np.array([reading.faults for reading in rows]) != 0
+    return _table(np.where(faulty, np.nan, counts) if faulty.any() else counts, fingers)
+
+
+def _table(counts: NDArray[np.generic], fingers: Sequence[str]) -> pd.DataFrame:
+    columns = [name for finger in fingers for name in electrode_columns(finger)]
+    return pd.DataFrame(counts.reshape(-1, len(columns)), columns=columns)

@@ -1,0 +1,1 @@
+../../clients/python/graspd_client.py

@@ -1,0 +1,126 @@
+"""The library says what the daemon's own commands say, and its page's example runs."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import graspd
+from graspd.daemon.session.file import SessionFileError
+from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING
+from graspd.models.contract import ModelError
+from tests.conftest import ROOT
+from tests.kit import inside
+
+PAGE = (ROOT / "deploy" / "LIBRARY.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def counts() -> NDArray[np.float64]:
+    """The demo's grasps, as numpy reads the file."""
+    rows = np.genfromtxt(DEMO_DAY, delimiter=",", skip_header=1)
+    names = DEMO_DAY.read_text().partition("\n")[0].split(",")
+    places = [names.index(f"{f}_biotac_{e}") for f in ("ff", "mf", "th") for e in range(1, 25)]
+    return rows[:, places].reshape(-1, 3, 24)
+
+
+def messages(*words: object) -> list[dict[str, Any]]:
+    """What `graspd replay` says."""
+    done = inside.graspd("replay", *words, "--json")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_importing_graspd_loads_neither_onnxruntime_nor_numpy() -> None:
+    code = "import sys, graspd; sys.exit('numpy' in sys.modules or 'onnxruntime' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_each_name_of_the_library_is_there_and_told() -> None:
+    for name in graspd.__all__:
+        assert getattr(graspd, name) is not None
+        assert name in PAGE
+    with pytest.raises(AttributeError, match="no attribute 'loads'"):
+        graspd.loads  # noqa: B018
+
+
+def test_probabilities_are_those_of_a_replay(counts: NDArray[np.float64]) -> None:
+    said = messages(DEMO_DAY, "--model", "mlp")
+    expected = [np.nan if each["p_slip"] is None else each["p_slip"] for each in said]
+    got = graspd.load("mlp").predict_proba(counts)
+    assert np.isfinite(expected).sum() > 100
+    np.testing.assert_array_equal(got[:, 1], expected)
+    np.testing.assert_allclose(got.sum(axis=1)[np.isfinite(expected)], 1.0)
+
+
+def test_a_session_of_earlier_grasps_is_that_of_a_replay(counts: NDArray[np.float64]) -> None:
+    said = messages(DEMO_DAY)
+    got = graspd.load("small-session").predict_proba(counts[40:41], session=counts[:40])
+    assert got[0, 1] == said[40]["p_slip"]
+
+
+def test_without_a_session_there_is_a_warning(counts: NDArray[np.float64]) -> None:
+    model = graspd.load("small-session")
+    with pytest.warns(UserWarning, match="Give session= 20 grasps or more"):
+        model.predict_proba(counts[:1])
+    with pytest.warns(UserWarning, match="does not know the sensors of this day"):
+        model.predict_proba(counts[:1], session=counts[:19])
+
+
+def test_what_the_daemon_would_refuse_has_no_probability(counts: NDArray[np.float64]) -> None:
+    flat, broken, few = counts[0].copy(), counts[0].copy(), counts[0].copy()
+    flat[1] = 2000.0
+    broken[0, :9] = np.nan
+    few[0, :2] = np.nan
+    got = graspd.load("mlp").predict_proba([flat, broken, few])
+    assert np.isnan(got[:2]).all()
+    assert np.isfinite(got[2]).all()
+
+
+@pytest.mark.parametrize("value", [-1.0, 4096.0, 2000.5, np.inf])
+def test_what_is_no_count_is_refused(counts: NDArray[np.float64], value: float) -> None:
+    wrong = counts[:2].copy()
+    wrong[1, 2, 3] = value
+    with pytest.raises(ValueError, match=r"whole numbers in 0\.\.4095"):
+        graspd.load("mlp").predict_proba(wrong)
+
+
+def test_counts_of_another_shape_are_refused(counts: NDArray[np.float64]) -> None:
+    with pytest.raises(ValueError, match=r"takes \(n, 3, 24\)"):
+        graspd.load("mlp").predict_proba(counts[0])
+
+
+def test_a_session_that_does_not_fit_is_refused(
+    counts: NDArray[np.float64], tmp_path: Path
+) -> None:
+    with pytest.raises(ModelError, match="mlp keeps no session"):
+        graspd.load("mlp").predict_proba(counts[:1], session=counts)
+    with pytest.raises(SessionFileError, match="No such file"):
+        graspd.load("small-session").predict_proba(counts[:1], session=tmp_path / "none")
+
+
+def test_a_stream_is_judged_as_replay_judges_it() -> None:
+    names = "grasp", "judged", "gate", "verdict", "p_slip", "reasons", "motion"
+    expected = [tuple(each[name] for name in names) for each in messages(DEMO_RECORDING)]
+    got = [tuple(getattr(each, name) for name in names) for each in graspd.judge(DEMO_RECORDING)]
+    assert {each[3] for each in got} >= {"stable", "unknown"}
+    assert json.loads(json.dumps(got)) == json.loads(json.dumps(expected))
+
+
+def test_the_example_of_the_page_runs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    exec(compile(example, "LIBRARY.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "slipped" in said
+    assert "Name: ff_biotac_1" in said
+    assert re.search(r"^1 (stable|slip|unknown) ", said, re.MULTILINE)
