@@ -1,6 +1,6 @@
 """graspd: says before a hand lifts whether the grasp is stable or will slip.
 
-What is imported here loads when it is first used: `import graspd` alone takes no time.
+Names are loaded when they are first used: `import graspd` alone takes no time.
 """
 
 from importlib import import_module
