@@ -111,9 +111,8 @@ class Pipeline:
         electrodes = Electrodes(contract.seen)
         self._session: SessionCalibration | None = None
         if isinstance(contract.input, SessionInput):
-            from graspd.daemon.judge.calibration import (
-                SessionCalibration,  # only where it is needed
-            )
+            # Only where it is needed.
+            from graspd.daemon.judge.calibration import SessionCalibration
 
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
@@ -323,12 +322,10 @@ class Pipeline:
         return memory.assessment
 
     def _is_told(self, moment: Moment) -> bool:
-        """Return True if the hand still holds a grasp whose outcome is known."""
         over = moment.state in (GateState.IDLE, GateState.RELEASED)
         return not over and self.lifts.is_told(GraspId(self.boot_id, moment.grasp))
 
     def _note(self, grasp: GraspId, assessment: Assessment | None, *, stable: bool) -> None:
-        """Enter in the book what was said of a grasp."""
         if self.trust is None or assessment is None:
             self.lifts.note(grasp, NOT_ASSESSED, stable=stable)
         else:

@@ -39,10 +39,8 @@ u32 spi_errors[sensors]
 83 STOP    (nothing)
 """
 DIGEST = zlib.crc32(SCHEMA.encode("ascii"))
-"""Start value of the checksum of all frames except HELLO and PING.
-
-A peer with another layout so fails the check, instead of being misread.
-"""
+"""Start value of the checksum of all frames except HELLO and PING, so that a peer with another
+layout fails the check and is not misread."""
 
 SENSORS_MAX = 5
 """Most sensors of a bridge: one for each finger of a hand."""
