@@ -675,7 +675,7 @@ class Newest:
         """`topic` is the hand's; other messages are passed over."""
         self.counts = Counts()
         self.passed: set[tuple[str, FingerState | None]] = set()
-        """What each finger felt by the messages of the last look."""
+        """Words of each finger in the messages of the last look."""
         self._topic, self._max_age_ns, self._same_computer = topic, max_age_ns, same_computer
         self._max_p_slip = max_p_slip
         self._message: _Message | None = None
