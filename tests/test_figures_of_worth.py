@@ -81,7 +81,7 @@ def test_the_scale_of_the_learner_is_told_as_it_was_fitted() -> None:
     measured, judging, learner = (" ".join(text.split()) for text in (MEASURED, JUDGING, LEARNER))
     assert figures["shipped"] == SCALE
     assert all(scales in text for text in (measured, judging, learner))
-    assert f"log-odds is {figures['slope']:.2f} on the others" in learner
+    assert f"scaled log-odds is {figures['slope']:.2f} on the others" in learner
     assert f"so scaled is {figures['slope']:.2f} (1 is honest)" in measured
     assert f"a session {middle:.2f} in the median and {low:.2f} to {high:.2f}" in measured
     parts = {one["low"]: f"{100 * one['slipped']:.0f} %" for one in figures["parts"]}

@@ -116,7 +116,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--warm-up",
         type=int,
         metavar="N",
-        help="with it: outcomes until which every lift is supervised (default: 50)",
+        help="with it: outcomes before which uncertain lifts are supervised (default: 50)",
     )
     parser.add_argument(
         "--explore",

@@ -75,7 +75,8 @@ class Verdict(_Message, frozen=True, kw_only=True):
     session_calibrated: bool | None = None
     """False: the grasps are too few yet, so it is less sure; null: the model needs none."""
     judged: bool = True
-    """False: the reading confirms the grasp's standing verdict, or is `unknown`."""
+    """True: the network was asked about this reading. False: it confirms the standing verdict, or
+    is `unknown`."""
     gate: GateState | None = None
     """Null: each reading is a grasp of its own."""
     contact: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None

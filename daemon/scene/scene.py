@@ -105,7 +105,7 @@ class RiskSection(Section):
     max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5), unit()] = 0.05
     """Largest share of the `stable` lifts that may slip."""
     warm_up: Annotated[int, Field(ge=0, le=1000), unit("outcomes")] = 50
-    """Number of outcomes in a session until which all grasps are lifted under supervision."""
+    """Number of outcomes before which each grasp that is not `stable` is lifted supervised."""
     explore: Annotated[float, Field(ge=0.0, le=1.0), unit()] = 0.05
     """Share of the grasps that are not `stable` to lift under supervision after that. Only their
     outcomes can show that the rule is too strict."""

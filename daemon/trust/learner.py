@@ -20,7 +20,7 @@ SCALE: Final = 1.6
 """Factor of moderated log-odds, which are too timid on days, objects and poses that are new.
 
 With it, a tenth of the grasps with a `p_slip` of 0.1 slips. Fitted on the sessions of three
-quarters of the objects it is 1.61 to 1.69. The slope of outcomes on log-odds is then 1.00 on the
+quarters of the objects it is 1.61 to 1.69. The slope of outcomes on scaled log-odds is 1.00 on the
 others (`graspd report worth`, `worth` on the card of `small-session`).
 """
 MARGIN_MAX: Final = 30.0

@@ -74,7 +74,7 @@ complete -c graspd -n '_shtab_graspd_using replay' -l session -xka "(__fish_comp
 complete -c graspd -n '_shtab_graspd_using replay' -l outcomes -d 'of tables and streams: tell how each lift ended after its verdict, as a controller would; what graspd has recorded has its outcomes inside'
 complete -c graspd -n '_shtab_graspd_using replay' -l only-lifted -d 'with --outcomes: only of lifts that a controller would make, which are those of `stable` verdicts and where supervision is asked for'
 complete -c graspd -n '_shtab_graspd_using replay' -l max-slip-when-stable -xka "(__fish_complete_path (commandline -ct))" -d 'for tables and streams: largest share of `stable` lifts that may slip'
-complete -c graspd -n '_shtab_graspd_using replay' -l warm-up -xka "(__fish_complete_path (commandline -ct))" -d 'with it: outcomes until which every lift is supervised (default: 50)'
+complete -c graspd -n '_shtab_graspd_using replay' -l warm-up -xka "(__fish_complete_path (commandline -ct))" -d 'with it: outcomes before which uncertain lifts are supervised (default: 50)'
 complete -c graspd -n '_shtab_graspd_using replay' -l explore -xka "(__fish_complete_path (commandline -ct))" -d 'with it: grasps that are not `stable` to lift under supervision (default: 0.05)'
 complete -c graspd -n '_shtab_graspd_using replay' -l min-confidence -xka "(__fish_complete_path (commandline -ct))" -d 'of tables and streams: call less sure verdicts `unknown`'
 complete -c graspd -n '_shtab_graspd_using replay' -l gate -xka "settled every" -d 'judge each grasp once it has settled, or every reading as a grasp of its own (default: settled for streams, every for grasp tables, as then for MCAP recordings)'

@@ -206,7 +206,7 @@ _shtab_graspd_replay_options=(
   "--outcomes[of tables and streams\: tell how each lift ended after its verdict, as a controller would\; what graspd has recorded has its outcomes inside]"
   "--only-lifted[with --outcomes\: only of lifts that a controller would make, which are those of \`stable\` verdicts and where supervision is asked for]"
   "--max-slip-when-stable[for tables and streams\: largest share of \`stable\` lifts that may slip]:SHARE:_files"
-  "--warm-up[with it\: outcomes until which every lift is supervised (default\: 50)]:N:_files"
+  "--warm-up[with it\: outcomes before which uncertain lifts are supervised (default\: 50)]:N:_files"
   "--explore[with it\: grasps that are not \`stable\` to lift under supervision (default\: 0.05)]:SHARE:_files"
   "--min-confidence[of tables and streams\: call less sure verdicts \`unknown\`]:P:_files"
   "--gate[judge each grasp once it has settled, or every reading as a grasp of its own (default\: settled for streams, every for grasp tables, as then for MCAP recordings)]:gate:(settled every)"

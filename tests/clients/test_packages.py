@@ -85,7 +85,8 @@ def test_the_program_of_the_readme_says_not_to_lift_where_nobody_answers(
     """In both languages."""
     said = {}
     endpoint = f"ipc://{project}/nobody"
-    programs = {each: "\n".join(block(each, "")) for each in ("python", "cpp")}
+    begins = {"python": "from graspd_client import Client, Outcome", "cpp": "#include <iostream>"}
+    programs = {each: "\n".join(block(each, first)) for each, first in begins.items()}
     assert all(code.count("ipc:///run/graspd/right") == 2 for code in programs.values())
     cpp, python = (
         programs[each].replace("ipc:///run/graspd/right", endpoint) for each in ("cpp", "python")

@@ -111,4 +111,5 @@ def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> Non
 def test_the_node_says_why_it_is_no(node: Node, tmp_path: Path) -> None:
     with false_daemon(tmp_path, told(), "unknown", reasons=["moving"]):
         until(lambda: node.ask("~/may_i_lift") == (False, "unknown moving"))
+        assert node.ask("~/held", data=True) == (False, "no lift was allowed")
     node.graspd.close()  # type: ignore[attr-defined]

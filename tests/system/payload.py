@@ -36,7 +36,9 @@ def make_payload(cache: Path, disk: Path) -> None:
         wheels = content / "wheels"
         shutil.copytree(_dependencies(cache), wheels)
         _wheel(wheels, "--no-deps", str(PROJECT))
-        shutil.copytree(PROJECT / "deploy", content / "deploy", symlinks=True)
+        # The wheel has the package; its links lead out of `deploy/`.
+        package = shutil.ignore_patterns("package")
+        shutil.copytree(PROJECT / "deploy", content / "deploy", symlinks=True, ignore=package)
         write_recording(content / "recording.csv")
         shutil.copytree(GUEST, content / "guest", ignore=shutil.ignore_patterns("__pycache__"))
         bytes_ = sum(path.stat().st_size for path in content.rglob("*"))

@@ -316,8 +316,8 @@ class _Hand:
     def unreported(self) -> int:
         """Lifts that were allowed before the last one, and of which graspd has no outcome.
 
-        It cannot learn from them, and they are in no bound of `risk`. The logger `graspd_client`
-        warns of the first one and of each tenth.
+        It cannot learn from them. With `[risk]`, one that is forgotten counts as a slip. The logger
+        `graspd_client` warns of the first one and of each tenth.
         """
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)

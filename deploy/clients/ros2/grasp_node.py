@@ -20,7 +20,7 @@ class GraspNode(Node):
         endpoint = self.declare_parameter("endpoint", "ipc:///run/graspd/right.ipc")
         ask_endpoint = self.declare_parameter("ask_endpoint", "ipc:///run/graspd/right.ask.ipc")
         self.graspd = Client(endpoint.value, ask_endpoint=ask_endpoint.value)
-        self.lifted_on = self.graspd.verdict()
+        self.lifted_on: Verdict | None = None
         self.decisions = self.create_publisher(String, "~/decision", 1)
         self.create_timer(0.02, self.publish_decision)
         self.create_service(Trigger, "~/may_i_lift", self.may_i_lift)
@@ -31,11 +31,15 @@ class GraspNode(Node):
 
     def may_i_lift(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self.graspd.may_i_lift(0.5)
-        self.lifted_on = answer.verdict
+        if answer:
+            self.lifted_on = answer.verdict
         response.success, response.message = bool(answer), _words(answer.verdict)
         return response
 
     def tell(self, held: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self.lifted_on is None:
+            response.success, response.message = False, "no lift was allowed"
+            return response
         answer = self.graspd.tell(self.lifted_on, "held" if held.data else "slipped")
         response.success, response.message = bool(answer), answer.why
         return response

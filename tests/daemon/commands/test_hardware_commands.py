@@ -161,7 +161,7 @@ def test_the_doctor_finds_what_the_twin_broke(tmp_path: Path) -> None:
 def test_the_doctor_takes_a_recording_at_its_own_rate() -> None:
     scene = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
     report = json.loads(graspd("doctor", scene, "--listen", 2, "--json").stdout)
-    assert report["readings"] > 150, "of 200 that the demo has in two seconds"
+    assert report["readings"] > 100, "of 142 that the demo has in two seconds"
 
 
 def test_the_doctor_without_a_scene_looks_at_the_computer() -> None:

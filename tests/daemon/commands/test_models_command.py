@@ -81,6 +81,7 @@ def test_an_added_model_is_found_by_its_name_until_it_is_removed(
     assert command() == 0
     assert f"{'a' * 40} (own)  ff mf th  " in capsys.readouterr().out  # columns do not touch
     assert command("remove", "a" * 40, "--user") == 0
+    capsys.readouterr()
     assert command("mine", "--json") == 0
     assert json.loads(capsys.readouterr().out) == zoo.card("mlp")
     assert command("remove", "mine", "--user") == 0
