@@ -18,6 +18,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import Limits
+from graspd.daemon.judge.health import at_rail
 from graspd.daemon.judge.network import Network, Opinion, Plausibility
 from graspd.daemon.scene.scene import Hand
 from graspd.daemon.session import file as session_file
@@ -66,7 +67,8 @@ class GraspModel:
         """Return the probabilities of `classes`, shape (n, 2), for each of n held grasps.
 
         `counts`: shape (n, fingers, 24), or a table with columns such as `ff_biotac_1`. NaN is an
-        electrode that is known to be broken. A row is NaN if the daemon would refuse to judge it.
+        electrode that is known to be broken, as is one at 0 or 4095. A row is NaN if the daemon
+        would refuse to judge it.
 
         `session`, for models that need one: grasps of the same sensors on the same day, like
         `counts` and without outcomes, or the file of a session that a daemon has kept.
@@ -88,8 +90,8 @@ class GraspModel:
         self, values: NDArray[np.float64], now: Calibration | None
     ) -> tuple[Opinion, NDArray[np.generic] | None]:
         """Return what the network says, and the counts that a session may take in."""
-        broken = np.isnan(values)
-        counts = np.where(broken, 0.0, values).astype(np.uint16)
+        counts = np.where(np.isnan(values), 0.0, values).astype(np.uint16)
+        broken = at_rail(counts)  # as is a NaN, which is 0 there
         examined = self._plausibility.examine(counts, broken if broken.any() else None, now)
         return self._network.judge(examined, now), examined.grasp
 

@@ -167,7 +167,7 @@ class Health:
         for where, reason in (
             (memory.jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
             (memory.changed <= memory.number - UNCHANGED_MAX, Reason.ELECTRODE_DEAD),
-            (_railed(memory.previous) & (memory.previous != NO_COUNT), Reason.SATURATED),
+            (at_rail(memory.previous) & (memory.previous != NO_COUNT), Reason.SATURATED),
         ):
             findings |= dict.fromkeys(_places(where), reason)
         for finger, electrode in _places(memory.faults != 0):
@@ -245,7 +245,8 @@ def too_many(broken: NDArray[np.bool_]) -> bool:
     return bool(per_finger.sum() > BROKEN_MAX or per_finger.max() > BROKEN_FINGER_MAX)
 
 
-def _railed(counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def at_rail(counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Return which counts are 0 or 4095: such electrodes mean nothing."""
     # One less than 0 is 65535: both rails are on the same side.
     railed: NDArray[np.bool_] = counts - np.uint16(1) >= np.uint16(COUNT_MAX - 1)
     return railed

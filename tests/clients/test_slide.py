@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import time
 from collections.abc import Mapping
@@ -90,6 +91,22 @@ def test_one_reading_that_cannot_be_used_stops_no_lift() -> None:
     assert not watched(lift(*[HELD] * 5, nothing, *[HELD] * 5, nothing, *[HELD] * 30))
 
 
+@pytest.mark.parametrize(("passing", "sliding"), [("slide", ("th",)), ("free", ())])
+def test_what_passed_between_two_looks_stops_the_lift(
+    passing: str, sliding: tuple[str, ...]
+) -> None:
+    coming = lift(*[HELD] * 5, {"ff": "touch", "th": passing}, *[HELD] * 30)
+    late_ns = coming[8][0]  # four messages wait for one look
+    answer = watched(
+        [
+            (max(at_ns, late_ns) if seq >= 5 else at_ns, message)
+            for seq, (at_ns, message) in enumerate(coming)
+        ]
+    )
+    assert (bool(answer), answer.held, answer.sliding) == (True, False, sliding)
+    assert answer.waited_s == pytest.approx(0.08, abs=0.012)
+
+
 def test_words_of_an_old_reading_are_not_told() -> None:
     with client(World(lift(HELD, age_ms=101.0))) as graspd:
         assert graspd.verdict().fingers == {"ff": None, "th": None}
@@ -112,18 +129,27 @@ def test_a_time_that_is_none_is_refused(timeout_s: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("max_age_ms", "timeout_s", "later", "answer"),
+    ("max_age_ms", "timeout_s", "later", "passes", "answer"),
     [
-        (5000, 0.1, {}, "0 1"),
-        (5000, 60.0, {"th": "slide"}, "1 0 th"),
-        (5000, 60.0, {"ff": "free"}, "1 0"),
-        (100, 60.0, {"ff": None}, "1 0"),
+        (5000, 0.1, {}, False, "0 1"),
+        (5000, 60.0, {"th": "slide"}, False, "1 0 th"),
+        (5000, 60.0, {"th": "slide"}, True, "1 0 th"),
+        (5000, 60.0, {"ff": "free"}, False, "1 0"),
+        (5000, 60.0, {"ff": "free"}, True, "1 0"),
+        (100, 60.0, {"ff": None}, False, "1 0"),
     ],
-    ids=["held", "slide", "let go", "not known"],
+    ids=["held", "slide", "slid", "let go", "had let go", "not known"],
 )
 def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
-    binary: Path, tmp_path: Path, max_age_ms: int, timeout_s: float, later: Words, answer: str
+    binary: Path,
+    tmp_path: Path,
+    max_age_ms: int,
+    timeout_s: float,
+    later: Words,
+    passes: bool,
+    answer: str,
 ) -> None:
+    """`passes`: it is over when the client looks again."""
     fingers = dict(HELD)
     with (
         false_daemon(tmp_path, told(), "unknown", fingers=fingers),
@@ -142,7 +168,14 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
         probe.stdin.write(f"slide {timeout_s}\n")
         probe.stdin.flush()
         time.sleep(0.1)
+        if passes:
+            probe.send_signal(signal.SIGSTOP)
         fingers.update(later)
+        if passes:
+            time.sleep(0.1)
+            fingers.update(HELD)
+            time.sleep(0.1)
+            probe.send_signal(signal.SIGCONT)
         assert probe.stdout.readline() == f"{answer}\n"
         probe.communicate(timeout=200)
         assert probe.returncode == 0, "the sanitizers found something"

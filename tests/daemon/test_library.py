@@ -66,6 +66,23 @@ def test_a_session_of_earlier_grasps_is_that_of_a_replay(counts: NDArray[np.floa
     assert got[0, 1] == said[40]["p_slip"]
 
 
+def test_an_electrode_at_a_rail_is_repaired_as_by_a_replay(
+    counts: NDArray[np.float64], tmp_path: Path
+) -> None:
+    table, railed = tmp_path / "railed.csv", counts.copy()
+    head, *lines = DEMO_DAY.read_text().splitlines()
+    for row, line in enumerate(lines[:12]):
+        column, rail = head.split(",").index(f"mf_biotac_{2 * row + 1}"), 4095 * (row % 2)
+        cells = line.split(",")
+        cells[column] = str(rail)
+        lines[row], railed[row, 1, 2 * row] = ",".join(cells), rail
+    table.write_text("\n".join([head, *lines[:12], ""]))
+    expected = [each["p_slip"] for each in messages(table, "--model", "mlp")]
+    assert sum(p_slip is not None for p_slip in expected) > 5
+    got = graspd.load("mlp").predict_proba(railed[:12])
+    assert [None if np.isnan(each) else each for each in got[:, 1]] == expected
+
+
 def test_without_a_session_there_is_a_warning(counts: NDArray[np.float64]) -> None:
     model = graspd.load("small-session")
     with pytest.warns(UserWarning, match="Give session= 20 grasps or more"):

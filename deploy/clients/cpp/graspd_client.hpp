@@ -488,6 +488,8 @@ public:
         : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer),
           max_p_slip_(max_p_slip) {}
 
+    // What each finger felt by the messages of the last look.
+    std::set<std::pair<std::string, FingerState>> passed;
     Counts counts;
 
     // For how long no message may come; 0 without one.
@@ -525,6 +527,8 @@ public:
         ++counts.messages;
         published_ns_ = same_computer_ ? found->published_ns
                                        : by_arrival(found->published_ns, empty_ns, now_ns);
+        for (const auto& [finger, felt] : found->verdict.fingers)
+            if (felt) passed.emplace(finger, *felt);
         message_ = std::move(found);
         return true;
     }
@@ -918,18 +922,24 @@ public:
         Nanoseconds sure_ns = began_ns;
         std::vector<std::string> touched;
         Key grasp;
+        bool is_first = true;  // what came before the first look was before the lift
         while (true) {
             const Verdict newest = verdict();
             const Nanoseconds now_ns = detail::now_ns();
             const auto touching = detail::feeling(newest, FingerState::touch);
-            const auto sliding = detail::feeling(newest, FingerState::slide);
+            auto felt = is_first ? decltype(newest_.passed){} : newest_.passed;
+            is_first = false;
+            for (const auto& [finger, state] : newest.fingers)
+                if (state) felt.emplace(finger, *state);
+            std::vector<std::string> sliding;
+            for (const auto& [finger, state] : felt)
+                if (state == FingerState::slide) sliding.push_back(finger);
             if (touched.empty()) {
                 touched = touching;
                 grasp = detail::key(newest);
             }
             const auto is_free = [&](const std::string& finger) {
-                const auto felt = newest.fingers.find(finger);
-                return felt != newest.fingers.end() && felt->second == FingerState::free;
+                return felt.count({finger, FingerState::free}) > 0;
             };
             const bool lost = std::any_of(touched.begin(), touched.end(), is_free) ||
                               (!touching.empty() && detail::key(newest) != grasp);
@@ -1050,6 +1060,7 @@ private:
         hear();
         compare_clocks();
         behind_ = true;
+        newest_.passed.clear();
         for (int taken = 0; behind_ && taken < QUEUE_MAX; ++taken) {
             const Nanoseconds before_ns = detail::now_ns();
             if (link_.receive(frames_)) {

@@ -371,13 +371,17 @@ class _Hand:
         began_ns = sure_ns = time.monotonic_ns()
         due_ns = _due_ns("timeout_s", timeout_s)
         touched: set[str] = set()
-        grasp = "", 0
+        grasp, is_first = ("", 0), True
         while True:
             newest = yield from self._verdict(0)
             now_ns = time.monotonic_ns()
             touching = _feeling(newest, FingerState.TOUCH)
-            sliding = _feeling(newest, FingerState.SLIDE)
-            free = _feeling(newest, FingerState.FREE)
+            felt = set((newest.fingers or {}).items())
+            if not is_first:  # what came before the first look was before the lift
+                felt |= self._newest.passed
+            is_first = False
+            sliding = tuple(sorted(finger for finger, state in felt if state == FingerState.SLIDE))
+            free = {finger for finger, state in felt if state == FingerState.FREE}
             if not touched:
                 touched, grasp = set(touching), _key(newest)
             lost = not touched.isdisjoint(free) or (touching and _key(newest) != grasp)
@@ -462,6 +466,7 @@ class _Hand:
         self._hear()
         self._compare_clocks()
         new, heard_ns, self._behind = False, self._heard_ns, True
+        self._newest.passed.clear()
         for _ in range(QUEUE_MAX):
             before_ns = time.monotonic_ns()
             frames = self._link.receive()
@@ -669,6 +674,8 @@ class Newest:
     ) -> None:
         """`topic` is the hand's; other messages are passed over."""
         self.counts = Counts()
+        self.passed: set[tuple[str, FingerState | None]] = set()
+        """Words of each finger in the messages of the last look."""
         self._topic, self._max_age_ns, self._same_computer = topic, max_age_ns, same_computer
         self._max_p_slip = max_p_slip
         self._message: _Message | None = None
@@ -724,6 +731,7 @@ class Newest:
         if not self._is_new(found):
             return False
         self.counts.messages += 1
+        self.passed.update((found.verdict.fingers or {}).items())
         self._message = found
         self._published_ns = found.published_ns
         if not self._same_computer:
