@@ -22,7 +22,6 @@ from graspd.daemon.judge.health import at_rail
 from graspd.daemon.judge.network import Network, Opinion, Plausibility
 from graspd.daemon.scene.scene import Hand
 from graspd.daemon.session import file as session_file
-from graspd.daemon.session.file import SessionFileError, statistics_of
 from graspd.drivers.base import COUNT_MAX, ELECTRODES, JointReading
 from graspd.drivers.recordings.csv_rows import electrode_columns
 from graspd.models import own, trial, zoo
@@ -35,9 +34,6 @@ if TYPE_CHECKING:
     from graspd.daemon.judge.calibration import Calibration
     from graspd.daemon.publish.messages import Verdict
     from graspd.models.contract import Finger
-
-NO_SILENCE_NS = 3_600_000_000_000
-"""Time without a reading, ns, that counts as silence: no pause of a recording does."""
 
 
 class GraspModel:
@@ -106,7 +102,7 @@ class GraspModel:
             return None
         calibration = SessionCalibration(wanted, electrodes.centre, electrodes.spread)
         if isinstance(session, str | os.PathLike):
-            self._restore(calibration, Path(session))
+            session_file.restore(Path(session), self.fingers, calibration)
         elif session is not None:
             for values in self._counts(session):
                 opinion, grasp = self._opinion(values, calibration.now)
@@ -115,15 +111,6 @@ class GraspModel:
                     slip = None if p_slip is None else p_slip >= Limits.slip_threshold
                     calibration.observe(grasp.astype(np.float64), slip=slip)
         return calibration
-
-    def _restore(self, calibration: SessionCalibration, path: Path) -> None:
-        kept = session_file.load(path)
-        if kept is None:
-            raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
-        try:
-            calibration.restore(statistics_of(kept, self.fingers))
-        except ValueError as error:
-            raise SessionFileError(f"{path}: {error}") from error
 
     def _without_session(self) -> str:
         wanted = self._contract.input
@@ -183,7 +170,8 @@ def judge(
                     pipeline.observe_joints(reading)
                     continue
                 received_ns = time.monotonic_ns()
-                yield outbox.verdict(pipeline.judge(reading), received_ns, NO_SILENCE_NS)[0]
+                judgement = pipeline.judge(reading)
+                yield outbox.verdict(judgement, received_ns, assembly.NO_SILENCE_NS)[0]
                 pipeline.learn()
 
 

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 DEFAULT_MODEL = "small-session"
 RECORDED_MAX_AGE_MS = 1000.0
 """Age limit of recorded readings, ms; generous, because a recording has no link to be late on."""
+NO_SILENCE_NS = 3_600_000_000_000
+"""Time without a reading, ns, that counts as silence: no pause of a recording does."""
 MCAP = ".mcap"
 LINK_LOGS = (".log", ".serial")
 """File name endings of link logs: candump text and serial bytes."""

@@ -30,7 +30,8 @@ from graspd.daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSumm
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.scene.scene import Hand
-from graspd.daemon.session.file import SessionFileError, load, statistics_of
+from graspd.daemon.session import file as session_file
+from graspd.daemon.session.file import SessionFileError
 from graspd.drivers.base import DriverError, RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_DAY
 from graspd.drivers.recordings.csv_rows import SLIPPED, columns_of
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
 Source: TypeAlias = "_Tables | LinkLogs | RecordedRun"
 """Source of recorded readings. Recordings of graspd contain the scene that judged them."""
 
-NO_SILENCE_NS = 3_600_000_000_000
-"""A recording has its own silences: those of this machine must not count."""
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
@@ -204,7 +203,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         told.append(controller)
     source.tell(shown)
     timing = LoopTiming(
-        parts.scene.max_age_ns if isinstance(source, _Tables) else NO_SILENCE_NS,
+        parts.scene.max_age_ns if isinstance(source, _Tables) else assembly.NO_SILENCE_NS,
         sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
     )
     with ExitStack() as stack:
@@ -349,14 +348,7 @@ def _restore_session(
         source.restore(pipeline)
     if args.session in (RUNNING, OFF) or pipeline.session is None:
         return
-    path = Path(args.session)
-    kept = load(path)
-    if kept is None:
-        raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
-    try:
-        pipeline.session.restore(statistics_of(kept, fingers))
-    except ValueError as error:
-        raise SessionFileError(f"{path}: {error}") from error
+    session_file.restore(Path(args.session), fingers, pipeline.session)
 
 
 def _comparisons(

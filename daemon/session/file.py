@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Final, Self
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import msgspec
 
@@ -19,6 +19,9 @@ from graspd.daemon.process.files import read_regular, write_atomically
 from graspd.daemon.trust.trust import TrustState, encode
 from graspd.drivers.base import COUNT_MAX
 from graspd.models.session_statistics import SessionState
+
+if TYPE_CHECKING:
+    from graspd.daemon.judge.calibration import SessionCalibration
 
 log = logging.getLogger("graspd")
 
@@ -256,6 +259,17 @@ def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
     if kept.statistics is None:
         raise SessionFileError("the kept session is of a model that needs no statistics")
     return kept.statistics
+
+
+def restore(path: Path, fingers: Sequence[str], session: SessionCalibration) -> None:
+    """Let `session` go on from the file. Raises `SessionFileError` if that is not possible."""
+    kept = load(path)
+    if kept is None:
+        raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
+    try:
+        session.restore(statistics_of(kept, fingers))
+    except ValueError as error:
+        raise SessionFileError(f"{path}: {error}") from error
 
 
 def of_fingers(kept: KeptSession, fingers: Sequence[str]) -> None:
