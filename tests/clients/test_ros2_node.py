@@ -21,7 +21,7 @@ EXAMPLE = CPP.parent / "ros2" / "grasp_node.py"
 
 
 class Node:
-    """What `rclpy.node.Node` has, as far as the example needs it."""
+    """The part of `rclpy.node.Node` that the example uses."""
 
     endpoints: dict[str, str]
 
