@@ -254,11 +254,11 @@ def _palm(
             heed_finger_bits=heed,
             clock=clock,
         )
-    from graspd.drivers.recordings.link_log_player import LinkLogDriver
     from graspd.drivers.recordings.palm_file import PalmFile
 
-    log = PalmFile(fingers, calibration=calibration, heed_finger_bits=heed)
-    return LinkLogDriver([Path(options.source)], log, speed=1.0, clock=clock)
+    return PalmFile(
+        Path(options.source), fingers, calibration=calibration, heed_finger_bits=heed, clock=clock
+    )
 
 
 def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:

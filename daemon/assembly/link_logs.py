@@ -86,7 +86,7 @@ def _driver(replayed: Scene, paths: Sequence[Path], speed: float | None) -> Link
     if isinstance(tactile, SpiTactile):
         from graspd.drivers.recordings.serial_log import SerialLog
 
-        return LinkLogDriver(paths, SerialLog(fingers, tactile.sensors), speed=speed)
+        return SerialLog(paths, fingers, tactile.sensors, speed=speed)
     if not isinstance(tactile, CanTactile):
         raise ValueError("link logs are of the drivers can and spi")
     from graspd.drivers.recordings.can_log import CanLog
@@ -94,4 +94,4 @@ def _driver(replayed: Scene, paths: Sequence[Path], speed: float | None) -> Link
     board = tactile.model_dump(
         exclude={"driver", "interface", "channel", "bitrate", "data_bitrate"}
     )
-    return LinkLogDriver(paths, CanLog(fingers, **board), speed=speed)
+    return CanLog(paths, fingers, speed=speed, **board)

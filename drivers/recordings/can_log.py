@@ -8,7 +8,8 @@ Bit 29 of an id marks an error frame (can-utils, lib.c and linux/can.h).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, Unpack
 
@@ -30,6 +31,7 @@ from graspd.drivers.can.frames import (
 )
 from graspd.drivers.can.stream import CanStream
 from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.link_log_player import LinkLogDriver
 
 LINE_MAX: Final = 256
 """Longest line, characters; a frame of CAN FD takes 170."""
@@ -84,11 +86,22 @@ def frame_of(line: str) -> tuple[int, CanFrame] | None:
     return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags)
 
 
-class CanLog:
-    """Play candump text through the driver's `CanStream`. A `LinkLog`."""
+class CanLog(LinkLogDriver[CanFrame]):
+    """Play candump text through the driver's `CanStream`."""
 
-    def __init__(self, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
-        """Take the arguments of `CanStream`. Raises `ValueError`."""
+    stream: CanStream
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        fingers: Sequence[str],
+        *,
+        speed: float | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        **board: Unpack[BoardOptions],
+    ) -> None:
+        """Take the arguments of `RecordedDriver` and `CanStream`. Raises `ValueError`."""
+        super().__init__(paths, speed, clock)
         self._fingers, self._board = fingers, board
         self.begin()
 

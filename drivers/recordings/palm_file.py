@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -12,6 +13,7 @@ from graspd.drivers.base import Reading, RecordingError
 from graspd.drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, parse_packet
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.link_log_player import LinkLogDriver
 
 PACKETS_TRIED: Final = 64
 """Number of packets by which the packet length of a file is found."""
@@ -19,17 +21,22 @@ SENSE_MIN: Final = 0.5
 """Smallest share of them that must hold sensor data."""
 
 
-class PalmFile:
-    """Play packets through the driver's `PalmStream`. A `LinkLog`."""
+class PalmFile(LinkLogDriver[bytes]):
+    """Play packets through the driver's `PalmStream`, in real time."""
+
+    stream: PalmStream
 
     def __init__(
         self,
+        path: Path,
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
         calibration: Path | None = None,
         heed_finger_bits: bool = True,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Take the arguments of `PalmStream`; `begin` reads the file. Raises `ValueError`."""
+        super().__init__([path], 1.0, clock)
         self._calibration = calibration
         self._make_stream = functools.partial(
             PalmStream, fingers, heed_finger_bits=heed_finger_bits

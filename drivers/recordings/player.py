@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -26,8 +27,8 @@ class RecordedDriver(Opened, Generic[Item]):
     def __init__(
         self,
         paths: Sequence[Path],
-        speed: float | None,
-        clock: Callable[[], int],
+        speed: float | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
         *,
         delay_ns: int = 0,
     ) -> None:

@@ -16,6 +16,7 @@ from typing import Final
 from graspd.drivers.base import Reading
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.link_log_player import LinkLogDriver
 from graspd.drivers.spi.conversation import Conversation
 from graspd.drivers.spi.line import LineEvent
 from graspd.drivers.spi.messages import FrameParser, encode_frame
@@ -56,11 +57,21 @@ def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[SerialRecord]:
             yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
 
 
-class SerialLog:
-    """Play serial link logs through the driver's `Conversation`; nothing is sent. A `LinkLog`."""
+class SerialLog(LinkLogDriver[SerialRecord]):
+    """Play serial link logs through the driver's `Conversation`; nothing is sent."""
 
-    def __init__(self, fingers: Sequence[str], sensors: Sequence[str] | None = None) -> None:
-        """Take the arguments of `Conversation`. Raises `ValueError`."""
+    stream: Conversation
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        fingers: Sequence[str],
+        sensors: Sequence[str] | None = None,
+        *,
+        speed: float | None = None,
+    ) -> None:
+        """Take the arguments of `RecordedDriver` and `Conversation`. Raises `ValueError`."""
+        super().__init__(paths, speed)
         self._fingers, self._sensors = fingers, sensors
         self.begin()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -134,7 +135,9 @@ def bus_log(form: str, frame: Callable[[Unit], CanFrame], unit_ns: int) -> Calla
     """Through the lines of a log, which must tell no other story than the bus."""
 
     def begin(_first: int) -> Feed:
-        log = CanLog(FINGERS, format=form, arbitration_id=BASE_ID, sequence="electrodes")
+        log = CanLog(
+            [Path("bus.log")], FINGERS, format=form, arbitration_id=BASE_ID, sequence="electrodes"
+        )
 
         def feed(unit: Unit) -> Sequence[Reading]:
             logged = frame_of(line_of(frame(unit), unit.at * unit_ns, "can0"))
@@ -160,7 +163,7 @@ def bridge(_first: int) -> Feed:
 
 def bridge_log(_first: int) -> Feed:
     """Through the records of a log, which must tell no other story than the line."""
-    log = SerialLog(FINGERS)
+    log = SerialLog([Path("line.serial")], FINGERS)
 
     def feed(event: LineEvent, data: bytes, t_ns: int) -> list[Reading]:
         records = parse_records(FrameParser(), encode_records(event, t_ns, data))

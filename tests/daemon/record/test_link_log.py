@@ -15,7 +15,6 @@ from graspd.daemon.record.mcap import header_of
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.can_log import CanLog
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from graspd.drivers.recordings.link_log_player import LinkLogDriver
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import compared, messages
 
@@ -115,10 +114,10 @@ def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_wer
 ) -> None:
     recording, log = of_can
     offset_ns = header_of(recording).wall_minus_monotonic_ns
-    board = CanLog(("ff", "mf", "th"), arbitration_id=0x100, sequence="electrodes")
     decoded: dict[int, TactileReading] = {}
     readings = 0
-    with LinkLogDriver([log], board) as driver:
+    fingers = ("ff", "mf", "th")
+    with CanLog([log], fingers, arbitration_id=0x100, sequence="electrodes") as driver:
         while not driver.exhausted:
             for reading in driver.read_ready():
                 assert isinstance(reading, TactileReading)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
 
 import can
 import pytest
@@ -15,7 +14,6 @@ from graspd.drivers.base import RecordingError, TactileReading
 from graspd.drivers.biotac import sample_command
 from graspd.drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
 from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
-from graspd.drivers.recordings.link_log_player import LinkLogDriver
 from graspd.drivers.recordings.serial_log import (
     SerialLog,
     SerialRecord,
@@ -159,17 +157,13 @@ def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content:
     path = tmp_path / "link.log"
     path.write_bytes(content)
     fingers = ("ff", "mf", "th")
-    drivers: tuple[LinkLogDriver[Any], ...] = (
-        LinkLogDriver([path], CanLog(fingers)),
-        LinkLogDriver([path], SerialLog(fingers)),
-    )
-    for driver in drivers:
+    for driver in (CanLog([path], fingers), SerialLog([path], fingers)):
         with pytest.raises(RecordingError, match="nothing that came over a link"), driver:
             pass
     for speed in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="positive speed"):
-            LinkLogDriver([path], CanLog(fingers), speed=speed)
-    LinkLogDriver([path], CanLog(fingers), speed=0.5)
+            CanLog([path], fingers, speed=speed)
+    CanLog([path], fingers, speed=0.5)
 
 
 @pytest.mark.parametrize(("length", "taken"), [(256, True), (257, False)])
@@ -179,7 +173,8 @@ def test_a_line_has_at_most_256_characters(length: int, taken: bool) -> None:
 
 
 def test_the_frames_of_a_can_log_are_counted_and_other_lines_passed_over(tmp_path: Path) -> None:
-    path, log = tmp_path / "can.log", CanLog(("ff", "mf", "th"), sequence="electrodes")
+    path = tmp_path / "can.log"
+    log = CanLog([path], ("ff", "mf", "th"), sequence="electrodes")
     lines = ["# of yesterday\n", "\n"]
     for sweep in range(2):
         for at, channel in enumerate(range(17, 41)):
@@ -207,8 +202,8 @@ def test_a_link_log_plays_at_its_own_pace_times_speed(tmp_path: Path) -> None:
         line_of(CanFrame(0x1A5, data[at % 24]), t_ns, "can0") for at, t_ns in enumerate(times_ns)
     ]
     path.write_text("".join(lines))
-    log = CanLog(("ff", "mf", "th"), sequence="electrodes")
-    with LinkLogDriver([path], log, speed=2.0, clock=clock) as driver:
+    fingers = ("ff", "mf", "th")
+    with CanLog([path], fingers, sequence="electrodes", speed=2.0, clock=clock) as driver:
         assert driver.period_ns is None
         began_ns, times_us = clock.now_ns, []
         while not driver.exhausted:
@@ -216,6 +211,6 @@ def test_a_link_log_plays_at_its_own_pace_times_speed(tmp_path: Path) -> None:
             times_us += [(r.t_ns - began_ns) // 1000 for r in driver.read_ready()]
         assert driver.period_ns == 24 * 200_000
     assert times_us == [(24 * sweep + 23) * 200 for sweep in range(7)]
-    with LinkLogDriver([path], log, clock=clock) as driver:
+    with CanLog([path], fingers, sequence="electrodes", clock=clock) as driver:
         assert len([reading for _ in range(7) for reading in driver.read_ready()]) == 7
         assert driver.period_ns == 24 * 400_000

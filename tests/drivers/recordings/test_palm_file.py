@@ -10,16 +10,10 @@ import pytest
 
 from graspd.drivers.base import RecordingError
 from graspd.drivers.palm.packet import Palm
-from graspd.drivers.recordings.link_log_player import LinkLogDriver
 from graspd.drivers.recordings.palm_file import PalmFile
 from graspd.drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import MS, datagrams, rows, tactile
 from tests.kit.clock import Clock
-
-
-def player(path: Path, clock: Clock) -> tuple[PalmFile, LinkLogDriver[bytes]]:
-    log = PalmFile()
-    return log, LinkLogDriver([path], log, speed=1.0, clock=clock)
 
 
 @pytest.mark.parametrize(("palm", "appended"), [(Palm.PALM_0220, bytes(12)), (Palm.PALM_0250, b"")])
@@ -31,12 +25,11 @@ def test_a_file_of_packets_plays_count_for_count(
     path.write_bytes(b"".join(packet.to_bytes() + appended for packet in twin.packets()) + bytes(5))
     readings = []
     clock = Clock()
-    log, driver = player(path, clock)
-    with driver:
+    with PalmFile(path, clock=clock) as driver:
         while not driver.exhausted:
             clock.now_ns = driver.due_ns() or clock.now_ns
             readings += tactile(driver.read_ready())
-        assert log.stream.counters.bad_lengths == 1  # the file ends in the middle of a packet
+        assert driver.stream.counters.bad_lengths == 1  # the file ends in the middle of a packet
         assert driver.due_ns() is None
     assert np.array_equal([reading.counts for reading in readings], rows(40))
 
@@ -51,7 +44,7 @@ def test_half_of_the_packets_of_a_file_make_sense_and_with_one_length(
 ) -> None:
     path = tmp_path / "hand.palm"
     path.write_bytes(b"".join(datagrams(1)[:good]) + bytes(nonsense))
-    _, driver = player(path, Clock())
+    driver = PalmFile(path)
     if plays:
         driver.open()
         driver.close()
@@ -65,8 +58,7 @@ def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
     path = tmp_path / "hand.palm"
     path.write_bytes(b"".join(datagrams(10)))
     times = []
-    _, driver = player(path, clock)
-    with driver:
+    with PalmFile(path, clock=clock) as driver:
         start_ns = clock.now_ns
         while (due_ns := driver.due_ns()) is not None:
             clock.now_ns = due_ns
@@ -78,7 +70,7 @@ def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
     path = tmp_path / "hand.palm"
     os.mkfifo(path)
     with pytest.raises(RecordingError, match="is not a regular file"):
-        player(path, Clock())[1].open()
+        PalmFile(path).open()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no packets at all" * 500, bytes(22000)])
@@ -87,6 +79,6 @@ def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"hand\.palm"):
-        player(path, Clock())[1].open()
+        PalmFile(path).open()
     with pytest.raises(RecordingError, match="is a directory"):
-        player(tmp_path, Clock())[1].open()
+        PalmFile(tmp_path).open()
