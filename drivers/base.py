@@ -101,22 +101,18 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 
 class JointReading(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """Joint angles of a hand at one time."""
+    """Joint angles of a hand at one time; times and `seq` are as in `TactileReading`."""
 
     t_ns: int
-    """Monotonic time, ns, when the last byte of the reading was received."""
     seq: int
-    """Number of the reading, one more per reading that the sender made."""
     names: tuple[str, ...]
     """Joint names without hand prefix, such as `FFJ3`."""
     position_rad: NDArray[np.float64]
     """Shape (joints,), radians; NaN where a joint has no valid angle."""
     recorded_ns: int | None = None
-    """See `TactileReading.recorded_ns`."""
 
     @property
     def made_ns(self) -> int:
-        """See `TactileReading.made_ns`."""
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
 
@@ -135,7 +131,6 @@ class DriverCounters:
     """Readings that never arrived, by the sensor's own sequence."""
 
     def as_dict(self) -> dict[str, int]:
-        """Return all counters by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 

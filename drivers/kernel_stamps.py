@@ -15,7 +15,6 @@ TIMESPEC: Final = struct.Struct("@ll")
 DROPS: Final = struct.Struct("@I")
 """Ancillary data of `SO_RXQ_OVFL`: drops since the socket was opened, modulo 2**32."""
 ANCILLARY_BYTES: Final = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(DROPS.size)
-"""Bytes for the ancillary data of both options."""
 
 
 def read_stamps(ancillary: list[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:

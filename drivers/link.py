@@ -59,7 +59,6 @@ class Link:
         self._down_since_ns = 0
 
     def is_due(self, now_ns: int) -> bool:
-        """True if the next try is due."""
         return self.retry_ns is None or now_ns >= self.retry_ns
 
     def start(self, now_ns: int) -> None:
@@ -101,7 +100,6 @@ class Link:
         self.state = LinkState.WAITING
 
     def close(self) -> None:
-        """Stop trying."""
         self.state = LinkState.CLOSED
         self.retry_ns = None
 

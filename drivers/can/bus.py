@@ -49,7 +49,6 @@ _OPTIONS: Final[dict[str, dict[str, Any]]] = {
 }
 
 _PACKAGES: Final = {"serial": "pyserial"}
-"""Name of the package by module, where they differ."""
 _MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module is)? not installed")
 
 
@@ -100,7 +99,6 @@ class CanBus:
         self.tap: Callable[[list[Stamped]], None] | None = None
         """Called with the frames of each `drain` that returns some."""
         self.counters = CanCounters()
-        """Counters of malformed records and of the kernel's drops."""
         self._interface = interface
         self._channel = channel
         self._options = {**_OPTIONS.get(interface, {}), **options}
@@ -113,7 +111,6 @@ class CanBus:
         """Descriptor to wait on; None while closed, or if the interface has none."""
 
     def open(self) -> None:
-        """Take the bus. Raises as `open_bus` does."""
         self.close()
         self.failure = None
         self._idle_ns = self._clock()
@@ -234,7 +231,6 @@ def _has_more(descriptor: int | None) -> bool:
 
 
 def _enlarge_buffer(descriptor: int) -> None:
-    """Ask the kernel for a larger buffer if the descriptor is a socket."""
     if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
         return
     with socket.socket(fileno=os.dup(descriptor)) as same, contextlib.suppress(OSError):

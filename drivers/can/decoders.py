@@ -104,7 +104,6 @@ class SweepFrameDecoder:
     def push(
         self, frame: CanFrame, t_ns: int, _until_ns: int | None = None
     ) -> Sequence[TactileReading]:
-        """Return the readings that a data frame of `t_ns` completes, oldest first."""
         base_id, counters = self.arbitration_id, self._counters
         finger = frame.arbitration_id - base_id
         if finger not in self._rows or frame.flags & EXTENDED != self._flags:
@@ -192,7 +191,6 @@ def _is_sound(words: bytes) -> bool:
 
 
 def _id_flags(identifier: int | None) -> int:
-    """Return the flags of an id: `EXTENDED` above 0x7FF (29 bits), else 0 (11 bits)."""
     if identifier is None or identifier <= STANDARD_ID_MAX:
         return 0
     return EXTENDED

@@ -80,7 +80,6 @@ class CanBridgeDriver(Opened):
 
     @property
     def link_state(self) -> LinkState:
-        """State of the link; `GREETING` while the bus is open without frames of the board."""
         return self.stream.link.state
 
     @property
@@ -129,7 +128,6 @@ class CanBridgeDriver(Opened):
         return None if self._resting_until_ns is not None else self._bus.descriptor
 
     def due_ns(self) -> int | None:
-        """Return the time, ns, to reopen the bus, to notice silence, or to poll."""
         link = self.stream.link
         if link.state in (CLOSED, WAITING):
             return link.retry_ns

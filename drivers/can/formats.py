@@ -83,7 +83,6 @@ class SweepFrame(msgspec.Struct, frozen=True, gc=False):
     words: bytes
     """Response words of E1 to E24, 48 bytes, first byte on the SPI wire first."""
     status: int = 0
-    """`SweepStatus` bits."""
 
     def to_bytes(self) -> bytes:
         head = _SWEEP_HEAD.pack(SWEEP_VERSION, self.finger, self.sequence, self.tick_us)

@@ -42,7 +42,6 @@ _ERROR_CLASSES: Final = {
 EXTENDED: Final = 1
 """29-bit arbitration id."""
 REMOTE: Final = 2
-"""Request for data, without data."""
 ERROR: Final = 4
 """Error frame, made by the controller: the id holds error classes."""
 FD: Final = 8

@@ -23,7 +23,6 @@ class CanCounters(DriverCounters):
     lost_frames: int = 0
     """Frames that never came, although others of their sweep did."""
     duplicate_frames: int = 0
-    """Frames that came again; the copy is dropped."""
     reordered_frames: int = 0
     """Frames that came in time for their sweep, but after a later one."""
     late_frames: int = 0
@@ -43,12 +42,10 @@ class CanCounters(DriverCounters):
     contradicting_frames: int = 0
     """Frames with the current sweep's number and another tick; dropped."""
     parity_words: int = 0
-    """Response words with a byte of wrong (even) parity."""
     error_words: int = 0
     unplugged_words: int = 0
     """Response words of a line that no sensor drives, or of a sensor reported as absent."""
     frames: int = 0
-    """All frames that the bus delivered, of any kind."""
     accepted_frames: int = 0
     """Samples or sweep frames of the configured sensors, duplicates included."""
     foreign_frames: int = 0
@@ -57,11 +54,9 @@ class CanCounters(DriverCounters):
     error_frames: int = 0
     """Frames in which the controller reports trouble on the bus."""
     wrong_length_frames: int = 0
-    """Frames with the right id and another length than configured."""
     unknown_commands: int = 0
     """Frames with the right id whose first byte samples no channel."""
     unknown_versions: int = 0
-    """Sweep frames of another layout version."""
     malformed_frames: int = 0
     """Frames with the right id whose contents the format forbids."""
     stuck_ticks: int = 0
@@ -73,11 +68,9 @@ class CanCounters(DriverCounters):
     kernel_drops: int = 0
     """Frames that the kernel dropped because the socket's buffer was full (socketcan only)."""
     bus_off: int = 0
-    """Times that the controller left the bus after too many errors."""
     bus_faults: int = 0
     """Failures of the bus or of python-can, also when opening it."""
     link_losses: int = 0
-    """Times that the link was lost after it had been up."""
 
 
 class SweepPeriod:
@@ -86,7 +79,6 @@ class SweepPeriod:
     def __init__(self) -> None:
         self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
         self.period_ns: int | None = None
-        """Time between sweeps, ns; None until it is known."""
 
     def learn(self, gap_ns: int) -> None:
         """Add the time between two sweeps in a row; an outage is ignored."""

@@ -91,7 +91,6 @@ class SampleAssembler:
 
     @property
     def period_ns(self) -> int | None:
-        """Measured time between sweeps, ns; None until it is known."""
         return self._period.period_ns
 
     @property

@@ -27,7 +27,6 @@ SILENCE_PERIODS: Final = 10
 SILENCE_MIN_NS: Final = 100_000_000
 """Shortest timeout of a reading, ns: adapters and busy hosts delay frames by less."""
 _SPECIAL: Final = ERROR | REMOTE | LOST
-"""Flags of entries that are no data frames."""
 
 
 class CanStream:
@@ -50,7 +49,6 @@ class CanStream:
 
     @property
     def period_ns(self) -> int | None:
-        """Measured time between readings, ns; None until it is known."""
         return self._decoder.sweeps.period_ns
 
     @property

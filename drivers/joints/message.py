@@ -34,11 +34,9 @@ class JointCounters(DatagramCounters):
     """Counters of joint messages. `missed_readings` stays 0 if the sender sends no `seq`."""
 
     bad_messages: int = 0
-    """Datagrams that are no joint message; dropped."""
     old_messages: int = 0
     """Messages that came again or after a later one; dropped."""
     restarts: int = 0
-    """Times that the sender restarted its numbers."""
     unknown_names: int = 0
     """Names that no joint of a Shadow hand has; left out."""
     bad_angles: int = 0
@@ -134,7 +132,6 @@ class JointStream:
         return True
 
     def _has_restarted(self, now: float) -> bool:
-        """Return True if enough old messages in a row have rising numbers."""
         if self._last_old is None or now <= self._last_old:
             self._old_in_a_row = 0
         self._old_in_a_row += 1

@@ -61,14 +61,12 @@ class PalmDriver(DatagramDriver[PalmStream]):
         return None if self._clock() < self._attention_ns else super().fileno()
 
     def due_ns(self) -> int | None:
-        """Return the time, ns, when a round is about to end or silence is noticed."""
         due_ns = super().due_ns()
         if self.link_state is LinkState.CLOSED or self._clock() >= self._attention_ns:
             return due_ns
         return self._attention_ns if due_ns is None else min(due_ns, self._attention_ns)
 
     def read_ready(self) -> Sequence[Reading]:
-        """Return the readings that are complete, from up to `DRAIN_MAX` packets."""
         readings = super().read_ready()
         cycles = max(0, self.stream.cycles_to_go - SPARE_CYCLES)
         self._attention_ns = self._clock() + cycles * CYCLE_NS

@@ -28,7 +28,6 @@ TACTILE_FINGERS = 5
 COMMAND_EMPTY: Final = 0
 """`command` of a packet that the palm was too late to fill; all its bytes are zero."""
 COMMAND_SENSOR_DATA: Final = 1
-"""`command` of a packet with sensor data."""
 COMMAND_MAX = 4
 """Largest known `command`. 2 to 4 are service modes, whose `sensors` are not joints."""
 
@@ -121,13 +120,11 @@ class PalmCounters(DatagramCounters):
     """Counters of packets, values and angles. `readings` are the tactile ones."""
 
     packets: int = 0
-    """Packets with sensor data."""
     bad_lengths: int = 0
     """Datagrams of a length that no known palm sends."""
     empty_packets: int = 0
     """Packets that the palm was too late to fill."""
     service_packets: int = 0
-    """Packets of a service mode of the palm."""
     nonsense_packets: int = 0
     """Packets with a value in a field that no palm sends."""
     lost_packets: int = 0
@@ -147,7 +144,6 @@ class PalmCounters(DatagramCounters):
     metadata_packets: int = 0
     """Packets whose tactile part describes the sensors: serial numbers, versions."""
     unknown_types: int = 0
-    """Packets with an undocumented `tactile_type`."""
     held_values: int = 0
     """Electrode values that the palm marked as not fresh."""
     not_counts: int = 0

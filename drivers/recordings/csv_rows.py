@@ -304,7 +304,6 @@ def number_of(cell: str) -> float | None:
 
 
 def _shown(cell: str) -> str:
-    """Return a cell for an error message: quoted, escaped and shortened."""
     return repr(cell if len(cell) <= SHOWN_LENGTH_MAX else cell[:SHOWN_LENGTH_MAX] + "...")
 
 

@@ -47,7 +47,6 @@ class ReplayCounters(DriverCounters):
     cut_off: int = 0
     """Readings handed over whose row has no line end."""
     bad_angles: int = 0
-    """Joint angles handed over as NaN."""
     injected_off: int = 0
     """Readings removed by `off`. Each fault counts once in each reading, here and below."""
     injected_stuck: int = 0
@@ -121,7 +120,6 @@ class FaultInjector:
 
 
 def _mask(faults: ReplayFaults, fingers: Sequence[str]) -> NDArray[np.bool_]:
-    """Return which electrodes change, shape (fingers, 24)."""
     chosen_fingers = tuple(fingers) if faults.fingers is None else faults.fingers
     strangers = [finger for finger in chosen_fingers if finger not in fingers]
     if strangers:

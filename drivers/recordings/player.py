@@ -66,7 +66,6 @@ class RecordedDriver(Opened, Generic[Item]):
         return None
 
     def start(self, items: Generator[tuple[int, Item], None, None]) -> None:
-        """Play `items` from the first one."""
         self.close()
         self._began = None
         self.handed_over_ns = self._opened_ns = self._clock()
@@ -74,7 +73,6 @@ class RecordedDriver(Opened, Generic[Item]):
         self._read_ahead(items)
 
     def close(self) -> None:
-        """Close the file."""
         if self._playing is not None:
             self._playing.close()
             self._playing = None

@@ -41,7 +41,6 @@ PING_FIRST_NS = 50_000_000
 PINGS_FIRST = 8
 """Number of PINGs that are sent at the shorter interval."""
 NONCES = 1 << 32
-"""Number of nonces: the field has 32 bits."""
 PINGS_OUT_MAX = 8
 """Most PINGs that may wait for an answer; the oldest is given up."""
 PERIOD_MAX_NS = 1_000_000_000
@@ -81,7 +80,6 @@ class Conversation:
         self.serials: dict[str, str] = {}
         """Serial numbers in `hello` by finger; silent sensors are left out."""
         self.status: BridgeStatus | None = None
-        """Last STATUS; None before the first."""
         self._confirmed: tuple[str, ...] = ()
         """Serial numbers that two HELLOs in a row agreed on."""
         self._unconfirmed: tuple[str, ...] | None = None
@@ -98,7 +96,6 @@ class Conversation:
 
     @property
     def period_ns(self) -> int | None:
-        """Nominal time between sweeps, ns, from the last HELLO; None before the first."""
         return None if self.hello is None else self.hello.period_ns
 
     @property
@@ -108,7 +105,6 @@ class Conversation:
         return min(self._ping_due_ns, self._silent_at_ns)
 
     def describe(self) -> dict[str, Fact]:
-        """Return facts about port, link and bridge, for `Driver.describe`."""
         facts = {"port": Fact(self._port), **self.link.describe()}
         if self.hello is not None:
             facts |= _about(self.hello)

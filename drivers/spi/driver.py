@@ -84,7 +84,6 @@ class SpiBridgeDriver(Opened):
         self._line.tap = sink
 
     def close(self) -> None:
-        """Stop the bridge and release the port."""
         if self.link_state in (GREETING, UP):
             with contextlib.suppress(LinkError):  # a bridge that is unplugged needs no STOP
                 self._line.write(encode(Stop()))

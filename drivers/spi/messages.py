@@ -164,7 +164,6 @@ class Hello:
     commands: tuple[int, ...]
     """First command byte of each slot (manual figure 13)."""
     firmware: int = 0
-    """Major * 256 + minor."""
     board: str = ""
     version: int = VERSION
     digest: int = DIGEST

@@ -74,7 +74,6 @@ class BridgeCounters(FrameCounters):
     bad_frames: int = 0
     """Whole frames with content that the protocol forbids, or that does not fit the HELLO."""
     duplicates: int = 0
-    """Sweeps that came twice; the second is dropped."""
     reordered: int = 0
     """Sweeps that came after a later one; dropped, and also counted as missed."""
     stale_sweeps: int = 0
@@ -86,7 +85,6 @@ class BridgeCounters(FrameCounters):
     absent_sensors: int = 0
     """Sensors without a serial number; each counts once in each sweep."""
     link_losses: int = 0
-    """Times that a link that was up was lost."""
     link_failures: int = 0
     """Times that opening or greeting failed, or the link was lost."""
     refused_bridges: int = 0
@@ -114,7 +112,6 @@ class SweepDecoder:
         self.hello = hello
         self.clock = DeviceClock(hello.tick_hz, counters)
         self.longest_ticks = 0
-        """Duration of the longest sweep so far, ticks."""
         self._sensors = tuple(sensors)
         self._counters = counters
         self._bridge_seq: int | None = None

@@ -47,7 +47,6 @@ _UNDRIVEN: Final = b"\xff\xff"
 _WORDS: Final = [encode_word(count).to_bytes(2, "big") for count in range(4096)]
 
 Outgoing = tuple[int, bytes]
-"""Arbitration id and data."""
 
 
 class CanTwin(Opened):
@@ -103,7 +102,6 @@ class CanTwin(Opened):
         self._sweep = first_sweep
         self._stuck_tick_us = self._tick_us()
         self.unsent = 0
-        """Frames that the bus refused."""
 
     def open(self) -> None:
         """Open the bus. Raises `DriverError`, also if a package is missing."""
@@ -184,7 +182,6 @@ class CanTwin(Opened):
         return self._clock() // 1000 % (1 << 32)
 
     def _send(self, frame: Outgoing) -> bool:
-        """Send a frame with link faults; return False if the link broke."""
         if self._injector.breaks_here():
             self.open()
             return False
@@ -216,7 +213,6 @@ class CanTwin(Opened):
             self.unsent += 1
 
     def _discard_received(self) -> None:
-        """Empty the queue of a virtual bus, which has no bound."""
         if self._interface == "virtual" and self._bus is not None:
             with contextlib.suppress(can.CanError):
                 while self._bus.recv(timeout=0) is not None:

@@ -23,7 +23,6 @@ class LinkFaults:
     reorder_probability: float = 0.0
     """Chance that a frame comes after the next one instead of before it."""
     one_byte_at_a_time: bool = False
-    """True to write each byte on its own; for byte streams only."""
     burst_frames: int = 1
     """Number of frames that are collected and then sent at once."""
     disconnect_every_frames: int | None = None
@@ -33,7 +32,6 @@ class LinkFaults:
     dead_electrodes: tuple[tuple[int, int], ...] = ()
     """Pairs (finger, electrode) that always read 0."""
     unplugged_fingers: tuple[int, ...] = ()
-    """Fingers whose line no sensor drives."""
     stuck_clock: bool = False
     seed: int = 0
 

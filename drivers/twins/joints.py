@@ -32,7 +32,6 @@ class JointTwin:
         self.injected = self._injector.injected
 
     def messages(self) -> Iterator[JointMessage]:
-        """Yield the messages without faults, without end."""
         seq = 0
         while True:
             t_s = seq / RATE_HZ

@@ -70,7 +70,6 @@ class PalmTwin:
         self._random = np.random.default_rng(seed)
         self._dead = frozenset(faults.dead_electrodes)
         self.packets_made = 0
-        """Packets that the palm made, sent or not."""
 
     def packets(self) -> Iterator[PalmPacket]:
         """Yield the palm's packets, without faults of the link."""

@@ -115,7 +115,6 @@ class SpiTwin(Opened):
         self._reset()
 
     def _reset(self) -> None:
-        """Set the state after power-on: ticks begin at 0."""
         now_ns = self._clock()
         self._boot_ns = now_ns
         self._started = False
@@ -132,7 +131,6 @@ class SpiTwin(Opened):
         self.plug()
 
     def close(self) -> None:
-        """Unplug and remove the path."""
         self.unplug()
         self._replug_ns = None
 
@@ -165,7 +163,6 @@ class SpiTwin(Opened):
         )
 
     def unplug(self) -> None:
-        """Close the pseudo-terminal."""
         ours = None if self._slave is None else os.ttyname(self._slave)
         if self.path.is_symlink() and str(self.path.readlink()) == ours:
             self.path.unlink()
@@ -181,7 +178,6 @@ class SpiTwin(Opened):
         self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
 
     def fileno(self) -> int | None:
-        """Return the descriptor of the host's bytes; None while unplugged."""
         return self._master
 
     def due_ns(self) -> int | None:
@@ -267,7 +263,6 @@ class SpiTwin(Opened):
         self._send(Sweep(seq, *ticks, present, words))
 
     def _words(self, counts: Counts) -> NDArray[np.uint16]:
-        """Return the sensors' response words, shape (slots, sensors)."""
         felt = counts.copy()
         for finger, electrode in self._faults.dead_electrodes:
             felt[finger, electrode] = 0

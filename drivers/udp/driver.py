@@ -100,7 +100,6 @@ class DatagramDriver(Opened, Generic[Stream]):
 
     @property
     def link_state(self) -> LinkState:
-        """State of the link; `GREETING` while it listens and no good datagram comes."""
         return self._link.state
 
     @property

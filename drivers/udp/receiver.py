@@ -90,7 +90,6 @@ class DatagramReceiver:
         return port
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable when a datagram waits."""
         return self._socket.fileno()
 
     def close(self) -> None:

@@ -31,7 +31,6 @@ SLIP_WINDOW: Range = (0.1, 0.7)
 
 JOINT_NAMES = ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
 OPEN_RAD = 0.2
-"""Joint angle of an open hand, rad."""
 CLOSED_RAD: Range = (0.8, 1.0)
 """Joint angle at the end of closing, rad; drawn for each grasp and joint."""
 
@@ -84,11 +83,9 @@ class Timetable:
     """End of closing; the joints stand still from here to the release."""
     lift_s: float
     release_s: float
-    """Start of opening."""
     open_s: float
     """End of opening: no contact."""
     end_s: float
-    """Start of the next grasp."""
     creep_tau_s: float
     creep_counts_per_s: float
     """Mean speed of creep of all electrodes at `closed_s`, counts/s."""

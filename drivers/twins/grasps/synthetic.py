@@ -43,9 +43,7 @@ class Component:
     """A Gaussian with few axes; its covariance is `axes.T @ axes` plus `spread` squared."""
 
     weight: float
-    """Share of the class, 0..1."""
     mean: NDArray[np.float64]
-    """Shape (72,), counts."""
     axes: NDArray[np.float64]
     """Shape (axes, 72), counts: the largest principal axes, one standard deviation long."""
     spread: NDArray[np.float64]
@@ -71,9 +69,7 @@ class SyntheticGrasps:
     """Grasps drawn by `draw` or `draw_day`."""
 
     counts: NDArray[np.uint16]
-    """Shape (grasps, 72)."""
     slipped: NDArray[np.bool_]
-    """Shape (grasps,)."""
     component: NDArray[np.int64]
     """Shape (grasps,): mixture component, from 0, instead of an object."""
 

@@ -42,7 +42,6 @@ PLACES_MS = 1 + np.arange(1, ELECTRODES + 1) // 2
 POSITION_NOISE_RAD = 0.0003
 """Noise (standard deviation) of a joint that stands still, rad."""
 REST_QUANTILE = 0.98
-"""Default quantile of `rest_above`."""
 WARM_REST_MAX = COUNT_MAX - 50
 """Highest count after drift; the end of the range would look like a fault."""
 DEMO_GRASPS = 12
@@ -86,7 +85,6 @@ class GraspRow:
     t_s: float
     """Time since the first row, s."""
     counts: NDArray[np.uint16]
-    """Shape (fingers, 24), raw counts."""
     joint_names: tuple[str, ...]
     position_rad: NDArray[np.float64]
     """Shape (joints,), in the order of `joint_names`."""
