@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from enum import StrEnum
+from typing import Final
 
 from graspd.drivers.base import Fact, LinkCause
 
@@ -13,6 +14,13 @@ BACKOFF_FACTOR = 1.8
 """Factor of the wait from one failure to the next; the seventh wait is the longest."""
 BACKOFF_MAX_S = 1.0
 """Longest wait, s: a device that is plugged in again is opened within this time."""
+SILENCE_PERIODS, SILENCE_MIN_NS = 10, 100_000_000
+"""Missing readings after which a link is lost, and the shortest timeout for them, ns.
+
+Adapters and busy hosts delay bytes by less.
+"""
+OUTAGE_NS: Final = 2_000_000_000
+"""Longest outage, ns, in which missed readings are counted; a longer one counts as one."""
 WARNINGS_MAX = 8
 """Most warnings in one outage, each for another reason; the log cannot fill up."""
 
@@ -32,7 +40,9 @@ class LinkState(StrEnum):
     """The device works; readings can arrive."""
 
 
-CLOSED, WAITING, GREETING, UP = LinkState
+def longest_silence_ns(period_ns: int | None) -> int:
+    """Return how long a link with this time between readings may be silent, ns."""
+    return max(SILENCE_PERIODS * (period_ns or 0), SILENCE_MIN_NS)
 
 
 class Link:
@@ -106,8 +116,8 @@ class Link:
     def describe(self) -> dict[str, Fact]:
         """Return the state, and why it is not up, as facts for `Driver.describe`."""
         cause = self.cause
-        if cause is None and self.state is not UP:
-            cause = LinkCause.SILENT if self.state is GREETING else LinkCause.UNKNOWN
+        if cause is None and self.state is not LinkState.UP:
+            cause = LinkCause.SILENT if self.state is LinkState.GREETING else LinkCause.UNKNOWN
         facts = {"link": Fact(str(self.state), cause)}
         if self.reason is not None:
             facts["why"] = Fact(self.reason)

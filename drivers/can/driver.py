@@ -20,7 +20,7 @@ from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.can.frames import LOST, Stamped
 from graspd.drivers.can.readings import CanCounters
 from graspd.drivers.can.stream import NAME, CanStream
-from graspd.drivers.link import CLOSED, UP, WAITING, LinkState
+from graspd.drivers.link import LinkState
 
 POLL_NS: Final = 1_000_000
 """Time between reads of a bus without a descriptor, ns."""
@@ -79,10 +79,6 @@ class CanBridgeDriver(Opened):
         return self.stream.counters
 
     @property
-    def link_state(self) -> LinkState:
-        return self.stream.link.state
-
-    @property
     def frames_per_s(self) -> float:
         """Frames of all kinds in the last full second."""
         silent = self._clock() - self._window_start_ns > 2 * RATE_WINDOW_NS
@@ -99,7 +95,7 @@ class CanBridgeDriver(Opened):
 
     def describe(self) -> dict[str, Fact]:
         facts = self.stream.describe()
-        if self.link_state is UP:
+        if self.stream.link.state is LinkState.UP:
             facts["frames"] = Fact(f"{self.frames_per_s:.0f} /s")
         return facts
 
@@ -129,7 +125,7 @@ class CanBridgeDriver(Opened):
 
     def due_ns(self) -> int | None:
         link = self.stream.link
-        if link.state in (CLOSED, WAITING):
+        if link.state in (LinkState.CLOSED, LinkState.WAITING):
             return link.retry_ns
         if self._resting_until_ns is not None:
             return self._resting_until_ns
@@ -138,11 +134,11 @@ class CanBridgeDriver(Opened):
         return self.stream.silent_at_ns
 
     def read_ready(self) -> Sequence[Reading]:
-        if self.link_state is CLOSED:
+        if self.stream.link.state is LinkState.CLOSED:
             raise RuntimeError("the CAN bridge is not open")
-        if self.link_state is WAITING and self.stream.link.is_due(self._clock()):
+        if self.stream.link.state is LinkState.WAITING and self.stream.link.is_due(self._clock()):
             self._try_to_open()
-        if self.link_state is WAITING:
+        if self.stream.link.state is LinkState.WAITING:
             return ()
         frames = self._bus.drain()
         readings, trouble = self.stream.receive(frames)

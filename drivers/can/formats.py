@@ -30,10 +30,9 @@ SWEEP_VERSION: Final = 1
 """Version of the sweep frame's layout; raise it with each change of meaning."""
 SWEEP_BASE_ID: Final = 0x5B0
 """Default arbitration id of finger 0; finger i has this id + i."""
-SWEEP_WORDS_BYTES: Final = ELECTRODES * WORD_BYTES
 _SWEEP_HEAD: Final = struct.Struct("<BBHI")
 _SWEEP_STATUS: Final = struct.Struct("<H")
-_STATUS_AT: Final = _SWEEP_HEAD.size + SWEEP_WORDS_BYTES
+_STATUS_AT: Final = _SWEEP_HEAD.size + ELECTRODES * WORD_BYTES
 _RESERVED_AT: Final = _STATUS_AT + _SWEEP_STATUS.size
 _RESERVED: Final = bytes(FD_DATA_MAX - _RESERVED_AT)
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from graspd.drivers.base import DriverCounters
+from graspd.drivers.link import OUTAGE_NS
 
 PERIODS_KEPT: Final = 15
 PERIODS_NEEDED: Final = 5
 """Measured periods after which the period is known; it is the median of the last 15."""
-OUTAGE_NS: Final = 2_000_000_000
-"""Longest gap, ns, in which missed sweeps are counted; a longer one counts as one."""
 
 
 @dataclass(slots=True)

@@ -24,7 +24,8 @@ import numpy as np
 
 from graspd.drivers.base import ELECTRODES, ElectrodeFault, TactileReading
 from graspd.drivers.biotac import E1, E24, make_reading
-from graspd.drivers.can.readings import OUTAGE_NS, CanCounters, SweepPeriod
+from graspd.drivers.can.readings import CanCounters, SweepPeriod
+from graspd.drivers.link import OUTAGE_NS
 
 REORDER_MAX: Final = 3
 """Most places by which a sample may be late; adapters with few buffers swap neighbours."""

@@ -19,13 +19,9 @@ from graspd.drivers.can.frames import (
     is_overflow,
 )
 from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.link import GREETING, UP, Link
+from graspd.drivers.link import Link, LinkState, longest_silence_ns
 
 NAME: Final = "can"
-SILENCE_PERIODS: Final = 10
-"""Missing readings after which the link is lost."""
-SILENCE_MIN_NS: Final = 100_000_000
-"""Shortest timeout of a reading, ns: adapters and busy hosts delay frames by less."""
 _SPECIAL: Final = ERROR | REMOTE | LOST
 
 
@@ -59,7 +55,7 @@ class CanStream:
     @property
     def silent_at_ns(self) -> int | None:
         """Time when the link counts as silent, ns; None while it is not up."""
-        return self._silent_at_ns if self.link.state is UP else None
+        return self._silent_at_ns if self.link.state is LinkState.UP else None
 
     def describe(self) -> dict[str, Fact]:
         facts = {"bus": Fact(self._where), **self.link.describe()}
@@ -89,12 +85,13 @@ class CanStream:
         """
         if self.counters.accepted_frames > self._accepted:
             self._accepted = self.counters.accepted_frames
-            self._silent_at_ns = now_ns + self._silence_ns()
-            if self.link.state is GREETING:
+            self._silent_at_ns = now_ns + longest_silence_ns(self.period_ns)
+            if self.link.state is LinkState.GREETING:
                 self.link.up(self._where, now_ns)
-        elif self.link.state is UP and now_ns >= self._silent_at_ns and not more:
-            silence = f"nothing from the board for {self._silence_ns() / 1e6:.0f} ms"
-            self._down(LinkError(LinkCause.TIMEOUT, silence), now_ns)
+        elif self.link.state is LinkState.UP and now_ns >= self._silent_at_ns and not more:
+            silence_ms = longest_silence_ns(self.period_ns) / 1e6
+            text = f"nothing from the board for {silence_ms:.0f} ms"
+            self._down(LinkError(LinkCause.TIMEOUT, text), now_ns)
             self.link.greeting()
 
     def lost(self, error: LinkError, now_ns: int) -> None:
@@ -111,9 +108,6 @@ class CanStream:
         self.interrupt()
         self.link.failed(error.cause, f"{self._where}: {error}", now_ns)
         self.counters.link_losses = self.link.losses
-
-    def _silence_ns(self) -> int:
-        return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
 
     def _take_special(self, frame: CanFrame) -> LinkError | None:
         """Count a remote or error frame; return why the link is lost, if it is."""

@@ -96,13 +96,11 @@ class Table:
     """Convert one raw value to radians."""
 
     def __init__(self, points: Points) -> None:
-        """Raises `ValueError` for fewer than two points, or for equal raw values."""
+        """`points`: two or more, checked by `parse_calibration`."""
         ordered = sorted(points, key=itemgetter(0))
         self._raws = [raw for raw, _ in ordered]
         self._slopes: list[float] = []
         self._offsets: list[float] = []
-        if len(ordered) < 2 or len(set(self._raws)) < len(ordered):
-            raise ValueError("a table needs two points or more, with different raw values")
         for (raw, degrees), (next_raw, next_degrees) in itertools.pairwise(ordered):
             slope = math.radians((next_degrees - degrees) / (next_raw - raw))
             self._slopes.append(slope)

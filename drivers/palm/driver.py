@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from graspd.drivers.base import Reading
-from graspd.drivers.link import LinkState
+from graspd.drivers.link import LinkState, longest_silence_ns
 from graspd.drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
 from graspd.drivers.palm.stream import ROUND_NS, PalmStream
 from graspd.drivers.udp.driver import DatagramDriver
@@ -22,7 +22,7 @@ class PalmDriver(DatagramDriver[PalmStream]):
 
     name = "palm"
     bytes_max = PACKET_BYTES_MAX
-    silence_ns = 10 * ROUND_NS
+    silence_ns = longest_silence_ns(ROUND_NS)
     period_ns: int | None = ROUND_NS
 
     def __init__(
@@ -62,7 +62,7 @@ class PalmDriver(DatagramDriver[PalmStream]):
 
     def due_ns(self) -> int | None:
         due_ns = super().due_ns()
-        if self.link_state is LinkState.CLOSED or self._clock() >= self._attention_ns:
+        if self.link.state is LinkState.CLOSED or self._clock() >= self._attention_ns:
             return due_ns
         return self._attention_ns if due_ns is None else min(due_ns, self._attention_ns)
 

@@ -34,6 +34,7 @@ from graspd.drivers.base import (
     TactileReading,
     check_fingers,
 )
+from graspd.drivers.link import OUTAGE_NS
 from graspd.drivers.palm.packet import (
     CHANNELS,
     CYCLE_NS,
@@ -64,8 +65,6 @@ LATE_MAX: Final = 10
 
 After `ROUND - 1 + LATE_MAX` cycles of silence, no packet counts for the round before.
 """
-OUTAGE_NS: Final = 2_000_000_000
-"""Longest outage, ns, in which missed rounds are counted; a longer one counts as one."""
 
 _COMPLETE: Final = (1 << ROUND) - 1
 _TELLING: Final = 0b11

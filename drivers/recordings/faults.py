@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from graspd.drivers.base import COUNT_MAX, ELECTRODES, DriverCounters, ElectrodeFault
 
-WORD_MAX = 0xFFFF
-"""Largest value of the 16-bit word in which a BioTac SP answers."""
-
 
 @dataclass(frozen=True, slots=True)
 class ReplayFaults:
@@ -107,7 +104,7 @@ class FaultInjector:
             np.copyto(counts, shifted.astype(np.uint16), where=where & (flags == 0))
             self._counters.injected_wrong += 1
         if self._rng is not None and self._happens(faults.garbage_probability):
-            words = self._rng.integers(0, WORD_MAX, size=counts.shape, endpoint=True)
+            words = self._rng.integers(0, 1 << 16, size=counts.shape)  # any 16-bit word
             is_count = words <= COUNT_MAX
             garbage = np.where(is_count, words, 0).astype(np.uint16)
             marks = np.where(is_count, 0, int(ElectrodeFault.NOT_A_COUNT)).astype(np.uint8)

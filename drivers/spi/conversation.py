@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from graspd.drivers.base import DeviceFault, Fact, LinkCause, Reading, TactileReading, sensor_rows
-from graspd.drivers.link import GREETING, WAITING, Link
+from graspd.drivers.link import Link, LinkState, longest_silence_ns
 from graspd.drivers.spi.messages import (
     DELIMITER,
     DIGEST,
@@ -45,10 +45,6 @@ PINGS_OUT_MAX = 8
 """Most PINGs that may wait for an answer; the oldest is given up."""
 PERIOD_MAX_NS = 1_000_000_000
 """Longest accepted time between sweeps, ns. Silence of a slower bridge is noticed too late."""
-SILENCE_PERIODS = 10
-"""Missing sweeps after which the link is lost."""
-SILENCE_MIN_NS = 100_000_000
-"""Shortest timeout of a sweep, ns: USB adapters and busy hosts delay bytes by less."""
 
 _FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 
@@ -138,7 +134,7 @@ class Conversation:
 
     def say(self, now_ns: int) -> list[bytes]:
         """Return the frames to send now. A timeout that has passed closes the link instead."""
-        if self.link.state is WAITING:
+        if self.link.state is LinkState.WAITING:
             return []
         frames = [encode(Start())] if self._starts else []
         self._starts = False
@@ -180,7 +176,7 @@ class Conversation:
         """
         readings: list[Reading] = []
         for kind, payload in self._parser.feed(chunk):
-            if self.link.state is WAITING:
+            if self.link.state is LinkState.WAITING:
                 break  # an earlier frame of this chunk has closed the link
             if kind == Hello.TYPE and not self._has_our_layout(payload, arrival_ns):
                 continue
@@ -280,7 +276,7 @@ class Conversation:
             self._starts = True
             self._pings_sent = 1
             self._ping_due_ns = now_ns + PING_FIRST_NS
-            self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
+            self._silence_ns = longest_silence_ns(hello.period_ns)
             self._silent_at_ns = now_ns + self._silence_ns
             self._sweeps = SweepDecoder(hello, self._sensors, self.counters)
 
@@ -300,7 +296,7 @@ class Conversation:
         if reading is None:
             return None
         self._silent_at_ns = arrival_ns + self._silence_ns
-        if self.link.state is GREETING:
+        if self.link.state is LinkState.GREETING:
             about = _about(self._sweeps.hello).values()
             self.link.up(", ".join(fact.text for fact in about), arrival_ns)
         return reading

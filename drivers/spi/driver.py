@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from graspd.drivers.base import Fact, LinkError, Opened, Reading
-from graspd.drivers.link import CLOSED, GREETING, UP, WAITING, LinkState
+from graspd.drivers.link import LinkState
 from graspd.drivers.spi.conversation import NAME, NONCES, Conversation
 from graspd.drivers.spi.line import LineEvent, SerialLine
 from graspd.drivers.spi.messages import Stop, encode
@@ -54,10 +54,6 @@ class SpiBridgeDriver(Opened):
         return Conversation(self._line.port, self._fingers, self._sensors, nonce=nonce)
 
     @property
-    def link_state(self) -> LinkState:
-        return self.conversation.link.state
-
-    @property
     def counters(self) -> BridgeCounters:
         return self.conversation.counters
 
@@ -84,7 +80,7 @@ class SpiBridgeDriver(Opened):
         self._line.tap = sink
 
     def close(self) -> None:
-        if self.link_state in (GREETING, UP):
+        if self.conversation.link.state in (LinkState.GREETING, LinkState.UP):
             with contextlib.suppress(LinkError):  # a bridge that is unplugged needs no STOP
                 self._line.write(encode(Stop()))
         self._line.close()
@@ -97,7 +93,7 @@ class SpiBridgeDriver(Opened):
     def due_ns(self) -> int | None:
         """Return the time of the next try, PING, timeout or poll, ns; None while closed."""
         link = self.conversation.link
-        if link.state in (CLOSED, WAITING):
+        if link.state in (LinkState.CLOSED, LinkState.WAITING):
             return link.retry_ns
         due_ns = self.conversation.due_ns
         return due_ns if self._line.descriptor is not None else min(due_ns, self._poll_due_ns)
@@ -105,10 +101,10 @@ class SpiBridgeDriver(Opened):
     def read_ready(self) -> Sequence[Reading]:
         """Return the readings that have arrived, oldest first. No fault of a bridge raises."""
         link = self.conversation.link
-        if link.state is CLOSED:
+        if link.state is LinkState.CLOSED:
             raise RuntimeError("the bridge is not open")
         began_ns = self._clock()
-        if link.state is WAITING:
+        if link.state is LinkState.WAITING:
             if link.is_due(began_ns):
                 self._connect()
             return ()
@@ -143,7 +139,7 @@ class SpiBridgeDriver(Opened):
                     self.counters.host_tx_dropped += 1
         except LinkError as error:
             self._lose(error)
-        if self.conversation.link.state is WAITING:
+        if self.conversation.link.state is LinkState.WAITING:
             self._line.close()
 
     def _lose(self, error: LinkError) -> None:

@@ -40,8 +40,6 @@ from graspd.drivers.twins.grasps.grasps import Counts
 TICK_HZ = 1_000_000
 SLOT_NS = 80_000
 """Time of one sample of three sensors at 4.4 MHz, ns (manual figure 14)."""
-NOMINAL_HZ = 100.0
-"""Rate, Hz, that a twin states when it sends as fast as the host reads."""
 STATUS_PERIOD_NS = 1_000_000_000
 REPLUG_NS = 50_000_000
 """Time that a broken link stays down, ns."""
@@ -64,7 +62,6 @@ class SpiTwin(Opened):
 
     `path` becomes a symbolic link to a new pseudo-terminal at each `plug`, which is a reset.
     `source`: counts of each sweep, shape (sensors, 24); after the last the twin only answers.
-    `rate_hz` None: sweeps are sent as fast as the host reads, and no frame is dropped.
     """
 
     def __init__(
@@ -72,14 +69,14 @@ class SpiTwin(Opened):
         path: Path,
         source: Iterable[Counts],
         *,
-        rate_hz: float | None = NOMINAL_HZ,
+        rate_hz: float = 100.0,
         channels: Sequence[int] = SEQUENCE_ELECTRODES,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
         """`tap`: called with all bytes to the host. Raises `ValueError`."""
-        if rate_hz is not None and not rate_hz > 0.0:
+        if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         counts = iter(source)
         first = next(counts, None)
@@ -95,8 +92,7 @@ class SpiTwin(Opened):
         self.exhausted = False
         self._sensors = first.shape[0]
         self._source = itertools.chain([first], counts)
-        self._period_ns = round(1e9 / (rate_hz or NOMINAL_HZ))
-        self._as_fast_as_read = rate_hz is None
+        self._period_ns = round(1e9 / rate_hz)
         self._commands = tuple(sample_command(channel) for channel in channels)
         self._slots = [slot for slot, channel in enumerate(channels) if E1 <= channel <= E24]
         self._electrodes = [channels[slot] - E1 for slot in self._slots]
@@ -106,7 +102,6 @@ class SpiTwin(Opened):
         self.injected_in_sweeps: Counter[str] = Counter()
         """Number of faults that hit sweeps, by name."""
         self._clock = clock
-        self._tick_hz = TICK_HZ
         self._tap = tap
         self._parser = FrameParser(DIGEST)
         self._master: int | None = None
@@ -220,9 +215,7 @@ class SpiTwin(Opened):
             elif isinstance(message, Start) and not self._started:
                 self._started = True
                 self._seq = 0
-                self._sweep_due_ns = self._clock() + (
-                    0 if self._as_fast_as_read else self._period_ns
-                )
+                self._sweep_due_ns = self._clock() + self._period_ns
             elif isinstance(message, Stop):
                 self._started = False
 
@@ -234,12 +227,9 @@ class SpiTwin(Opened):
         for _ in range(SWEEPS_AT_ONCE):
             if self._master is None or not self._sweeping() or self._sweep_due_ns > now_ns:
                 break
-            if not self._as_fast_as_read:
-                end_ns = self._sweep_due_ns
-                self._sweep_due_ns += self._period_ns
-                self._sweep(end_ns)
-            elif not self._unsent:
-                self._sweep(self._clock())
+            end_ns = self._sweep_due_ns
+            self._sweep_due_ns += self._period_ns
+            self._sweep(end_ns)
         if self._master is not None and now_ns >= self._status_due_ns:
             self._status_due_ns += STATUS_PERIOD_NS
             self._send(self._status(), waits=False)
@@ -254,8 +244,7 @@ class SpiTwin(Opened):
             return
         words = self._words(counts)
         length_ns = min(len(self._commands) * SLOT_NS, self._period_ns // 2)
-        begin_ns = end_ns if self._as_fast_as_read else end_ns - length_ns
-        ticks = self._tick(begin_ns), self._tick(end_ns)
+        ticks = self._tick(end_ns - length_ns), self._tick(end_ns)
         present = sum(1 << i for i in range(self._sensors) if self._is_plugged(i))
         seq, self._seq = self._seq, (self._seq + 1) % (1 << 32)
         self.sweeps += 1
@@ -279,7 +268,7 @@ class SpiTwin(Opened):
     def _tick(self, host_ns: int) -> int:
         if self._faults.stuck_clock:
             return 0
-        return max((host_ns - self._boot_ns) * self._tick_hz // 1_000_000_000, 0)
+        return max((host_ns - self._boot_ns) * TICK_HZ // 1_000_000_000, 0)
 
     def _hello(self, nonce: int) -> Hello:
         return Hello(

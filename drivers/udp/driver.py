@@ -89,7 +89,7 @@ class DatagramDriver(Opened, Generic[Stream]):
 
     def _reset(self) -> None:
         self.stream = self._new_stream()
-        self._link = Link(self.name)
+        self.link = Link(self.name)
         self._earlier_drops = 0
         self._sender: Sender | None = None
         self.sender: str | None = None
@@ -97,10 +97,6 @@ class DatagramDriver(Opened, Generic[Stream]):
         self._t_ns = 0
         self._heard_from: str | None = None
         self._pauses = False
-
-    @property
-    def link_state(self) -> LinkState:
-        return self._link.state
 
     @property
     def port(self) -> int | None:
@@ -111,7 +107,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return {}
 
     def describe(self) -> dict[str, Fact]:
-        facts = {"source": Fact(str(self._endpoint)), **self._link.describe()}
+        facts = {"source": Fact(str(self._endpoint)), **self.link.describe()}
         if self._heard_from is not None:
             facts["heard"] = Fact(self._heard_from)
         return facts
@@ -120,22 +116,22 @@ class DatagramDriver(Opened, Generic[Stream]):
         self.close()
         self._reset()
         receiver = DatagramReceiver(self._endpoint, self.bytes_max)
-        self._link.start(self._clock())
+        self.link.start(self._clock())
         self._use(receiver)
 
     def close(self) -> None:
         self._drop_receiver()
         self._sender = None
-        self._link.close()
+        self.link.close()
 
     def fileno(self) -> int | None:
         return None if self._receiver is None else self._receiver.fileno()
 
     def due_ns(self) -> int | None:
         """Return the time, ns, to reopen the socket or to notice silence."""
-        if self._link.state is LinkState.UP:
+        if self.link.state is LinkState.UP:
             return self._good_t_ns + self.silence_ns
-        return self._link.retry_ns
+        return self.link.retry_ns
 
     def read_ready(self) -> Sequence[Reading]:
         if self._pauses:  # between the readings of two senders: see `Driver.serials`
@@ -154,7 +150,7 @@ class DatagramDriver(Opened, Generic[Stream]):
 
     def _datagrams(self) -> Iterator[tuple[bytes, int]]:
         """Yield the waiting datagrams, oldest first, with their arrival times, ns."""
-        if self._link.state is LinkState.CLOSED:
+        if self.link.state is LinkState.CLOSED:
             raise RuntimeError(f"the {self.name} link is not open")
         receiver = self._receiver or self._listen_again()
         if receiver is None:
@@ -175,21 +171,21 @@ class DatagramDriver(Opened, Generic[Stream]):
 
     def _confirm(self) -> None:
         self._good_t_ns = self._t_ns
-        if self._link.state is not LinkState.UP:
+        if self.link.state is not LinkState.UP:
             self._sender = self._heard
             self.sender = str(Endpoint(*self._heard))
             self._heard_from = (
                 f"{self.stream.sender_kind} from {self._heard[0]} port {self._heard[1]}"
             )
-            self._link.up(self._heard_from, self._clock())
+            self.link.up(self._heard_from, self._clock())
 
     def _fell_silent(self) -> bool:
         """Return True if the link is down now and was up at the last call."""
-        is_up = self._link.state is LinkState.UP
+        is_up = self.link.state is LinkState.UP
         if is_up and self._clock() - self._good_t_ns >= self.silence_ns:
             silence = f"nothing good for {self.silence_ns / 1e6:.0f} ms"
             self._lose(LinkError(LinkCause.TIMEOUT, silence))
-            self._link.greeting()
+            self.link.greeting()
             is_up = False
         lost = self._sender is not None and not is_up
         if lost:
@@ -202,16 +198,16 @@ class DatagramDriver(Opened, Generic[Stream]):
         return self._only_from is None or sender[0] == self._only_from
 
     def _lose(self, error: LinkError) -> None:
-        self._link.failed(error.cause, str(error), self._clock())
-        self.stream.counters.link_losses = self._link.losses
+        self.link.failed(error.cause, str(error), self._clock())
+        self.stream.counters.link_losses = self.link.losses
 
     def _use(self, receiver: DatagramReceiver) -> DatagramReceiver:
         self._receiver = receiver
-        self._link.greeting()
+        self.link.greeting()
         return receiver
 
     def _listen_again(self) -> DatagramReceiver | None:
-        if not self._link.is_due(self._clock()):
+        if not self.link.is_due(self._clock()):
             return None
         try:
             return self._use(DatagramReceiver(self._endpoint, self.bytes_max))

@@ -112,7 +112,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 def test_the_first_good_sender_is_the_only_one_until_it_is_silent(bench: Bench) -> None:
     assert bench.hear(Datagram(b"x", 0, THERE)) == [(b"x", 0)]
-    assert bench.link.link_state is LinkState.GREETING
+    assert bench.link.link.state is LinkState.GREETING
     assert bench.hear(Datagram(b"a", 0, HERE), Datagram(b"b", 0, THERE)) == [(b"a", 0)]
     assert bench.counters.foreign_datagrams == 1
     assert bench.link.describe() == {
@@ -153,7 +153,7 @@ def test_silence_is_noticed_when_it_is_due_and_once(bench: Bench) -> None:
     bench.clock.now_ns += 1
     assert bench.fell_silent()
     assert not bench.fell_silent()
-    assert (bench.link.link_state, bench.counters.link_losses) == (LinkState.GREETING, 1)
+    assert (bench.link.link.state, bench.counters.link_losses) == (LinkState.GREETING, 1)
     assert bench.link.describe()["link"] == Fact("greeting", LinkCause.TIMEOUT)
     assert bench.link.describe()["why"].text == "nothing good for 100 ms"
     assert bench.link.due_ns() is None
@@ -172,7 +172,7 @@ def test_what_the_kernel_dropped_is_summed_over_the_sockets(bench: Bench) -> Non
     assert bench.counters.kernel_drops == 3
     first.waiting.append(LinkError(LinkCause.INTERFACE_DOWN, "Network is down"))
     assert bench.hear() == []
-    assert (bench.link.link_state, first.closed) == (LinkState.WAITING, True)
+    assert (bench.link.link.state, first.closed) == (LinkState.WAITING, True)
     assert bench.listening() == (None, None)
     due_ns = bench.link.due_ns()
     assert due_ns is not None

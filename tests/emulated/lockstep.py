@@ -110,7 +110,7 @@ class LockStep:
         if self._is_open and not is_open:
             self.board.do("close")
         self._is_open = is_open
-        state = self.driver.link_state
+        state = self.driver.conversation.link.state
         if not self.states or self.states[-1] is not state:
             self.states.append(state)
 

@@ -139,12 +139,12 @@ def test_a_link_that_is_lost_comes_back_and_no_reading_mixes_both(
     before = linked.readings[-1]
     board.cut(loss)
     linked.serve(1500.0)
-    assert linked.driver.link_state is not LinkState.UP or loss == "stick"
+    assert linked.driver.conversation.link.state is not LinkState.UP or loss == "stick"
     if loss != "stick":
         board.do({"unplug": "plug", "detach": "attach"}[loss])
     linked.serve(6000.0, lambda: linked.readings[-1].seq >= before.seq + 100)
     counters = linked.driver.counters
-    assert linked.driver.link_state is LinkState.UP
+    assert linked.driver.conversation.link.state is LinkState.UP
     assert counters.link_losses == 1
     assert counters.clock_faults == 0
     assert not any(reading.faults.any() for reading in linked.readings)

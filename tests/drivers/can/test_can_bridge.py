@@ -58,7 +58,7 @@ def test_every_sweep_arrives_count_for_count(frame_format: str, sequence: str) -
         link.send(counts)
         assert_same(link.readings, counts)
         assert link.driver.period_ns == pytest.approx(10 * MS, abs=1000)
-        assert link.driver.link_state is LinkState.UP
+        assert link.driver.stream.link.state is LinkState.UP
         assert link.driver.counters.missed_readings == 0
         assert link.driver.counters.frames == link.driver.counters.accepted_frames
 
@@ -90,7 +90,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
             name: names.count(name) for name in names
         }
         assert counted["frames"] == len(ours) + len(strange)
-        assert driver.link_state is LinkState.UP
+        assert driver.stream.link.state is LinkState.UP
         assert driver.stream.last_error == "bus error"
 
 
@@ -133,4 +133,4 @@ def test_an_interface_that_python_can_does_not_have_is_no_matter_of_trying_again
     with pytest.raises(DriverError, match="carrier_pigeon") as raised:
         driver.open()
     assert not isinstance(raised.value, LinkError)
-    assert driver.link_state is LinkState.CLOSED
+    assert driver.stream.link.state is LinkState.CLOSED

@@ -44,7 +44,7 @@ def test_an_absent_socketcan_interface_is_waited_for(caplog: pytest.LogCaptureFi
     clock = Clock()
     with CanBridgeDriver("socketcan", "nocan77", clock=clock) as driver:
         for _ in range(20):
-            assert driver.link_state is LinkState.WAITING
+            assert driver.stream.link.state is LinkState.WAITING
             due_ns = driver.due_ns()
             assert due_ns is not None
             assert 0 < due_ns - clock.now_ns <= 1000 * MS
@@ -179,23 +179,23 @@ def test_a_board_that_falls_silent_is_not_up_and_comes_back_by_itself() -> None:
     driver, clock = link.driver, link.clock
     with driver:
         link.send(contact(8))
-        assert driver.link_state is LinkState.UP
+        assert driver.stream.link.state is LinkState.UP
         with can.Bus(interface="virtual", channel=link.where, ignore_config=True) as bus:
             for _ in range(10):
                 clock.now_ns += 10 * MS - 1
                 bus.send(message(bytes(7), 0x7FF))
                 assert driver.read_ready() == []
-                assert driver.link_state is LinkState.UP
+                assert driver.stream.link.state is LinkState.UP
             clock.now_ns += 10
             bus.send(message(bytes(7), 0x7FF))
             assert driver.read_ready() == []
-        assert str(driver.link_state) == "greeting"
+        assert str(driver.stream.link.state) == "greeting"
         assert driver.describe()["why"].text.endswith(": nothing from the board for 100 ms")
         assert "last error" not in driver.describe()
         assert (driver.counters.link_losses, driver.counters.bus_faults) == (1, 0)
         before = len(link.readings)
         link.send(contact(3))
-        assert driver.link_state is LinkState.UP
+        assert driver.stream.link.state is LinkState.UP
         assert len(link.readings) == before + 3
         assert not any(reading.faults.any() for reading in link.readings)
         assert driver.counters.link_losses == 1
@@ -209,10 +209,10 @@ def test_slow_boards_have_ten_periods() -> None:
             link.send([sweep])
         link.clock.now_ns += 499 * MS
         link.driver.read_ready()
-        assert link.driver.link_state is LinkState.UP
+        assert link.driver.stream.link.state is LinkState.UP
         link.clock.now_ns += 2 * MS
         link.driver.read_ready()
-        assert str(link.driver.link_state) == "greeting"
+        assert str(link.driver.stream.link.state) == "greeting"
 
 
 def test_a_bus_with_a_descriptor_is_looked_at_when_silence_is_due(
@@ -229,7 +229,7 @@ def test_a_bus_with_a_descriptor_is_looked_at_when_silence_is_due(
             assert driver.due_ns() == clock.now_ns + SILENCE_NS
             clock.now_ns += SILENCE_NS
             driver.read_ready()
-            assert str(driver.link_state) == "greeting"
+            assert str(driver.stream.link.state) == "greeting"
             assert driver.due_ns() is None
 
 

@@ -77,7 +77,7 @@ def test_an_slcan_adapter_is_read_and_its_unplugging_leaves_nothing_open(
         assert sum(slept_s) < 1.5, "python-can's default sleeps two seconds"
         unplug()
         driver.read_ready()
-        assert driver.link_state is LinkState.WAITING
+        assert driver.stream.link.state is LinkState.WAITING
         assert driver.counters.link_losses == 1
         for _ in range(3):
             time.sleep(0.12)

@@ -91,7 +91,7 @@ def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
                 first.send(frame)
             first.send(CanFrame(0x040, bytes(8), ERROR))
             assert len(driver.read_ready()) == 1
-            assert driver.link_state is LinkState.WAITING
+            assert driver.stream.link.state is LinkState.WAITING
             assert driver.stream.last_error == "bus-off"
             due_ns = driver.due_ns()
             assert due_ns is not None
@@ -142,7 +142,7 @@ def test_an_interface_that_goes_down_is_a_link_fault(monkeypatch: pytest.MonkeyP
         stand_in(monkeypatch, lambda: bus)
         with over_socket() as driver:
             assert driver.read_ready() == []
-            assert driver.link_state is LinkState.WAITING
+            assert driver.stream.link.state is LinkState.WAITING
             assert driver.stream.last_error is not None
             assert "Network is down" in driver.stream.last_error
 

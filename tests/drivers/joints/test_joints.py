@@ -253,7 +253,7 @@ def test_a_sender_that_repeats_itself_is_never_taken(driver: JointStreamDriver) 
 
 def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:
     assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
-    assert driver.link_state is LinkState.UP
+    assert driver.link.state is LinkState.UP
 
 
 def test_a_twin_refuses_a_fault_that_it_cannot_show() -> None:

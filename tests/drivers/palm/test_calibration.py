@@ -19,7 +19,6 @@ from graspd.drivers.palm.calibration import (
     CalibrationError,
     CoupledTable,
     JointCalibration,
-    Table,
     impossible_angles,
     load_calibration,
     parse_calibration,
@@ -347,12 +346,6 @@ def test_a_file_has_at_most_256_kilobytes(tmp_path: Path, length: int, taken: bo
     else:
         with pytest.raises(CalibrationError, match="is longer than 262144 bytes"):
             load_calibration(path)
-
-
-def test_a_table_needs_two_different_points() -> None:
-    for points in ([], [(5.0, 1.0)], [(5.0, 1.0), (5.0, 2.0)]):
-        with pytest.raises(ValueError, match="two points"):
-            Table(points)
 
 
 values = st.recursive(

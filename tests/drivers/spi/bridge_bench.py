@@ -164,7 +164,10 @@ def take(driver: SpiBridgeDriver, bridge: ScriptedBridge) -> list[TactileReading
     """All readings of what the bridge has sent; returns early when the driver gives up."""
     readings: list[TactileReading] = []
     deadline = time.monotonic() + PATIENCE_S
-    while driver.counters.bytes < bridge.sent_bytes and driver.link_state is not LinkState.WAITING:
+    while (
+        driver.counters.bytes < bridge.sent_bytes
+        and driver.conversation.link.state is not LinkState.WAITING
+    ):
         assert time.monotonic() < deadline, f"{driver.counters} of {bridge.sent_bytes} bytes"
         descriptor = driver.fileno()
         assert descriptor is not None
@@ -221,7 +224,7 @@ def replug_times_s(
     for _ in range(times):
         twin.unplug()
         plug_s = time.monotonic() + rng.uniform(0.0, 0.3)
-        while driver.link_state is not LinkState.WAITING or time.monotonic() < plug_s:
+        while driver.conversation.link.state is not LinkState.WAITING or time.monotonic() < plug_s:
             driver.read_ready()
             time.sleep(0.001)
         twin.plug()

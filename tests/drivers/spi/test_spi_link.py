@@ -53,7 +53,7 @@ def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:
     said = rig.greet()
     assert [type(message) for message in said] == [Stop, Ping]
     assert [type(message) for message in rig.bridge.heard(Start)] == [Start]
-    assert rig.driver.link_state is LinkState.GREETING
+    assert rig.driver.conversation.link.state is LinkState.GREETING
     assert rig.driver.conversation.hello is not None
     assert rig.driver.conversation.hello.board == "b"
     assert rig.driver.period_ns == 10 * MS
@@ -71,7 +71,7 @@ def test_closing_tells_the_bridge_to_stop(rig: Rig) -> None:
     rig.bridge.heard(Start)
     rig.driver.close()
     assert [type(message) for message in rig.bridge.heard(Stop)] == [Stop]
-    assert rig.driver.link_state is LinkState.CLOSED
+    assert rig.driver.conversation.link.state is LinkState.CLOSED
 
 
 REFUSALS = [
@@ -96,7 +96,7 @@ def test_a_bridge_of_another_version_is_refused_in_one_line(
         rig.bridge.send(answer, encode(sweep(0, 0)))
         assert take(rig.driver, rig.bridge) == []
     assert rig.driver.conversation.link.reason == f"{rig.bridge.port}: {why}"
-    assert rig.driver.link_state is LinkState.WAITING
+    assert rig.driver.conversation.link.state is LinkState.WAITING
     assert rig.driver.counters.refused_bridges == 1
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert rig.bridge.says_nothing_more(), "not even START"
@@ -109,7 +109,7 @@ def test_sweeps_that_waited_while_the_host_slept_are_no_silence(rig: Rig) -> Non
     rig.clock.now_ns += 500 * MS
     readings = take(rig.driver, rig.bridge)
     assert len(readings) == 50
-    assert rig.driver.link_state is LinkState.UP
+    assert rig.driver.conversation.link.state is LinkState.UP
     # The first is half a second old and the times between them are those of the bridge.
     ages_ms = [(rig.clock.now_ns - reading.t_ns) / MS for reading in readings]
     assert ages_ms[0] == pytest.approx(498, abs=0.5)
@@ -120,7 +120,7 @@ def test_a_port_that_another_program_has_is_said(rig: Rig) -> None:
     rig.greet()
     with SpiBridgeDriver(rig.bridge.port, FINGERS) as second:
         assert second.conversation.link.reason == f"{rig.bridge.port}: another program has it open"
-    assert rig.driver.link_state is LinkState.GREETING
+    assert rig.driver.conversation.link.state is LinkState.GREETING
 
 
 def test_unplugging_is_noticed_at_once(rig: Rig) -> None:
@@ -129,7 +129,7 @@ def test_unplugging_is_noticed_at_once(rig: Rig) -> None:
     take(rig.driver, rig.bridge)
     rig.bridge.unplug()
     assert rig.driver.read_ready() == ()
-    assert rig.driver.link_state is LinkState.WAITING
+    assert rig.driver.conversation.link.state is LinkState.WAITING
     assert rig.driver.conversation.link.reason == f"{rig.bridge.port}: the device went away"
     assert rig.driver.counters.link_losses == 1
 
@@ -138,7 +138,7 @@ def test_a_port_without_descriptor_is_polled(rig: Rig) -> None:
     clock = Clock()
     with SpiBridgeDriver("loop://", FINGERS, clock=clock) as driver:
         assert driver.fileno() is None
-        assert driver.link_state is LinkState.GREETING
+        assert driver.conversation.link.state is LinkState.GREETING
         clock.now_ns += 5 * MS
         assert driver.read_ready() == []
         assert driver.due_ns() == clock.now_ns + 2 * MS
@@ -156,10 +156,10 @@ def test_a_socket_has_a_descriptor_and_its_end_is_a_lost_link() -> None:
                 assert driver.fileno() is not None
                 assert len(peer.recv(1)) == 1
             for _ in range(100):
-                if driver.link_state is LinkState.WAITING:
+                if driver.conversation.link.state is LinkState.WAITING:
                     break
                 driver.read_ready()
-            assert driver.link_state is LinkState.WAITING
+            assert driver.conversation.link.state is LinkState.WAITING
 
 
 def test_a_bridge_that_does_not_read_never_blocks_the_host(rig: Rig) -> None:

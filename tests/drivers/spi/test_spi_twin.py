@@ -18,8 +18,9 @@ from graspd.drivers.spi.messages import DIGEST
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.spi import SpiTwin
-from tests.drivers.spi.bridge_bench import FINGERS, replug_times_s, run
+from tests.drivers.spi.bridge_bench import FINGERS, replug_times_s, run, tactile
 from tests.drivers.twins.signals import GeneratedContact
+from tests.kit.clock import Clock
 
 SWEEPS = 600
 REPLUGS = 10
@@ -33,19 +34,20 @@ def generated(sweeps: int = SWEEPS, seed: int = 3) -> list[Counts]:
 def together(
     folder: Path, rows: list[Counts], faults: LinkFaults
 ) -> tuple[SpiTwin, SpiBridgeDriver, list[TactileReading], bytes]:
-    """All rows through twin and driver as fast as they are read, and what was on the wire."""
-    wire = bytearray()
-    twin = SpiTwin(folder / "bridge", rows, rate_hz=None, faults=faults, tap=wire.extend)
-    driver = SpiBridgeDriver(str(folder / "bridge"), FINGERS)
+    """All rows through twin and driver, each when the one before is read, and the wire's bytes."""
+    wire, clock = bytearray(), Clock()
+    readings: list[TactileReading] = []
+    twin = SpiTwin(folder / "bridge", rows, faults=faults, tap=wire.extend, clock=clock)
+    driver = SpiBridgeDriver(str(folder / "bridge"), FINGERS, clock=clock)
     with twin:
         wire.clear()  # what is on the line before it is opened is thrown away
         with driver:
-
-            def done(readings: list[TactileReading]) -> bool:
-                return twin.exhausted and driver.counters.bytes >= len(wire)
-
-            readings = run(twin, driver, done)
-            driver.read_ready()
+            while not twin.exhausted or driver.counters.bytes < len(wire):
+                if driver.counters.bytes >= len(wire):
+                    clock.now_ns += 10_000_000
+                    twin.run_once()
+                readings += tactile(driver.read_ready())
+            readings += tactile(driver.read_ready())
     return twin, driver, readings, bytes(wire)
 
 
