@@ -23,6 +23,7 @@ from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
 
 SWEEPS = 600
+RATE_HZ = 10_000.0
 REPLUGS = 10
 BACK_WITHIN_S = 2.0
 
@@ -37,14 +38,15 @@ def together(
     """All rows through twin and driver, each when the one before is read, and the wire's bytes."""
     wire, clock = bytearray(), Clock()
     readings: list[TactileReading] = []
-    twin = SpiTwin(folder / "bridge", rows, faults=faults, tap=wire.extend, clock=clock)
-    driver = SpiBridgeDriver(str(folder / "bridge"), FINGERS, clock=clock)
+    path = folder / "bridge"
+    twin = SpiTwin(path, rows, rate_hz=RATE_HZ, faults=faults, tap=wire.extend, clock=clock)
+    driver = SpiBridgeDriver(str(path), FINGERS, clock=clock)
     with twin:
         wire.clear()  # what is on the line before it is opened is thrown away
         with driver:
             while not twin.exhausted or driver.counters.bytes < len(wire):
                 if driver.counters.bytes >= len(wire):
-                    clock.now_ns += 10_000_000
+                    clock.now_ns += round(1e9 / RATE_HZ)
                     twin.run_once()
                 readings += tactile(driver.read_ready())
             readings += tactile(driver.read_ready())
