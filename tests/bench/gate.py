@@ -25,10 +25,8 @@ from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import (
-    FreshSampler,
     GraspRow,
-    HeldSampler,
-    Sampling,
+    Sampler,
     WholeGrasps,
     rest_above,
 )
@@ -197,9 +195,7 @@ def streams(
     """The same grasps as a palm's recording has them, and as an SPI bridge reads them."""
     noise = residuals(data / "untouched")
     return {
-        "71.43 Hz held": WholeGrasps(
-            rest, points, sampling=Sampling.HELD, noise=played(noise), seed=seed
-        ),
+        "71.43 Hz held": WholeGrasps(rest, points, held=True, noise=played(noise), seed=seed),
         "100 Hz fresh": WholeGrasps(rest, points, noise=played(noise), seed=seed),
     }
 
@@ -212,7 +208,7 @@ class Closing:
         self._pressed = rng.uniform(0.0, PRESSED_COUNTS, (len(FINGERS), ELECTRODES))
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Course`."""
+        """Counts less the rest, shape (fingers, 24)."""
         share = np.clip((t_s - REST_S) / CLOSES_S, 0.0, 1.0)
         ramp = share**3 * (10.0 + share * (6.0 * share - 15.0))  # minimum jerk
         return self._hold.deviation(t_s) - ramp * self._pressed
@@ -225,7 +221,7 @@ def moments(
     *,
     begins: bool = False,
     slide_spread: float = SLIDE_SPREAD,
-    sampling: Sampling = Sampling.FRESH,
+    late: bool = False,
 ) -> tuple[list[Moment], int]:
     """Return the moments since a hand has closed, and which one is the first with a slide.
 
@@ -237,12 +233,12 @@ def moments(
     begins_s = slide_s if begins else None
     hold = Hold(sliding, rng, closed_s + HOLDS_S, closed_s, begins_s, slide_spread)
     rest = np.full((len(FINGERS), ELECTRODES), REST_COUNTS)
-    sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler
-    sample, course = sampler(rest, HeldNoise(len(FINGERS), rng)).sample, Closing(hold, rng)
+    sampler = Sampler(rest, HeldNoise(len(FINGERS), rng).sweep, held=late)
+    course = Closing(hold, rng)
     hand = HandTracker(FINGERS, HandLimits(gate=GateLimits(false_alarms=false_alarms)))
     felt = []
     for row in range(round(100 * (closed_s + HOLDS_S))):
-        counts = sample(course, row / 100.0)
+        counts = sampler.sample(course.deviation, row / 100.0)
         moment, _ = hand.step(row * 10_000_000, counts, Checked((), None))
         felt.append(moment)
     first = round(100 * closed_s)
@@ -255,25 +251,25 @@ def follow(
     *,
     slides: bool = False,
     begins: bool = False,
-    sampling: Sampling = Sampling.FRESH,
+    late: bool = False,
 ) -> Held:
     """Say what the gate makes of a hand that holds; of one of which three fingers slide from the
     start, or of one along which the object `begins` to slide."""
     sliding = [slides or begins] * len(FINGERS)
-    felt, slides_at = moments(false_alarms, seed, sliding, begins=begins, sampling=sampling)
+    felt, slides_at = moments(false_alarms, seed, sliding, begins=begins, late=late)
     changes = [[change.state for change in moment.changes] for moment in felt]
     settles = sum(GateState.SETTLED in states for states in changes)
     return Held(np.array([moment.settled for moment in felt]), settles, slides_at)
 
 
-def tell(episodes: int, false_alarms: float, sampling: Sampling) -> str:
+def tell(episodes: int, false_alarms: float, late: bool) -> str:
     """One row of the table."""
     seeds = range(episodes)
     return row(
         false_alarms,
-        [follow(false_alarms, seed, sampling=sampling) for seed in seeds],
-        [follow(false_alarms, seed, slides=True, sampling=sampling) for seed in seeds],
-        [follow(false_alarms, seed, begins=True, sampling=sampling) for seed in seeds],
+        [follow(false_alarms, seed, late=late) for seed in seeds],
+        [follow(false_alarms, seed, slides=True, late=late) for seed in seeds],
+        [follow(false_alarms, seed, begins=True, late=late) for seed in seeds],
     )
 
 
@@ -296,7 +292,7 @@ def row(false_alarms: float, holds: list[Held], slides: list[Held], begun: list[
     return " | ".join(cells)
 
 
-def tell_words(episodes: int, false_alarms: float, sampling: Sampling) -> str:
+def tell_words(episodes: int, false_alarms: float, late: bool) -> str:
     """Return a row of the table of the fingers' words."""
 
     def feel(sliding: Sequence[bool]) -> Iterator[tuple[list[Moment], int]]:
@@ -305,7 +301,7 @@ def tell_words(episodes: int, false_alarms: float, sampling: Sampling) -> str:
                 *(false_alarms, seed, sliding),
                 begins=True,
                 slide_spread=0.0,
-                sampling=sampling,
+                late=late,
             )
 
     held = [slides(felt, settled_at(felt)) for felt, _ in feel([False] * len(FINGERS))]
@@ -346,17 +342,17 @@ def main(arguments: Sequence[str]) -> None:
         "false_alarms | hold stands | of the time since it did | settles | verdict comes | first "
         "after, p50 / p99 | slide stands | slides that ever do | revoked, p50 / p90\n"
     )
-    for sampling in Sampling:
+    for late in (False, True):
         for share in shares:
-            sys.stdout.write(f"{sampling} {tell(episodes, share, sampling)}\n")
+            sys.stdout.write(f"{'held' if late else 'fresh'} {tell(episodes, share, late)}\n")
             sys.stdout.flush()
     sys.stdout.write(
         "false_alarms | a finger that holds says `slide` | changes of its word | slide along three "
         "fingers named after, p50 / p90 | along one\n"
     )
-    for sampling in Sampling:
+    for late in (False, True):
         for share in shares:
-            sys.stdout.write(f"{sampling} {tell_words(episodes, share, sampling)}\n")
+            sys.stdout.write(f"{'held' if late else 'fresh'} {tell_words(episodes, share, late)}\n")
             sys.stdout.flush()
 
 

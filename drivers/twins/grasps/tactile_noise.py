@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,13 +17,6 @@ DRIFT_COUNTS_PER_S = 0.7
 """Warm-up drift, counts/s; measured 0.56 to 0.84, always upward."""
 WARM_UP_S = 300.0
 """End of the drift, s, after 210 counts; assumed, because the recordings are shorter."""
-
-
-class TactileNoise(Protocol):
-    """Noise that is added to a sweep."""
-
-    def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return noise, counts, shape (fingers, 24). `t_s`: sample times, shape () or (24,)."""
 
 
 class MeasuredNoise:
@@ -47,6 +38,7 @@ class MeasuredNoise:
         self._spiked = rng.integers(0, ELECTRODES, fingers)
 
     def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return noise, counts, shape (fingers, 24). `t_s`: sample times, shape () or (24,)."""
         noise = self._rng.normal(0.0, NOISE_COUNTS, (self._fingers.size, ELECTRODES))
         drift = DRIFT_COUNTS_PER_S * np.minimum(t_s, WARM_UP_S)
         noise += np.minimum(drift, self._drift_max)

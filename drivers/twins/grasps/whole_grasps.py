@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from itertools import count
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +29,10 @@ from graspd.drivers.twins.grasps.grasp_script import (
     GraspScript,
     Timetable,
 )
-from graspd.drivers.twins.grasps.tactile_noise import MeasuredNoise, TactileNoise
+from graspd.drivers.twins.grasps.tactile_noise import MeasuredNoise
 
+Counting = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Counts over time, shape (fingers, 24), by sample times, s, of shape () or (24,)."""
 RATE_HZ = 100.0
 """Rows per second in the public recordings; sweeps per second of an SPI bridge."""
 PALM_RATE_HZ = 1000 / 14
@@ -69,15 +70,6 @@ LOOPED_DRAWS = 200
 """Number of different synthetic grasps in an endless stream."""
 
 
-class Sampling(StrEnum):
-    """Way in which electrodes are sampled for a row."""
-
-    FRESH = "fresh"
-    """Every electrode is sampled at the time of the row."""
-    HELD = "held"
-    """Rows of 100 Hz with values of 71.43 Hz, as recorded: 2 of 7 rows repeat a pair."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class GraspRow:
     """One row of the stream."""
@@ -103,25 +95,25 @@ class WholeGrasps:
         rest: NDArray[np.float64],
         end_points: Sequence[EndPoint],
         *,
-        sampling: Sampling = Sampling.FRESH,
+        held: bool = False,
         rate_hz: float = RATE_HZ,
-        noise: Callable[[int, np.random.Generator], TactileNoise] | None = None,
+        noise: Callable[[int, np.random.Generator], Counting] | None = None,
         durations: Durations = Durations(),  # noqa: B008 (immutable)
         loop: bool = False,
         seed: int = 0,
     ) -> None:
         """Raises `ValueError` for a wrong rate.
 
-        `rest`: untouched counts, shape (fingers, 24). `noise`: `MeasuredNoise` by default.
-        `loop`: repeat the end points without end.
+        `rest`: untouched counts, shape (fingers, 24). `held`: see `Sampler`. `noise`:
+        `MeasuredNoise` by default. `loop`: repeat the end points without end.
         """
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
-        if sampling is Sampling.HELD and rate_hz != RATE_HZ:
+        if held and rate_hz != RATE_HZ:
             raise ValueError(f"held values come at {RATE_HZ:g} Hz, not {rate_hz}")
         self._rest = rest.astype(np.float64)
         self._end_points = end_points
-        self._sampling = sampling
+        self._held = held
         self._rate_hz = rate_hz
         self._noise = noise or self._measured_noise
         self._durations = durations
@@ -131,9 +123,8 @@ class WholeGrasps:
     def __iter__(self) -> Iterator[GraspRow]:
         noise_seed, joint_seed = np.random.SeedSequence([self._seed, 0]).spawn(2)
         joint_rng = np.random.default_rng(joint_seed)
-        kind = HeldSampler if self._sampling is Sampling.HELD else FreshSampler
         noise = self._noise(len(self._rest), np.random.default_rng(noise_seed))
-        sampler = kind(self._rest, noise)
+        sampler = Sampler(self._rest, noise, held=self._held)
         scripts = self._scripts()
         script = next(scripts)
         for row in count():
@@ -148,7 +139,7 @@ class WholeGrasps:
             has_begun = t_s >= timetable.approach_s
             yield GraspRow(
                 t_s=t_s,
-                counts=sampler.sample(script, t_s),
+                counts=sampler.sample(script.deviation, t_s),
                 joint_names=JOINT_NAMES,
                 position_rad=script.position_rad(t_s) + jitter,
                 grasp=timetable.grasp if has_begun else 0,
@@ -173,57 +164,45 @@ class WholeGrasps:
             yield script
             start_s = script.timetable.end_s
 
-    def _measured_noise(self, fingers: int, rng: np.random.Generator) -> MeasuredNoise:
-        return MeasuredNoise(fingers, rng, np.maximum(WARM_REST_MAX - self._rest, 0.0))
+    def _measured_noise(self, fingers: int, rng: np.random.Generator) -> Counting:
+        return MeasuredNoise(fingers, rng, np.maximum(WARM_REST_MAX - self._rest, 0.0)).sweep
 
 
-class Course(Protocol):
-    """Deviation of a hand's electrodes over time."""
+class Sampler:
+    """Sample a hand row by row, in order of time.
 
-    def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return counts less the rest, shape (fingers, 24). `t_s`: shape () or (24,)."""
+    With `held`, rows of 100 Hz have values of 71.43 Hz, as recorded: 2 of 7 rows repeat a pair. An
+    electrode not sampled yet keeps its old value. Else all are sampled at the time of the row.
+    """
 
-
-class FreshSampler:
-    """Sampler for `Sampling.FRESH`."""
-
-    def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
-        """`rest`: untouched counts, shape (fingers, 24)."""
+    def __init__(self, rest: NDArray[np.float64], noise: Counting, *, held: bool = False) -> None:
+        """`rest`: untouched counts, shape (fingers, 24). `noise`: added to them."""
         self._rest = rest
         self._noise = noise
-
-    def sample(self, course: Course, t_s: float) -> NDArray[np.uint16]:
-        """Return the counts of the row at `t_s`, shape (fingers, 24). Call in order of time."""
-        return self._sweep(course, np.asarray(t_s))
-
-    def _sweep(self, course: Course, t_s: NDArray[np.float64]) -> NDArray[np.uint16]:
-        """Return counts, shape (fingers, 24). `t_s`: sample times, shape () or (24,)."""
-        counts = self._rest + course.deviation(t_s) + self._noise.sweep(t_s)
-        # Counts stay away from 0 and 4095, which would look like broken electrodes.
-        readable = np.minimum(np.maximum(np.rint(counts), 1), COUNT_MAX - 1)
-        return readable.astype(np.uint16)
-
-
-class HeldSampler(FreshSampler):
-    """Sampler for `Sampling.HELD`: an electrode not sampled yet keeps its old value."""
-
-    def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
-        super().__init__(rest, noise)
+        self._held = held
         self._round: int | None = None
         self._present = self._former = np.zeros(rest.shape, dtype=np.uint16)
 
-    def sample(self, course: Course, t_s: float) -> NDArray[np.uint16]:
-        """Return the counts of the row at `t_s`; rows are 10 ms apart."""
+    def sample(self, deviation: Counting, t_s: float) -> NDArray[np.uint16]:
+        """Return the counts of the row at `t_s`. `deviation`: counts less the rest."""
+        if not self._held:
+            return self._sweep(deviation, np.asarray(t_s))
         number, into_ms = divmod(round(t_s * 1000.0), ROUND_MS)
         if self._round is None:
-            self._present = self._begin(course, number - 1)
+            self._present = self._begin(deviation, number - 1)
         if number != self._round:
-            self._former, self._present = self._present, self._begin(course, number)
+            self._former, self._present = self._present, self._begin(deviation, number)
         return np.where(into_ms >= PLACES_MS, self._present, self._former)
 
-    def _begin(self, course: Course, number: int) -> NDArray[np.uint16]:
+    def _begin(self, deviation: Counting, number: int) -> NDArray[np.uint16]:
         self._round = number
-        return self._sweep(course, (number * ROUND_MS + PLACES_MS) / 1000.0)
+        return self._sweep(deviation, (number * ROUND_MS + PLACES_MS) / 1000.0)
+
+    def _sweep(self, deviation: Counting, t_s: NDArray[np.float64]) -> NDArray[np.uint16]:
+        counts = self._rest + deviation(t_s) + self._noise(t_s)
+        # Counts stay away from 0 and 4095, which would look like broken electrodes.
+        readable = np.minimum(np.maximum(np.rint(counts), 1), COUNT_MAX - 1)
+        return readable.astype(np.uint16)
 
 
 def rest_above(
@@ -240,7 +219,7 @@ def rest_above(
 def synthetic_grasps(
     grasps: int = LOOPED_DRAWS,
     *,
-    sampling: Sampling = Sampling.FRESH,
+    held: bool = False,
     rate_hz: float = RATE_HZ,
     durations: Durations = Durations(),  # noqa: B008 (immutable)
     loop: bool = False,
@@ -261,7 +240,7 @@ def synthetic_grasps(
     return WholeGrasps(
         rest,
         end_points,
-        sampling=sampling,
+        held=held,
         rate_hz=rate_hz,
         durations=durations,
         loop=loop,
@@ -282,7 +261,7 @@ def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> Non
 
 def main(path: Path = DEMO_RECORDING, show: Path = SHOW_RECORDING) -> None:
     """Write the recordings of the demo: a short one, and one to watch."""
-    stream = synthetic_grasps(DEMO_GRASPS, sampling=Sampling.HELD, durations=DEMO_DURATIONS)
+    stream = synthetic_grasps(DEMO_GRASPS, held=True, durations=DEMO_DURATIONS)
     watched = synthetic_grasps(SHOW_GRASPS, rate_hz=PALM_RATE_HZ, durations=SHOW_DURATIONS)
     for grasps, file_path, t_decimals in ((stream, path, 2), (watched, show, 3)):
         with file_path.open("w", encoding="utf-8", newline="") as file:

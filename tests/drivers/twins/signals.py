@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from graspd.drivers.twins.grasps.tactile_noise import (
     SPIKE_COUNTS,
     SPIKE_PROBABILITY,
 )
+from graspd.drivers.twins.grasps.whole_grasps import Counting
 
 UNTOUCHED_COUNTS = (2400.0, 3400.0)
 """Range in which untouched electrodes rest, counts."""
@@ -59,24 +61,20 @@ class GeneratedContact:
         return readable
 
 
-class PlayedNoise:
-    """Residuals played in a loop, one row per sweep, from a random start; nothing is added."""
+def played(
+    residuals: NDArray[np.float64],
+) -> Callable[[int, np.random.Generator], Counting]:
+    """The noise of whole grasps: residuals, shape (rows, fingers, 24), in a loop.
 
-    def __init__(self, residuals: NDArray[np.float64], rng: np.random.Generator) -> None:
-        """`residuals`: counts, shape (rows, fingers, 24), at least one row."""
-        self._residuals = residuals
-        self._next = int(rng.integers(len(residuals)))
+    One row per sweep, from a random start; nothing is added.
+    """
 
-    def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `TactileNoise`; the time does not matter."""
-        row: NDArray[np.float64] = self._residuals[self._next]
-        self._next = (self._next + 1) % len(self._residuals)
-        return row
+    def begin(_fingers: int, rng: np.random.Generator) -> Counting:
+        start = int(rng.integers(len(residuals)))
+        rows = itertools.cycle(np.roll(residuals, -start, axis=0))
+        return lambda _t_s: next(rows)
 
-
-def played(residuals: NDArray[np.float64]) -> Callable[[int, np.random.Generator], PlayedNoise]:
-    """The noise of a stream of whole grasps: these residuals, shape (rows, fingers, 24)."""
-    return lambda _fingers, rng: PlayedNoise(residuals, rng)
+    return begin
 
 
 def fresh_residuals(held: NDArray[np.uint16]) -> NDArray[np.float64]:

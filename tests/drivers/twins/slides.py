@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graspd.drivers.base import ELECTRODES
 from graspd.drivers.twins.grasps.grasps import Counts
-from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, FreshSampler, HeldSampler, Sampling
+from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, Sampler
 
 NOISE_COUNTS = (3.0, 4.5)
 """Standard deviation of an electrode, another one for each finger, counts. With the wander,
@@ -116,7 +116,7 @@ class HeldNoise:
         self._last = rng.normal(0.0, self._deviation)
 
     def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `TactileNoise`; the time does not matter."""
+        """The noise of the next sweep, counts; the time does not matter."""
         new = self._rng.normal(0.0, self._deviation)
         noise: NDArray[np.float64] = new + ECHO * self._last
         self._last = new
@@ -131,19 +131,20 @@ def held(
     seconds: float = SECONDS,
     rate_hz: float = RATE_HZ,
     rest_s: float = 0.0,
-    sampling: Sampling = Sampling.FRESH,
+    late: bool = False,
     seed: int = 0,
 ) -> Iterator[tuple[float, Counts]]:
     """Times, s, and counts, shape (fingers, 24), of fingers that hold, or along which it slides.
 
-    Nothing moves for the first `rest_s`. The same seed gives the same stream.
+    Nothing moves for the first `rest_s`. The same seed gives the same stream. `late`: electrodes
+    are sampled as `Sampler` does with `held`.
     """
     rng = np.random.default_rng([seed, 3])
     hold, noise = Hold(sliding, rng, seconds, rest_s), HeldNoise(len(sliding), rng)
-    sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler
-    sample = sampler(np.full((len(sliding), ELECTRODES), LEVEL_COUNTS), noise).sample
+    level = np.full((len(sliding), ELECTRODES), LEVEL_COUNTS)
+    sampler = Sampler(level, noise.sweep, held=late)
     for row in range(math.ceil(seconds * rate_hz)):
-        yield row / rate_hz, sample(hold, row / rate_hz)
+        yield row / rate_hz, sampler.sample(hold.deviation, row / rate_hz)
 
 
 Way = tuple[NDArray[np.float64], NDArray[np.float64]]

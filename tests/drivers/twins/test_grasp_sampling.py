@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.tactile_noise import MeasuredNoise
-from graspd.drivers.twins.grasps.whole_grasps import GraspRow, Sampling, WholeGrasps
+from graspd.drivers.twins.grasps.whole_grasps import GraspRow, WholeGrasps
 from tests.drivers.twins.signals import fresh_residuals, played
 
 REST = np.full((3, 24), 3000.0)
@@ -30,9 +30,9 @@ def counts_of(moments: list[GraspRow]) -> NDArray[np.float64]:
     return np.array([moment.counts for moment in moments], dtype=np.float64)
 
 
-def untouched(sampling: Sampling) -> NDArray[np.float64]:
+def untouched() -> NDArray[np.float64]:
     """A minute of rest, shape (6000, 3, 24)."""
-    grasps = WholeGrasps(REST, [UNPRESSED], sampling=sampling, durations=LONG_REST, seed=3)
+    grasps = WholeGrasps(REST, [UNPRESSED], durations=LONG_REST, seed=3)
     return counts_of(list(itertools.islice(grasps, 6000)))
 
 
@@ -42,7 +42,7 @@ def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_p
         grasps = WholeGrasps(
             np.ones((3, 24)),
             [EndPoint(np.ones((3, 24), dtype=np.uint16), False, "")],
-            sampling=Sampling.HELD,
+            held=True,
             noise=played(numbers),
             seed=seed,
         )
@@ -56,14 +56,14 @@ def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_p
 
 
 def test_fresh_values_repeat_no_more_than_noise_does() -> None:
-    repeats = np.diff(untouched(Sampling.FRESH), axis=0) == 0.0
+    repeats = np.diff(untouched(), axis=0) == 0.0
     # Two whole numbers of sigma 3.5 are equal with a chance of 1 / (2 sqrt(pi) 3.5) = 0.0806.
     assert repeats.mean() == pytest.approx(0.0806, abs=0.003)
     assert not any(repeats[:, :, pair].all(axis=(1, 2)).any() for pair in PAIRS[1:-1])
 
 
 def test_noise_has_the_measured_width_drift_and_spikes() -> None:
-    counts = untouched(Sampling.FRESH)
+    counts = untouched()
     times = np.arange(len(counts)) * 0.01
     slopes = np.polyfit(times, counts.reshape(len(counts), -1), 1)[0]
     assert slopes.mean() == pytest.approx(0.7, abs=0.01)

@@ -13,7 +13,6 @@ from graspd.drivers.twins.grasps import whole_grasps
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.whole_grasps import (
     GraspRow,
-    Sampling,
     WholeGrasps,
     synthetic_grasps,
 )
@@ -81,7 +80,7 @@ def test_held_values_come_at_the_rate_of_recordings_only() -> None:
     with pytest.raises(ValueError, match="must be positive"):
         WholeGrasps(REST, GRASPS, rate_hz=0.0)
     with pytest.raises(ValueError, match="held values come at 100 Hz"):
-        WholeGrasps(REST, GRASPS, sampling=Sampling.HELD, rate_hz=50.0)
+        WholeGrasps(REST, GRASPS, held=True, rate_hz=50.0)
 
 
 def test_a_looped_stream_goes_on_with_other_numbers() -> None:
