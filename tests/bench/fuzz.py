@@ -27,9 +27,7 @@ from typing import Any, Protocol
 
 TARGETS = {
     "framing": "tests.drivers.spi.fuzz_bridge:FRAMING",
-    "messages": "tests.drivers.spi.fuzz_bridge:MESSAGES",
     "palm": "tests.drivers.palm.fuzz_palm:PALM",
-    "joints": "tests.drivers.palm.fuzz_palm:JOINT_STREAM",
 }
 """Name of each parser and where its `Target` is: module and attribute."""
 

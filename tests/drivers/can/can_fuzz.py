@@ -6,10 +6,11 @@ import random
 
 from graspd.drivers.base import TactileReading
 from graspd.drivers.can.decoders import CanDecoder, make_decoder
-from graspd.drivers.can.formats import CanFormat, SweepFrame, encode_sample
+from graspd.drivers.can.formats import CanFormat, SweepFrame
 from graspd.drivers.can.frames import ERROR, FD, REMOTE, CanFrame, unpack_frame
 from graspd.drivers.can.readings import CanCounters
-from tests.drivers.can.can_words import pack_frame, samples, truth, word
+from tests.drivers.can.can_standin import sweep_of_frames
+from tests.drivers.can.can_words import pack_frame, truth, word
 from tests.kit.clock import Clock
 
 SAMPLE_ID = 0x100
@@ -33,10 +34,7 @@ def decoder(
 def sweep_frames(frame_format: CanFormat, sweep: int) -> list[CanFrame]:
     """Undamaged frames of one sweep."""
     if frame_format is CanFormat.SYNTOUCH:
-        return [
-            CanFrame(SAMPLE_ID, encode_sample(channel, words))
-            for channel, words, _ in samples(sweep)
-        ]
+        return sweep_of_frames(sweep)
     return [
         CanFrame(
             SAMPLE_ID + finger,

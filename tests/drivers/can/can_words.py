@@ -16,8 +16,6 @@ from graspd.drivers.can.samples import SampleAssembler
 
 # linux/can.h
 EFF_FLAG, RTR_FLAG, ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
-STANDARD_ID_MAX, EXTENDED_ID_MAX = 0x7FF, 0x1FFFFFFF
-CLASSIC_DATA_MAX, FD_DATA_MAX = 8, 64
 CAN_FRAME, CANFD_FRAME = struct.Struct("=IB3x8s"), struct.Struct("=IBB2x64s")
 
 FINGERS = 3
@@ -82,12 +80,7 @@ def assert_true(reading: TactileReading, sweep: int) -> None:
 
 
 def pack_frame(frame: CanFrame) -> bytes:
-    """The struct that Linux would hand over. Raises `ValueError` for a frame that cannot be."""
-    extended = bool(frame.flags & (EXTENDED | ERROR))
-    if not 0 <= frame.arbitration_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX):
-        raise ValueError(f"arbitration id {frame.arbitration_id:#x} is out of range")
-    if len(frame.data) > (FD_DATA_MAX if frame.flags & FD else CLASSIC_DATA_MAX):
-        raise ValueError(f"{len(frame.data)} bytes of data do not fit into a frame")
+    """The struct that Linux would hand over."""
     word = frame.arbitration_id
     word |= EFF_FLAG if frame.flags & EXTENDED else 0
     word |= RTR_FLAG if frame.flags & REMOTE else 0

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd.drivers.base import Driver, Fact, JointReading, LinkCause
+from graspd.drivers.hand import JOINTS
 from graspd.drivers.joints.driver import JointStreamDriver
 from graspd.drivers.joints.message import (
     JointCounters,
@@ -142,6 +143,22 @@ def test_one_joint_under_two_names_has_no_angle() -> None:
 def test_whatever_is_fed_nothing_is_raised(data: bytes) -> None:
     found, counters = parse(data)
     assert (found is None) == counters.bad_messages
+
+
+@given(
+    st.dictionaries(st.sampled_from(("FFJ3", "rh_THJ5", "elbow")), st.floats() | st.booleans()),
+    st.integers(0, 60),
+    st.binary(max_size=2),
+)
+def test_damage_of_a_message_leaves_no_number_that_is_no_angle(
+    angles: dict[str, float], at: int, damage: bytes
+) -> None:
+    data = json.dumps({"seq": 1, "joints": angles}).encode()
+    found, counters = parse(data[:at] + damage + data[at + len(damage) :])
+    assert (found is None) == counters.bad_messages
+    if found is not None:
+        assert set(found.names) <= JOINTS
+        assert not (np.abs(found.position_rad) > math.radians(200)).any()
 
 
 def test_a_message_is_written_as_it_is_read() -> None:

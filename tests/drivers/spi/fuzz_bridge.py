@@ -1,4 +1,4 @@
-"""The serial bridge's frames and messages as targets of `tests.bench.fuzz`."""
+"""The serial bridge's frames as a target of `tests.bench.fuzz`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from graspd.drivers.spi.messages import (
     Start,
     Stop,
     Sweep,
-    decode,
     encode_frame,
 )
 from tests.bench.fuzz import Target
@@ -75,25 +74,4 @@ FRAMING = Target(
     parser=lambda: FrameParser(DIGEST),
     held_max=ENCODED_MAX_BYTES,
     delimiter=DELIMITER,
-)
-
-
-class _Messages:
-    """Payloads that passed the checksum, for what a faulty bridge may say."""
-
-    held_bytes = 0
-
-    def feed(self, chunk: bytes) -> list[Value]:
-        message = decode(chunk[0], chunk[1:]) if chunk else None
-        return [] if message is None else [(message.TYPE, message.to_bytes())]
-
-
-def _payload(rng: random.Random) -> tuple[bytes, Value]:
-    message = _message(rng)
-    payload = message.to_bytes()
-    return bytes([message.TYPE]) + payload, (message.TYPE, payload)
-
-
-MESSAGES = Target(
-    name="messages", frame=_payload, parser=_Messages, held_max=0, detects_damage=False
 )

@@ -7,17 +7,15 @@ to 150 counts, all downward, drift 0.56 to 0.84 counts/s, pairs unchanged in 2 o
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint
-from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.tactile_noise import MeasuredNoise
 from graspd.drivers.twins.grasps.whole_grasps import GraspRow, WholeGrasps
-from tests.drivers.twins.signals import fresh_residuals, played
+from tests.drivers.twins.signals import played
 
 REST = np.full((3, 24), 3000.0)
 UNPRESSED = EndPoint(REST.astype(np.uint16), False, "nothing")
@@ -93,16 +91,3 @@ def test_no_electrode_drifts_out_of_its_range() -> None:
     assert counts[100:, 0, 2].std() > 2.9
     assert np.median(counts[100:, 0, 2]) == pytest.approx(4045.0, abs=1.0)
     assert np.median(counts[100:, 1]) == pytest.approx(3210.0, abs=1.0)
-
-
-def test_real_residuals_are_as_wide_as_measured_and_hold_no_repeats(bts3_dir: Path) -> None:
-    path = bts3_dir.parent / "untouched" / "untouched.csv"
-    if not path.exists():
-        pytest.skip("no untouched recording beside the real grasps")
-    residuals = fresh_residuals(np.array(list(recorded_counts(path))))
-    sigma = np.median(1.4826 * np.median(np.abs(residuals), axis=0), axis=1)
-    # Robust sigma of FF, MF and TH in the recording; with a level of its own per electrode.
-    np.testing.assert_allclose(sigma, [4.3, 3.0, 2.9], atol=0.5)
-    repeats = np.diff(residuals, axis=0)
-    assert (np.abs(repeats) < 0.01).mean() < 0.13
-    assert not residuals.max() > 10 * sigma.max()
