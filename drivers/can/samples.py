@@ -1,18 +1,8 @@
 """Combine samples into one `TactileReading` per sweep; missing electrodes are flagged.
 
-The real CAN format has no counter. A sample's command byte names its channel. Its sweep follows
-from its place in the known order of the sequence, and from the time between samples:
-
-- An electrode earlier in the order starts a new sweep. There are two exceptions: a copy of a sample
-  that this sweep has (duplicated), and a sample that this sweep has just passed by (reordered, by
-  at most `REORDER_MAX` places).
-- A sample that is later than its place in the order explains starts a new sweep too.
-- A loss of whole sweeps is found by time alone.
-- A loss of an unknown number of samples ends the current sweep.
-
-Damage that names another valid channel is not noticed. A sender that stalls within a sweep looks
-like a loss of whole sweeps. A copy that is more than `REORDER_MAX` electrodes late looks like a new
-sweep. No electrode is shifted or filled from memory; those that a sweep lacks are `MISSING`.
+The format has no counter. A sample's command byte names its channel; its place in the order of the
+sequence and the time between samples tell its sweep. `deploy/can/PROTOCOL.md` says what becomes of
+each loss, copy and delay. No electrode is shifted or filled from memory.
 """
 
 from __future__ import annotations

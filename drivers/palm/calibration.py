@@ -1,16 +1,9 @@
 """A hand's calibration: convert raw Hall values of a palm packet to joint angles.
 
-A calibration file is TOML:
-
-    version = 1
-    hand = "378"                       # for people
-
-    [joints]                           # [raw, degrees], 2 to 64 points, any order
-    FFJ1 = [[3109, 0.0], [2673, 22.5], [1942, 45.0], [1247, 67.5], [649, 90.0]]
-    THJ5 = [[3633, -60.0], [1063, 60.0]]   # raw is the mean of THJ5A and THJ5B; WRJ1 alike
-
-    [coupled]                          # optional; without it THJ1 and THJ2 have no angle
-    THJ1_THJ2 = [[2132, 2294, 0.0, -20.0], ...]   # [raw THJ1, raw THJ2, degrees, degrees]
+A calibration file is TOML, as `deploy/calibration/example_hand.toml`. `[joints]` has points of [raw,
+degrees] for each joint, 2 to 64 in any order; of two sensors, as of THJ5, raw is the mean.
+`[coupled]` has THJ1_THJ2, points of [raw THJ1, raw THJ2, degrees, degrees]; it is optional, but
+without it THJ1 and THJ2 have no angle.
 
 Tables are linear between their points, and go on in a straight line beyond them, as in Shadow's
 driver. The sensors of THJ1 and THJ2 see each other's magnets, so both angles come from both raw

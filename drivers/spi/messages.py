@@ -148,17 +148,18 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Description of the bridge and its sampling; sent after a PING, and once after a reset."""
+    """Description of the bridge and its sampling; sent after a PING, and once after a reset.
+
+    Ticks are those of the bridge's clock, here and in the other messages.
+    """
 
     TYPE: ClassVar[int] = 0x01
 
     nonce: int
     """Nonce of the answered PING; 0 after a reset."""
     tick: int
-    """Ticks of the bridge's clock when it received the PING."""
     tick_hz: int
     period_ticks: int
-    """Nominal ticks from one sweep to the next."""
     serials: tuple[str, ...]
     """Serial number at each chip select; empty where no sensor answered."""
     commands: tuple[int, ...]
@@ -183,7 +184,6 @@ class Hello:
 
     @property
     def period_ns(self) -> int:
-        """Nominal time from one sweep to the next, ns."""
         return self.period_ticks * 1_000_000_000 // self.tick_hz
 
     def is_sound(self) -> bool:
@@ -243,9 +243,7 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
     seq: int
     """Number of the sweep since START, from 0, modulo 2**32."""
     tick_start: int
-    """Ticks of the bridge's clock at the first command."""
     tick_end: int
-    """Ticks of the bridge's clock after the last word."""
     present: int
     """Bit i is set if sensor i answered when the bridge last asked for its serial number."""
     words: NDArray[np.uint16]
@@ -285,11 +283,8 @@ class BridgeStatus:
     tick: int
     sweeps: int
     overruns: int
-    """Sweeps that began late, because the sweep before took longer than the period."""
     tx_dropped: int
-    """Frames dropped because the host did not read in time."""
     rx_errors: int
-    """Frames from the host that were damaged, too long or unknown."""
     spi_errors: tuple[int, ...]
     """Words of bad parity at each chip select, error words included."""
 
