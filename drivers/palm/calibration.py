@@ -1,7 +1,7 @@
 """A hand's calibration: convert raw Hall values of a palm packet to joint angles.
 
-A calibration file is TOML, as `deploy/calibration/example_hand.toml`. `[joints]` has points of [raw,
-degrees] for each joint, 2 to 64 in any order; of two sensors, as of THJ5, raw is the mean.
+A calibration file is TOML, as `deploy/calibration/example_hand.toml`. `[joints]` has points of
+[raw, degrees] for each joint, 2 to 64 in any order; of two sensors, as of THJ5, raw is the mean.
 `[coupled]` has THJ1_THJ2, points of [raw THJ1, raw THJ2, degrees, degrees]; it is optional, but
 without it THJ1 and THJ2 have no angle.
 
