@@ -8,15 +8,15 @@ import signal
 import struct
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.spi.driver import SpiBridgeDriver
+from tests.drivers.spi.bridge_bench import tactile
 from tests.drivers.spi.bridge_c import (
     DIGEST,
     ELECTRODE_COMMANDS,
@@ -111,59 +111,21 @@ def test_a_wrong_option_is_refused(
     assert message in done.stderr
 
 
-Readings = list[TactileReading]
-
-
-def drive(
-    driver: SpiBridgeDriver, enough: Callable[[Readings], bool], timeout_s: float
-) -> Readings:
-    """Serve a driver as the daemon does until its readings are enough."""
-    readings: Readings = []
+def read(port: object, count: int, timeout_s: float = 20.0) -> list[TactileReading]:
+    """The first readings of three fingers, of a driver that is served as the daemon does."""
+    readings: list[TactileReading] = []
     end_s = time.monotonic() + timeout_s
-    while not enough(readings):
-        assert time.monotonic() < end_s, f"{len(readings)} readings, {driver.counters}"
-        due_ns, descriptor = driver.due_ns(), driver.fileno()
-        wait_s = 0.1 if due_ns is None else (due_ns - time.monotonic_ns()) / 1e9
-        descriptors = [] if descriptor is None else [descriptor]
-        select.select(descriptors, [], [], min(max(wait_s, 0.0), 0.1))
-        for reading in driver.read_ready():
-            assert isinstance(reading, TactileReading)
-            readings.append(reading)
-    return readings
-
-
-def read(port: object, count: int, timeout_s: float = 20.0) -> Readings:
-    """The first readings of three fingers."""
     with SpiBridgeDriver(str(port), FINGERS) as driver:
-        readings = drive(driver, lambda readings: len(readings) >= count, timeout_s)
+        while len(readings) < count:
+            assert time.monotonic() < end_s, f"{len(readings)} readings, {driver.counters}"
+            due_ns, descriptor = driver.due_ns(), driver.fileno()
+            wait_s = 0.1 if due_ns is None else (due_ns - time.monotonic_ns()) / 1e9
+            descriptors = [] if descriptor is None else [descriptor]
+            select.select(descriptors, [], [], min(max(wait_s, 0.0), 0.1))
+            readings += tactile(driver.read_ready())
         assert driver.counters.missed_readings == 0
         assert driver.counters.bad_crc + driver.counters.bad_cobs == 0
-        return readings[:count]
-
-
-def write_counts(path: Path, rows: NDArray[np.uint16]) -> Path:
-    path.write_text("".join(" ".join(map(str, row.ravel())) + "\n" for row in rows))
-    return path
-
-
-def check_count_for_count(readings: Readings, rows: NDArray[np.uint16]) -> None:
-    assert [reading.seq for reading in readings] == list(range(len(rows)))
-    assert not np.any([reading.faults for reading in readings])
-    np.testing.assert_array_equal([reading.counts for reading in readings], rows)
-
-
-def test_the_driver_reads_random_counts_count_for_count(
-    start_bridge: StartBridge, tmp_path: Path
-) -> None:
-    rows = np.random.default_rng(7).integers(0, 4096, (300, 3, 24), dtype=np.uint16)
-    file = write_counts(tmp_path / "counts", rows)
-    host = start_bridge("--counts", file, "--period-us", 5000)
-    began_ns = time.monotonic_ns()
-    readings = read(host.path, len(rows))
-    check_count_for_count(readings, rows)
-    t_ns = np.array([reading.t_ns for reading in readings])
-    assert began_ns < t_ns[0] < t_ns[-1] < time.monotonic_ns()
-    assert np.median(np.diff(t_ns)) == pytest.approx(5_000_000, rel=0.01)
+    return readings[:count]
 
 
 def test_the_driver_flags_what_is_wrong_with_a_sensor(start_bridge: StartBridge) -> None:
