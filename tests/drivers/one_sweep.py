@@ -42,6 +42,10 @@ def expect_one_sweep(readings: Iterable[Reading]) -> int:
     return sound
 
 
+def tactile(readings: Iterable[Reading]) -> list[TactileReading]:
+    return [reading for reading in readings if isinstance(reading, TactileReading)]
+
+
 @dataclass(frozen=True)
 class Step:
     """What happens next."""

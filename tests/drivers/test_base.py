@@ -10,15 +10,22 @@ import pytest
 from graspd.drivers.base import (
     ELECTRODES,
     FINGERS,
+    Driver,
     DriverCounters,
     ElectrodeFault,
+    Fact,
+    LinkCause,
     TactileReading,
     sensor_rows,
 )
+from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.joints.driver import JointStreamDriver
 from graspd.drivers.joints.message import JointCounters
+from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.recordings.faults import ReplayCounters
+from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.spi.messages import FrameCounters
 from graspd.drivers.spi.sweeps import BridgeCounters
 from graspd.drivers.udp.driver import DatagramCounters
@@ -91,3 +98,28 @@ def test_a_recorded_reading_was_made_when_it_was_recorded_a_live_one_when_it_cam
     arrays = np.zeros((1, 24), np.uint16), np.zeros((1, 24), np.uint8)
     assert TactileReading(5, 0, *arrays).made_ns == 5
     assert TactileReading(5, 0, *arrays, recorded_ns=0).made_ns == 0
+
+
+@pytest.mark.parametrize(
+    ("driver", "name", "period_ns", "silence_ns"),
+    [
+        (SpiBridgeDriver("/dev/serial/by-id/none", FINGERS), "spi", None, None),
+        (CanBridgeDriver("virtual", "test-closed"), "can", None, None),
+        (PalmDriver("udp://127.0.0.1:0"), "palm", 14_000_000, 140_000_000),
+        (JointStreamDriver("udp://127.0.0.1:0"), "joints", None, 500_000_000),
+    ],
+    ids=["spi", "can", "palm", "joints"],
+)
+def test_a_link_that_is_closed_says_so_and_reads_nothing(
+    driver: Driver, name: str, period_ns: int | None, silence_ns: int | None
+) -> None:
+    assert (driver.name, driver.period_ns, driver.live) == (name, period_ns, True)
+    assert getattr(driver, "silence_ns", None) == silence_ns
+    assert driver.fileno() is driver.due_ns() is None
+    assert not driver.exhausted
+    assert driver.describe()["link"] == Fact("closed", LinkCause.UNKNOWN)
+    assert driver.serials == {}
+    with pytest.raises(RuntimeError, match="not open"):
+        driver.read_ready()
+    driver.close()
+    driver.close()

@@ -18,7 +18,7 @@ from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.palm import PalmTwin
 from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.fault_bench import Fault, Step
-from tests.drivers.palm.palm_stream import tactile
+from tests.drivers.one_sweep import tactile
 
 JOINTS_LOST_FOR = 120
 """Readings at 100 Hz: longer than `joints_lost_ms` of the scene, 1000 ms."""

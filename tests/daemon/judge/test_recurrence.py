@@ -26,7 +26,7 @@ from tests.bench.recurrence import TABLES, UNTOUCHED, again
 from tests.daemon.fakes import FINGERS, MS, Clock
 from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
-from tests.drivers.palm.palm_stream import tactile
+from tests.drivers.one_sweep import tactile
 
 # By the words of `graspd.daemon.judge.health`.
 SWEEPS, EQUAL_MIN, READ_MIN = 128, 20, 12

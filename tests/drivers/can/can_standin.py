@@ -12,7 +12,7 @@ from unittest import mock
 import can
 import pytest
 
-from graspd.drivers.base import Reading, TactileReading
+from graspd.drivers.base import TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.formats import encode_sample
 from graspd.drivers.can.frames import CanFrame
@@ -21,6 +21,7 @@ from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_words import pack_frame, samples
+from tests.drivers.one_sweep import tactile
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
 
@@ -107,11 +108,6 @@ def bridge(where: str, frame_format: str = "syntouch", **options: Any) -> CanBri
         options.setdefault("arbitration_id", SAMPLE_ID)
         options.setdefault("sequence", "electrodes")
     return CanBridgeDriver("virtual", where, format=frame_format, **options)
-
-
-def tactile(readings: Sequence[Reading]) -> list[TactileReading]:
-    assert all(isinstance(reading, TactileReading) for reading in readings)
-    return [reading for reading in readings if isinstance(reading, TactileReading)]
 
 
 def contact(sweeps: int, seed: int = 0) -> list[Counts]:

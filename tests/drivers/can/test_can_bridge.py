@@ -8,7 +8,7 @@ from typing import Any
 import can
 import pytest
 
-from graspd.drivers.base import Driver, DriverError, LinkError, TactileReading
+from graspd.drivers.base import DriverError, LinkError, TactileReading
 from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.formats import CanFormat
@@ -21,9 +21,9 @@ from tests.drivers.can.can_standin import (
     contact,
     message,
     sweep_messages,
-    tactile,
 )
 from tests.drivers.can.can_words import truth
+from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -36,17 +36,6 @@ def assert_same(readings: Sequence[TactileReading], counts: Sequence[Counts]) ->
         assert not reading.faults.any()
         assert (reading.counts == expected).all()
     assert [reading.seq for reading in readings] == list(range(len(readings)))
-
-
-def test_the_bridge_is_a_driver() -> None:
-    driver: Driver = bridge(channel())
-    assert driver.name == "can"
-    assert not driver.exhausted
-    assert driver.fileno() is driver.due_ns() is driver.period_ns is None
-    assert driver.describe()["link"].text == "closed"
-    driver.close()
-    with pytest.raises(RuntimeError, match="not open"):
-        driver.read_ready()
 
 
 @pytest.mark.parametrize("frame_format", FORMATS)

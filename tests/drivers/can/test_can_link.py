@@ -26,9 +26,9 @@ from tests.drivers.can.can_standin import (
     stand_in,
     sweep_messages,
     sweep_of_frames,
-    tactile,
 )
 from tests.drivers.can.can_words import truth
+from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
 FRAMES_PER_DRAIN = 512

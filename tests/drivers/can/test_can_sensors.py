@@ -11,8 +11,9 @@ import pytest
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.formats import encode_sample
-from tests.drivers.can.can_standin import ScriptedBus, bridge, channel, message, stand_in, tactile
+from tests.drivers.can.can_standin import ScriptedBus, bridge, channel, message, stand_in
 from tests.drivers.can.can_words import SLOT_NS, samples, truth
+from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
 ORDER = ("th", "ff", "mf")

@@ -24,9 +24,9 @@ from tests.drivers.can.can_standin import (
     stand_in,
     sweep_messages,
     sweep_of_frames,
-    tactile,
 )
 from tests.drivers.can.can_words import SLOT_NS, truth
+from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000

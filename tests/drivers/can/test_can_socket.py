@@ -25,9 +25,9 @@ from tests.drivers.can.can_standin import (
     contact,
     stand_in,
     sweep_of_frames,
-    tactile,
 )
 from tests.drivers.can.can_words import pack_frame, truth
+from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000

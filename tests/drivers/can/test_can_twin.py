@@ -13,11 +13,8 @@ from graspd.drivers.base import DriverError, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.twins.can import CanTwin
 from graspd.drivers.twins.faults import LinkFaults
-from tests.drivers.can.can_standin import (
-    bridge,
-    channel,
-    tactile,
-)
+from tests.drivers.can.can_standin import bridge, channel
+from tests.drivers.one_sweep import tactile
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
 

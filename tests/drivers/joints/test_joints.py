@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.drivers.base import Driver, Fact, JointReading, LinkCause
+from graspd.drivers.base import JointReading
 from graspd.drivers.hand import JOINTS
 from graspd.drivers.joints.driver import JointStreamDriver
 from graspd.drivers.joints.message import (
@@ -22,7 +22,7 @@ from graspd.drivers.joints.message import (
 from graspd.drivers.link import LinkState
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.joints import JointTwin
-from tests.drivers.palm.palm_stream import MS, DatagramClock, Sender, joints
+from tests.drivers.palm.palm_stream import DatagramClock, Sender, joints
 
 DATAGRAM_BYTES_MAX = 4096
 
@@ -211,21 +211,6 @@ def test_no_joint_turns_further_than_200_degrees(degrees: float, angle: bool) ->
     assert found is not None
     assert math.isnan(found.position_rad[0]) == (not angle)
     assert counters.bad_angles == (not angle)
-
-
-def test_the_joint_stream_is_a_driver() -> None:
-    driver: Driver = JointStreamDriver(LOOPBACK)
-    assert (driver.name, driver.period_ns, driver.exhausted) == ("joints", None, False)
-    assert JointStreamDriver.silence_ns == 500 * MS, "a sender of 10 Hz passes"
-    assert driver.fileno() is driver.due_ns() is None
-    assert driver.describe() == {
-        "source": Fact(LOOPBACK),
-        "link": Fact("closed", LinkCause.UNKNOWN),
-    }
-    with pytest.raises(RuntimeError, match="not open"):
-        driver.read_ready()
-    driver.close()
-    driver.close()
 
 
 def taken(driver: JointStreamDriver, *data: bytes) -> list[JointReading]:

@@ -18,6 +18,7 @@ from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.palm import PalmTwin
 from graspd.drivers.udp.receiver import Datagram, DatagramReceiver
+from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
 FINGERS = ("ff", "mf", "th")
@@ -124,10 +125,6 @@ class Sender:
 
     def __exit__(self, *_: object) -> None:
         self.socket.close()
-
-
-def tactile(readings: Iterable[Reading]) -> list[TactileReading]:
-    return [reading for reading in readings if isinstance(reading, TactileReading)]
 
 
 def joints(readings: Iterable[Reading]) -> list[JointReading]:

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd.drivers.base import Driver
 from graspd.drivers.palm.calibration import CalibrationError
 from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.palm.packet import Palm
 from graspd.drivers.twins.palm import PalmTwin
 from tests.conftest import ROOT
+from tests.drivers.one_sweep import tactile
 from tests.drivers.palm.palm_stream import (
     FINGERS,
     MS,
@@ -29,7 +29,6 @@ from tests.drivers.palm.palm_stream import (
     joints,
     rounds_of,
     rows,
-    tactile,
 )
 
 LOOPBACK = "udp://127.0.0.1:0"
@@ -47,23 +46,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> DatagramClock:
 def driver(clock: DatagramClock) -> Iterator[PalmDriver]:
     with PalmDriver(LOOPBACK, clock=clock) as driver:
         yield driver
-
-
-def test_the_palm_is_a_driver() -> None:
-    driver: Driver = PalmDriver(LOOPBACK)
-    assert driver.name == "palm"
-    assert driver.period_ns == 14 * MS
-    assert PalmDriver.silence_ns == 140 * MS
-    assert driver.fileno() is None
-    assert driver.due_ns() is None
-    assert not driver.exhausted
-    with pytest.raises(RuntimeError, match="not open"):
-        driver.read_ready()
-    driver.close()
-    driver.open()
-    assert driver.fileno() is not None
-    driver.close()
-    driver.close()
 
 
 @pytest.mark.parametrize("palm", list(Palm))

@@ -18,6 +18,7 @@ from graspd.drivers.base import (
     TactileReading,
 )
 from graspd.drivers.recordings.csv_player import ReplayDriver
+from tests.drivers.one_sweep import tactile
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,
@@ -44,10 +45,6 @@ def play(driver: ReplayDriver, clock: Clock | None = None) -> list[Reading]:
                 clock.now_ns = max(clock.now_ns, due_ns)
             readings.extend(driver.read_ready())
     return readings
-
-
-def tactile(readings: list[Reading]) -> list[TactileReading]:
-    return [reading for reading in readings if isinstance(reading, TactileReading)]
 
 
 def times_ms(readings: list[Reading], start_ns: int = START_NS) -> list[float]:

@@ -12,7 +12,8 @@ from graspd.drivers.base import RecordingError
 from graspd.drivers.palm.packet import Palm
 from graspd.drivers.recordings.palm_file import PalmFile
 from graspd.drivers.twins.palm import PalmTwin
-from tests.drivers.palm.palm_stream import MS, datagrams, rows, tactile
+from tests.drivers.one_sweep import tactile
+from tests.drivers.palm.palm_stream import MS, datagrams, rows
 from tests.kit.clock import Clock
 
 

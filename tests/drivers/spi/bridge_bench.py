@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import Reading, TactileReading
+from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.conversation import Conversation
@@ -31,6 +31,7 @@ from graspd.drivers.spi.messages import (
     encode,
 )
 from graspd.drivers.twins.spi import SpiTwin
+from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -154,10 +155,6 @@ def greeted(about: Hello | None = None, sensors: Sequence[str] | None = None) ->
         if conversation.hello is None and conversation.link.state is LinkState.GREETING:
             answer(conversation, about or hello(0))
     return conversation
-
-
-def tactile(readings: Sequence[Reading]) -> list[TactileReading]:
-    return [reading for reading in readings if isinstance(reading, TactileReading)]
 
 
 def take(driver: SpiBridgeDriver, bridge: ScriptedBridge) -> list[TactileReading]:

@@ -16,7 +16,7 @@ import pytest
 
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.spi.driver import SpiBridgeDriver
-from tests.drivers.spi.bridge_bench import tactile
+from tests.drivers.one_sweep import tactile
 from tests.drivers.spi.bridge_c import (
     DIGEST,
     ELECTRODE_COMMANDS,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from graspd.drivers.base import Driver, DriverError
+from graspd.drivers.base import DriverError
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.spi.line import SerialLine
@@ -27,19 +27,6 @@ def rig() -> Iterator[Rig]:
         driver = SpiBridgeDriver(bridge.port, FINGERS, clock=clock)
         yield Rig(bridge, driver, clock)
         driver.close()
-
-
-def test_the_bridge_is_a_driver() -> None:
-    driver: Driver = SpiBridgeDriver("/dev/serial/by-id/none", FINGERS)
-    assert driver.name == "spi"
-    assert driver.fileno() is None
-    assert driver.due_ns() is None
-    assert driver.period_ns is None
-    assert not driver.exhausted
-    with pytest.raises(RuntimeError, match="not open"):
-        driver.read_ready()
-    driver.close()
-    driver.close()
 
 
 def test_a_port_that_can_never_be_is_said_at_once() -> None:

@@ -18,7 +18,8 @@ from graspd.drivers.spi.messages import DIGEST
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.spi import SpiTwin
-from tests.drivers.spi.bridge_bench import FINGERS, replug_times_s, run, tactile
+from tests.drivers.one_sweep import tactile
+from tests.drivers.spi.bridge_bench import FINGERS, replug_times_s, run
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
 
