@@ -99,7 +99,7 @@ class SweepFrameDecoder:
             raise ValueError(f"arbitration_id {base_id:#x}: the fingers' ids are of two kinds")
         self._ticks: dict[int, tuple[int, int]] = {}
         self._counters = counters
-        self.sweeps = FrameAssembler(len(fingers), counters, list(self._rows))
+        self.sweeps = FrameAssembler(list(self._rows), counters)
 
     def push(
         self, frame: CanFrame, t_ns: int, _until_ns: int | None = None

@@ -43,7 +43,7 @@ class SampleAssembler:
         sensors: int,
         sequence: Sequence[int],
         counters: CanCounters,
-        rows: Sequence[int] | None = None,
+        rows: Sequence[int],
     ) -> None:
         """Raises `ValueError` if `sequence`, the channels in order, lacks an electrode.
 
@@ -58,7 +58,7 @@ class SampleAssembler:
         self._position = [sequence.index(channel) / len(sequence) for channel in electrodes]
         self._samples = len(sequence)
         self._sensors = sensors
-        self._rows = np.arange(sensors) if rows is None else np.array(rows, dtype=np.intp)
+        self._rows = np.array(rows, dtype=np.intp)
         self._width = 2 * sensors
         self._period = SweepPeriod()
         self._counters = counters

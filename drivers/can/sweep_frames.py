@@ -33,12 +33,10 @@ class FrameAssembler:
     expected_ns: int | None = None
     """Always None: a sweep has few frames, so resting between them gains nothing."""
 
-    def __init__(
-        self, fingers: int, counters: CanCounters, order: Sequence[int] | None = None
-    ) -> None:
-        """`order`: place of each row's frame in a sweep; None: the row's own number."""
-        self._order = range(fingers) if order is None else order
-        self._fingers = fingers
+    def __init__(self, order: Sequence[int], counters: CanCounters) -> None:
+        """`order`: place of each row's frame in a sweep."""
+        self._order = order
+        self._fingers = fingers = len(order)
         self._all = (1 << fingers) - 1
         self._period = SweepPeriod()
         self._counters = counters

@@ -10,7 +10,6 @@ over the raw counts of ff, mf, th, with the 24 largest principal axes of each.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -60,8 +59,11 @@ class GraspClass:
     components: tuple[Component, ...]
 
 
-GraspModel = Mapping[bool, GraspClass]
-"""Model of each class by its label: False stable, True slip."""
+class GraspModel(msgspec.Struct):
+    """Model of each class."""
+
+    stable: GraspClass
+    slip: GraspClass
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +82,7 @@ def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticG
     counts = np.zeros((grasps, COUNTS), dtype=np.uint16)
     component = np.zeros(grasps, dtype=np.int64)
     for index, label in enumerate(slipped):
-        grasp_class = model[bool(label)]
+        grasp_class = model.slip if label else model.stable
         component[index], counts[index] = _draw_one(grasp_class, rng)
     return SyntheticGrasps(counts, slipped, component)
 
@@ -93,8 +95,8 @@ def draw_day(model: GraspModel, rng: np.random.Generator, grasps: int) -> Synthe
     """
     drawn = draw(model, rng, grasps)
     means = [
-        sum((part.weight * part.mean for part in model[label].components), np.zeros(COUNTS))
-        for label in (False, True)
+        sum((part.weight * part.mean for part in grasp_class.components), np.zeros(COUNTS))
+        for grasp_class in (model.stable, model.slip)
     ]
     offset = DRIFT_TO_STABLE * (means[0] - means[1]) + rng.normal(0.0, DRIFT_COUNTS, COUNTS)
     gain = np.exp(rng.normal(0.0, DRIFT_GAIN, COUNTS))
@@ -117,13 +119,7 @@ def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
 
 def read_model() -> GraspModel:
     """Read the model of real grasps."""
-    model = msgspec.json.decode(MODEL.read_bytes(), type=_ModelFile, dec_hook=_to_array)
-    return {False: model.stable, True: model.slip}
-
-
-class _ModelFile(msgspec.Struct):
-    stable: GraspClass
-    slip: GraspClass
+    return msgspec.json.decode(MODEL.read_bytes(), type=GraspModel, dec_hook=_to_array)
 
 
 def _to_array(_kind: type, numbers: list[float]) -> NDArray[np.float64]:

@@ -42,7 +42,6 @@ PLACES_MS = 1 + np.arange(1, ELECTRODES + 1) // 2
 """Time in a round when each electrode is sampled, ms: PDC/TAC, TDC/E1, E2/E3, ... E24."""
 POSITION_NOISE_RAD = 0.0003
 """Noise (standard deviation) of a joint that stands still, rad."""
-REST_QUANTILE = 0.98
 WARM_REST_MAX = COUNT_MAX - 50
 """Highest count after drift; the end of the range would look like a fault."""
 DEMO_GRASPS = 12
@@ -205,15 +204,13 @@ class Sampler:
         return readable.astype(np.uint16)
 
 
-def rest_above(
-    end_points: NDArray[np.uint16], quantile: float = REST_QUANTILE
-) -> NDArray[np.float64]:
+def rest_above(end_points: NDArray[np.uint16]) -> NDArray[np.float64]:
     """Return a resting level, (fingers, 24), for the grasps of a table, (grasps, fingers, 24).
 
     Contact lowers counts, and in many grasps an electrode is hardly pressed, so the rest is near
     the highest counts. One odd grasp decides a maximum, but not a quantile.
     """
-    return np.asarray(np.quantile(end_points, quantile, axis=0), dtype=np.float64)
+    return np.asarray(np.quantile(end_points, 0.98, axis=0), dtype=np.float64)
 
 
 def synthetic_grasps(

@@ -61,7 +61,7 @@ def samples(sweep: int, sequence: str = "electrodes", start_ns: int = 0) -> list
 
 def assembler(sequence: str = "electrodes") -> tuple[SampleAssembler, CanCounters]:
     counters = CanCounters()
-    return SampleAssembler(FINGERS, SEQUENCES[sequence], counters), counters
+    return SampleAssembler(FINGERS, SEQUENCES[sequence], counters, range(FINGERS)), counters
 
 
 def concatenated(sweeps: Sequence[Sequence[Sample]]) -> list[Sample]:

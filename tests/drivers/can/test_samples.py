@@ -185,7 +185,7 @@ def test_channels_that_the_sequence_lacks_are_counted() -> None:
 )
 def test_a_sequence_must_have_every_electrode_once(sequence: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="exactly once"):
-        SampleAssembler(FINGERS, sequence, CanCounters())
+        SampleAssembler(FINGERS, sequence, CanCounters(), range(FINGERS))
 
 
 def test_the_next_reading_is_expected_when_its_last_electrode_is() -> None:

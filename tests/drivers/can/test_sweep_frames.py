@@ -31,7 +31,7 @@ def push(
 
 def frame_sweeps() -> tuple[FrameAssembler, CanCounters]:
     counters = CanCounters()
-    return FrameAssembler(FINGERS, counters), counters
+    return FrameAssembler(range(FINGERS), counters), counters
 
 
 def whole(
@@ -159,7 +159,7 @@ def test_frames_of_a_sweep_that_come_in_another_order_are_counted() -> None:
     whole(sweeps, 1)
     assert counters.reordered_frames == 1
     counters = CanCounters()
-    sweeps = FrameAssembler(FINGERS, counters, order=(2, 0, 1))  # row 1 comes first
+    sweeps = FrameAssembler((2, 0, 1), counters)  # row 1 comes first
     for row in (1, 2, 0):
         push(sweeps, row, 0)
     assert counters.reordered_frames == 0
