@@ -18,7 +18,7 @@ from typing import Final
 
 import msgspec
 
-from graspd.drivers.base import ELECTRODES, FINGERS
+from graspd.drivers.base import ELECTRODES
 from graspd.drivers.biotac import channel_of, sample_command
 from graspd.drivers.can.frames import CLASSIC_DATA_MAX, FD_DATA_MAX
 
@@ -111,7 +111,7 @@ def parse_sweep(data: bytes) -> SweepFrame | Reject:
     if version != SWEEP_VERSION:
         return Reject.VERSION
     (status,) = _SWEEP_STATUS.unpack_from(data, _STATUS_AT)
-    if finger >= len(FINGERS) or status & ~_STATUS_BITS or data[_RESERVED_AT:] != _RESERVED:
+    if status & ~_STATUS_BITS or data[_RESERVED_AT:] != _RESERVED:
         return Reject.CONTENT
     return SweepFrame(finger, sequence, tick_us, data[_SWEEP_HEAD.size : _STATUS_AT], status)
 

@@ -34,28 +34,33 @@ def test_every_dropped_sample_frame_is_counted_by_its_reason(frame: CanFrame, co
     assert sum(counters.as_dict().values()) == 1
 
 
+def changed(at: int, value: int) -> bytes:
+    return SWEEP_EXAMPLE[:at] + bytes((value,)) + SWEEP_EXAMPLE[at + 1 :]
+
+
 @pytest.mark.parametrize(
-    ("identifier", "changed", "flags", "counter"),
+    ("frame", "counter"),
     [
-        (0x104, {}, FD, "accepted_frames"),
-        (0x105, {}, FD, "foreign_frames"),
-        (0x102, {}, FD, "foreign_frames"),  # rf, which this scene does not have
-        (0x104, {}, FD | EXTENDED, "foreign_frames"),
-        (0x100, {}, FD, "malformed_frames"),  # the id of ff, the data of th
-        (0x104, {1: 2}, FD, "malformed_frames"),
-        (0x104, {}, 0, "malformed_frames"),
-        (0x104, {0: 2}, FD, "unknown_versions"),
-        (0x104, {63: 1}, FD, "malformed_frames"),
+        (CanFrame(0x104, SWEEP_EXAMPLE, FD), "accepted_frames"),
+        (CanFrame(0x105, SWEEP_EXAMPLE, FD), "foreign_frames"),
+        (CanFrame(0x102, SWEEP_EXAMPLE, FD), "foreign_frames"),  # rf, which the scene lacks
+        (CanFrame(0x104, SWEEP_EXAMPLE, FD | EXTENDED), "foreign_frames"),
+        (CanFrame(0x100, SWEEP_EXAMPLE, FD), "malformed_frames"),  # the id of ff, the data of th
+        (CanFrame(0x104, SWEEP_EXAMPLE), "malformed_frames"),
+        *((CanFrame(0x104, changed(0, it), FD), "unknown_versions") for it in (0, 2)),
+        *(
+            (CanFrame(0x104, changed(at, value), FD), "malformed_frames")
+            for at, value in ((1, 2), (1, 5), (56, 8), (57, 1), (58, 1), (63, 1), (63, 0x80))
+        ),
+        *(
+            (CanFrame(0x104, SWEEP_EXAMPLE[:length], FD), "wrong_length_frames")
+            for length in (0, 1, 8, 48, 63)
+        ),
     ],
 )
-def test_every_dropped_sweep_frame_is_counted_by_its_reason(
-    identifier: int, changed: dict[int, int], flags: int, counter: str
-) -> None:
+def test_every_dropped_sweep_frame_is_counted_by_its_reason(frame: CanFrame, counter: str) -> None:
     made, counters = decoder(CanFormat.SWEEP_FD)
-    data = bytearray(SWEEP_EXAMPLE)
-    for at, value in changed.items():
-        data[at] = value
-    made.push(CanFrame(identifier, bytes(data), flags), 0)
+    made.push(frame, 0)
     assert getattr(counters, counter) == 1
     assert sum(counters.as_dict().values()) == 1
 

@@ -74,29 +74,6 @@ def test_the_protocols_example_of_a_sweep_frame_is_read_and_written() -> None:
     assert sweep.to_bytes() == SWEEP_EXAMPLE
 
 
-@pytest.mark.parametrize(
-    ("at", "value", "reject"),
-    [
-        (0, 0, Reject.VERSION),
-        (0, 2, Reject.VERSION),
-        (1, 5, Reject.CONTENT),
-        (56, 8, Reject.CONTENT),
-        (57, 1, Reject.CONTENT),
-        (58, 1, Reject.CONTENT),
-        (63, 0x80, Reject.CONTENT),
-    ],
-)
-def test_what_is_no_sweep_frame_is_refused(at: int, value: int, reject: Reject) -> None:
-    data = bytearray(SWEEP_EXAMPLE)
-    data[at] = value
-    assert parse_sweep(bytes(data)) == reject
-
-
-@pytest.mark.parametrize("length", [0, 1, 8, 48, 63])
-def test_a_short_sweep_frame_is_refused(length: int) -> None:
-    assert parse_sweep(SWEEP_EXAMPLE[:length]) == Reject.LENGTH
-
-
 @given(
     st.integers(0, 4),
     st.integers(0, 65535),
