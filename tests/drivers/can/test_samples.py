@@ -144,33 +144,6 @@ def test_a_sweep_cut_by_silence_is_not_filled_up_later(known: bool) -> None:
     assert counters.lost_frames == 24
 
 
-@pytest.mark.parametrize(
-    ("spoiled", "fault", "counter"),
-    [
-        ("A52D", ElectrodeFault.ERROR_WORD, "error_words"),
-        ("A558", ElectrodeFault.ERROR_WORD, "error_words"),
-        ("0000", ElectrodeFault.MISSING, "unplugged_words"),
-        ("FFFF", ElectrodeFault.MISSING, "unplugged_words"),
-        ("A250", ElectrodeFault.PARITY, "parity_words"),
-        ("A351", ElectrodeFault.PARITY, "parity_words"),
-        ("A257", ElectrodeFault.PARITY, "parity_words"),
-    ],
-)
-def test_a_bad_word_flags_its_electrode_only(
-    spoiled: str, fault: ElectrodeFault, counter: str
-) -> None:
-    sweeps, counters = assembler()
-    stream = samples(0)
-    channel, words, t_ns = stream[8]
-    stream[8] = (channel, words[:2] + bytes.fromhex(spoiled) + words[4:], t_ns)
-    (reading,) = feed(sweeps, stream)
-    assert reading.faults[1, 8] == fault
-    assert np.count_nonzero(reading.faults) == 1
-    assert reading.counts[1, 8] == 0
-    assert_true(reading, 0)
-    assert getattr(counters, counter) == 1
-
-
 def test_channels_that_the_sequence_lacks_are_counted() -> None:
     sweeps, counters = assembler("electrodes")
     stream = samples(0)

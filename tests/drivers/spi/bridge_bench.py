@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import random
 import select
 import time
 import tty
@@ -210,25 +209,6 @@ def run(
         else:
             time.sleep(0.0002)
     return readings
-
-
-def replug_times_s(
-    twin: SpiTwin, driver: SpiBridgeDriver, times: int, rng: random.Random
-) -> list[float]:
-    """Unplug for up to 0.3 s and plug in again; s from each plugging in to the next reading."""
-    run(twin, driver, lambda readings: len(readings) >= 3)
-    times_s = []
-    for _ in range(times):
-        twin.unplug()
-        plug_s = time.monotonic() + rng.uniform(0.0, 0.3)
-        while driver.conversation.link.state is not LinkState.WAITING or time.monotonic() < plug_s:
-            driver.read_ready()
-            time.sleep(0.001)
-        twin.plug()
-        plug_s = time.monotonic()
-        run(twin, driver, lambda readings: len(readings) > 0)
-        times_s.append(time.monotonic() - plug_s)
-    return times_s
 
 
 def is_readable(driver: SpiBridgeDriver) -> bool:

@@ -14,8 +14,7 @@ from graspd.drivers.biotac import (
     SEQUENCE_INTERLEAVED,
     TDC,
 )
-from graspd.drivers.spi.conversation import Conversation
-from tests.drivers.spi.bridge_bench import FINGERS, T0, greeted, hear, hello, sweep, words
+from tests.drivers.spi.bridge_bench import T0, greeted, hear, hello, sweep, words
 
 
 @pytest.mark.parametrize("channels", [SEQUENCE_ELECTRODES, SEQUENCE_ALL, SEQUENCE_INTERLEAVED])
@@ -46,12 +45,6 @@ def test_the_order_of_the_wiring_does_not_matter_to_the_reading(
     assert not reading.counts[2].any(), "whatever its words say"
     counters = conversation.counters
     assert (counters.absent_sensors, counters.unplugged_words) == (1, 0)
-
-
-@pytest.mark.parametrize("sensors", [("ff", "mf"), ("ff", "ff", "mf", "th"), ("ff", "mf", "toe")])
-def test_sensors_that_do_not_hold_the_fingers_are_refused(sensors: tuple[str, ...]) -> None:
-    with pytest.raises(ValueError, match="fingers"):
-        Conversation("port", FINGERS, sensors)
 
 
 def test_electrodes_that_are_not_in_the_sequence_are_missing() -> None:
