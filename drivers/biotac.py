@@ -42,18 +42,17 @@ Without the check of parity they would be counts of 2629 to 2635.
 UNPLUGGED_WORDS = (0x0000, 0xFFFF)
 """Words of a line that no sensor drives: all zeros or all ones, both of even parity."""
 
-SEQUENCE_ELECTRODES = tuple(range(E1, E24 + 1))
-SEQUENCE_ALL = CHANNELS
-SEQUENCE_INTERLEAVED = tuple(
-    channel for other in (*SEQUENCE_ELECTRODES, PDC, TAC, TDC) for channel in (other, PAC)
-)
-"""The default: every other sample is PAC, 54 samples (manual table 12, order of the C library)."""
 SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
-    "electrodes": SEQUENCE_ELECTRODES,
-    "all": SEQUENCE_ALL,
-    "interleaved": SEQUENCE_INTERLEAVED,
+    "electrodes": CHANNELS[4:],
+    "all": CHANNELS,
+    "interleaved": tuple(
+        channel for other in (*CHANNELS[4:], PDC, TAC, TDC) for channel in (other, PAC)
+    ),
 }
-"""Sampling sequences of manual table 12 by the name that a scene gives them."""
+"""Sampling sequences of manual table 12 by the name that a scene gives them.
+
+`interleaved` is the default: every other of 54 samples is PAC (order of the C library).
+"""
 
 
 def sample_command(channel: int) -> int:

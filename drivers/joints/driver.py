@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from graspd.drivers.joints.message import DATAGRAM_BYTES_MAX, JointCounters, JointStream
+from graspd.drivers.joints.message import DATAGRAM_BYTES_MAX, JointStream
 from graspd.drivers.udp.driver import DatagramDriver
 
 
@@ -17,7 +17,3 @@ class JointStreamDriver(DatagramDriver[JointStream]):
 
     def _new_stream(self) -> JointStream:
         return JointStream()
-
-    @property
-    def counters(self) -> JointCounters:
-        return self.stream.counters

@@ -9,7 +9,7 @@ from typing import Final
 
 from graspd.drivers.base import Reading
 from graspd.drivers.link import LinkState, longest_silence_ns
-from graspd.drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
+from graspd.drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX
 from graspd.drivers.palm.stream import ROUND_NS, PalmStream
 from graspd.drivers.udp.driver import DatagramDriver
 
@@ -46,10 +46,6 @@ class PalmDriver(DatagramDriver[PalmStream]):
         return PalmStream(
             self._fingers, calibration=self._calibration, heed_finger_bits=self._heed_finger_bits
         )
-
-    @property
-    def counters(self) -> PalmCounters:
-        return self.stream.counters
 
     @property
     def serials(self) -> dict[str, str]:

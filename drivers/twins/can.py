@@ -11,16 +11,7 @@ from typing import Any, Final
 import can
 
 from graspd.drivers.base import FINGERS, Opened
-from graspd.drivers.biotac import (
-    E1,
-    PAC,
-    PDC,
-    SEQUENCE_ELECTRODES,
-    SEQUENCES,
-    TAC,
-    TDC,
-    encode_word,
-)
+from graspd.drivers.biotac import E1, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
 from graspd.drivers.can.bus import open_bus
 from graspd.drivers.can.formats import (
     SWEEP_BASE_ID,
@@ -170,7 +161,7 @@ class CanTwin(Opened):
         tick_us = self._stuck_tick_us if self._faults.stuck_clock else self._tick_us()
         frames = []
         for row, finger in enumerate(self._fingers):
-            words = [self._word(row, channel, counts) for channel in SEQUENCE_ELECTRODES]
+            words = [self._word(row, channel, counts) for channel in SEQUENCES["electrodes"]]
             sweep = SweepFrame(finger, self._sweep % (1 << 16), tick_us, b"".join(words))
             data = sweep.to_bytes()
             if self._faults.wrong_version:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.drivers.base import Opened
-from graspd.drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_command
+from graspd.drivers.biotac import E1, E24, SEQUENCES, encode_word, sample_command
 from graspd.drivers.spi.messages import (
     DELIMITER,
     DIGEST,
@@ -70,7 +70,7 @@ class SpiTwin(Opened):
         source: Iterable[Counts],
         *,
         rate_hz: float = 100.0,
-        channels: Sequence[int] = SEQUENCE_ELECTRODES,
+        channels: Sequence[int] = SEQUENCES["electrodes"],
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,

@@ -99,6 +99,10 @@ class DatagramDriver(Opened, Generic[Stream]):
         self._pauses = False
 
     @property
+    def counters(self) -> DatagramCounters:
+        return self.stream.counters
+
+    @property
     def port(self) -> int | None:
         return None if self._receiver is None else self._receiver.port
 

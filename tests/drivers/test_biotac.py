@@ -13,9 +13,7 @@ from graspd.drivers.biotac import (
     FORBIDDEN_COMMAND,
     PAC,
     PDC,
-    SEQUENCE_ALL,
-    SEQUENCE_ELECTRODES,
-    SEQUENCE_INTERLEAVED,
+    SEQUENCES,
     TAC,
     TDC,
     channel_of,
@@ -128,9 +126,9 @@ def test_words_keep_their_shape() -> None:
 
 def test_sequences_are_those_of_the_manual() -> None:
     electrodes = list(range(17, 41))
-    assert list(SEQUENCE_ELECTRODES) == electrodes
-    assert sorted(SEQUENCE_ALL) == [0, 1, 2, 3, *electrodes]
-    lengths = (SEQUENCE_INTERLEAVED, SEQUENCE_ALL, SEQUENCE_ELECTRODES)
+    assert list(SEQUENCES["electrodes"]) == electrodes
+    assert sorted(SEQUENCES["all"]) == [0, 1, 2, 3, *electrodes]
+    lengths = (SEQUENCES["interleaved"], SEQUENCES["all"], SEQUENCES["electrodes"])
     assert [len(sequence) for sequence in lengths] == [54, 28, 24]
-    assert set(SEQUENCE_INTERLEAVED[1::2]) == {PAC}
-    assert list(SEQUENCE_INTERLEAVED[::2]) == [*electrodes, PDC, TAC, TDC]
+    assert set(SEQUENCES["interleaved"][1::2]) == {PAC}
+    assert list(SEQUENCES["interleaved"][::2]) == [*electrodes, PDC, TAC, TDC]

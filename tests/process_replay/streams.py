@@ -12,7 +12,7 @@ from typing import BinaryIO, Final
 import numpy as np
 
 from graspd.drivers.base import Reading
-from graspd.drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
+from graspd.drivers.biotac import SEQUENCES, encode_word, sample_command
 from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.can.frames import FD, CanFrame
 from graspd.drivers.can.stream import CanStream
@@ -178,7 +178,7 @@ def _hello(nonce: int, now_ns: int) -> Hello:
         tick_hz=1_000_000,
         period_ticks=PERIOD_NS // 1000,
         serials=tuple(f"BTSP-{finger}" for finger in WIRED),
-        commands=tuple(sample_command(channel) for channel in SEQUENCE_ELECTRODES),
+        commands=tuple(sample_command(channel) for channel in SEQUENCES["electrodes"]),
         board="replayed",
     )
 

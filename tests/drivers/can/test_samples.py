@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from graspd.drivers.base import ElectrodeFault, TactileReading
-from graspd.drivers.biotac import PAC, PDC, SEQUENCE_ELECTRODES, SEQUENCES
+from graspd.drivers.biotac import PAC, PDC, SEQUENCES
 from graspd.drivers.can.readings import CanCounters
 from graspd.drivers.can.samples import SampleAssembler
 from tests.drivers.can.can_words import (
@@ -154,7 +154,7 @@ def test_channels_that_the_sequence_lacks_are_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    "sequence", [(PAC, PDC), SEQUENCE_ELECTRODES[1:], (*SEQUENCE_ELECTRODES, 17)]
+    "sequence", [(PAC, PDC), SEQUENCES["electrodes"][1:], (*SEQUENCES["electrodes"], 17)]
 )
 def test_a_sequence_must_have_every_electrode_once(sequence: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="exactly once"):

@@ -223,8 +223,8 @@ def test_each_message_is_a_reading_and_a_gap_is_a_loss(driver: JointStreamDriver
     readings = taken(driver, *(message(seq, FFJ3=seq / 100) for seq in (3, 4, 7, 8)))
     assert [reading.seq for reading in readings] == [0, 1, 4, 5]
     assert [reading.position_rad[0] for reading in readings] == [0.03, 0.04, 0.07, 0.08]
-    assert driver.counters.readings == 4
-    assert driver.counters.missed_readings == 2
+    assert driver.stream.counters.readings == 4
+    assert driver.stream.counters.missed_readings == 2
 
 
 @pytest.mark.parametrize("by", ["seq", "t_s"])
@@ -232,7 +232,7 @@ def test_late_and_doubled_messages_are_dropped(driver: JointStreamDriver, by: st
     stream = [message(**{by: number}, FFJ3=number / 100) for number in (1, 2, 2, 4, 3, 5)]
     angles = [reading.position_rad[0] for reading in taken(driver, *stream)]
     assert angles == [0.01, 0.02, 0.04, 0.05]
-    assert driver.counters.old_messages == 2
+    assert driver.stream.counters.old_messages == 2
 
 
 def test_without_number_and_time_every_message_counts(driver: JointStreamDriver) -> None:
@@ -244,13 +244,13 @@ def test_a_sender_that_begins_anew_is_taken_at_its_eleventh_message(
 ) -> None:
     stream = [message(seq) for seq in (*range(500, 510), *range(20))]
     assert len(taken(driver, *stream)) == 10 + 10
-    assert driver.counters.old_messages == 10
-    assert driver.counters.restarts == 1
+    assert driver.stream.counters.old_messages == 10
+    assert driver.stream.counters.restarts == 1
 
 
 def test_a_sender_that_repeats_itself_is_never_taken(driver: JointStreamDriver) -> None:
     assert len(taken(driver, *[message(5)] * 100)) == 1
-    assert driver.counters.old_messages == 99
+    assert driver.stream.counters.old_messages == 99
 
 
 def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:

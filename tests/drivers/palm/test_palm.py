@@ -96,7 +96,7 @@ def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver) -> None:
             sender.send(one, two)
         readings = tactile(driver.read_ready())
     assert np.array_equal([reading.counts for reading in readings], rows(2))
-    assert driver.counters.other_palms == 2 * ROUND
+    assert driver.stream.counters.other_palms == 2 * ROUND
 
 
 def test_the_loop_is_not_woken_in_the_middle_of_a_round(
@@ -134,9 +134,11 @@ def test_joints_come_at_their_own_rate_with_the_angles_of_the_calibration(
             sender.send(data)
             readings += joints(driver.read_ready())
             clock.now_ns += MS
-        assert len(readings) == driver.counters.joint_readings == pytest.approx(100, abs=1)
-        assert driver.counters.bad_angles == 0
-        assert driver.counters.impossible_angles == 2 * len(readings)  # another hand's raw values
+        assert len(readings) == driver.stream.counters.joint_readings == pytest.approx(100, abs=1)
+        assert driver.stream.counters.bad_angles == 0
+        assert driver.stream.counters.impossible_angles == 2 * len(
+            readings
+        )  # another hand's raw values
     assert [reading.seq for reading in readings] == list(range(len(readings)))
     angles = dict(zip(readings[0].names, readings[0].position_rad, strict=True))
     # Raw 1303 of the snapshot, by hand from the table of hand 378, noise of one count.
@@ -152,7 +154,7 @@ def test_a_raw_value_that_is_no_count_gives_no_angle_and_is_counted() -> None:
         sender.send(broken.to_bytes())
         (reading,) = joints(driver.read_ready())
         assert np.isnan(reading.position_rad[reading.names.index("FFJ1")])
-        assert driver.counters.bad_angles == 1
+        assert driver.stream.counters.bad_angles == 1
 
 
 def test_a_wrong_calibration_keeps_the_driver_from_opening(tmp_path: Path) -> None:

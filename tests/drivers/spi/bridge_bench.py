@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.drivers.base import TactileReading
-from graspd.drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
+from graspd.drivers.biotac import SEQUENCES, encode_word, sample_command
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.conversation import Conversation
 from graspd.drivers.spi.driver import SpiBridgeDriver
@@ -89,7 +89,7 @@ def hello(
     nonce: int,
     tick: int = 0,
     *,
-    channels: Sequence[int] = SEQUENCE_ELECTRODES,
+    channels: Sequence[int] = SEQUENCES["electrodes"],
     sensors: int = 3,
     period_ms: int = 10,
 ) -> Hello:

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from graspd.drivers.base import DeviceFault, Fact, LinkCause
-from graspd.drivers.biotac import SEQUENCE_ALL
+from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.conversation import Conversation
 from graspd.drivers.spi.messages import (
@@ -124,7 +124,7 @@ def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again() -> None:
 
 def test_a_bridge_that_changes_its_sampling_is_greeted_again() -> None:
     conversation = greeted()
-    answer(conversation, hello(0, channels=SEQUENCE_ALL), T0 + 50 * MS)
+    answer(conversation, hello(0, channels=SEQUENCES["all"]), T0 + 50 * MS)
     assert conversation.link.reason == "the bridge changed what it samples"
 
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from graspd.drivers.biotac import SEQUENCE_ELECTRODES, sample_command
+from graspd.drivers.biotac import SEQUENCES, sample_command
 from graspd.drivers.spi.messages import (
     DIGEST,
     SCHEMA,
@@ -41,7 +41,7 @@ HELLO = Hello(
     tick_hz=1_000_000,
     period_ticks=10_000,
     serials=("BTSP-0001", "", "BTTB-0003"),
-    commands=tuple(sample_command(channel) for channel in SEQUENCE_ELECTRODES),
+    commands=tuple(sample_command(channel) for channel in SEQUENCES["electrodes"]),
     firmware=0x0102,
     board="bench-7",
 )

@@ -6,18 +6,13 @@ import numpy as np
 import pytest
 
 from graspd.drivers.base import ElectrodeFault
-from graspd.drivers.biotac import (
-    E1,
-    PAC,
-    SEQUENCE_ALL,
-    SEQUENCE_ELECTRODES,
-    SEQUENCE_INTERLEAVED,
-    TDC,
-)
+from graspd.drivers.biotac import E1, PAC, SEQUENCES, TDC
 from tests.drivers.spi.bridge_bench import T0, greeted, hear, hello, sweep, words
 
 
-@pytest.mark.parametrize("channels", [SEQUENCE_ELECTRODES, SEQUENCE_ALL, SEQUENCE_INTERLEAVED])
+@pytest.mark.parametrize(
+    "channels", [SEQUENCES["electrodes"], SEQUENCES["all"], SEQUENCES["interleaved"]]
+)
 def test_a_sweep_becomes_a_reading_by_slot_and_sensor(channels: tuple[int, ...]) -> None:
     conversation = greeted(hello(0, channels=channels))
     read = words(1000, len(channels))
