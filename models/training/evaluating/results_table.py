@@ -59,10 +59,10 @@ def results_table(summaries: Sequence[SystemSummary], made: Made) -> str:
 def _head(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
     yield "# Results"
     yield (
-        "F1 in % with slip as the positive class, unless a column says otherwise. `+-` is the "
-        "standard deviation over the folds (`unknown`: over the trainings), s.e. the standard "
-        "error over the split seeds. A model's card (`graspd models NAME`) has the first seed "
-        "alone."
+        "This page is for those who compare models. Figures are F1 in %, slip positive, unless a "
+        "column says otherwise. `+-` is the standard deviation over the folds (`unknown`: over the "
+        "trainings), s.e. the standard error over the split seeds. A model's card (`graspd models "
+        "NAME`) has the first seed alone."
     )
     if made.quick:
         yield "**Made with `--quick`: hardly trained, on few grasps. The figures mean nothing.**"
@@ -237,10 +237,9 @@ def _day_row(figures: DayFigures) -> list[str]:
 def _differences(by_group: ByGroup) -> Iterator[str]:
     yield "## 5. Differences on the same splits"
     yield (
-        f"F1 of the system less that of `{REFERENCE}`, and less that of the protocol's best, in "
-        "percentage points, with the standard error over all folds of all seeds, corrected for "
-        "trainings that share their grasps (Nadeau and Bengio 2003); in `unknown` over the "
-        "trainings alone."
+        f"F1 less that of `{REFERENCE}`, and less that of the protocol's best, in percentage "
+        "points. The standard error is over all folds of all seeds, corrected for trainings that "
+        "share their grasps (Nadeau and Bengio 2003); in `unknown` it is over the trainings."
     )
     rows = []
     for protocol in PROTOCOLS:
@@ -281,9 +280,9 @@ def _f1_of(summary: SystemSummary, seed: int) -> list[float | None]:
 def _everything(summaries: Sequence[SystemSummary]) -> Iterator[str]:
     yield "## 6. Every figure"
     yield (
-        "Means. Accuracy, precision and recall in %; AUC and expected calibration error (ECE) as "
-        "fractions, probabilities calibrated by a temperature of the other folds; accuracy, %, of "
-        "the 80 % most confident verdicts; seconds of one training."
+        "Means. Accuracy, precision and recall are in %. The expected calibration error (ECE) is "
+        "of probabilities calibrated by a temperature of the other folds. `at 80 %` is the "
+        "accuracy, %, of the 80 % most confident verdicts, `s` the seconds of one training."
     )
     percent, fractions = ("accuracy", "precision", "recall"), ("auc", "ece")
     yield _table(
