@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,27 +25,30 @@ counts or more.
 """
 
 
-class InputBuilder(Protocol):
-    """Builder of one kind of model's input, for one reading or for many."""
+class InputBuilder:
+    """Builder of one kind of model's input: the same arithmetic for one reading and for many."""
 
-    @property
-    def name(self) -> str:
-        """Name of the model's input."""
+    name: str
+    """Name of the model's input."""
+    shape: tuple[int, ...]
+    """Shape of one reading's input."""
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of one reading's input."""
-
-    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> Floats:
         """Write the input of `counts` (fingers, 24) into `out`; return each finger's spread.
 
         A finger with a spread below `SPREAD_FLOOR_COUNTS` must not be judged.
         """
+        out[...], spread = self._values(counts.astype(np.float64))
+        return spread
 
-    def build_batch(
-        self, counts: NDArray[np.generic]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    def build_batch(self, counts: NDArray[np.generic]) -> tuple[NDArray[np.float32], Floats]:
         """Return inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24)."""
+        values, spread = self._values(counts.astype(np.float64))
+        return values.astype(np.float32), spread
+
+    def _values(self, counts: Floats) -> tuple[Floats, Floats]:
+        """Return inputs (..., width) and spreads (..., fingers) of counts (..., fingers, 24)."""
+        raise NotImplementedError
 
 
 def builder(kind: Input, fingers: int) -> InputBuilder:
@@ -81,23 +82,7 @@ def builder(kind: Input, fingers: int) -> InputBuilder:
             return features
 
 
-class _FlatBuilder:
-    """Base of builders with the same arithmetic for one reading and for many."""
-
-    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> Floats:
-        out[...], spread = self._values(counts.astype(np.float64))
-        return spread
-
-    def build_batch(self, counts: NDArray[np.generic]) -> tuple[NDArray[np.float32], Floats]:
-        values, spread = self._values(counts.astype(np.float64))
-        return values.astype(np.float32), spread
-
-    def _values(self, counts: Floats) -> tuple[Floats, Floats]:
-        """Return inputs (..., width) and spreads (..., fingers) of counts (..., fingers, 24)."""
-        raise NotImplementedError
-
-
-class VectorBuilder(_FlatBuilder):
+class VectorBuilder(InputBuilder):
     """Counts as one vector, z-scored over the 24 electrodes of each finger (paper, III-D)."""
 
     name = "tactile_vector"
@@ -110,7 +95,7 @@ class VectorBuilder(_FlatBuilder):
         return features[..., : -2 * spread.shape[-1]], spread
 
 
-class CountsBuilder(_FlatBuilder):
+class CountsBuilder(InputBuilder):
     """Raw counts as one vector."""
 
     name = "tactile_counts"
@@ -122,7 +107,7 @@ class CountsBuilder(_FlatBuilder):
         return counts.reshape(*counts.shape[:-2], -1), _features(counts)[1]
 
 
-class SessionBuilder(_FlatBuilder):
+class SessionBuilder(InputBuilder):
     """Features of a reading, standardised by the values of `use`, then clipped.
 
     The error is the rounding to float32, 6e-8 of the largest magnitude, if no mean is over a

@@ -12,7 +12,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.models.inputs import scale_of
+from graspd.models.inputs import InputBuilder, scale_of
 from graspd.models.layout import D1, ELECTRODES, Layout
 
 
@@ -68,7 +68,7 @@ def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
     return matrix.reshape(height * width, ELECTRODES + 1)
 
 
-class TactileImager:
+class TactileImager(InputBuilder):
     """Build normalised tactile images without allocating an image per reading.
 
     The arithmetic is float64 on integers below 2**12, and the mean is subtracted from each pixel
@@ -144,10 +144,7 @@ class TactileImager:
     def build_batch(
         self, counts: NDArray[np.generic]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return images (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24).
-
-        `build` makes each, so training and daemon have the same bits.
-        """
+        """Return images and spreads, each by `build`: training and daemon have the same bits."""
         images = np.empty((len(counts), *self.shape), dtype=np.float32)
         spreads = np.empty((len(counts), self._planes[2]))
         for index, reading in enumerate(counts):

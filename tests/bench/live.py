@@ -1,7 +1,7 @@
 """A daemon at work, for soaks and benches: real processes and links, only the hardware is a twin.
 
-`python -m tests.bench.live twin PLAN` is the process of a twin, `... listen ENDPOINT N` that of N
-subscribers who do nothing with what they hear.
+`python -m tests.bench.live twin PLAN` is the process of a twin, `... listen ENDPOINT` that of a
+subscriber that does nothing with what it hears.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
@@ -26,7 +26,8 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from graspd.daemon.process.text import markdown_table
+from graspd.daemon.publish.keys import load_pair
+from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.base import FINGERS
 from graspd.drivers.spi.messages import Message, Sweep
 from graspd.drivers.twins.can import CanTwin
@@ -35,6 +36,7 @@ from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.drivers.twins.spi import SpiTwin
+from tests.kit.messages import decode_verdict
 
 PATIENCE_S = 30.0
 """Longest wait for what must come, s."""
@@ -248,18 +250,25 @@ def start_twin(plan: TwinPlan) -> Child:
     return Child(["-m", "tests.bench.live", "twin", msgspec.json.encode(plan).decode()])
 
 
-def start_listeners(endpoint: str, number: int) -> Child:
-    """The process of so many subscribers who do nothing with what they hear; see `listen`."""
-    return Child(["-m", "tests.bench.live", "listen", endpoint, str(number)])
+def start_listener(endpoint: str) -> Child:
+    """The process of a subscriber that does nothing with what it hears; see `listen`."""
+    return Child(["-m", "tests.bench.live", "listen", endpoint])
 
 
 class Subscriber:
     """Hears one daemon or several."""
 
-    def __init__(self, *endpoints: str, topics: Sequence[str] = ("verdict.",)) -> None:
+    def __init__(
+        self, *endpoints: str, topics: Sequence[str] = ("verdict.",), keys: Path | None = None
+    ) -> None:
+        """`keys`: folder of a daemon's key and of its client `friend`'s; None: without keys."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.rcvhwm = 0  # what is lost must be lost elsewhere
+        if keys is not None:
+            own = load_pair(keys / "clients" / "friend.key_secret")
+            self._socket.curve_publickey, self._socket.curve_secretkey = own
+            self._socket.curve_serverkey = load_pair(keys / "daemon.key_secret")[0]
         for topic in topics:
             self._socket.subscribe(topic)
         for endpoint in endpoints:
@@ -282,6 +291,24 @@ class Subscriber:
         self.received_ns = time.monotonic_ns()
         return topic, payload
 
+    def drain(self) -> None:
+        """Drop what has come already."""
+        while self.take(0.0) is not None:
+            pass
+
+    def verdict(self, timeout_s: float) -> Verdict | None:
+        """Return the next verdict; None if none comes in time."""
+        message = self.take(timeout_s)
+        return None if message is None else decode_verdict(message[1])
+
+    def wait_for(self, wanted: Callable[[Verdict], bool]) -> Verdict:
+        """Return the first verdict like that. Raises `TimeoutError`."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while (verdict := self.verdict(deadline_s - time.monotonic())) is not None:
+            if wanted(verdict):
+                return verdict
+        raise TimeoutError("the verdict that was waited for never came")
+
 
 class Numbered(msgspec.Struct):
     """Of a message, its number."""
@@ -289,34 +316,20 @@ class Numbered(msgspec.Struct):
     seq: int
 
 
-def listen(endpoint: str, number: int) -> None:
-    """Hear with so many sockets until SIGTERM.
-
-    Prints a line when all of them hear, and at the end how many messages the first has missed.
-    """
+def listen(endpoint: str) -> None:
+    """Hear until SIGTERM; print a line at the first message, and at the end the number missed."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
     heard: list[int] = []
     decoder = msgspec.json.Decoder(Numbered)
-    with contextlib.ExitStack() as stack:
-        poller = zmq.Poller()
-        context = stack.enter_context(zmq.Context())
-        sockets = [stack.enter_context(context.socket(zmq.SUB)) for _ in range(number)]
-        for one in sockets:
-            one.linger = 0
-            one.subscribe("verdict.")
-            one.connect(endpoint)
-            poller.register(one, zmq.POLLIN)
-        unheard = set(sockets)
+    with Subscriber(endpoint) as subscriber:
         while not stop.is_set():
-            for one, _ in poller.poll(100):
-                payload = one.recv_multipart()[1]
-                if one in unheard:
-                    unheard.remove(one)
-                    if not unheard:
-                        print(HEARING, flush=True)  # noqa: T201
-                if one is sockets[0]:
-                    heard.append(decoder.decode(payload).seq)
+            message = subscriber.take(0.1)
+            if message is None:
+                continue
+            if not heard:
+                print(HEARING, flush=True)  # noqa: T201
+            heard.append(decoder.decode(message[1]).seq)
     missed = np.diff(heard) - 1  # -1: the last message again, for somebody who has just come
     print(int(missed.clip(0).sum()))  # noqa: T201
 
@@ -354,24 +367,16 @@ def end_children_at_sigterm() -> None:
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Markdown; what is not in the first column is right-aligned."""
-    cells = [list(map(str, row)) for row in rows]
-    return "".join(f"{line}\n" for line in markdown_table(head, cells, right=head[1:]))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.live", description=__doc__)
     kinds = parser.add_subparsers(dest="kind", required=True)
     kinds.add_parser("twin").add_argument("plan")
-    listener = kinds.add_parser("listen")
-    listener.add_argument("endpoint")
-    listener.add_argument("number", type=int)
+    kinds.add_parser("listen").add_argument("endpoint")
     given = parser.parse_args()
     if given.kind == "twin":
         serve_twin(msgspec.json.decode(given.plan, type=TwinPlan))
     else:
-        listen(given.endpoint, given.number)
+        listen(given.endpoint)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -32,8 +33,8 @@ from tests.bench.live import (
     start_daemon,
     tactile_section,
 )
-from tests.kit.messages import decode_verdict
 from tests.ports import free_port
+from tests.threads import at_work
 
 JOINTS = ("FFJ3", "MFJ3", "THJ5")
 JOINT_PERIOD_S = 0.01
@@ -45,7 +46,6 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._stop = threading.Event()
         self._deeds: queue.SimpleQueue[tuple[Callable[[], object], threading.Event]] = (
             queue.SimpleQueue()
         )
@@ -53,9 +53,6 @@ class Bench:
         self.joints_flow.set()
         self.twin = SpiTwin(folder / "bridge", held_grasp())
         self._subscriber = Subscriber(f"ipc://{folder}/graspd")
-        self.last: Verdict | None = None
-        self.last_s = 0.0
-        """When the last message came, s."""
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
@@ -64,14 +61,8 @@ class Bench:
             joint_socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             port = free_port(socket.SOCK_DGRAM)
             joint_socket.connect(("127.0.0.1", port))
-            threads = [
-                threading.Thread(target=self.twin.serve, args=(self._ends,)),
-                threading.Thread(target=self._send_joints, args=(joint_socket,)),
-            ]
-            for thread in threads:
-                thread.start()
-                stack.callback(thread.join)
-            stack.callback(self._stop.set)
+            send_joints = partial(self._send_joints, joint_socket)
+            stack.enter_context(at_work(self._serve_twin, send_joints))
             self.daemon: Child = stack.enter_context(start_daemon(self._scene(port)))
             self._stack = stack.pop_all()
         return self
@@ -89,12 +80,15 @@ class Bench:
 
         return ask
 
-    def _ends(self) -> bool:
-        while not self._deeds.empty():
-            deed, done = self._deeds.get()
-            deed()
-            done.set()
-        return self._stop.is_set()
+    def _serve_twin(self, stop: threading.Event) -> None:
+        def is_over() -> bool:
+            while not self._deeds.empty():
+                deed, done = self._deeds.get()
+                deed()
+                done.set()
+            return stop.is_set()
+
+        self.twin.serve(is_over)
 
     def _scene(self, port: int) -> Path:
         path = self._folder / "scene.toml"
@@ -105,9 +99,9 @@ class Bench:
         )
         return path
 
-    def _send_joints(self, joint_socket: socket.socket) -> None:
+    def _send_joints(self, joint_socket: socket.socket, stop: threading.Event) -> None:
         seq, random = 0, np.random.default_rng(1)
-        while not self._stop.wait(JOINT_PERIOD_S):
+        while not stop.wait(JOINT_PERIOD_S):
             if self.joints_flow.is_set():
                 angles = 0.8 + JOINT_NOISE_RAD * random.standard_normal(len(JOINTS))
                 message = JointMessage(seq, None, JOINTS, angles)
@@ -115,25 +109,11 @@ class Bench:
                     joint_socket.send(message.to_bytes())
                 seq += 1
 
-    def take(self, timeout_s: float = PATIENCE_S) -> Verdict | None:
-        """The next verdict; None if none comes in time."""
-        message = self._subscriber.take(timeout_s)
-        if message is None:
-            return None
-        self.last_s = self._subscriber.received_ns / 1e9
-        self.last = decode_verdict(message[1])
-        return self.last
-
-    def wait_for(self, wanted: Callable[[Verdict], bool]) -> Verdict:
-        """The first verdict like that from now on. Raises `TimeoutError`."""
-        while self._subscriber.take(0.0):
-            pass
-        deadline_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline_s:
-            verdict = self.take(deadline_s - time.monotonic())
-            if verdict is not None and wanted(verdict):
-                return verdict
-        raise TimeoutError(f"the last verdict was {self.last}")
+    def wait_for(self, wanted: Callable[[Verdict], bool]) -> float:
+        """Return when the first verdict like that came from now on, s. Raises `TimeoutError`."""
+        self._subscriber.drain()
+        self._subscriber.wait_for(wanted)
+        return self._subscriber.received_ns / 1e9
 
     def until_unknown_s(self, deed: Callable[[], object], reason: Reason) -> float:
         """Do it while a verdict stands; s until one came that is unknown for this reason.
@@ -143,16 +123,19 @@ class Bench:
         self.wait_for(is_valid)
         began_s = time.monotonic()
         deed()
-        self.wait_for(lambda said: said.verdict is Decision.UNKNOWN and reason in said.reasons)
-        return self.last_s - began_s
+        return (
+            self.wait_for(lambda said: said.verdict is Decision.UNKNOWN and reason in said.reasons)
+            - began_s
+        )
 
     def until_silence_s(self, deed: Callable[[], object]) -> float:
         """Do it while a verdict stands; s until a subscriber knows by silence alone."""
-        verdict: Verdict | None = self.wait_for(is_valid)
+        self._subscriber.drain()
+        verdict: Verdict | None = self._subscriber.wait_for(is_valid)
         began_s = time.monotonic()
         deed()
         while verdict is not None:
-            verdict = self.take(verdict.silence_ms / 1e3)
+            verdict = self._subscriber.verdict(verdict.silence_ms / 1e3)
         return time.monotonic() - began_s
 
 
@@ -172,8 +155,7 @@ def outages(bench: Bench) -> Iterator[tuple[str, float]]:
     took_s = bench.until_unknown_s(bench.joints_flow.clear, Reason.JOINTS_LATE)
     yield "joints", took_s
     began_s = time.monotonic()
-    bench.wait_for(is_valid)
-    yield "joints, and judged without them", took_s + bench.last_s - began_s
+    yield "joints, and judged without them", took_s + bench.wait_for(is_valid) - began_s
     bench.joints_flow.set()
     yield "daemon", bench.until_silence_s(bench.daemon.process.kill)
 

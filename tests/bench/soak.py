@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import itertools
-import json
 import random
 import signal
 import sys
@@ -22,12 +21,11 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 
-from graspd.drivers.base import ELECTRODES
+from graspd.daemon.process.text import markdown_table
 from graspd.drivers.twins.faults import LinkFaults
 from tests.bench.live import (
     PATIENCE_S,
@@ -40,9 +38,8 @@ from tests.bench.live import (
     end_children_at_sigterm,
     new_tally,
     start_daemon,
-    start_listeners,
+    start_listener,
     start_twin,
-    table,
     tactile_section,
     usage,
     where_of,
@@ -64,7 +61,7 @@ AWAY_S = (0.1, 2.0)
 """How long a killed twin stays away."""
 STOPPED_S = (1.0, 5.0)
 """How long a subscriber is stopped: less than its queue holds at 100 Hz."""
-DEFAULT_FAULTS: Mapping[Kind, LinkFaults] = {
+FAULTS: Mapping[Kind, LinkFaults] = {
     "spi": LinkFaults(
         bit_flip_probability=0.002,
         drop_probability=0.002,
@@ -89,8 +86,6 @@ class Plan:
     seconds: float
     kind: Kind = "spi"
     rate_hz: float = 100.0
-    faults: LinkFaults | None = None
-    """Of the link; those of `DEFAULT_FAULTS` unless given."""
     seed: int = 0
 
 
@@ -115,7 +110,7 @@ class Soak:
             where=where,
             tally=str(folder / "tally"),
             rate_hz=plan.rate_hz,
-            faults=DEFAULT_FAULTS[plan.kind] if plan.faults is None else plan.faults,
+            faults=FAULTS[plan.kind],
         )
         # The path of a serial bridge alone: on CAN the numbers go on, so that all is counted.
         self._ends_ns = np.zeros(0, dtype=np.int64)
@@ -137,7 +132,7 @@ class Soak:
         with (
             Subscriber(self._endpoint, topics=topics) as self._subscriber,
             start_daemon(self._scene, self._log) as self._daemon,
-            start_listeners(self._endpoint, 2) as self._other,
+            start_listener(self._endpoint) as self._other,
             ExitStack() as self._twins,
         ):
             self._hear(lambda: self._has_begun() or self._has_ended(), PATIENCE_S)
@@ -244,37 +239,19 @@ def soak(plan: Plan) -> Found:
         return Soak(Path(folder), plan).run()
 
 
-def link_faults(text: str) -> LinkFaults:
-    """Of `name=value,...` by the fields of `LinkFaults`; of `dead`, how many electrodes are.
-
-    Raises `ValueError` or `TypeError` for what it does not have.
-    """
-    given: dict[str, Any] = {}
-    for name, _, value in (part.partition("=") for part in text.split(",") if part):
-        given[name] = json.loads(value)
-    dead = given.pop("dead", 0)
-    places = random.Random(0).sample([(f, e) for f in range(3) for e in range(ELECTRODES)], dead)
-    return LinkFaults(dead_electrodes=tuple(places), **given)
-
-
 def main() -> int:
     """Print the table; 1 if a limit is broken."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.soak", description=__doc__)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--rate", type=float, default=100.0, metavar="HZ")
-    parser.add_argument("--link", choices=tuple(DEFAULT_FAULTS), default="spi")
+    parser.add_argument("--link", choices=tuple(FAULTS), default="spi")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--faults",
-        type=link_faults,
-        metavar="NAME=VALUE,...",
-        help="fields of LinkFaults, such as drop_probability=0.01,disconnect_every_frames=500,"
-        "dead=3 (default: a little of each)",
-    )
     given = parser.parse_args()
     end_children_at_sigterm()
-    rows = judge(soak(Plan(given.seconds, given.link, given.rate, given.faults, given.seed)))
-    sys.stdout.write(table(("", "found", "at most"), [row.cells() for row in rows]))
+    rows = judge(soak(Plan(given.seconds, given.link, given.rate, given.seed)))
+    head = ("", "found", "at most")
+    lines = markdown_table(head, [row.cells() for row in rows], right=head[1:])
+    sys.stdout.write("\n".join(lines) + "\n")
     return int(any(row.broken for row in rows))
 
 

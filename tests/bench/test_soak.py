@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from graspd.daemon.judge.reasons import Decision
-from graspd.daemon.publish.messages import State, Status, Verdict, encode
-from graspd.drivers.twins.faults import LinkFaults
+from graspd.daemon.publish.messages import Verdict, encode
 from tests.bench.live import TALLIED, Kind, Usage
-from tests.bench.soak import Plan, link_faults, soak
-from tests.bench.soak_judge import Found, Heard, Row, judge, slope
+from tests.bench.soak import Plan, soak
+from tests.bench.soak_judge import Found, Heard, Row, judge
 from tests.daemon.processes import before_others
 
 SPEED = {"late verdicts", "worst, last byte to subscriber", "time to stop"}
@@ -154,48 +153,6 @@ def test_what_is_wrong_breaks_its_limit_and_no_other(name: str) -> None:
     assert broken(judge(found)) == wrong
 
 
-@pytest.mark.parametrize("losses", [1, 0])
-def test_sweeps_are_explained_that_were_made_while_the_link_was_lost(losses: int) -> None:
-    found = with_driver(readings=MADE - COUNTED - 50, link_losses=losses)
-    found.heard.pauses_ns.append((2_000_000_000, 2_060_000_000))
-    found.heard.pauses_ns.append((1_000_000_000, 1_510_000_000))  # 50 ends between them
-    assert ("unexplained losses" in broken(judge(found))) == (not losses)
-
-
-def test_a_can_sweep_that_was_torn_makes_two_readings_and_one_missed() -> None:
-    torn = {"readings": MADE - COUNTED + 3, "missed_readings": COUNTED + 3, "restarts": 3}
-    assert broken(judge(with_driver(**torn, lost_frames=9, link_losses=0))) == set()
-
-
-@pytest.mark.parametrize("left_out", [3, 2])
-def test_readings_that_the_daemon_left_out_and_counted_are_explained(left_out: int) -> None:
-    status = Status(
-        boot_id="one",
-        seq=0,
-        t=0.0,
-        t_mono_ns=0,
-        state=State.RUNNING,
-        readings_hz=100.0,
-        verdicts={},
-        reasons={},
-        drivers={},
-        latency_us={},
-        skipped_readings=left_out,
-        model="any",
-        model_sha="",
-        versions={},
-    )
-    found = with_heard(readings=MADE - COUNTED - 3, status=status)
-    assert ("unexplained losses" in broken(judge(found))) == (left_out != 3)
-
-
-def test_the_slope_is_that_of_the_line_whatever_a_few_samples_say() -> None:
-    x = np.arange(100.0)
-    y = 3.0 * x + 7.0
-    y[::10] += 1e6
-    assert slope(x, y) == pytest.approx(3.0)
-
-
 def verdict(seq: int, t_ns: int, age_ms: float = 0.0, *, boot: str = "one") -> bytes:
     """The payload of one; an old one says that nothing came."""
     return encode(
@@ -238,15 +195,6 @@ def test_a_subscriber_tells_readings_gaps_pauses_and_restarts_apart() -> None:
     assert (subscriber.late, subscriber.worst_ms) == (2, 11.0)
     assert subscriber.pauses_ns[:2] == [(0, 500 * ms), (510 * ms, 900 * ms)]
     assert subscriber.boots == {"one", "two"}
-
-
-def test_faults_are_given_by_the_names_of_their_fields() -> None:
-    assert link_faults("drop_probability=0.01,disconnect_every_frames=500") == LinkFaults(
-        drop_probability=0.01, disconnect_every_frames=500
-    )
-    assert len(link_faults("dead=3").dead_electrodes) == 3
-    with pytest.raises(TypeError):
-        link_faults("gremlins=1")
 
 
 def test_a_run_that_has_tried_nothing_does_not_pass() -> None:

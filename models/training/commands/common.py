@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from graspd.models.training.data.datasets import DatasetError
+from graspd.models.contract import Dataset
+from graspd.models.training.data.datasets import DatasetError, lab_table_names, unpublished
 from graspd.models.training.data.protocols import TooFewGraspsError
 
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
@@ -53,11 +54,13 @@ def exit_code(
     return EXIT_OK
 
 
-def warn_of_unpublished(command: str, names: Iterable[str]) -> None:
-    """Warn of tables that are not, byte for byte, the published ones."""
-    for name in names:
-        text = f"{name}.csv is not the published table; the figures are of this data only"
-        say(command, f"warning: {text}")
+def warn_of_unpublished(command: str, files: Sequence[Dataset]) -> None:
+    """Warn of tables with a published name that are not, byte for byte, the published ones."""
+    own = lab_table_names(files)
+    for name in unpublished(files):
+        if name not in own:
+            text = f"{name}.csv is not the published table; the figures are of this data only"
+            say(command, f"warning: {text}")
 
 
 def say(command: str, text: str) -> None:
@@ -69,26 +72,13 @@ def say(command: str, text: str) -> None:
 def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
     """Show on stderr, if it is a terminal, how many of `total` trainings are done.
 
-    It yields a function: call it after each training, with the bar's next text. `first`: the first
-    text.
+    Yields a function to call after each training, with the bar's next text.
     """
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import MofNCompleteColumn, Progress
 
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trainings, left"),
-        TimeRemainingColumn(),
-    )
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     hidden = hidden or not console.is_terminal
     with Progress(*columns, console=console, disable=hidden, transient=True) as bar:
         task = bar.add_task(first, total=total)

@@ -9,8 +9,6 @@ from graspd.models.training.commands.common import EXIT_INPUT, exit_code, say, w
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS
 from graspd.models.training.systems.registry import SYSTEMS
 
-MAX_PROCESSES = 1024
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
@@ -51,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--jobs",
-        type=whole(1, MAX_PROCESSES),
+        type=whole(1, 1024),
         default=1,
         metavar="N",
         help="processes on this machine (default: 1)",

@@ -20,13 +20,12 @@ from graspd.models.training.commands.common import (
     say,
     warn_of_unpublished,
 )
-from graspd.models.training.data.datasets import Grasps, lab_table_names, unpublished
-from graspd.models.training.data.lab_tables import read_with_lab_tables
+from graspd.models.training.data.datasets import Grasps, read_with_lab_tables
 from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
 from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
 from graspd.models.training.evaluating.files import to_json, write_whole
 from graspd.models.training.evaluating.jobs import Job, JobResult, jobs_of
-from graspd.models.training.evaluating.results_table import Made, results_table
+from graspd.models.training.evaluating.results_table import results_table
 from graspd.models.training.evaluating.run_jobs import run_jobs
 from graspd.models.training.evaluating.summaries import (
     SystemSummary,
@@ -35,8 +34,7 @@ from graspd.models.training.evaluating.summaries import (
     summarise,
     write_summary,
 )
-from graspd.models.training.making.plan import TrainingPlan
-from graspd.models.training.making.preflight import with_enough_folds
+from graspd.models.training.making.plan import TrainingPlan, with_enough_folds
 from graspd.models.training.systems.registry import SYSTEMS
 from graspd.models.training.systems.system import BlendConfig, System, digest, with_recipes
 
@@ -51,8 +49,7 @@ def evaluate(args: argparse.Namespace) -> None:
     systems = _systems(args.names, grid=args.grid)
     _check_extras(args)
     grasps = read_with_lab_tables(args.data, args.own)
-    own = lab_table_names(grasps.files)
-    warn_of_unpublished("evaluate", (name for name in unpublished(grasps.files) if name not in own))
+    warn_of_unpublished("evaluate", grasps.files)
     if args.quick:
         systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
         chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]
@@ -177,19 +174,16 @@ def _show(summary: SystemSummary, args: argparse.Namespace) -> None:
     if args.grid:
         return
     write_summary(summary, args.out)
-    if not args.json:
-        sys.stdout.write(_line(summary))
-        sys.stdout.flush()
-
-
-def _line(summary: SystemSummary) -> str:
+    if args.json:
+        return
     f1, accuracy = (summary.main.spreads[name] for name in ("f1", "accuracy"))
     error = "" if f1.error is None else f", s.e. {100 * f1.error:.2f} over {f1.seeds} seeds"
-    return (
+    sys.stdout.write(
         f"{summary.system} {summary.protocol} ({summary.headline}): "
         f"F1 {100 * f1.mean:.1f} +- {100 * f1.std:.1f} %{error}; "
         f"accuracy {100 * accuracy.mean:.1f} %, {summary.seconds:.0f} s\n"
     )
+    sys.stdout.flush()
 
 
 def _report(data: str, args: argparse.Namespace) -> None:
@@ -201,9 +195,9 @@ def _report(data: str, args: argparse.Namespace) -> None:
     summaries = read_summaries(args.out, data, digests)
     if args.table:
         command = "graspd " + " ".join(_command(args))
-        made = Made(command, made_with(), quick=args.quick)
+        text = results_table(summaries, command, made_with(), quick=args.quick)
         args.table.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(args.table, results_table(summaries, made).encode())
+        write_whole(args.table, text.encode())
     if args.plots:
         from graspd.models.training.evaluating.plots import draw
 
@@ -242,17 +236,13 @@ def _report_grids(
             points = [one for one in summaries if one.system in names and one.protocol == protocol]
             points.sort(key=lambda one: -one.main.spreads["f1"].mean)
             report = [
-                {
-                    "name": point.system,
-                    "f1": point.main.spreads["f1"],
-                    "accuracy": point.main.spreads["accuracy"],
-                }
+                {"name": point.system}
+                | {name: point.main.spreads[name] for name in ("f1", "accuracy")}
                 for point in points
             ]
             write_whole(args.out / f"{system.name}.{protocol}.grid.json", to_json(report))
             if not args.json:
-                f1 = points[0].main.spreads["f1"]
-                sys.stdout.write(
-                    f"{points[0].system} {protocol}: best of {len(points)}, "
-                    f"F1 {100 * f1.mean:.2f} +- {100 * f1.std:.1f} %\n"
-                )
+                best = points[0]
+                f1 = best.main.spreads["f1"]
+                score = f"F1 {100 * f1.mean:.2f} +- {100 * f1.std:.1f} %"
+                sys.stdout.write(f"{best.system} {protocol}: best of {len(points)}, {score}\n")

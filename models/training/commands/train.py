@@ -19,13 +19,16 @@ from graspd.models.training.commands.common import (
     warn_of_unpublished,
     whole,
 )
-from graspd.models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
-from graspd.models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
+from graspd.models.training.data.datasets import (
+    FEWEST_GRASPS,
+    DatasetError,
+    Grasps,
+    read_with_lab_tables,
+)
 from graspd.models.training.data.protocols import FOLDS, TooFewGraspsError
 from graspd.models.training.systems.registry import SYSTEMS
 
 if TYPE_CHECKING:
-    from graspd.models.training.making.card import Card
     from graspd.models.training.making.plan import TrainingPlan
 
 MAX_SEED = 2**32 - 1
@@ -103,24 +106,28 @@ def run(args: argparse.Namespace) -> int:
         return EXIT_INPUT
     from graspd.models.training.making.export import ExportError
 
-    name = _plan(args).model
-    if args.own and name in zoo.names():
-        say("train", f"graspd ships a model {name!r}: choose another --name")
+    plan = _plan(args)
+    if args.own and plan.model in zoo.names():
+        say("train", f"graspd ships a model {plan.model!r}: choose another --name")
         return EXIT_INPUT
-    out: Path = args.out or Path("runs") / name
-    return exit_code("train", out, lambda: _train(args, out), ExportError)
+    out: Path = args.out or Path("runs") / plan.model
+    return exit_code("train", out, lambda: _train(args, plan, out), ExportError)
 
 
-def _train(args: argparse.Namespace, out: Path) -> None:
+def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
     from graspd.models.training.commands.common import progress_bar
     from graspd.models.training.making.make_model import EXTRA_TRAININGS, make_model
-    from graspd.models.training.making.preflight import limits, preflight, with_enough_folds
+    from graspd.models.training.making.plan import limits, preflight, with_enough_folds
 
     started_s = time.monotonic()
     grasps = read_with_lab_tables(args.data, args.own)
-    plan = _plan(args)
     if args.data is not None:
-        _check_published(plan, grasps, args.data)
+        there = {file.name for file in grasps.files}
+        for table in plan.system.tables:
+            if table not in there:
+                path = args.data / f"{table}.csv"
+                raise DatasetError(path, f"is missing, {plan.system.name} needs it")
+        warn_of_unpublished("train", grasps.files)
     for sentence in limits(plan, grasps):
         say("train", f"warning: {sentence}")
     try:
@@ -134,19 +141,23 @@ def _train(args: argparse.Namespace, out: Path) -> None:
         results = args.results or out / "trainings"
         total = len(plan.jobs(grasps)) + EXTRA_TRAININGS
         with progress_bar(args.model, total, hidden=args.quiet) as on_job:
-            card = make_model(plan, grasps, out, results, lambda: on_job(args.model))
+            contract = make_model(plan, grasps, out, results, lambda: on_job(args.model))
     except TooFewGraspsError as error:
         _propose(plan, grasps)
         raise WrongInputError(f"{error} (see --folds and --only)") from error
     seconds, file = time.monotonic() - started_s, out / f"{plan.model}.onnx"
-    sys.stdout.write(f"{file}: {_figures(card)}, {seconds:.0f} s\n")
+    figures = ", ".join(
+        f"{measured.protocol} F1 {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} %"
+        for measured in contract.measured
+    )
+    sys.stdout.write(f"{file}: {figures}, {seconds:.0f} s\n")
     if plan.lab_files or plan.name:
         say("train", f"for a scene: graspd models add {shlex.quote(str(file))} --name {plan.model}")
 
 
 def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
     """Say with which options these grasps are enough, if there are such."""
-    from graspd.models.training.making.preflight import enough_folds
+    from graspd.models.training.making.plan import enough_folds
 
     for only in (plan.only, "cv"):
         other = dataclasses.replace(plan, only=only, folds=plan.folds + (only != plan.only))
@@ -176,19 +187,3 @@ def _name(text: str) -> str:
             f"{text!r} is no name: up to {own.NAME_MAX} letters, digits, '.', '_' and '-'"
         )
     return text
-
-
-def _check_published(plan: TrainingPlan, grasps: Grasps, folder: Path) -> None:
-    """Raise `DatasetError` if a table is missing; warn of tables that are not the published."""
-    there, lab = {file.name for file in grasps.files}, lab_table_names(grasps.files)
-    for table in plan.system.tables:
-        if table not in there:
-            raise DatasetError(folder / f"{table}.csv", f"is missing, {plan.system.name} needs it")
-    warn_of_unpublished("train", (name for name in unpublished(grasps.files) if name not in lab))
-
-
-def _figures(card: Card) -> str:
-    return ", ".join(
-        f"{measured.protocol} F1 {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} %"
-        for measured in card.contract.measured
-    )

@@ -13,6 +13,7 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 from onnx.compose import add_prefix_graph
+from onnx.parser import parse_node
 from skl2onnx import to_onnx
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.neural_network import MLPClassifier
@@ -22,7 +23,6 @@ from torch import nn
 from graspd.models.contract import OUTPUT_NAME
 from graspd.models.training.arrays import Floats, Floats32, Numbers
 from graspd.models.training.estimators.classical import PROBABILITY_FLOOR, Boosting, ClassicalModel
-from graspd.models.training.estimators.networks import for_inference, for_margin
 
 OPSET = 18
 """Operator set of the exporters; all allowed versions of onnxruntime have it."""
@@ -31,23 +31,7 @@ ML_OPSET = 3
 IR_VERSION = 10
 """Version of the file format; onnxruntime 1.18 reads it."""
 MARGIN_NAME = "margin"
-
-_Steps = Sequence[tuple[str, Sequence[str], str, dict[str, Any]]]
-"""Nodes as (operator, inputs, output, attributes)."""
-
-
-def network_probability(
-    network: nn.Sequential, shape: Sequence[int], temperature: float, input_name: str
-) -> onnx.ModelProto:
-    """Return the graph `softmax(logits / temperature)`, (N, 2), of a network."""
-    return _from_torch(for_inference(network, temperature), shape, input_name, OUTPUT_NAME)
-
-
-def network_margin(
-    network: nn.Sequential, shape: Sequence[int], input_name: str
-) -> onnx.ModelProto:
-    """Return the graph of a network's log-odds of slip, (N, 1)."""
-    return _from_torch(for_margin(network), shape, input_name, MARGIN_NAME)
+FLOAT, DOUBLE = onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
 
 
 def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
@@ -71,13 +55,11 @@ def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> 
         prefix = f"member{index}_"
         graph = add_prefix_graph(part.graph, prefix)
         _feed(graph, prefix + given.name, given.name)
-        nodes += graph.node
-        constants += graph.initializer
-        constants.append(_constant(f"{prefix}factor", np.array(factor, np.float32)))
-        term = f"{prefix}term"
-        nodes.append(helper.make_node("Mul", [prefix + MARGIN_NAME, f"{prefix}factor"], [term]))
+        term, weight = f"{prefix}term", f"{prefix}factor"
+        nodes += [*graph.node, *_nodes(f"{term} = Mul ({prefix}{MARGIN_NAME}, {weight})")]
+        constants += [*graph.initializer, _constant(weight, np.array(factor, np.float32))]
         terms.append(term)
-    nodes.append(helper.make_node("Sum", terms, [MARGIN_NAME]))
+    nodes += _nodes(f"{MARGIN_NAME} = Sum ({', '.join(terms)})")
     return _model(nodes, constants, given, MARGIN_NAME, 1)
 
 
@@ -85,16 +67,14 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
     """Return the graph with `probability` (N, 2) of stable and slip: sigmoid(margin / T)."""
     # softmax(-m / 2T, m / 2T) is 1 - sigmoid(m / T), sigmoid(m / T).
     share = np.array([[-0.5, 0.5]]) / temperature
-    nodes = [
-        *margin.graph.node,
-        helper.make_node("MatMul", [MARGIN_NAME, "half_over_temperature"], ["tempered"]),
-        helper.make_node("Softmax", ["tempered"], [OUTPUT_NAME], axis=1),
-    ]
-    constants = [
-        *margin.graph.initializer,
-        _constant("half_over_temperature", share.astype(np.float32)),
-    ]
-    return _model(nodes, constants, margin.graph.input[0], OUTPUT_NAME, 2)
+    nodes = _nodes(
+        f"tempered = MatMul ({MARGIN_NAME}, half_over_temperature)",
+        f"{OUTPUT_NAME} = Softmax <axis: int = 1> (tempered)",
+    )
+    graph, constant = margin.graph, _constant("half_over_temperature", share.astype(np.float32))
+    return _model(
+        [*graph.node, *nodes], [*graph.initializer, constant], graph.input[0], OUTPUT_NAME, 2
+    )
 
 
 def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onnx.ModelProto:
@@ -102,11 +82,10 @@ def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onn
     graph = model.graph
     given = graph.input[0].name
     _feed(graph, given, "standardised")
-    steps: _Steps = (
-        ("Sub", (given, "input_mean"), "centred", {}),
-        ("Mul", ("centred", "input_scale"), "standardised", {}),
+    steps = _nodes(
+        f"centred = Sub ({given}, input_mean)", "standardised = Mul (centred, input_scale)"
     )
-    nodes = [*_nodes(steps), *graph.node]
+    nodes = [*steps, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)
     graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
@@ -138,21 +117,21 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
         _constant("bias", model.intercept_.astype(np.float64)),
         _constant("axis", np.array([1])),
     ]
-    steps: _Steps = (
-        ("Cast", (input_name,), "x_64", {"to": onnx.TensorProto.DOUBLE}),
-        ("Cast", ("vectors",), "vectors_64", {"to": onnx.TensorProto.DOUBLE}),
-        ("MatMul", ("x_64", "vectors_64"), "products", {}),
-        ("Mul", ("products", "two_gamma"), "both_part", {}),
-        ("ReduceSumSquare", ("x_64", "axis"), "squares", {"keepdims": 1}),
-        ("Mul", ("squares", "minus_gamma"), "x_part", {}),
-        ("Add", ("both_part", "vector_part"), "without_x", {}),
-        ("Add", ("without_x", "x_part"), "exponent", {}),
-        ("Exp", ("exponent",), "kernel", {}),
-        ("MatMul", ("kernel", "weights"), "weighted", {}),
-        ("Add", ("weighted", "bias"), "decision", {}),
-        ("Cast", ("decision",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
+    nodes = _nodes(
+        f"x_64 = Cast <to: int = {DOUBLE}> ({input_name})",
+        f"vectors_64 = Cast <to: int = {DOUBLE}> (vectors)",
+        "products = MatMul (x_64, vectors_64)",
+        "both_part = Mul (products, two_gamma)",
+        "squares = ReduceSumSquare <keepdims: int = 1> (x_64, axis)",
+        "x_part = Mul (squares, minus_gamma)",
+        "without_x = Add (both_part, vector_part)",
+        "exponent = Add (without_x, x_part)",
+        "kernel = Exp (exponent)",
+        "weighted = MatMul (kernel, weights)",
+        "decision = Add (weighted, bias)",
+        f"{MARGIN_NAME} = Cast <to: int = {FLOAT}> (decision)",
     )
-    return _model(_nodes(steps), constants, _vectors(input_name, features), MARGIN_NAME, 1)
+    return _vector_model(nodes, constants, input_name, features)
 
 
 def _boosting(model: Boosting, input_name: str) -> onnx.ModelProto:
@@ -182,7 +161,7 @@ def _boosting(model: Boosting, input_name: str) -> onnx.ModelProto:
         target_ids=[0] * int(leaf.sum()),
         target_weights=nodes["value"][leaf].tolist(),
     )
-    return _model([node], [], _vectors(input_name, model.n_features_in_), MARGIN_NAME, 1)
+    return _vector_model([node], [], input_name, model.n_features_in_)
 
 
 def _float32_below(thresholds: Floats) -> Floats32:
@@ -197,15 +176,15 @@ def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
     number = len(model.estimators_)
     (weights,) = (part for part in trees.attribute if part.name == "class_weights")
     weights.floats[:] = np.array(weights.floats) * number
-    steps: _Steps = (
-        ("Gather", ("probabilities", "slip_column"), "votes", {"axis": 1}),
-        ("Cast", ("votes",), "votes_64", {"to": onnx.TensorProto.DOUBLE}),
-        ("Div", ("votes_64", "trees"), "p", {}),
-        ("Clip", ("p", "floor", "ceiling"), "p_slip", {}),
-        ("Sub", ("one", "p_slip"), "p_stable", {}),
-        ("Div", ("p_slip", "p_stable"), "odds", {}),
-        ("Log", ("odds",), "log_odds", {}),
-        ("Cast", ("log_odds",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
+    nodes = _nodes(
+        "votes = Gather <axis: int = 1> (probabilities, slip_column)",
+        f"votes_64 = Cast <to: int = {DOUBLE}> (votes)",
+        "p = Div (votes_64, trees)",
+        "p_slip = Clip (p, floor, ceiling)",
+        "p_stable = Sub (one, p_slip)",
+        "odds = Div (p_slip, p_stable)",
+        "log_odds = Log (odds)",
+        f"{MARGIN_NAME} = Cast <to: int = {FLOAT}> (log_odds)",
     )
     constants = [
         _constant("slip_column", np.array([1])),
@@ -214,8 +193,7 @@ def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
         _constant("ceiling", np.array(1.0 - PROBABILITY_FLOOR)),
         _constant("one", np.array(1.0)),
     ]
-    width = _vectors(input_name, model.n_features_in_)
-    return _model([trees, *_nodes(steps)], constants, width, MARGIN_NAME, 1)
+    return _vector_model([trees, *nodes], constants, input_name, model.n_features_in_)
 
 
 def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
@@ -226,8 +204,7 @@ def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
     nodes[-1].output[0] = MARGIN_NAME
     used = {name for node in nodes for name in node.input}
     constants = [tensor for tensor in graph.initializer if tensor.name in used]
-    width = _vectors(input_name, model.n_features_in_)
-    return _model(nodes, constants, width, MARGIN_NAME, 1)
+    return _vector_model(nodes, constants, input_name, model.n_features_in_)
 
 
 def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
@@ -242,9 +219,10 @@ def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
     return converted
 
 
-def _from_torch(
+def from_torch(
     network: nn.Module, shape: Sequence[int], input_name: str, output_name: str
 ) -> onnx.ModelProto:
+    """Return the graph of a network of inputs (N, *shape)."""
     # Two inputs, because one would let the exporter take the batch for a constant.
     example = torch.zeros(2, *shape)
     with _quiet("torch.onnx"):
@@ -298,7 +276,7 @@ def _model(
     output_name: str,
     columns: int,
 ) -> onnx.ModelProto:
-    output = helper.make_tensor_value_info(output_name, onnx.TensorProto.FLOAT, ["N", columns])
+    output = helper.make_tensor_value_info(output_name, FLOAT, ["N", columns])
     opsets = [helper.make_opsetid("", OPSET)]
     if any(node.domain == "ai.onnx.ml" for node in nodes):
         opsets.append(helper.make_opsetid("ai.onnx.ml", ML_OPSET))
@@ -306,12 +284,22 @@ def _model(
     return helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION)
 
 
-def _nodes(steps: _Steps) -> list[onnx.NodeProto]:
-    return [helper.make_node(op, inputs, [out], **more) for op, inputs, out, more in steps]
+def _vector_model(
+    nodes: Sequence[onnx.NodeProto],
+    constants: Sequence[onnx.TensorProto],
+    input_name: str,
+    width: int,
+) -> onnx.ModelProto:
+    """Return the graph from vectors (N, width) to their margin."""
+    given = helper.make_tensor_value_info(input_name, FLOAT, ["N", width])
+    return _model(nodes, constants, given, MARGIN_NAME, 1)
 
 
-def _vectors(name: str, width: int) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", width])
+def _nodes(*texts: str) -> list[onnx.NodeProto]:
+    nodes = [parse_node(text) for text in texts]
+    for node in nodes:
+        node.ClearField("domain")  # the parser writes "", which stands for itself
+    return nodes
 
 
 def _constant(name: str, values: Numbers) -> onnx.TensorProto:

@@ -73,9 +73,11 @@ def build(config: NetworkConfig, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Seque
         width = nn.Sequential(*look).eval()(torch.zeros(1, *shape)).shape[1]
     except RuntimeError as error:
         raise ValueError(f"inputs {tuple(shape)} are too small for the network") from error
-    dense = _dense(width, config.hidden, config.batch_norm)
-    last = nn.Linear(config.hidden, 2)
-    network = nn.Sequential(*look, *_drop(config), *dense, *_drop(config), last).train()
+    dense = [nn.Linear(width, config.hidden), nn.ReLU()]
+    if config.batch_norm:
+        dense.insert(1, nn.BatchNorm1d(config.hidden, eps=NORM_EPSILON))
+    drop = [nn.Dropout(config.dropout)] if config.dropout > 0.0 else []
+    network = nn.Sequential(*look, *drop, *dense, *drop, nn.Linear(config.hidden, 2)).train()
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
@@ -95,23 +97,21 @@ def for_inference(network: nn.Sequential, temperature: float) -> nn.Sequential:
     Batch norm is folded into the layer before it, and the temperature into the last layer. A linear
     layer divided by T gives `softmax(logits / T)`.
     """
-    layers = _folded(copy.deepcopy(network).eval())
-    last = _last(layers)
+    layers, last = _split(network)
     with torch.no_grad():
         last.weight.div_(temperature)
         last.bias.div_(temperature)
-    return nn.Sequential(*layers, nn.Softmax(dim=1)).eval()
+    return nn.Sequential(*layers, last, nn.Softmax(dim=1)).eval()
 
 
 def for_margin(network: nn.Sequential) -> nn.Sequential:
     """Return a copy that gives log-odds of slip (N, 1), folded like `for_inference`."""
-    layers = _folded(copy.deepcopy(network).eval())
-    last = _last(layers)
+    layers, last = _split(network)
     margin = nn.Linear(last.in_features, 1)
     with torch.no_grad():
         margin.weight.copy_(last.weight[1:] - last.weight[:1])
         margin.bias.copy_(last.bias[1:] - last.bias[:1])
-    return nn.Sequential(*layers[:-1], margin).eval()
+    return nn.Sequential(*layers, margin).eval()
 
 
 def _look(config: NetworkConfig, shape: tuple[int, ...]) -> list[nn.Module]:
@@ -144,15 +144,6 @@ def _convolution(inputs: int, filters: int, kernel: int, batch_norm: bool) -> li
     return [nn.Conv2d(inputs, filters, kernel, bias=not batch_norm), *norm, nn.ReLU()]
 
 
-def _dense(inputs: int, units: int, batch_norm: bool) -> list[nn.Module]:
-    norm = [nn.BatchNorm1d(units, eps=NORM_EPSILON)] if batch_norm else []
-    return [nn.Linear(inputs, units), *norm, nn.ReLU()]
-
-
-def _drop(config: NetworkConfig) -> list[nn.Module]:
-    return [nn.Dropout(config.dropout)] if config.dropout > 0.0 else []
-
-
 def _folded(network: nn.Sequential) -> list[nn.Module]:
     """Return the layers without batch norm (folded) and dropout. Changes `network`."""
     layers: list[nn.Module] = []
@@ -168,8 +159,9 @@ def _folded(network: nn.Sequential) -> list[nn.Module]:
     return layers
 
 
-def _last(layers: list[nn.Module]) -> nn.Linear:
-    last = layers[-1]
+def _split(network: nn.Sequential) -> tuple[list[nn.Module], nn.Linear]:
+    """Return a copy for inference: the folded layers, and the last one."""
+    *layers, last = _folded(copy.deepcopy(network).eval())
     if not isinstance(last, nn.Linear):
         raise TypeError(f"a network ends in a linear layer, not {type(last).__name__}")
-    return last
+    return layers, last

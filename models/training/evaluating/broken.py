@@ -118,17 +118,17 @@ class _Fold:
         return float(f1_score(self._slipped, verdict, zero_division=0.0))
 
     def find(self, counts: Numbers) -> Bools:
-        values = self._trained.sensors.to_training(counts, self._table_of)
+        values = self._trained.mapped(counts, self._table_of)
         nothing = np.zeros(counts.shape[1:], dtype=np.bool_)
         return np.array(
             [self._electrodes.implausible(reading, nothing, LOOKED_FOR_MAX) for reading in values]
         )
 
     def repair(self, counts: Numbers, broken: Bools) -> Numbers:
-        values = self._trained.sensors.to_training(counts, self._table_of)
+        values = self._trained.mapped(counts, self._table_of)
         for index in np.flatnonzero(broken.any(axis=(1, 2))):
             values[index] = self._electrodes.repaired(values[index], broken[index])
-        repaired = self._trained.sensors.from_training(values, self._table_of)
+        repaired = self._trained.unmapped(values, self._table_of)
         return np.where(broken, np.clip(repaired, 0.0, COUNT_MAX), counts)
 
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from sklearn.metrics import f1_score
 
 from graspd.models.bts3 import NEW_SESSION, WHOLE
 from graspd.models.training.arrays import Bools
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import DAYS
 from graspd.models.training.evaluating.jobs import JobResult
-from graspd.models.training.evaluating.metrics import score
 
 A, B_DOWN, B_SIDE = f"A {NEW_SESSION}", f"B {WHOLE[0]}", f"B {WHOLE[1]}"
 C_DOWN, C_SIDE = f"C {WHOLE[0]}", f"C {WHOLE[1]}"
@@ -40,9 +40,10 @@ class VerdictFigures:
     def of(cls, called_slip: Bools, slipped: Bools) -> VerdictFigures:
         """Return the figures of verdicts and outcomes, shape (N,) each."""
         missed, alarms = ~called_slip & slipped, called_slip & ~slipped
+        f1 = f1_score(slipped, called_slip, zero_division=0.0) if len(slipped) else 0.0
         return cls(
             len(slipped),
-            score(np.where(called_slip, 1.0, -1.0), slipped).f1 if len(slipped) else 0.0,
+            float(f1),
             _share(missed, ~called_slip),
             _share(missed, slipped),
             _share(alarms, ~slipped),

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
-
 FINDINGS = (
     "**Convolution gains nothing on known objects.** F1 in `cv`: `svm` {svm/cv}, `cnn1` {cnn1/cv}, "
     "`mlp` {mlp/cv}, `rf` {rf/cv}. Less `cnn1` on the same splits: `svm` {svm/cv/difference}, "
@@ -37,10 +34,3 @@ HOW_SURE = (
     "How sure: one hand, 41 objects, three tables. Folds share grasps, and the standard errors of "
     "section 5 are corrected for that. A row of one seed does not show what another seed changes."
 )
-
-
-def findings(figures: Mapping[str, str]) -> Iterator[str]:
-    """Yield the findings whose figures are all there."""
-    for finding in FINDINGS:
-        with suppress(KeyError):
-            yield finding.format_map(figures)

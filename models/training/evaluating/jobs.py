@@ -12,25 +12,20 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import joblib
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike
 
 from graspd.models.inputs import raw_features
-from graspd.models.training.arrays import Bools, Floats, Ints, Numbers
+from graspd.models.training.arrays import Bools, Floats, Ints
 from graspd.models.training.data.datasets import Grasps
-from graspd.models.training.data.protocols import FOLDS, EvalProtocol, Split, fold_seed, splits
+from graspd.models.training.data.protocols import FOLDS, EvalProtocol, fold_seed, splits
 from graspd.models.training.evaluating.days import judged_days
 from graspd.models.training.evaluating.files import write_whole
-from graspd.models.training.fitting.standards import (
-    NONE,
-    TRAINING,
-    TrainingStandards,
-    later_session,
-)
-from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.fitting.standards import NONE, TRAINING, later_session
+from graspd.models.training.fitting.trained import train
 from graspd.models.training.systems.system import SessionFeatures, System, digest
 
 FORMAT = 1
@@ -40,9 +35,14 @@ MAX_FILE_BYTES = 64 * 2**20
 _ONE_AT_A_TIME = threading.Lock()
 """Lock of torch's random state and number of threads, which the process shares."""
 
-_log = logging.getLogger(__name__)
+_BY_VARIANT: dict[str, DTypeLike] = {
+    "margins": np.float64,
+    "ages": np.int64,
+    "refused": np.bool_,
+}
+"""Types of the arrays that a result has for each variant."""
 
-Number = TypeVar("Number", np.float64, np.int64, np.bool_)
+_log = logging.getLogger(__name__)
 
 
 class BrokenResultError(Exception):
@@ -110,12 +110,14 @@ class JobResult:
             "seconds": self.seconds,
             "parameters": self.parameters,
         }
-        arrays = {f"margins.{variant}": values for variant, values in self.margins.items()}
-        ages = {f"ages.{variant}": values for variant, values in self.ages.items()}
-        refused = {f"refused.{variant}": values for variant, values in self.refused.items()}
+        arrays = {
+            f"{kind}.{variant}": values
+            for kind in _BY_VARIANT
+            for variant, values in getattr(self, kind).items()
+        }
         text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         file = io.BytesIO()
-        np.savez(file, allow_pickle=False, test=self.test, meta=text, **arrays, **ages, **refused)
+        np.savez(file, allow_pickle=False, test=self.test, meta=text, **arrays)
         return file.getvalue()
 
     @classmethod
@@ -123,7 +125,21 @@ class JobResult:
         """Return the result in `data`, from `to_bytes`. Raises `BrokenResultError`."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                return _result({name: arrays[name] for name in arrays.files})
+                meta = json.loads(arrays["meta"].tobytes())
+                if meta["format"] != FORMAT:
+                    raise ValueError(f"format {meta['format']}, not {FORMAT}")
+                by_variant: dict[str, dict[str, Any]] = {kind: {} for kind in _BY_VARIANT}
+                for name in arrays.files:
+                    kind, _, variant = name.partition(".")
+                    if variant:
+                        by_variant[kind][variant] = arrays[name].astype(_BY_VARIANT[kind])
+                return cls(
+                    test=arrays["test"].astype(np.int64),
+                    train_grasps=int(meta["train_grasps"]),
+                    seconds=float(meta["seconds"]),
+                    parameters=int(meta["parameters"]),
+                    **by_variant,
+                )
         except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
             raise BrokenResultError(f"is no result of a job: {error}") from error
 
@@ -146,12 +162,19 @@ def run(job: Job, grasps: Grasps) -> JobResult:
         trained = train(system, grasps.rows(split.train), seed)
         if job.protocol == "days":
             margins, refused, ages = judged_days(trained, grasps, split.test, seed)
-        elif trained.standards is None:
+        elif trained.standards is None or not isinstance(system.input, SessionFeatures):
             margins = {NONE: trained.margins(counts, table_of)}
         elif split.calibration is None:
             margins = {TRAINING: trained.margins(counts, table_of)}
         else:
-            margins, ages = _later_margins(trained, trained.standards, grasps, split, seed)
+            features, clip = raw_features(grasps.counts), system.input.clip
+            by_variant, ages = later_session(
+                features, split.test, split.calibration, trained.standards, seed
+            )
+            margins = {
+                variant: trained.fitted.margins(by.apply(features[split.test], clip))
+                for variant, by in by_variant.items()
+            }
         seconds = time.perf_counter() - started_s
     numbers = len(split.train), seconds, trained.fitted.parameters
     return JobResult(split.test, margins, *numbers, ages, refused)
@@ -175,40 +198,3 @@ def load(folder: Path, job: Job, data: str) -> JobResult | None:
 def save(folder: Path, job: Job, data: str, result: JobResult) -> None:
     """Store a result for `load`. Raises `OSError`."""
     write_whole(folder / job.file_name(data), result.to_bytes())
-
-
-def _later_margins(
-    trained: Trained, standards: TrainingStandards, grasps: Grasps, split: Split, seed: int
-) -> tuple[dict[str, Floats], dict[str, Ints]]:
-    """By variant: margins of the test grasps of a later session, and ages of the session."""
-    if not isinstance(trained.system.input, SessionFeatures) or split.calibration is None:
-        raise ValueError(f"{trained.system.name} is not calibrated by a session")
-    features, clip = raw_features(grasps.counts), trained.system.input.clip
-    by_variant, ages = later_session(features, split.test, split.calibration, standards, seed)
-    margins = {
-        variant: trained.fitted.margins(by.apply(features[split.test], clip))
-        for variant, by in by_variant.items()
-    }
-    return margins, ages
-
-
-def _result(arrays: dict[str, Numbers]) -> JobResult:
-    meta = json.loads(arrays["meta"].tobytes())
-    if meta["format"] != FORMAT:
-        raise ValueError(f"format {meta['format']}, not {FORMAT}")
-    test = arrays["test"].astype(np.int64)
-    margins = _by_variant(arrays, "margins.", np.float64)
-    ages = _by_variant(arrays, "ages.", np.int64)
-    refused = _by_variant(arrays, "refused.", np.bool_)
-    numbers = int(meta["train_grasps"]), float(meta["seconds"]), int(meta["parameters"])
-    return JobResult(test, margins, *numbers, ages, refused)
-
-
-def _by_variant(
-    arrays: dict[str, Numbers], prefix: str, kind: type[Number]
-) -> dict[str, NDArray[Number]]:
-    return {
-        name.removeprefix(prefix): values.astype(kind)
-        for name, values in arrays.items()
-        if name.startswith(prefix)
-    }

@@ -20,33 +20,12 @@ ECE_BINS = 15
 """Bins of equal width, as in Guo et al."""
 HALVINGS = 60
 """Steps of the bisection: enough for every bit of a double."""
-METRICS = ("accuracy", "precision", "recall", "f1", "auc", "brier", "ece", "log_loss")
-"""Names of the figures of `Scores`."""
 Z_95 = 1.959963984540054
 """Standard normal quantile of a two-sided 95 % interval."""
 CURVE_STEPS = 50
 """Points of an accuracy-coverage curve."""
 FEWEST_JUDGED = 50
 """Fewest verdicts whose accuracy sets a threshold; of fewer, all may be right by chance."""
-
-
-@dataclass(frozen=True, slots=True)
-class Scores:
-    """Figures of one test set as fractions, slip positive."""
-
-    ece: float
-    """Expected calibration error of the verdict's probability; 0 is perfect."""
-    brier: float
-    """Mean squared error of the slip probability."""
-    log_loss: float
-    """Mean negative log-likelihood, nats: what the temperature is fitted to."""
-    grasps: int
-    accuracy: float
-    precision: float
-    recall: float
-    f1: float
-    auc: float
-    """Area under the ROC curve, which needs no threshold; NaN for a single class."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,28 +62,29 @@ class CurvePoint:
     coverage: float
 
 
-def score(margins: Floats, slipped: Bools, probability: Floats | None = None) -> Scores:
-    """Return the figures of margins (N,) against labels (N,).
-    Brier score, ECE and log loss are of `probability` (N,) of slip, else uncalibrated."""
+def score(margins: Floats, slipped: Bools, probability: Floats) -> dict[str, float | None]:
+    """Return figures of margins and slip probabilities against labels (N,), slip positive.
+
+    `auc`, the area under the ROC curve, is None for a single class. `ece` is the expected
+    calibration error of the verdict's probability, `brier` the mean squared error of the slip
+    probability, `log_loss` its mean negative log-likelihood, nats.
+    """
     verdict = margins > 0.0
     precision, recall, f1, _ = precision_recall_fscore_support(
         slipped, verdict, average="binary", zero_division=0.0
     )
     both = len(np.unique(slipped)) == 2
-    if probability is None:
-        probability = p_slip(margins)
     of_truth = np.where(slipped, probability, 1.0 - probability)
-    return Scores(
-        ece=_ece(probability, slipped),
-        brier=float(np.mean((probability - slipped) ** 2)),
-        log_loss=float(-np.mean(np.log(np.maximum(of_truth, np.finfo(np.float64).tiny)))),
-        grasps=len(slipped),
-        accuracy=float(accuracy_score(slipped, verdict)),
-        precision=float(precision),
-        recall=float(recall),
-        f1=float(f1),
-        auc=float(roc_auc_score(slipped, margins)) if both else math.nan,
-    )
+    return {
+        "accuracy": float(accuracy_score(slipped, verdict)),
+        "precision": float(precision),
+        "recall": float(recall),
+        "f1": float(f1),
+        "auc": float(roc_auc_score(slipped, margins)) if both else None,
+        "brier": float(np.mean((probability - slipped) ** 2)),
+        "ece": _ece(probability, slipped),
+        "log_loss": float(-np.mean(np.log(np.maximum(of_truth, np.finfo(np.float64).tiny)))),
+    }
 
 
 def fit_temperature(margins: Floats, slipped: Bools) -> float:
@@ -138,9 +118,9 @@ def cross_fitted_p_slip(margins: Floats, slipped: Bools, fold_of: Ints) -> Float
     return probability
 
 
-def over_seeds(figures: Sequence[Sequence[float]]) -> Spread:
-    """Mean and spread of figures (seeds, folds). NaN is left out; all NaN give NaN."""
-    table = np.array(figures)
+def over_seeds(figures: Sequence[Sequence[float | None]]) -> Spread:
+    """Return mean and spread of figures (seeds, folds) without None; only None gives NaN."""
+    table = np.array(figures, dtype=np.float64)
     if np.isnan(table).all():  # the mean of nothing is a warning
         return Spread(math.nan, math.nan, None, *table.shape)
     means = np.nanmean(table, axis=1)
@@ -194,7 +174,7 @@ def coverage_curve(
 
 
 def accuracy_at(probability: Floats, slipped: Bools, coverage: float) -> float:
-    """Accuracy of this share of the grasps, the most confident ones; at least one."""
+    """Return the accuracy of this share of the grasps, the most confident ones; at least one."""
     _, accuracy = _by_confidence(probability, slipped)
     return float(accuracy[max(1, round(coverage * len(accuracy))) - 1])
 

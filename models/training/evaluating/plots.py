@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from sklearn.calibration import CalibrationDisplay
+from sklearn.metrics import ConfusionMatrixDisplay
 
+from graspd.models.contract import CLASSES
 from graspd.models.training.data.protocols import PROTOCOLS
 from graspd.models.training.evaluating.style import (
     BLUE,
@@ -85,61 +89,36 @@ def _report(summary: SystemSummary) -> Figure:
 
 
 def _reliability(axes: Axes, summary: SystemSummary) -> None:
-    bins = summary.main.bins
-    total = sum(number for _, _, number in bins)
-    axes.plot((0.0, 1.0), (0.0, 1.0), color=QUIET, linewidth=1.0, linestyle="--")
-    predicted, seen = [bin_[0] for bin_ in bins], [bin_[1] for bin_ in bins]
-    axes.plot(predicted, seen, color=NAVY, linewidth=1.2)
-    sizes = [10.0 + 300.0 * number / total for _, _, number in bins]
-    axes.scatter(predicted, seen, s=sizes, color=ORANGE, zorder=3)
+    predicted, slipped, grasps = np.array(summary.main.bins).T
+    CalibrationDisplay(slipped, predicted, predicted).plot(ax=axes, color=NAVY)
+    axes.scatter(predicted, slipped, s=10.0 + 300.0 * grasps / grasps.sum(), color=ORANGE)
     ece = summary.main.spreads["ece"].mean
     axes.set_title(f"Reliability (ECE of a fold {100 * ece:.1f} %)", fontsize=10)
     axes.set(xlabel="predicted slip probability (size: grasps)", ylabel="share that slipped")
 
 
 def _coverage(axes: Axes, summary: SystemSummary) -> None:
-    axes.plot(*_curve(summary), color=NAVY)
+    axes.plot(*_curve(summary), color=NAVY, label="all verdicts")
     for wanted, threshold in summary.main.thresholds.items():
         if threshold is not None:
-            place = (100.0 * threshold.coverage, 100.0 * threshold.accuracy)
-            to_left = place[0] > 30.0
-            axes.plot(*place, "o", color=ORANGE, markersize=4)
-            axes.annotate(
-                f"{100 * float(wanted):g} % from {threshold.confidence:.2f}",
-                place,
-                xytext=(-4, -5) if to_left else (6, 4),
-                textcoords="offset points",
-                ha="right" if to_left else "left",
-                va="top" if to_left else "bottom",
-                fontsize=8,
-            )
+            label = f"{100 * float(wanted):g} % from {threshold.confidence:.2f}"
+            axes.plot(100.0 * threshold.coverage, 100.0 * threshold.accuracy, "o", label=label)
+    axes.legend(loc="lower left", fontsize=8)
     axes.set_title("Accuracy of the most confident verdicts, and reject thresholds", fontsize=10)
     axes.set(xlim=(0.0, 103.0), xlabel="coverage, %", ylabel="accuracy, %")
 
 
 def _curve(summary: SystemSummary) -> tuple[list[float], list[float]]:
-    """Coverage and accuracy, %."""
+    """Return coverage and accuracy, %."""
     curve = summary.main.curve
     return [100.0 * point.coverage for point in curve], [100.0 * point.accuracy for point in curve]
 
 
 def _confusion(axes: Axes, summary: SystemSummary) -> None:
-    rows = summary.main.confusion
-    shares = [[number / max(1, sum(row)) for number in row] for row in rows]
-    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto", alpha=0.4)
+    display = ConfusionMatrixDisplay(np.array(summary.main.confusion), display_labels=CLASSES)
+    display.plot(ax=axes, cmap="Blues", colorbar=False)
     axes.grid(visible=False)
-    for y, row in enumerate(rows):
-        for x, number in enumerate(row):
-            axes.text(
-                x,
-                y,
-                f"{100 * shares[y][x]:.1f} %\n{number}",
-                ha="center",
-                va="center",
-            )
-    axes.set_xticks((0, 1), ("judged stable", "judged slip"))
-    axes.set_yticks((0, 1), ("was stable", "slipped"))
-    axes.set_title("Confusion (grasps of all seeds)", fontsize=10)
+    axes.set(title="Confusion (grasps of all seeds)", xlabel="judged", ylabel="was")
 
 
 def _objects(axes: Axes, summary: SystemSummary) -> None:

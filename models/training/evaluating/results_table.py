@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
-from graspd.models.training.evaluating.day_figures import GROUPS, DayFigures
-from graspd.models.training.evaluating.findings import HOW_SURE, findings
+from graspd.models.training.evaluating.day_figures import GROUPS
+from graspd.models.training.evaluating.findings import FINDINGS, HOW_SURE
 from graspd.models.training.evaluating.metrics import Spread, paired_difference
 from graspd.models.training.evaluating.summaries import HEADLINE, SystemSummary
 from graspd.models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
@@ -26,24 +26,24 @@ ONE_ROW = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Made:
-    """How a table was made."""
-
-    command: str
-    made_with: Mapping[str, str]
-    quick: bool = False
-
-
 Row = Sequence[str]
 ByGroup = dict[tuple[str, EvalProtocol], SystemSummary]
 
 
-def results_table(summaries: Sequence[SystemSummary], made: Made) -> str:
-    """Return the whole document as Markdown; what was not run is `-`."""
+def results_table(
+    summaries: Sequence[SystemSummary],
+    command: str,
+    made_with: Mapping[str, str],
+    *,
+    quick: bool = False,
+) -> str:
+    """Return the whole document as Markdown; what was not run is `-`.
+
+    `command`, `made_with`: the command line, and versions by name, that made the summaries.
+    """
     by_group: ByGroup = {(summary.system, summary.protocol): summary for summary in summaries}
     sections = (
-        _head(summaries, made),
+        _head(summaries, quick=quick),
         _findings(by_group),
         _paper(by_group),
         _systems(by_group),
@@ -51,12 +51,12 @@ def results_table(summaries: Sequence[SystemSummary], made: Made) -> str:
         _days(by_group),
         _differences(by_group),
         _everything(summaries),
-        _how(summaries, made),
+        _how(summaries, command, made_with),
     )
     return "\n\n".join(paragraph for section in sections for paragraph in section) + "\n"
 
 
-def _head(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
+def _head(summaries: Sequence[SystemSummary], *, quick: bool) -> Iterator[str]:
     yield "# Results"
     yield (
         "This page is for those who compare models. Figures are F1 in %, slip positive, unless a "
@@ -64,45 +64,38 @@ def _head(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
         "trainings), s.e. the standard error over the split seeds. A model's card (`graspd models "
         "NAME`) has the first seed alone."
     )
-    if made.quick:
+    if quick:
         yield "**Made with `--quick`: hardly trained, on few grasps. The figures mean nothing.**"
     shown = {*STANDARD, *(summary.protocol for summary in summaries)}
     yield "\n".join(f"- `{name}`: {ABOUT[name]}" for name in PROTOCOLS if name in shown)
 
 
-class _Figures(dict[str, str]):
-    """Figures by their key in a finding. Raises `KeyError` for what was not run."""
-
-    def __init__(self, by_group: ByGroup) -> None:
-        super().__init__()
-        self._by_group = by_group
-
-    def __missing__(self, key: str) -> str:
-        system, protocol, *part = key.split("/")
-        summary = next(
-            (each for names, each in self._by_group.items() if names == (system, protocol)), None
-        )
-        if summary is None:
-            raise KeyError(key)
-        match part:
-            case ["paper"]:
-                published = SYSTEMS[system].published or ()
-                paper = next(one.f1 for one in published if one.protocol == protocol)
-                return _of_paper(paper)
-            case ["difference"]:
-                return _difference(summary, self._by_group[REFERENCE, summary.protocol])
-            case ["auc"]:
-                return f"{summary.main.spreads['auc'].mean:.2f}"
-            case _:
-                return _value(summary.main.spreads["f1"])
-
-
 def _findings(by_group: ByGroup) -> Iterator[str]:
-    said = [f"- {finding}" for finding in findings(_Figures(by_group))]
-    if said:
+    figures = _figures(by_group)
+    lines = []
+    for finding in FINDINGS:
+        with suppress(KeyError):  # of what was not run
+            lines.append(f"- {finding.format_map(figures)}")
+    if lines:
         yield "## Findings"
-        yield "\n".join(said)
+        yield "\n".join(lines)
         yield HOW_SURE
+
+
+def _figures(by_group: ByGroup) -> dict[str, str]:
+    """Return the figures of all summaries by their key in a finding."""
+    figures = {}
+    for (system, protocol), summary in by_group.items():
+        key, spreads = f"{system}/{protocol}", summary.main.spreads
+        figures[key] = _value(spreads["f1"])
+        figures[f"{key}/auc"] = f"{spreads['auc'].mean:.2f}"
+        reference = by_group.get((REFERENCE, protocol))
+        if reference is not None:
+            figures[f"{key}/difference"] = _difference(summary, reference)
+        for published in SYSTEMS[system].published:
+            if published.protocol == protocol:
+                figures[f"{key}/paper"] = _of_paper(published.f1)
+    return figures
 
 
 def _paper(by_group: ByGroup) -> Iterator[str]:
@@ -112,7 +105,7 @@ def _paper(by_group: ByGroup) -> Iterator[str]:
         (
             row
             for system in SYSTEMS.values()
-            for published in system.published or ()
+            for published in system.published
             for row in _published(system, published, by_group)
         ),
     )
@@ -200,38 +193,29 @@ def _days(by_group: ByGroup) -> Iterator[str]:
     order = {RUNNING: "random", RUNNING_SORTED: "object by object"}
     rows, more = [], []
     for one in here:
-        days = one.main.days
         cells = (
             f"{_percent(each.every.f1)} / {_percent(each.every.slips_among_stable)}"
-            for each in days.values()
+            for each in one.main.days.values()
         )
         rows.append((f"`{one.system}`", *cells))
         for name, variant in one.variants.items():
-            whole = variant.days["all"]
-            more.append((f"`{one.system}`", order.get(name, "any"), *_day_row(whole)))
+            figures = variant.days["all"]
+            every, judged = figures.every, figures.judged
+            fractions = (
+                *(every.f1, every.slips_among_stable),
+                *(every.slips_called_stable, every.stable_called_slip),
+                *(figures.coverage, judged.f1, judged.slips_among_stable, figures.refused_slipped),
+            )
+            names = f"`{one.system}`", order.get(name, "any")
+            more.append((*names, *map(_percent, fractions)))
     yield _table(("system", *GROUPS), rows)
     yield (
         "All streams together. The daemon calls `unknown` what is like nothing in the training: "
         "those grasps are in the first columns and not in those of `judged`."
     )
-    head = ("F1", "slips among stable", "slips called stable", "stable called slip")
-    judged = ("judged", "F1 of judged", "slips among stable of judged", "slips among refused")
-    yield _table(("system", "order", *head, *judged), more)
-
-
-def _day_row(figures: DayFigures) -> list[str]:
-    every, judged = figures.every, figures.judged
-    fractions = (
-        every.f1,
-        every.slips_among_stable,
-        every.slips_called_stable,
-        every.stable_called_slip,
-        figures.coverage,
-        judged.f1,
-        judged.slips_among_stable,
-        figures.refused_slipped,
-    )
-    return [_percent(fraction) for fraction in fractions]
+    head = ("F1", "slips among stable", "slips called stable", "stable called slip", "judged")
+    of_judged = ("F1 of judged", "slips among stable of judged", "slips among refused")
+    yield _table(("system", "order", *head, *of_judged), more)
 
 
 def _differences(by_group: ByGroup) -> Iterator[str]:
@@ -305,9 +289,11 @@ def _everything(summaries: Sequence[SystemSummary]) -> Iterator[str]:
     )
 
 
-def _how(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
+def _how(
+    summaries: Sequence[SystemSummary], command: str, made_with: Mapping[str, str]
+) -> Iterator[str]:
     yield "## How this was made"
-    yield f"    {made.command}"
+    yield f"    {command}"
     yield ONE_ROW
     total = sum(summary.seconds for summary in summaries)
     yield (
@@ -315,7 +301,7 @@ def _how(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
         "each. Without names, protocols and seeds the command makes everything, what is `-` too: "
         "more than a day on two cores."
     )
-    yield ", ".join(f"{name} {version}" for name, version in made.made_with.items()) + "."
+    yield ", ".join(f"{name} {version}" for name, version in made_with.items()) + "."
     files = {file.name: file for summary in summaries for file in summary.files}
     if files:
         yield "Data (SHA-256, grasps used):"
@@ -343,10 +329,6 @@ def _value(spread: Spread | None) -> str:
         return NOT_RUN
     alone = spread.seeds * spread.folds == 1
     return f"{100 * spread.mean:.1f}" + ("" if alone else f" +- {100 * spread.std:.1f}")
-
-
-def _error(error: float | None) -> str:
-    return NOT_RUN if error is None else f"{100 * error:.2f}"
 
 
 def _with_error(summary: SystemSummary | None) -> str:

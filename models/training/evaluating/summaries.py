@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
@@ -13,20 +12,18 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from sklearn.metrics import confusion_matrix
+from sklearn.metrics import confusion_matrix, f1_score
 
 from graspd.models.contract import Dataset
-from graspd.models.training.arrays import Bools, Ints
+from graspd.models.training.arrays import Bools, Floats
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import PROTOCOLS, EvalProtocol
 from graspd.models.training.evaluating.day_figures import DayFigures, day_figures
 from graspd.models.training.evaluating.files import to_json, write_whole
 from graspd.models.training.evaluating.jobs import Job, JobResult
 from graspd.models.training.evaluating.metrics import (
-    METRICS,
     CurvePoint,
     Fraction,
-    Scores,
     Spread,
     accuracy_at,
     coverage_curve,
@@ -70,7 +67,6 @@ class AgeFigures:
     """Lowest age of the group, grasps; it ends below that of the next group."""
     share: Fraction
     temperature: float
-    """Temperature that makes these margins probabilities."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +105,9 @@ class SystemSummary:
     system: str
     description: str
     digest: str
-    """Digest of the system's configuration."""
+    """Digest of the system's configuration; `data` is that of the grasps."""
     protocol: EvalProtocol
     data: str
-    """Digest of the grasps."""
     files: tuple[Dataset, ...]
     seeds: tuple[int, ...]
     folds: int
@@ -141,9 +136,10 @@ def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> SystemSummary:
     names = list(flat[0].margins)
     job = next(iter(found))
     system = job.system
-    results: dict[int, list[JobResult]] = {}
+    by_seed: dict[int, list[JobResult]] = {}
     for each, result in found.items():
-        results.setdefault(each.seed, []).append(result)
+        by_seed.setdefault(each.seed, []).append(result)
+    seeds = list(by_seed.values())
     return SystemSummary(
         format=FORMAT,
         system=system.name,
@@ -152,14 +148,14 @@ def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> SystemSummary:
         protocol=job.protocol,
         data=grasps.digest(),
         files=grasps.files,
-        seeds=tuple(results),
-        folds=len(next(iter(results.values()))),
+        seeds=tuple(by_seed),
+        folds=len(seeds[0]),
         train_grasps=float(np.mean([result.train_grasps for result in flat])),
         test_grasps=float(np.mean([len(result.test) for result in flat])),
         parameters=round(float(np.mean([result.parameters for result in flat]))),
         seconds=sum(result.seconds for result in flat),
         headline=HEADLINE if HEADLINE in names else names[0],
-        variants={name: _variant(name, results, grasps) for name in names},
+        variants={name: _variant(name, seeds, grasps) for name in names},
         made_with=made_with(),
     )
 
@@ -176,14 +172,6 @@ def write_summary(summary: SystemSummary, folder: Path) -> None:
     write_whole(folder / f"{summary.system}.{summary.protocol}.json", to_json(summary))
 
 
-def read_summary(path: Path) -> SystemSummary:
-    """Read a summary. Raises `OSError`, or `ValueError` if it has another format."""
-    summary = msgspec.json.decode(path.read_bytes(), type=SystemSummary)
-    if summary.format != FORMAT:
-        raise ValueError(f"{path}: format {summary.format}, not {FORMAT}")
-    return summary
-
-
 def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[SystemSummary]:
     """Return the folder's summaries of this data (a digest), by system and then by protocol.
 
@@ -195,7 +183,9 @@ def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[
         if path.name.endswith(".grid.json"):
             continue
         try:
-            summary = read_summary(path)
+            summary = msgspec.json.decode(path.read_bytes(), type=SystemSummary)
+            if summary.format != FORMAT:
+                raise ValueError(f"format {summary.format}, not {FORMAT}")
         except ValueError as error:
             _log.warning("%s is left out: %s", path, error)
             continue
@@ -207,41 +197,42 @@ def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[
     return sorted(found, key=lambda one: (systems.index(one.system), PROTOCOLS.index(one.protocol)))
 
 
-def _variant(name: str, results: Mapping[int, Sequence[JobResult]], grasps: Grasps) -> Variant:
-    """Return the figures of one way of judging; `results` has, by seed, those of all folds."""
-    pools = [_Pool(name, folds, grasps) for folds in results.values()]
-    scores = [pool.scores() for pool in pools]
+def _variant(name: str, seeds: Sequence[Sequence[JobResult]], grasps: Grasps) -> Variant:
+    """Return the figures of one way of judging; `seeds` has, for each, the results of all folds."""
+    results = [result for folds in seeds for result in folds]
+    rows = np.concatenate([result.test for result in results])
+    margins = np.concatenate([result.margins[name] for result in results])
+    probability = np.concatenate([_probability(name, folds, grasps) for folds in seeds])
+    ends = np.cumsum([len(result.test) for result in results])[:-1]
+    of_folds = iter(np.split(probability, ends))
+    scores = [
+        [score(fold.margins[name], grasps.slipped[fold.test], next(of_folds)) for fold in folds]
+        for folds in seeds
+    ]
     figures = {
-        metric: [[getattr(fold, metric) for fold in folds] for folds in scores]
-        for metric in METRICS
+        metric: [[fold[metric] for fold in folds] for folds in scores] for metric in scores[0][0]
     }
-    rows = np.concatenate([pool.rows for pool in pools])
-    margins = np.concatenate([pool.margins for pool in pools])
-    probability = np.concatenate([pool.probability for pool in pools])
-    judged_days = any(result.refused for folds in results.values() for result in folds)
     slipped, verdict = grasps.slipped[rows], margins > 0.0
     objects, tables = np.array(grasps.objects)[rows], grasps.table_of[rows]
 
     def share(inside: Bools) -> Fraction:
         # A grasp that was judged once per seed is one grasp to the interval.
         right = verdict[inside] == slipped[inside]
-        return wilson(float(right.mean()), max(1, len(right) // len(pools)))
+        return wilson(float(right.mean()), max(1, len(right) // len(seeds)))
 
     def by_object(inside: Bools) -> ObjectFigures:
-        return ObjectFigures(share(inside), score(margins[inside], slipped[inside]).f1)
+        f1 = f1_score(slipped[inside], verdict[inside], zero_division=0.0)
+        return ObjectFigures(share(inside), float(f1))
 
     def by_age(group: int, inside: Bools) -> AgeFigures:
         temperature = fit_temperature(margins[inside], slipped[inside])
         return AgeFigures(AGES[group], share(inside), temperature)
 
-    ages = [pool.ages for pool in pools if pool.ages is not None]
+    ages = [result.ages[name] for result in results if name in result.ages]
     groups = np.searchsorted(AGES, np.concatenate(ages), side="right") - 1 if ages else np.array([])
     return Variant(
         spreads={metric: over_seeds(values) for metric, values in figures.items()},
-        figures={
-            metric: [[None if math.isnan(value) else value for value in row] for row in values]
-            for metric, values in figures.items()
-        },
+        figures=figures,
         temperature=fit_temperature(margins, slipped),
         confusion=confusion_matrix(slipped, verdict, labels=(False, True)).tolist(),
         objects={name: by_object(objects == name) for name in np.unique(objects).tolist()},
@@ -251,33 +242,22 @@ def _variant(name: str, results: Mapping[int, Sequence[JobResult]], grasps: Gras
         thresholds={f"{a:g}": reject_threshold(probability, slipped, a) for a in WANTED_ACCURACIES},
         bins=reliability_bins(probability, slipped),
         ages=[by_age(group, groups == group) for group in np.unique(groups)],
-        days=day_figures(name, list(results.values()), grasps) if judged_days else {},
+        days=day_figures(name, seeds, grasps) if results[0].refused else {},
     )
 
 
-class _Pool:
-    """The folds of one seed, one after the other, in one variant."""
+def _probability(name: str, folds: Sequence[JobResult], grasps: Grasps) -> Floats:
+    """Return the slip probability of a seed's test grasps, calibrated by its other folds.
 
-    def __init__(self, variant: str, folds: Sequence[JobResult], grasps: Grasps) -> None:
-        self._fold_of = np.repeat(np.arange(len(folds)), [len(fold.test) for fold in folds])
-        self.rows = np.concatenate([fold.test for fold in folds])
-        self.margins = np.concatenate([fold.margins[variant] for fold in folds])
-        self.ages: Ints | None = None
-        if variant in folds[0].ages:
-            self.ages = np.concatenate([fold.ages[variant] for fold in folds])
-        self._slipped = grasps.slipped[self.rows]
-        groups = self._fold_of
-        if len(folds) == 1:  # calibrated by its other objects, for want of other folds
-            names = np.array(grasps.objects)[self.rows]
-            groups = np.unique(names, return_inverse=True)[1].astype(np.int64)
-        if len(np.unique(groups)) > 1:
-            self.probability = cross_fitted_p_slip(self.margins, self._slipped, groups)
-        else:
-            self.probability = p_slip(self.margins)
-
-    def scores(self) -> list[Scores]:
-        """Return the scores of each fold."""
-        return [
-            score(self.margins[inside], self._slipped[inside], self.probability[inside])
-            for inside in (self._fold_of == fold for fold in np.unique(self._fold_of))
-        ]
+    A single fold is calibrated by its other objects.
+    """
+    rows = np.concatenate([fold.test for fold in folds])
+    margins = np.concatenate([fold.margins[name] for fold in folds])
+    if len(folds) > 1:
+        groups = np.repeat(np.arange(len(folds)), [len(fold.test) for fold in folds])
+    else:
+        objects = np.array(grasps.objects)[rows]
+        groups = np.unique(objects, return_inverse=True)[1].astype(np.int64)
+    if len(np.unique(groups)) == 1:
+        return p_slip(margins)
+    return cross_fitted_p_slip(margins, grasps.slipped[rows], groups)

@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 from torch import nn
 
+from graspd.models.contract import OUTPUT_NAME
 from graspd.models.training.arrays import Bools, Floats, Floats32
 from graspd.models.training.data.augmentation import augment
 from graspd.models.training.estimators import graphs
@@ -20,7 +21,11 @@ from graspd.models.training.estimators.classical import (
     fit_classical,
 )
 from graspd.models.training.estimators.configs import AnyRecipe, ClassicalConfig, NetworkConfig
-from graspd.models.training.estimators.networks import parameter_count
+from graspd.models.training.estimators.networks import (
+    for_inference,
+    for_margin,
+    parameter_count,
+)
 from graspd.models.training.estimators.recipe import logits, train_network
 from graspd.models.training.systems.system import BlendConfig, System
 
@@ -77,10 +82,12 @@ class FittedNetwork(Fitted):
         return margins
 
     def margin_graph(self, input_name: str) -> onnx.ModelProto:
-        return graphs.network_margin(self.network, self.shape, input_name)
+        network = for_margin(self.network)
+        return graphs.from_torch(network, self.shape, input_name, graphs.MARGIN_NAME)
 
     def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
-        return graphs.network_probability(self.network, self.shape, temperature, input_name)
+        network = for_inference(self.network, temperature)
+        return graphs.from_torch(network, self.shape, input_name, OUTPUT_NAME)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,64 +17,46 @@ from graspd.models.training.systems.system import SessionFeatures, System
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorMapping:
-    """Map the counts of each table's sensors to the training's sensors, and back.
-
-    Each table is mapped by its own mean and spread, as the daemon maps a session. A model without a
-    session takes the counts unchanged.
-    """
-
-    margin: int
-    """Counts outside the training range that still pass as seen."""
-    tables: TrainingStandards | None = None
-    """Standards of the counts (fingers * 24,) of each table; all tables map to `prior`."""
-
-    @classmethod
-    def of(cls, counts: Numbers, table_of: Ints, *, session: bool) -> SensorMapping:
-        """Return the mapping of training counts (N, fingers, 24), by their tables (N,)."""
-        if not session:
-            return cls(MARGIN_COUNTS)
-        tables = TrainingStandards.of(counts.reshape(len(counts), -1).astype(np.float64), table_of)
-        centre = np.mean([table.mean for table in tables.tables.values()], axis=0)
-        prior = Standards(centre, tables.prior.spread)
-        return cls(SESSION_MARGIN_COUNTS, replace(tables, prior=prior))
-
-    def to_training(self, counts: Numbers, table_of: Ints) -> Floats:
-        """Return counts (N, fingers, 24) of tables (N,) as read by the training's sensors."""
-        values = counts.astype(np.float64)
-        if self.tables is None:
-            return values
-        return _moved(values, self.tables.each(table_of), self.tables.prior)
-
-    def from_training(self, values: Floats, table_of: Ints) -> Floats:
-        """Return the inverse of `to_training`."""
-        if self.tables is None:
-            return values
-        return _moved(values, self.tables.prior, self.tables.each(table_of))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Trained:
     """A system with its training data."""
 
     system: System
     fitted: Fitted
     grasps: Grasps
-    sensors: SensorMapping
     standards: TrainingStandards | None
     """Standards of a session system's features; None for other systems."""
+    sensors: TrainingStandards | None
+    """Standards of the counts (fingers * 24,) for a session system, to map tables to `prior`."""
 
     def margins(self, counts: Numbers, table_of: Ints) -> Floats:
         """Return uncalibrated log-odds of slip (N,) of counts (N, fingers, 24) and tables (N,)."""
         return self.fitted.margins(_inputs(self.system, self.standards, counts, table_of))
 
-    def mapped_counts(self) -> Floats:
-        """Counts (N, fingers, 24) of `grasps`, of a session system mapped to common sensors."""
-        return self.sensors.to_training(self.grasps.counts, self.grasps.table_of)
+    def mapped(self, counts: Numbers, table_of: Ints) -> Floats:
+        """Return counts (N, fingers, 24) of tables (N,) as the training's sensors would read them.
+
+        Each table is mapped by its own mean and spread, as the daemon maps a session. A model
+        without a session takes the counts unchanged.
+        """
+        values = counts.astype(np.float64)
+        if self.sensors is None:
+            return values
+        return _moved(values, self.sensors.each(table_of), self.sensors.prior)
+
+    def unmapped(self, values: Floats, table_of: Ints) -> Floats:
+        """Return the inverse of `mapped`."""
+        if self.sensors is None:
+            return values
+        return _moved(values, self.sensors.prior, self.sensors.each(table_of))
+
+    @property
+    def margin(self) -> int:
+        """Counts outside the training range that still pass as seen."""
+        return MARGIN_COUNTS if self.sensors is None else SESSION_MARGIN_COUNTS
 
     def seen(self) -> SeenCounts:
         """Description of the training counts, to find readings unlike them."""
-        return seen_counts(self.mapped_counts(), self.sensors.margin)
+        return seen_counts(self.mapped(self.grasps.counts, self.grasps.table_of), self.margin)
 
 
 def train(system: System, grasps: Grasps, seed: int) -> Trained:
@@ -87,8 +69,15 @@ def train(system: System, grasps: Grasps, seed: int) -> Trained:
     standards = TrainingStandards.of(raw_features(counts), table_of) if session else None
     inputs = _inputs(system, standards, counts, table_of)
     fitted = fit(system, inputs, grasps.slipped, seed=seed)
-    sensors = SensorMapping.of(counts, table_of, session=session)
-    return Trained(system, fitted, grasps, sensors, standards)
+    sensors = sensor_standards(counts, table_of) if session else None
+    return Trained(system, fitted, grasps, standards, sensors)
+
+
+def sensor_standards(counts: Numbers, table_of: Ints) -> TrainingStandards:
+    """Return the standards of counts (N, fingers, 24); the prior is the mean of the tables."""
+    tables = TrainingStandards.of(counts.reshape(len(counts), -1).astype(np.float64), table_of)
+    centre = np.mean([table.mean for table in tables.tables.values()], axis=0)
+    return replace(tables, prior=Standards(centre, tables.prior.spread))
 
 
 def _inputs(

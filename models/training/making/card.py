@@ -1,26 +1,13 @@
-"""The model card: a JSON file beside the model that says how it was made and what it is worth."""
+"""Parts of a model card, the JSON file beside a model that says what the model is worth."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from graspd.models.bts3 import CITATIONS, LICENCE, REPOSITORY
-from graspd.models.contract import Dataset, ModelContract
-from graspd.models.training.data.datasets import Grasps, lab_table_names, unpublished
-from graspd.models.training.data.lab_tables import ENOUGH_GRASPS
-from graspd.models.training.estimators.graphs import OPSET
-from graspd.models.training.evaluating.broken import Study
-from graspd.models.training.evaluating.day_figures import DayFigures
-from graspd.models.training.evaluating.metrics import CurvePoint, Fraction, Spread
-from graspd.models.training.evaluating.summaries import ObjectFigures, SystemSummary, Variant
-from graspd.models.training.making.export import Parity
-
-LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
+from graspd.models.contract import Dataset
+from graspd.models.training.data.datasets import ENOUGH_GRASPS, Grasps, lab_table_names, unpublished
+from graspd.models.training.evaluating.summaries import SystemSummary
 
 PUBLISHED_DATA = "The data is of one hand and 41 objects, lifted in one way."
 WEAK_POINTS = (
@@ -33,120 +20,45 @@ OWN_LICENCE = "whatever the owner of the tables says"
 """Licence of data without a published table."""
 
 
-class ExportedFile(msgspec.Struct, frozen=True):
-    """The ONNX file that the card is about."""
+def data_sources(files: Sequence[Dataset]) -> dict[str, object]:
+    """Return licence and sources of the tables used for training or judging.
 
-    sha256: str
-    size_bytes: int
-    opset: int
-    parity: Parity
-
-    @classmethod
-    def of(cls, path: Path, parity: Parity) -> ExportedFile:
-        data = path.read_bytes()
-        return cls(hashlib.sha256(data).hexdigest(), len(data), OPSET, parity)
-
-
-class Data(msgspec.Struct, frozen=True):
-    """Sources of the data. Digests and rows are in the contract."""
-
-    licence: str = LICENCE
-    repository: str | None = REPOSITORY
-    cite: tuple[str, ...] = CITATIONS
-    not_published: tuple[str, ...] = ()
-    """Files that differ from the published ones: licence and sources above are not theirs."""
-
-    @classmethod
-    def of(cls, files: Sequence[Dataset]) -> Data:
-        """Return the sources of the tables used for training or judging."""
-        not_published = tuple(unpublished(files))
-        if len(lab_table_names(files)) < len(files):
-            return cls(not_published=not_published)
-        return cls(OWN_LICENCE, None, (), not_published)
+    Files under `not_published` differ from the published ones: the rest is not about them.
+    """
+    not_published = unpublished(files)
+    sources: dict[str, object]
+    if len(lab_table_names(files)) == len(files):
+        sources = {"licence": OWN_LICENCE, "repository": None, "cite": ()}
+    else:
+        sources = {"licence": LICENCE, "repository": REPOSITORY, "cite": CITATIONS}
+    return {**sources, "not_published": not_published}
 
 
-class Measured(msgspec.Struct, frozen=True):
-    """One protocol: every figure is a fraction, slip positive, mean and spread over the folds."""
+def measured(summary: SystemSummary) -> dict[str, object]:
+    """Return the figures of a protocol that a user of the model needs, slip positive.
 
-    folds: int
-    train_grasps: float
-    test_grasps: float
-    spreads: dict[str, Spread]
-    temperature: float
-    """Makes these margins probabilities; Brier score and the like are cross-fitted."""
-    confusion: list[list[int]]
-    """Rows stable, slip as it was; columns as it was judged."""
-    palms: dict[str, Fraction]
-    objects: dict[str, ObjectFigures]
-    accuracy_at_coverage: dict[str, float]
-    thresholds: dict[str, CurvePoint | None]
-    """By wanted accuracy: from which confidence on."""
-    calibrated_by: dict[str, Spread]
-    """F1 by how the session was calibrated; empty where no session is left out."""
-    days: dict[str, DayFigures]
-    """Figures of the protocol `days`, by group of streams."""
-
-    @classmethod
-    def of(cls, summary: SystemSummary) -> Measured:
-        """The figures of a summary that a user of the model needs."""
-        main: Variant = summary.main
-        several = summary.variants if len(summary.variants) > 1 else {}
-        return cls(
-            folds=summary.folds,
-            train_grasps=summary.train_grasps,
-            test_grasps=summary.test_grasps,
-            spreads=main.spreads,
-            temperature=main.temperature,
-            confusion=main.confusion,
-            palms=main.palms,
-            objects=main.objects,
-            accuracy_at_coverage=main.coverages,
-            thresholds=main.thresholds,
-            calibrated_by={name: variant.spreads["f1"] for name, variant in several.items()},
-            days=main.days,
-        )
-
-
-class NeverSeen(msgspec.Struct, frozen=True):
-    """Fraction of readings that the contract's `seen` refuses."""
-
-    held_out_object: float | None
-    """Grasps of an object, by the other objects; None if there is only one."""
-    made_up: dict[str, float]
-    """Readings that no hand ever made, by the way they were made up; before any repair."""
-
-
-class Card(msgspec.Struct, frozen=True):
-    """Everything that is known about one model file."""
-
-    what: str
-    contract: ModelContract
-    """Word for word what stands in the file."""
-    file: ExportedFile
-    parameters: int
-    """How many numbers the model consists of."""
-    data: Data
-    system: dict[str, Any]
-    """Its configuration."""
-    protocols: dict[str, Measured]
-    temperature: float
-    """In the file, fitted on the margins of `calibrated_by`: grasps that were not trained on."""
-    calibrated_by: str
-    broken: Study | None
-    """Cost of broken electrodes, before and after their repair; None: not studied."""
-    never_seen: NeverSeen
-    same_seed_same_margins: bool
-    """Training the first fold again gave bit-identical margins."""
-    command: str
-    """Makes the file again, byte for byte on a machine of the same kind."""
-    made_with: dict[str, str]
-    weak_points: tuple[str, ...]
-    worth: dict[str, Any] | None = None
-    """Results of `graspd report worth --card` for networks of this system; None: none."""
+    `calibrated_by`: F1 by variant of session calibration; empty where no session is left out.
+    """
+    main = summary.main
+    several = summary.variants if len(summary.variants) > 1 else {}
+    return {
+        "folds": summary.folds,
+        "train_grasps": summary.train_grasps,
+        "test_grasps": summary.test_grasps,
+        "spreads": main.spreads,
+        "temperature": main.temperature,
+        "confusion": main.confusion,
+        "palms": main.palms,
+        "objects": main.objects,
+        "accuracy_at_coverage": main.coverages,
+        "thresholds": main.thresholds,
+        "calibrated_by": {name: variant.spreads["f1"] for name, variant in several.items()},
+        "days": main.days,
+    }
 
 
 def weak_points(summaries: Sequence[SystemSummary], grasps: Grasps) -> tuple[str, ...]:
-    """Sentences on what the model cannot do, with measured figures; `grasps` are trained on."""
+    """Return sentences on what the model cannot do, with figures; `grasps` are trained on."""
     texts = []
     for summary in summaries:
         f1 = 100 * summary.main.spreads["f1"].mean

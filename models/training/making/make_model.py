@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 from collections import Counter
 from collections.abc import Callable
@@ -19,30 +20,23 @@ from graspd.models.contract import (
     Sharpness,
 )
 from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.estimators.graphs import OPSET
 from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.broken import broken_study
 from graspd.models.training.evaluating.days import CALIBRATED_FROM
 from graspd.models.training.evaluating.files import to_json, write_whole
-from graspd.models.training.evaluating.jobs import JobResult
 from graspd.models.training.evaluating.metrics import FEWEST_JUDGED
 from graspd.models.training.evaluating.run_jobs import run_jobs
 from graspd.models.training.evaluating.summaries import SystemSummary, made_with, summarise
 from graspd.models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
 from graspd.models.training.fitting.standards import PRIOR_GRASPS, RUNNING
 from graspd.models.training.fitting.trained import Trained, train
-from graspd.models.training.making.card import (
-    LIBRARIES,
-    Card,
-    Data,
-    ExportedFile,
-    Measured,
-    NeverSeen,
-    weak_points,
-)
+from graspd.models.training.making.card import data_sources, measured, weak_points
 from graspd.models.training.making.export import export
 from graspd.models.training.making.plan import TrainingPlan
 from graspd.models.training.systems.system import SessionFeatures, System, configuration
 
+LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 EXTRA_TRAININGS = 2
 """Trainings beside the folds: one for repeatability, one for the model itself.
 
@@ -52,8 +46,8 @@ The study of broken electrodes, three more, comes last.
 
 def make_model(
     plan: TrainingPlan, grasps: Grasps, out: Path, results: Path, on_done: Callable[[], None]
-) -> Card:
-    """Write `NAME.onnx` and `NAME.json` into the folder `out`; trainings are kept in `results`.
+) -> ModelContract:
+    """Write `NAME.onnx` and its card `NAME.json` into `out`; trainings are kept in `results`.
 
     `grasps` are those of all tables that there are. `on_done` is called after each of the plan's
     jobs and of the `EXTRA_TRAININGS`. Raises `TooFewGraspsError` if the grasps are too few for the
@@ -81,25 +75,35 @@ def make_model(
     tables = trained.standards
     standards = None if tables is None else tables.each(trained.grasps.table_of)
     parity = export(trained.fitted, temperature, contract, trained.grasps.counts, path, standards)
-    card = Card(
-        what=system.description,
-        contract=contract,
-        file=ExportedFile.of(path, parity),
-        parameters=trained.fitted.parameters,
-        data=Data.of(grasps.files),
-        system=configuration(system, "input", "estimator", "recipe", "augmentation", "tables"),
-        protocols={summary.protocol: Measured.of(summary) for summary in summaries},
-        temperature=temperature,
-        calibrated_by=calibrator.protocol,
-        broken=None if plan.only else broken_study(system, trained.grasps, plan.seed),
-        never_seen=_never_seen(trained, contract, plan.seed),
-        same_seed_same_margins=_same(found[wanted[0]], again),
-        command=plan.command,
-        made_with=made_with(LIBRARIES) | {"machine": platform.machine()},
-        weak_points=weak_points(summaries, trained.grasps),
-    )
+    data, first = path.read_bytes(), found[wanted[0]]
+    card = {
+        "what": system.description,
+        "contract": contract,
+        "file": {
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "size_bytes": len(data),
+            "opset": OPSET,
+            "parity": parity,
+        },
+        "parameters": trained.fitted.parameters,
+        "data": data_sources(grasps.files),
+        "system": configuration(system, "input", "estimator", "recipe", "augmentation", "tables"),
+        "protocols": {summary.protocol: measured(summary) for summary in summaries},
+        "temperature": temperature,
+        "calibrated_by": calibrator.protocol,
+        "broken": None if plan.only else broken_study(system, trained.grasps, plan.seed),
+        "never_seen": _never_seen(trained, contract, plan.seed),
+        # Training the first fold again gave bit-identical margins.
+        "same_seed_same_margins": all(
+            np.array_equal(margins, again.margins[name]) for name, margins in first.margins.items()
+        ),
+        "command": plan.command,
+        "made_with": made_with(LIBRARIES) | {"machine": platform.machine()},
+        "weak_points": weak_points(summaries, trained.grasps),
+        "worth": None,  # `graspd report worth --card` fills it in
+    }
     write_whole(path.with_suffix(".json"), to_json(card))
-    return card
+    return contract
 
 
 def _calibrator(summaries: list[SystemSummary]) -> SystemSummary:
@@ -170,18 +174,17 @@ def _sharpness(summaries: list[SystemSummary]) -> tuple[Sharpness, ...]:
     return tuple(reversed(steps))
 
 
-def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> NeverSeen:
-    objects = np.array(trained.grasps.objects)
-    counts, margin = trained.mapped_counts(), trained.sensors.margin
+def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> dict[str, object]:
+    """Return the fractions of readings that the contract's `seen` refuses.
+
+    `held_out_object`: of grasps of an object, by the other objects. `made_up`: of readings that no
+    hand ever made, before any repair, by the way they were made up.
+    """
+    grasps, margin = trained.grasps, trained.margin
+    objects, counts = np.array(grasps.objects), trained.mapped(grasps.counts, grasps.table_of)
     # Two of other objects at least have a covariance.
-    several = len(objects) - max(Counter(trained.grasps.objects).values()) > 1
-    return NeverSeen(
-        held_out_object=held_out_never_seen(counts, objects, margin) if several else None,
-        made_up=made_up_never_seen(counts, contract.seen, seed),
-    )
-
-
-def _same(one: JobResult, other: JobResult) -> bool:
-    return all(
-        np.array_equal(margins, other.margins[name]) for name, margins in one.margins.items()
-    )
+    several = len(objects) - max(Counter(grasps.objects).values()) > 1
+    return {
+        "held_out_object": held_out_never_seen(counts, objects, margin) if several else None,
+        "made_up": made_up_never_seen(counts, contract.seen, seed),
+    }

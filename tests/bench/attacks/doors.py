@@ -14,14 +14,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Self
 
 import zmq
 
-from graspd.daemon.publish.keys import load_pair, make
+from graspd.daemon.publish.keys import make
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
-from tests.bench.live import PATIENCE_S, Child, start_daemon
+from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon
 from tests.ports import free_port
 from tests.threads import at_work
 
@@ -61,33 +60,6 @@ bytes, questions, malformed outcomes."""
 Connect = Callable[[], socket.socket]
 
 
-class Friend:
-    """Hears the daemon, and may send to it."""
-
-    def __init__(self, kind: int, endpoint: str, folder: Path) -> None:
-        """With a key if there is one in the folder."""
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.socket = self._context.socket(kind)
-        self.socket.linger = 0
-        own = folder / "clients" / "friend.key_secret"
-        if own.exists():
-            self.socket.curve_publickey, self.socket.curve_secretkey = load_pair(own)
-            self.socket.curve_serverkey = load_pair(folder / "daemon.key_secret")[0]
-        if kind == zmq.SUB:
-            self.socket.subscribe("verdict.")
-        self.socket.connect(endpoint)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self._context.destroy(0)
-
-    def take(self, timeout_s: float) -> list[bytes] | None:
-        """The next message; None if none comes in time."""
-        return self.socket.recv_multipart() if self.socket.poll(round(timeout_s * 1e3)) else None
-
-
 @dataclass(slots=True)
 class Hand:
     """A daemon, its doors, and a friend that hears it."""
@@ -95,7 +67,7 @@ class Hand:
     process: Child
     publish: str
     ask: str
-    friend: Friend
+    friend: Subscriber
     rest_mib: float = 0.0
     peak_mib: float = 0.0
 
@@ -112,8 +84,7 @@ class Hand:
 
     def outcome(self, tried: int, well: bool = True, said: str = "") -> Outcome:
         """What became of it: whether it lives, is heard, and has little memory."""
-        while self.friend.take(0.0) is not None:
-            pass  # what was on its way already
+        self.friend.drain()
         self.look()
         grown_mib = self.peak_mib - self.rest_mib
         lives = self.process.process.poll() is None
@@ -146,13 +117,11 @@ def hand(folder: Path, scheme: str) -> Iterator[Hand]:
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     with (
         start_daemon(scene, folder / "log") as process,
-        Friend(zmq.SUB, publish, folder) as friend,
+        Subscriber(publish, keys=folder if keys else None) as friend,
     ):
         made = Hand(process, publish, ask, friend)
-        until_s = time.monotonic() + PATIENCE_S
-        while friend.take(0.1) is None:
-            if time.monotonic() > until_s:
-                raise TimeoutError("the daemon says nothing")
+        if friend.take(PATIENCE_S) is None:
+            raise TimeoutError("the daemon says nothing")
         for _ in range(100):
             friend.take(1.0)
         made.look()
@@ -268,8 +237,7 @@ def flood(plan: Plan) -> Outcome:
 
 def _cost(daemon: Hand) -> tuple[float, float]:
     """Processor time of the loop's thread for each verdict, ms, and verdicts a second."""
-    while daemon.friend.take(0.0) is not None:
-        pass
+    daemon.friend.drain()
     path = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/schedstat")
     began_s, began_ns = time.monotonic(), int(path.read_text().split()[0])
     heard = 0

@@ -31,7 +31,6 @@ from tests.bench.live import (
     start_daemon,
     tactile_section,
 )
-from tests.kit.messages import decode_verdict
 from tests.ports import free_port
 from tests.threads import at_work
 
@@ -66,9 +65,9 @@ def hear(
     heard: list[Verdict] = []
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s and not until(heard):
-        message = subscriber.take(min(0.1, max(end_s - time.monotonic(), 0.0)))
-        if message is not None:
-            heard.append(decode_verdict(message[1]))
+        verdict = subscriber.verdict(min(0.1, end_s - time.monotonic()))
+        if verdict is not None:
+            heard.append(verdict)
     return heard
 
 

@@ -30,13 +30,11 @@ from graspd.drivers.twins.spi import SpiTwin
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import (
     HELD,
-    PATIENCE_S,
     SEED,
     Subscriber,
     start_daemon,
     tactile_section,
 )
-from tests.kit.messages import decode_verdict
 from tests.ports import free_port
 from tests.threads import at_work
 
@@ -110,15 +108,6 @@ def scene_in(folder: Path, sections: str) -> Path:
     return scene
 
 
-def wait_for(subscriber: Subscriber, wanted: Callable[[Verdict], bool]) -> None:
-    """Hear verdicts up to the first like that. Raises `TimeoutError`."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while message := subscriber.take(deadline_s - time.monotonic()):
-        if wanted(decode_verdict(message[1])):
-            return
-    raise TimeoutError("the hand was never judged, or fell silent")
-
-
 def under_attack(
     folder: Path,
     sections: str,
@@ -137,11 +126,10 @@ def under_attack(
         start_daemon(scene, folder / "log"),
         contextlib.ExitStack() as within,
     ):
-        wait_for(subscriber, lambda _: True)  # it is there, and sees the hand at rest
+        subscriber.wait_for(lambda _: True)  # it is there, and sees the hand at rest
         within.enter_context(at_work(*serve))
-        wait_for(
-            subscriber,
-            lambda verdict: verdict.verdict is Decision.STABLE and next(stable) >= STABLE_FIRST,
+        subscriber.wait_for(
+            lambda verdict: verdict.verdict is Decision.STABLE and next(stable) >= STABLE_FIRST
         )
         begin.set()
         late: list[Decision] = []
@@ -153,7 +141,7 @@ def under_attack(
             late.append(verdict.verdict)
             return verdict.t_mono_ns - began_ns > UNDER_ATTACK_S * 1e9
 
-        wait_for(subscriber, is_over)
+        subscriber.wait_for(is_over)
     return len(late), late.count(Decision.STABLE)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from graspd.models.runtime import read
 from tests.daemon.processes import graspd
-from tests.models.training.evaluation_samples import table, write
+from tests.models.training.samples import table, write
 
 
 def test_a_table_becomes_a_model_that_a_scene_names(

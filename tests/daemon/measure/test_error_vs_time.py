@@ -28,7 +28,7 @@ from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from graspd.models.tactile_image import TactileImager
 from tests.daemon.fakes import FakeModel, contract
-from tests.models.training.evaluation_samples import sessions
+from tests.models.training.samples import sessions
 
 WHOLE_S = 300.0
 """A quick report takes a quarter of a minute, and many on a busy machine."""

@@ -22,7 +22,7 @@ from graspd.models.training.estimators.configs import GRIDS, ForestConfig, SvmCo
 from graspd.models.training.evaluating import jobs, run_jobs
 from graspd.models.training.evaluating.jobs import Job
 from graspd.models.training.systems.registry import SYSTEMS
-from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
+from tests.models.training.samples import OBJECTS, table, write, write_sessions
 
 ROOT = Path(__file__).parents[4]
 

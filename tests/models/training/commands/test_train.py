@@ -18,8 +18,14 @@ from graspd.models.training.commands import train
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.making import make_model
 from graspd.models.training.making.export import ExportError
-from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
-from tests.models.training.training_samples import separable_counts, write_table
+from tests.models.training.samples import (
+    OBJECTS,
+    separable_counts,
+    table,
+    write,
+    write_sessions,
+    write_table,
+)
 
 SYSTEM = "svm-session"
 GRASPS = 80

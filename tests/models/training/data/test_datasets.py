@@ -19,7 +19,7 @@ from graspd.models.training.data.datasets import (
     read_whole,
     unpublished,
 )
-from tests.models.training.training_samples import separable_counts, write_table
+from tests.models.training.samples import separable_counts, write_table
 
 # Grasps, stable, slip, SHA-256: as recorded when the data was taken in.
 REAL = {

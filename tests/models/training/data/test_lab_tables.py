@@ -7,10 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from graspd.models.training.data.datasets import DatasetError
-from graspd.models.training.data.lab_tables import read_with_lab_tables
-from tests.models.training.evaluation_samples import table, write, write_sessions
-from tests.models.training.training_samples import separable_counts, write_table
+from graspd.models.training.data.datasets import DatasetError, read_with_lab_tables
+from tests.models.training.samples import (
+    separable_counts,
+    table,
+    write,
+    write_sessions,
+    write_table,
+)
 
 
 def refusal(lab: Sequence[Path], folder: Path | None = None) -> str:

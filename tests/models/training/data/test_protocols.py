@@ -18,7 +18,7 @@ from graspd.models.training.data.protocols import (
     object_folds,
     splits,
 )
-from tests.models.training.evaluation_samples import OBJECTS, sessions, table
+from tests.models.training.samples import OBJECTS, sessions, table
 
 GROUPED: tuple[EvalProtocol, ...] = ("objects", "objects-whole", "session")
 # Grasps that each protocol judges, from the paper and the tables' own row counts.

@@ -18,7 +18,7 @@ from graspd.models.training.estimators.configs import (
     MlpConfig,
     SvmConfig,
 )
-from tests.models.training.training_samples import separable_counts
+from tests.models.training.samples import separable_counts
 
 COUNTS, SLIPPED = separable_counts(120)
 VECTORS = VectorBuilder(3).build_batch(COUNTS)[0]

@@ -25,7 +25,7 @@ from graspd.models.training.estimators.recipe import (
     reproducible,
     train_network,
 )
-from tests.models.training.training_samples import separable_counts
+from tests.models.training.samples import separable_counts
 
 TINY = NetworkConfig(filters=4, hidden=16)
 QUICK = Recipe(epochs=4)

@@ -6,7 +6,7 @@ import pytest
 
 from graspd.models.training.evaluating.broken import KINDS, NUMBERS, broken_study
 from graspd.models.training.systems.registry import SYSTEMS
-from tests.models.training.evaluation_samples import sessions
+from tests.models.training.samples import sessions
 
 
 @pytest.mark.parametrize("name", ["svm", "svm-session"])

@@ -18,7 +18,7 @@ from graspd.models.training.evaluating.jobs import Job, JobResult
 from graspd.models.training.fitting.standards import PRIOR_GRASPS
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS
-from tests.models.training.evaluation_samples import sessions
+from tests.models.training.samples import sessions
 
 GRASPS = sessions(160)
 NOTHING = np.zeros((3, 24), np.bool_)

@@ -22,7 +22,7 @@ from graspd.models.training.fitting.standards import (
     later_session,
 )
 from graspd.models.training.systems.system import SessionFeatures, System
-from tests.models.training.evaluation_samples import sessions
+from tests.models.training.samples import sessions
 
 GRASPS = sessions(200)
 SVM = System("svm", "A machine.", VectorInput(), SvmConfig(3.0, 0.01))

@@ -10,31 +10,36 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sklearn.metrics import log_loss
 
 from graspd.models.training.data.protocols import EvalProtocol, splits
 from graspd.models.training.evaluating.jobs import Job, JobResult
-from graspd.models.training.evaluating.results_table import ONE_ROW, Made, difference, results_table
+from graspd.models.training.evaluating.metrics import fit_temperature
+from graspd.models.training.evaluating.results_table import ONE_ROW, difference, results_table
 from graspd.models.training.evaluating.summaries import (
     SystemSummary,
     read_summaries,
-    read_summary,
     summarise,
     write_summary,
 )
 from graspd.models.training.fitting.standards import SESSION_VARIANTS
 from graspd.models.training.systems.registry import SYSTEMS
 from graspd.models.training.systems.system import digest
-from tests.models.training.evaluation_samples import sessions
+from tests.models.training.samples import sessions
 
 GRASPS = sessions(200)
-MADE = Made("graspd evaluate --data DIR", {"machine": "a desk", "numpy": "2"})
+MADE = "graspd evaluate --data DIR", {"machine": "a desk", "numpy": "2"}
 TRUTH = np.where(GRASPS.slipped, 2.0, -2.0)
+
+
+def margins_of(name: str, wrong: float) -> NDArray[np.float64]:
+    flip = np.random.default_rng(len(name)).random(len(GRASPS)) < wrong
+    return np.where(flip, -TRUTH, TRUTH)
 
 
 def summary_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) -> SystemSummary:
     """A system that is wrong on this share of the grasps, at random."""
-    flip = np.random.default_rng(len(name)).random(len(GRASPS)) < wrong
-    margins = np.where(flip, -TRUTH, TRUTH)
+    margins = margins_of(name, wrong)
 
     def result(test: NDArray[np.int64], train: int) -> JobResult:
         variants = {"none": margins[test]}
@@ -73,6 +78,12 @@ def test_probabilities_are_calibrated_by_the_other_folds() -> None:
     # Margins of +-2, right nine times in ten: log-odds of 0.9 are 2.2, so T is about 2 / 2.2.
     assert made.main.temperature == pytest.approx(2.0 / np.log(9.0), rel=0.2)
     assert made.main.spreads["ece"].mean < 0.06
+    first, *others = (split.test for split in splits("cv", GRASPS, 0, 4))
+    rest, margins = np.concatenate(others), margins_of("cnn1", wrong=0.1)
+    temperature = fit_temperature(margins[rest], GRASPS.slipped[rest])
+    probability = 1.0 / (1.0 + np.exp(-margins[first] / temperature))
+    expected = log_loss(GRASPS.slipped[first], probability)
+    assert made.main.figures["log_loss"][0][0] == pytest.approx(expected)
 
 
 def test_a_single_split_is_calibrated_by_its_other_objects() -> None:
@@ -93,7 +104,8 @@ def test_a_summary_comes_back_from_its_file(tmp_path: Path) -> None:
     made = summary_of("cnn1", "cv", wrong=0.1)
     write_summary(made, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["cnn1.cv.json"]
-    assert read_summary(tmp_path / "cnn1.cv.json") == made
+    digests = {"cnn1": digest(SYSTEMS["cnn1"])}
+    assert read_summaries(tmp_path, GRASPS.digest(), digests) == [made]
 
 
 def test_a_summary_of_other_data_or_configuration_is_left_out(
@@ -121,7 +133,7 @@ def rows(text: str, section: int) -> list[list[str]]:
 def test_the_papers_figures_stand_beside_ours_and_nothing_is_made_up() -> None:
     ours = summary_of("cnn1", "cv", wrong=0.1)
     f1 = ours.main.spreads["f1"]
-    text = results_table([ours], MADE)
+    text = results_table([ours], *MADE)
     first = rows(text, 1)
     assert "## Findings" not in text
     found = {(row[0], row[1], row[2]): row[3:] for row in first}
@@ -158,14 +170,14 @@ PUBLISHED = [
 
 
 def test_every_published_row_is_there_even_if_nothing_was_run() -> None:
-    shown = rows(results_table([], MADE), 1)
+    shown = rows(results_table([], *MADE), 1)
     for system, protocol, figure, paper in PUBLISHED:
         assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-"] in shown
 
 
 def test_the_document_says_itself_how_one_row_is_made_again() -> None:
     kept = (Path(__file__).parents[4] / "models/RESULTS.md").read_text()
-    for text in (kept, results_table([], MADE)):
+    for text in (kept, results_table([], *MADE)):
         command, sentence, *_ = text.split("## How this was made\n\n")[1].split("\n\n")
         assert command.startswith("    graspd evaluate ")
         assert sentence == ONE_ROW
@@ -174,7 +186,7 @@ def test_the_document_says_itself_how_one_row_is_made_again() -> None:
 def test_a_finding_has_the_figures_of_the_tables() -> None:
     tried = [("cnn1", 0.1), ("svm", 0.05), ("mlp", 0.2), ("rf", 0.3)]
     made = {name: summary_of(name, "cv", wrong) for name, wrong in tried}
-    text = results_table(list(made.values()), MADE)
+    text = results_table(list(made.values()), *MADE)
     (finding,) = re.findall(r"^- \*\*.*$", text, re.MULTILINE)
     for name, one in made.items():
         f1 = one.main.spreads["f1"]
@@ -187,7 +199,7 @@ def test_a_finding_has_the_figures_of_the_tables() -> None:
 
 def test_sessions_are_told_by_the_number_of_grasps() -> None:
     ours = summary_of("svm-session", "session", wrong=0.2)
-    _, row, *_ = rows(results_table([ours], MADE), 3)
+    _, row, *_ = rows(results_table([ours], *MADE), 3)
     f1 = ours.main.spreads["f1"]
     value = f"{100 * f1.mean:.1f} +- {100 * f1.std:.1f}"
     assert row == ["`svm-session`", value, "-", "-", "-", value, "-", value, "-"]
@@ -203,7 +215,7 @@ def test_differences_are_taken_fold_by_fold_on_common_seeds() -> None:
     assert mean == pytest.approx(gaps.mean())
     # Four folds: 100 judged, 300 trained on.
     assert error == pytest.approx(np.sqrt((1 / 8 + 1 / 3) * gaps.var(ddof=1)))
-    fifth = rows(results_table([bad, good], MADE), 5)
+    fifth = rows(results_table([bad, good], *MADE), 5)
     cell = f"{100 * mean:+.1f} +- {100 * error:.1f}"
     assert ["`cnn2`", "`cv`", cell, "-"] in fifth
 
@@ -215,18 +227,18 @@ def test_other_data_are_not_compared() -> None:
 
 
 def test_the_table_says_how_it_was_made() -> None:
-    text = results_table([summary_of("cnn1", "cv", wrong=0.1)], MADE)
+    text = results_table([summary_of("cnn1", "cv", wrong=0.1)], *MADE)
     assert "    graspd evaluate --data DIR\n" in text
     assert "8 trainings, 16 s in all on one thread each." in text
     assert "machine a desk, numpy 2." in text
     assert f"- `palm_down.csv` {GRASPS.files[0].sha256}, 200" in text
     assert "--quick" not in text
-    assert "mean nothing" in results_table([], dataclasses.replace(MADE, quick=True))
+    assert "mean nothing" in results_table([], *MADE, quick=True)
 
 
 def test_every_row_has_as_many_cells_as_its_header() -> None:
     made = [summary_of("cnn1", "cv", 0.1), summary_of("svm-session", "session", 0.2)]
-    text = results_table(made, MADE)
+    text = results_table(made, *MADE)
     width = 0
     for before, line in zip(["", *text.splitlines()], text.splitlines(), strict=False):
         if line.startswith("|"):

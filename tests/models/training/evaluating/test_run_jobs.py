@@ -22,7 +22,7 @@ from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.jobs import Job, JobResult
 from graspd.models.training.evaluating.run_jobs import ClusterError, run_jobs
 from graspd.models.training.systems.system import System
-from tests.models.training.evaluation_samples import sessions
+from tests.models.training.samples import sessions
 
 GRASPS = sessions(120)
 ROOT = Path(__file__).parents[4]

@@ -28,7 +28,7 @@ from graspd.models.training.systems.system import (
     System,
     with_recipes,
 )
-from tests.models.training.training_samples import separable_counts
+from tests.models.training.samples import separable_counts
 
 TINY = NetworkConfig(filters=4, hidden=8, dropout=0.2)
 QUICK = Recipe(epochs=3)

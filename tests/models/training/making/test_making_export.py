@@ -38,12 +38,12 @@ from graspd.models.training.estimators.configs import (
     SecondConvolution,
     SvmConfig,
 )
-from graspd.models.training.fitting.fit import Fitted, fit
+from graspd.models.training.fitting.fit import Fitted, FittedClassical, fit
 from graspd.models.training.fitting.standards import Standards
 from graspd.models.training.making.export import ExportError, export
 from graspd.models.training.systems.registry import SESSION
 from graspd.models.training.systems.system import BlendConfig, Estimator, Member, System
-from tests.models.training.training_samples import separable_counts
+from tests.models.training.samples import separable_counts
 
 COUNTS, SLIPPED = separable_counts(90)
 OTHER_COUNTS = separable_counts(200, seed=12)[0]
@@ -190,26 +190,21 @@ def test_a_session_model_is_checked_by_the_statistics_given(
     """Every reading by its own: first shifted statistics, then those of the contract."""
     seen: list[NDArray[np.float32]] = []
     trained = fitted("hard svm")
+    assert isinstance(trained, FittedClassical)
 
-    class Watched:
-        parameters = trained.parameters
-
+    class Watched(FittedClassical):
         def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
             seen.append(inputs)
-            return trained.margins(inputs)
-
-        def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
-            return trained.to_onnx(temperature, input_name)
-
-        def margin_graph(self, input_name: str) -> onnx.ModelProto:
-            return trained.margin_graph(input_name)
+            return super().margins(inputs)
 
     mean = np.repeat(RAW.mean(axis=0)[np.newaxis], 4, axis=0)
     spread = np.repeat(RAW.std(axis=0)[np.newaxis], 4, axis=0)
     mean[0] += 0.5 * spread[0]
     standards = Standards(mean, spread)
     contract = _contract(STATISTICS)
-    parity = export(Watched(), 1.0, contract, COUNTS[:4], tmp_path / "made.onnx", standards)
+    parity = export(
+        Watched(trained.model), 1.0, contract, COUNTS[:4], tmp_path / "made.onnx", standards
+    )
     assert parity.grasps == 4
     expected = np.clip((RAW[:4] - mean) / spread, -3.0, 3.0)
     assert seen[0] == pytest.approx(expected, abs=1e-5)
@@ -218,21 +213,15 @@ def test_a_session_model_is_checked_by_the_statistics_given(
 def test_a_file_that_judges_otherwise_is_not_written(
     fitted: Callable[[str], Fitted], tmp_path: Path
 ) -> None:
-    class Warmer:
-        parameters = 0
-
-        def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
-            return fitted("svm").margins(inputs)
-
+    class Warmer(FittedClassical):
         def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
-            return fitted("svm").to_onnx(temperature * 1.01, input_name)
+            return super().to_onnx(temperature * 1.01, input_name)
 
-        def margin_graph(self, input_name: str) -> onnx.ModelProto:
-            return fitted("svm").margin_graph(input_name)
-
+    trained = fitted("svm")
+    assert isinstance(trained, FittedClassical)
     path = tmp_path / "made.onnx"
     path.write_bytes(b"the file before")
     with pytest.raises(ExportError, match="differs from the system"):
-        export(Warmer(), 1.0, _contract(CASES["svm"].input), COUNTS, path)
+        export(Warmer(trained.model), 1.0, _contract(CASES["svm"].input), COUNTS, path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["made.onnx"]
     assert path.read_bytes() == b"the file before"

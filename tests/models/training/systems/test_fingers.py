@@ -17,7 +17,7 @@ from graspd.models.training.making.make_model import make_model
 from graspd.models.training.making.plan import TrainingPlan
 from graspd.models.training.systems.registry import SYSTEMS
 from graspd.models.training.systems.system import digest, with_recipes
-from tests.models.training.evaluation_samples import sessions
+from tests.models.training.samples import sessions
 
 FORMS = {
     "small-session-ff": ("ff",),

@@ -1,20 +1,51 @@
-"""Made-up grasps of many objects in three sessions, the last with drifted sensors."""
+"""Made-up grasps that can be separated, of many objects in three sessions, as grasp tables."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspd.models.contract import Dataset
 from graspd.models.training.data.datasets import Grasps, concatenate
-from tests.models.training.training_samples import separable_counts, write_table
 
+HEADER = [
+    "object",
+    "slipped",
+    *(f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)),
+]
 UNKNOWN = ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case",
            "train")  # fmt: skip
 OBJECTS = (*UNKNOWN, *(f"object_{letter}" for letter in "abcdefghijkl"))
 TABLES = ("palm_down", "palm_side", "palm_45")
+
+
+def separable_counts(grasps: int, seed: int = 7) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Counts (N, 3, 24) that fall along the electrodes of a stable grasp and rise in a slip."""
+    random = np.random.default_rng(seed)
+    slipped = np.arange(grasps) % 2 == 1
+    ramp = np.linspace(-600.0, 600.0, 24) * np.where(slipped, 1.0, -1.0)[:, None, None]
+    counts = 2000.0 + ramp + random.normal(0.0, 120.0, (grasps, 3, 24))
+    return counts.astype(np.uint16), slipped
+
+
+def write_table(
+    path: Path,
+    counts: NDArray[np.uint16],
+    slipped: NDArray[np.bool_],
+    objects: Sequence[str] | None = None,
+) -> None:
+    """Write a grasp table in the published form; without `objects`, of balls."""
+    names = ["ball"] * len(counts) if objects is None else objects
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(HEADER)
+        for name, slip, reading in zip(names, slipped, counts, strict=True):
+            writer.writerow([name, int(slip), *reading.ravel()])
 
 
 def table(name: str, grasps: int, seed: int, drift: int = 0) -> Grasps:
