@@ -23,7 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.decision import HandLimits
-from graspd.daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
+from graspd.daemon.judge.reasons import (
+    FingerState,
+    GateCause,
+    GateChange,
+    GateState,
+    Moment,
+    Reason,
+)
 from graspd.daemon.judge.stillness import ONES, Motion, MotionLimits
 from graspd.daemon.judge.windows import LONG_NS, SHORT_NS
 from graspd.drivers.base import ELECTRODES
@@ -100,30 +107,44 @@ class Gate:
         if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gap_ns:
             self.restart(t_ns)
 
-    def step(
+    def observe(
         self,
         t_ns: int,
         counts: NDArray[np.uint16],
+        usable: NDArray[np.bool_] | None,
+        *,
+        touches: bool,
+    ) -> None:
+        """Take in the motion of a reading of `t_ns`, before `step`; `counts`: shape (fingers, 24).
+
+        `usable`: electrodes that can be used, shape (fingers, 24); None: all. `touches` is True if
+        any finger touches.
+        """
+        self.skip(t_ns)
+        self.memory.last_ns = t_ns
+        self.motion.add(t_ns, counts, usable, wanted=touches or not self.required)
+
+    def step(
+        self,
+        t_ns: int,
         median: NDArray[np.uint16],
         usable: NDArray[np.bool_] | None,
         touching: tuple[Finger, ...],
         objections: tuple[Reason, ...] = (),
         *,
+        fingers: dict[Finger, FingerState | None] | None = None,
         in_time: bool = True,
         fresh: bool = True,
     ) -> Moment:
-        """Take in one usable reading of `t_ns` and its median; return where in a grasp it is.
+        """Take in the median of the reading just observed; return where in a grasp it is.
 
-        `usable`: electrodes that can be used, shape (fingers, 24); None: all. `objections` of other
-        parts keep the grasp from settling: no tare, joints that move. The grasp is judged only
-        `in_time` and by `fresh` values, or by the newest once the verdict is too old to stand.
+        `objections` of other parts keep the grasp from settling: no tare, joints that move. The
+        grasp is judged only `in_time` and by `fresh` values, or by the newest once the verdict is
+        too old to stand. `fingers` goes into the moment as it is.
         """
         memory = self.memory
-        self.skip(t_ns)
-        memory.last_ns = t_ns
         self._follow_question(t_ns)
         in_contact = self.required.issubset(touching)
-        self.motion.add(t_ns, counts, usable, wanted=in_contact or bool(touching))
         if in_contact and not memory.in_contact:
             memory.touched_ns = t_ns
         memory.in_contact = in_contact
@@ -142,11 +163,17 @@ class Gate:
             reasons = (Reason.MOVING if self.motion.slides else Reason.SETTLING,)
         memory.objections = reasons
         if in_time and self._wants_judgement(fresh=fresh):
-            return self._judge(t_ns, median, touching)
-        return self.moment(touching)
+            judged = self._judge(t_ns, median)
+            return self.moment(touching, fingers, judges=True, judged=judged)
+        return self.moment(touching, fingers)
 
     def moment(
-        self, touching: tuple[Finger, ...], *, judges: bool = False, judged: bool = False
+        self,
+        touching: tuple[Finger, ...],
+        fingers: dict[Finger, FingerState | None] | None = None,
+        *,
+        judges: bool = False,
+        judged: bool = False,
     ) -> Moment:
         """Return where in a grasp the hand is, and forget the changes that led there."""
         memory = self.memory
@@ -170,6 +197,7 @@ class Gate:
             steady=self._keeps_to(self.motion.strict),
             motion=motion,
             motion_limits=motion_limits,
+            fingers=fingers,
         )
 
     def restart(self, t_ns: int) -> None:
@@ -222,8 +250,8 @@ class Gate:
             return age_ns > STANDS_NS or (fresh and (memory.asked or age_ns >= REFRESH_NS))
         return fresh and memory.state is GateState.SETTLED and self._is_asked
 
-    def _judge(self, t_ns: int, median: NDArray[np.uint16], touching: tuple[Finger, ...]) -> Moment:
-        """Enter `judged`, or stay there."""
+    def _judge(self, t_ns: int, median: NDArray[np.uint16]) -> bool:
+        """Enter `judged`, or stay there; return False if that only refreshes a judgement."""
         memory = self.memory
         refreshes = memory.state is GateState.JUDGED and not (memory.asked and self._on_request)
         memory.judged_ns = t_ns
@@ -234,7 +262,7 @@ class Gate:
             memory.early = self._still_ns < LONG_NS
             memory.moved_since_ns = None
             self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
-        return self.moment(touching, judges=True, judged=not refreshes)
+        return not refreshes
 
     def _nearest_to_limit(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
         """Per finger: motion in the window closer to its limit, and that limit."""

@@ -253,29 +253,38 @@ class HandTracker:
         self._fresh.push(counts, usable)
         median, fresh = self._fresh.counts, self._fresh.is_full(usable)
         self._contact.observe(t_ns, counts, median, usable)
-        touching = tuple(compress(self._fingers, self._contact.memory.touching.tolist()))
-        tared = compress(self._fingers, self._contact.memory.tared.tolist())
-        objections = () if self.gate.required.issubset(tared) else (Reason.NOT_TARED,)
+        contact = self._contact.memory
+        touching, tared = contact.touching.tolist(), contact.tared.tolist()
+        named_tared = compress(self._fingers, tared)
+        objections = () if self.gate.required.issubset(named_tared) else (Reason.NOT_TARED,)
         joints = None if self._joints is None else self._joints.objection(t_ns)
         if joints is not None:
             objections = (*objections, joints)
+        self.gate.observe(t_ns, counts, usable, touches=any(touching))
         moment = self.gate.step(
-            t_ns, counts, median, usable, touching, objections, in_time=in_time, fresh=fresh
+            t_ns,
+            median,
+            usable,
+            tuple(compress(self._fingers, touching)),
+            objections,
+            fingers=self._feel(t_ns, touching, tared),
+            in_time=in_time,
+            fresh=fresh,
         )
-        moment = moment._replace(fingers=self._feel(t_ns))
         if not moment.judges:
             return moment, None
         return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else counts
 
     def moment(self) -> Moment:
         """Return where in a grasp the hand is without a new reading; it is not to be judged."""
-        moment = self.gate.moment(self._named(self._contact.memory.touching))
-        return moment._replace(fingers=dict.fromkeys(self._fingers))
+        touching = self._named(self._contact.memory.touching)
+        return self.gate.moment(touching, dict.fromkeys(self._fingers))
 
-    def _feel(self, t_ns: int) -> dict[Finger, FingerState | None]:
-        """Return what each finger feels by the reading at hand."""
-        contact, motion = self._contact.memory, self.gate.motion
-        tared, touching = contact.tared.tolist(), contact.touching.tolist()
+    def _feel(
+        self, t_ns: int, touching: list[bool], tared: list[bool]
+    ) -> dict[Finger, FingerState | None]:
+        """Return what each finger feels by the reading just observed."""
+        motion = self.gate.motion
         feelings: dict[Finger, FingerState | None] = {}
         for place, finger in enumerate(self._fingers):
             memory = self.memory.fingers[place]

@@ -55,7 +55,8 @@ class Steps:
         self.t_ns += round(after_ms * MS)
         median = np.full(SHAPE, 3000, dtype=np.uint16)
         median[0] = round(counts)
-        self.now = self.gate.step(self.t_ns, median, median, ALL, touching, objections)
+        self.gate.observe(self.t_ns, median, ALL, touches=bool(touching))
+        self.now = self.gate.step(self.t_ns, median, ALL, touching, objections)
         assert self.now.judges or not self.now.judged
         self._changes += self.now.changes
         return self.now.state
@@ -136,7 +137,8 @@ def test_a_verdict_is_refreshed_after_50_ms_or_by_old_values_after_100(
     judged = []
     for place in range(1, 23):
         t_ns = steps.t_ns + place * 10 * MS
-        if steps.gate.step(t_ns, sweep, sweep, ALL, FINGERS, fresh=fresh).judges:
+        steps.gate.observe(t_ns, sweep, ALL, touches=True)
+        if steps.gate.step(t_ns, sweep, ALL, FINGERS, fresh=fresh).judges:
             judged.append(place)
     assert judged == list(range(first, 23, first))
 
@@ -219,9 +221,8 @@ def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> Non
     for place in range(50):
         median[0, :12] = 4095 * (place % 2)
         steps.t_ns += 10 * MS
-        sweep = median.copy()
-        now = steps.gate.step(steps.t_ns, sweep, sweep, usable, FINGERS)
-        assert now.settled
+        steps.gate.observe(steps.t_ns, median.copy(), usable, touches=True)
+        assert steps.gate.step(steps.t_ns, median, usable, FINGERS).settled
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -235,8 +236,7 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
         usual = random.random() < 0.97
         t_ns += 10 * MS if usual else round(MS * random.choice([0, 1, 90, 101, 5000, -20]))
         if random.random() < 0.02:
-            touches = random.random(3) < random.choice([0.1, 0.9])
-            touching = tuple(compress(FINGERS, touches))
+            touching = tuple(compress(FINGERS, random.random(3) < random.choice([0.1, 0.9])))
         if random.random() < 0.01:
             median = random.integers(2900, 3000, SHAPE)
         if random.random() < 0.05:
@@ -247,8 +247,9 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
             now = gate.moment(touching)
         else:
             sweep, usable = median.astype(np.uint16), random.random(SHAPE) < (0.9 + 0.1 * usual)
+            gate.observe(t_ns, sweep, usable, touches=bool(touching))
             now = gate.step(
-                *(t_ns, sweep, sweep, usable, touching, objections),
+                *(t_ns, sweep, usable, touching, objections),
                 in_time=random.random() < 0.8,
                 fresh=random.random() < 0.9,
             )
@@ -393,8 +394,7 @@ def test_of_both_windows_the_one_nearer_to_its_limit_is_told() -> None:
         for place, finger in enumerate(FINGERS):
             fast = alone.fast[place], most.fast[place]
             slow = alone.slow[place], most.slow[place]
-            is_slow = slow[0] / slow[1] > fast[0] / fast[1]
-            nearer = slow if is_slow else fast
+            nearer = max(fast, slow, key=lambda window: window[0] / window[1])
             assert (motion[finger], limits[finger]) == pytest.approx(nearer, abs=0.00501)
-            told.add(is_slow)
+            told.add(nearer is slow)
     assert told == {False, True}
