@@ -1,4 +1,4 @@
-"""Size and timing of the firmware's images on the emulated chip: the table of the bridge's README.
+"""Size and timing of the firmware's images on the emulated chip; some rows stand in the bridge's README.
 
 `python -m tests.emulated.figures` prints it.
 """
