@@ -1,4 +1,4 @@
-"""Size and timing of the firmware's images on the emulated chip: the table of the bridge's README.
+"""Size and timing of the firmware on the emulated chip; the README of the bridge has some rows.
 
 `python -m tests.emulated.figures` prints it.
 """
