@@ -8,18 +8,12 @@ electrode i with the residual `(P d)_i / P_ii` and the standard deviation `1 / s
 from __future__ import annotations
 
 import math
-from operator import gt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.models.contract import SeenCounts
 
-ROUNDING = 1e-9
-"""Distance from a limit, as a share of it, at which `Electrodes.plain_square` does not decide.
-
-It is about a thousand times the rounding error of a residual.
-"""
 IMPLAUSIBLE = 8.0
 """Residual, in its standard deviations, from which an electrode counts as broken.
 
@@ -59,8 +53,6 @@ class Electrodes:
         self._shape = np.shape(seen.centre)
         of_fingers = self._precision.reshape(self._shape * 2).sum(axis=(1, 3))
         self._finger_limits = IMPLAUSIBLE * np.sqrt(np.diag(of_fingers))
-        self._plain_limits = (1.0 - ROUNDING) * self._limits
-        self._plain_finger_limits: list[float] = ((1.0 - ROUNDING) * self._finger_limits).tolist()
         self.centre = self._centre.reshape(self._shape)
         """Training mean of each electrode, counts, shape (fingers, 24)."""
         self.spread = np.sqrt(np.diag(np.linalg.inv(self._precision))).reshape(self.centre.shape)
@@ -92,21 +84,6 @@ class Electrodes:
             bad[worst] = True
             others.forget(worst)
         return bad.reshape(broken.shape)
-
-    def plain_square(self, deviations: NDArray[np.float64]) -> float | None:
-        """Return `NoveltyCheck.square` of a reading; None if it is not plainly sound.
-
-        `deviations`: counts less `centre`, shape (fingers, 24). None means that `implausible` or
-        `moved_finger` may find something: call them.
-        """
-        flat = deviations.reshape(-1)
-        residuals = self._precision.dot(flat)
-        if 0 in (np.abs(residuals) < self._plain_limits).tobytes():
-            return None
-        of_fingers = np.add.reduce(residuals.reshape(self._shape), axis=1).tolist()
-        if any(map(gt, map(abs, of_fingers), self._plain_finger_limits)):
-            return None
-        return float(flat.dot(residuals)) / len(flat)
 
     def moved_finger(self, values: NDArray[np.float64]) -> bool:
         """Return True if all electrodes of a finger seem shifted by one offset.

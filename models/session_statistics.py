@@ -21,11 +21,12 @@ Without it, 400 grasps of one object would bias the next thousand. It also lets 
 follow the slow drift of a new sensor.
 """
 REPEAT_DISTANCE, REPEAT_IN_PRIOR = 0.05, 0.15
-"""Root-mean-square distances from the last grasp below which a reading is the same grasp again.
+"""Distances from the last grasp below which a reading is the same grasp again.
 
-The first is in spreads of the session, the second in spreads of the training, because the session's
-own shrink with each repetition. Noise of 5 counts gives at most 0.11 of the training's; 98 of 100
-grasps of one object differ by more than the limit.
+A distance is the root mean square of the differences, each in units of its value's spread. The
+first limit is in spreads of the session, the second in those of the training: the session's own
+shrink with each repetition. Noise of 5 counts gives at most 0.11 of the training's spreads; 98 of
+100 grasps of one object differ by more than the limit.
 """
 BALANCED_FROM = 20
 """Grasps after which verdicts are good enough to balance stable grasps and slips."""
@@ -42,7 +43,7 @@ After twenty grasps of the published tables it is 0.4 to 1.5; for a dead finger 
 AWAY_MAX = 8.0
 """Largest distance of a session's mean from the training's, in the training's spreads.
 
-It is a root mean square over the electrodes; on the published days it is 1.3 to 4.1.
+The distance is the root mean square over all electrodes. On the published days it is 1.3 to 4.1.
 """
 AWAY_MIN, ORDER_RATIO = 1.0, 1.2
 """Fingers count as exchanged above this distance, if another order is this factor nearer.
@@ -61,7 +62,7 @@ class SessionState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Number of all grasps."""
     mean: tuple[float, ...]
     squares: tuple[Annotated[float, msgspec.Meta(ge=0.0)], ...]
-    """Sums of the squared deviations from the mean."""
+    """Sum over the grasps of weight times squared deviation from `mean`, of each value."""
     slip_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.5
     """Share of slips among the latest grasps, by their verdicts."""
     last: tuple[float, ...] | None = None

@@ -118,12 +118,13 @@ class Touch:
         self.lowest = min(self.lowest, max(self.fall, 0.0))
 
     def has_lost_rest(self, t_ns: int, middle: float) -> bool:
-        """Return True if the baseline is no longer to be trusted; while not all fingers touch.
+        """Return True if the finger must be tared again. Call it while not all fingers touch.
 
-        `middle` is the fall of the finger's median electrode.
+        A finger must after a long hold, when it as a whole rests above its baseline, and when it
+        has touched alone for over `ALONE_NS`. `middle`: fall of its median electrode, counts.
         """
         if not self.touching:
-            # One that rests higher as a whole was tared while it touched, or has drifted far.
+            # A finger that rests higher was tared while it touched, or has drifted far.
             return self.held_long or middle < -self.threshold
         if self.alone_since_ns is None:
             self.alone_since_ns = t_ns

@@ -27,85 +27,102 @@ WITHHELD: Final = {
 # Without slots, so that a default can be read from the class.
 @dataclass(frozen=True)
 class ContactLimits:
-    """Limits of a touch: the third deepest electrode of a finger must reach both."""
+    """Fall below the baseline from which a finger counts as touching.
+
+    The fall of a finger is that of its third deepest electrode. It must reach the larger of the two
+    limits.
+    """
 
     counts: float = 20.0
-    """Fall below the baseline, counts. In 9.8 s of three untouched sensors it was 10 at most; from
-    24 on a touch of three electrodes was always seen there (thresholds were 20 to 22)."""
+    """Smallest fall of a touch, counts.
+
+    In 9.8 s of three untouched sensors no fall was over 10. On the same sensors each fall of three
+    electrodes by 24 was seen as a touch.
+    """
     sigmas: float = 5.0
-    """The same in standard deviations of the finger's median electrode."""
+    """Smallest fall of a touch, in standard deviations of the noise of the finger's median
+    electrode."""
 
 
 @dataclass(frozen=True)
 class GateLimits:
-    """When a grasp has settled, and when it is another one. Times in ns, counts raw."""
+    """Limits by which the gate decides that a grasp has settled, changed or ended."""
 
     false_alarms: float = 0.03
-    """Share of the sweeps of a settled hand that holds in which it may be said to move. Until it
-    has settled the limit is stricter. The larger, the slower the slides that are seen:
-    deploy/JUDGING.md."""
+    """Share of sweeps, 0..0.5, in which a hand that holds still may be reported as moving.
+
+    A larger share lets slower slides be seen: deploy/JUDGING.md. Until the hand has settled the
+    limit of motion is stricter.
+    """
     early: bool = False
-    """True if a grasp is judged as soon as fast motion is excluded, and again when slow slides
-    are."""
+    """True: judge once fast motion is excluded, and again once slow slides are excluded."""
     change_counts: float = 40.0
-    """Mean distance of a finger's electrodes from where they were judged, above which it is another
-    grasp."""
+    """Largest mean change of a finger's electrodes since the judgement, counts.
+
+    Above it the grasp is a different one, and must settle again.
+    """
     gap_ns: int = 100_000_000
-    """Time without a usable reading after which the grasp must settle again."""
+    """Time without a usable reading after which the grasp must settle again, ns."""
     release_ns: int = 100_000_000
     """How long the gate stays in `released` before `idle`, ns."""
     request_ns: int = 1_000_000_000
-    """Time after which a request that cannot be met is dropped."""
+    """Time after which an unanswered request to judge is dropped, ns."""
 
 
 @dataclass(frozen=True)
 class JointLimits:
-    """When joints keep still, and how long they are waited for."""
+    """Speed of a joint that keeps still, and ages of its angles."""
 
     rad_per_s: float = 0.1
-    """A joint that turns faster is moving. One count of a Hall sensor is 0.0006 rad, so noise in
-    a window shows up to 0.02."""
+    """Largest speed of a joint that keeps still, rad/s.
+
+    One count of a Hall sensor is 0.0006 rad, so noise alone shows up to 0.02 rad/s.
+    """
     window_ns: int = 80_000_000
-    """Speed is the difference to angles that are at least this old, ns."""
+    """Least time between the two angles of which a speed is made, ns."""
     late_ns: int = 150_000_000
-    """Angles that are older than this speak against settling, ns ..."""
+    """Age of the angles above which the grasp cannot settle, ns."""
     lost_ns: int = 1_000_000_000
-    """... until they are this old, ns: then the stream is lost, and judging goes on without it."""
+    """Age of the angles above which their stream is lost, ns: judging goes on without it."""
     frozen_ns: int = 1_000_000_000
-    """Angles of which none changes by a bit for this long, ns, are old ones, sent again. A
-    Hall sensor's noise is one count, so even a single joint changes many times in it."""
+    """Time without any change of any angle after which the angles are old ones sent again, ns.
+
+    The noise of a Hall sensor is one count, so even a single joint changes many times in it.
+    """
 
 
 @dataclass(frozen=True)
 class HandLimits:
-    """All conditions of the moment before the lift."""
+    """Limits of a hand's grasp: which fingers touch, that they keep still, and what is judged."""
 
     on_request: bool = False
     """True if a settled grasp is judged only when the controller asks."""
     sweeps: int = MEDIAN_SWEEPS
     """Sweeps that are judged: 1, the current reading; 3, the median of three fresh sweeps."""
     required: tuple[Finger, ...] | None = None
-    """Fingers that must touch; all unless given."""
+    """Fingers that must touch. None: all."""
     contact: ContactLimits = field(default_factory=ContactLimits)
     gate: GateLimits = field(default_factory=GateLimits)
     joints: JointLimits | None = None
-    """None for a hand without joint angles."""
+    """Limits of the joints. None: the hand sends no joint angles."""
 
 
 # Without slots, so that a default can be read from the class.
 @dataclass(frozen=True)
 class Limits:
-    """Limits of every verdict other than `unknown`."""
+    """Limits that `stable` and `slip` must keep; a verdict beyond one is `unknown`."""
 
     max_age_ns: int = 100_000_000
-    """Age of the reading at the end of judging, ns."""
+    """Largest age of the reading at the end of judging, ns."""
     slip_threshold: float = 0.5
-    """`p_slip` from here on is slip, in 0..1."""
+    """Smallest `p_slip` that is judged `slip`, 0..1."""
     min_confidence: float = 0.0
-    """Least `p_slip` of a slip, or `1 - p_slip` of a stable grasp, in 0..1."""
+    """Smallest `p_slip` of a `slip`, and smallest `1 - p_slip` of a `stable`, 0..1."""
     steady_ns: int = 1_000_000_000
-    """A grasp that was judged otherwise is `stable` only once all judgements have said so for this
-    long, ns: nothing flickers at a threshold, and asking often does not help."""
+    """Time after a judgement that was not stable before the same grasp may be `stable`, ns.
+
+    The verdict then does not flicker at a threshold, and asking often does not help.
+    """
 
 
 class RecentVerdict(msgspec.Struct, frozen=True, gc=False):
@@ -113,20 +130,23 @@ class RecentVerdict(msgspec.Struct, frozen=True, gc=False):
 
     grasp: int
     made_ns: int
-    """Time of the reading that was judged."""
+    """Time of the reading that was judged, ns."""
     decision: Decision
 
     def of(self, grasp: int, made_ns: int, limits: Limits) -> Decision:
-        """Return what still counts against calling a grasp stable now; `stable`: nothing does."""
+        """Return the decision if it still forbids `stable` at `made_ns`, else `stable`.
+
+        It does for `Limits.steady_ns`, and only for the same `grasp`.
+        """
         if grasp != self.grasp or made_ns - self.made_ns >= limits.steady_ns:
             return Decision.STABLE
         return self.decision
 
 
 NO_RECENT_VERDICT = RecentVerdict(0, 0, Decision.STABLE)
-"""Grasps are numbered from 1."""
+"""No judgement yet: grasps are numbered from 1."""
 HELD: Final = Moment(0)
-"""A hand that holds still: what a judgement says of a grasp by itself, whatever follows."""
+"""Moment of a hand that holds still, to decide by the network's answer alone."""
 
 
 def decide(
@@ -139,12 +159,11 @@ def decide(
     withheld: Reason | None = None,
     recent: Decision = Decision.STABLE,
 ) -> tuple[Decision, tuple[Reason, ...]]:
-    """Return the decision, and the reasons if it is unknown: all that is not clearly well is.
+    """Return the decision, and the reasons if it is `unknown`. Any doubt makes it `unknown`.
 
-    `p_slip`: probability of slip, 0..1; None if the network gave none. `objections`: what speaks
-    against the reading, or against the one that was judged. `age_ns`: age of the reading.
-    `withheld`: why the grasp must not be called stable; None: it may. `recent`: what it was judged
-    to be within `steady_ns`, if that was not stable.
+    `p_slip`: probability of slip, 0..1; None: the network gave none. `objections`: reasons against
+    the reading, or against the one that was judged. `age_ns`: age of the reading. `withheld`: why
+    the risk forbids `stable`; None: it does not. `recent`: result of `RecentVerdict.of`.
     """
     reasons = [*objections]
     if not (moment.in_contact and moment.settled):

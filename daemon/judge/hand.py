@@ -217,7 +217,7 @@ class HandTracker:
         self.memory.unsettled = MEDIAN_SWEEPS
 
     def memories(self) -> dict[str, dict[str, Any]]:
-        """Return what the hand's parts remember, by part; see `Pipeline.memories`."""
+        """Return the state of the hand's parts, by group and part; see `Pipeline.memories`."""
         hand: dict[str, Any] = {
             "hand": self.memory,
             "fresh": self._fresh.memory,

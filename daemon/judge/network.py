@@ -14,7 +14,7 @@ from graspd.daemon.judge.health import too_many
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import COUNT_MAX, ELECTRODES
 from graspd.models.contract import Finger, ModelError, SeenCounts
-from graspd.models.electrodes import CONTRADICTING_MAX, ROUNDING, Electrodes, NoveltyCheck
+from graspd.models.electrodes import CONTRADICTING_MAX, Electrodes, NoveltyCheck
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
 from graspd.models.runtime import TactileModel
 
@@ -80,8 +80,6 @@ class Plausibility:
         if _is_flat(values, broken):
             return Examined((Reason.FLAT,), counts)
         if session is not None:
-            if broken is None and self._is_plain(values, session):
-                return Examined((), counts, (), counts)
             values = session.to_training(values)
         if broken is None:
             broken = np.zeros(counts.shape, dtype=np.bool_)
@@ -108,19 +106,6 @@ class Plausibility:
             learned |= session is None or not session.calibrated
             return Examined((Reason.NEVER_SEEN,), counts, (), grasp if learned else None)
         return Examined((), repaired, self._names(implausible) if number else (), grasp)
-
-    def _is_plain(self, counts: NDArray[np.float64], session: Calibration) -> bool:
-        """Return True if nothing at all is found: each limit is kept by more than rounding can be.
-
-        The examination would say the same, in five times the time.
-        """
-        deviations = counts - session.counts_mean
-        deviations *= session.scale
-        square = None if session.odd else self._electrodes.plain_square(deviations)
-        if square is None:
-            return False
-        lower, upper = (1.0 - ROUNDING) * square, (1.0 + ROUNDING) * square
-        return self._novelty.is_near(lower) and self._novelty.is_near(upper)
 
     def _repair(
         self,

@@ -111,7 +111,6 @@ class Pipeline:
         electrodes = Electrodes(contract.seen)
         self._session: SessionCalibration | None = None
         if isinstance(contract.input, SessionInput):
-            # Only where it is needed.
             from graspd.daemon.judge.calibration import SessionCalibration
 
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
@@ -202,9 +201,9 @@ class Pipeline:
             self.hand.restart()
 
     def memories(self) -> dict[str, dict[str, Any]]:
-        """Return what every part remembers between two readings, but not the session.
+        """Return the state of each part of the judge but the session, by group and part.
 
-        A judge has each group of parts wholly or, except for `judge`, not at all.
+        Groups: `judge` always, `hand` with a gate, `joints` with joint angles.
         """
         judge = {"judge": {"judge": self.memory, "health": self._health.memory}}
         return judge if self.hand is None else judge | self.hand.memories()
@@ -220,7 +219,10 @@ class Pipeline:
             self.hand.observe_joints(reading)
 
     def judge(self, reading: TactileReading) -> Judgement:
-        """Judge one reading, as what it is of its grasp. Never raises on bad data."""
+        """Return the judgement of a reading: `unknown` unless its grasp has settled.
+
+        Bad data gives `unknown`; it never raises.
+        """
         memory = self.memory
         if memory.is_to_learn:
             self.learn()
@@ -289,9 +291,7 @@ class Pipeline:
     def learn(self) -> None:
         """Take the grasp that was judged last into the session, if it is over.
 
-        A grasp is judged only by what came before it: else what is like nothing seen before would
-        be seen the next time. It takes as long as judging, so the verdict goes first.
-        """
+        A grasp is judged only by those before it. Learning takes as long as judging."""
         memory = self.memory
         if self._session is None or not memory.is_to_learn:
             return

@@ -82,16 +82,16 @@ class Tails(NamedTuple):
 
 
 class MotionLimits(NamedTuple):
-    """Largest motion of each still finger, in units of its noise, and if all keep to it."""
+    """Largest motion of each finger, in units of its noise, and whether all fingers are within."""
 
     fast: list[float]
-    """In the short window."""
+    """Largest motion of each finger over the short window."""
     slow: list[float]
-    """In the long one."""
+    """Largest motion of each finger over the long window."""
     early: bool = False
-    """True if fast motion is excluded."""
+    """True if all fingers keep within `fast`."""
     sure: bool = False
-    """True if slow slides that noise does not hide are excluded as well."""
+    """True if all fingers keep within both: slow slides are excluded too."""
 
 
 class Motion:

@@ -48,20 +48,28 @@ for _number in range(STEPS_MIN, STEPS + 1):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Motion that noise alone causes, by steps of the window; shape (steps, fingers)."""
+    """Motion that noise alone seems to show; row n is that of a window of n steps.
+
+    Shape of each array: (`STEPS` + 1, fingers).
+    """
 
     slope: NDArray[np.float64]
-    """Mean absolute slope, counts/s, where squared times around their mean sum to 1 s**2."""
+    """Mean absolute slope times the square root of the sum of squared times, counts.
+
+    The times are counted from their mean, s. Divide by that root to get the slope, counts/s.
+    """
     variance: NDArray[np.float64]
-    """Mean square deviation from the mean, counts**2 ..."""
+    """Mean square deviation from the mean, counts**2."""
     spread: NDArray[np.float64]
-    """... and its standard deviation over that."""
+    """Standard deviation of a finger's `variance`, as a share of it."""
 
     @classmethod
     def of(cls, variance: NDArray[np.float64], correlations: NDArray[np.float64]) -> Noise:
-        """Return it by the variance of each finger's electrodes, counts**2, shape (fingers,).
+        """Return the motion that measured noise causes in windows of 0 to `STEPS` steps.
 
-        `correlations`, shape (APART - 1, fingers): those at 1 to `APART` - 1 steps.
+        `variance`: of the noise of each finger's electrodes, counts**2, shape (fingers,).
+        `correlations`: of the noise with itself 1 to `APART` - 1 steps later, shape
+        (APART - 1, fingers).
         """
         slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
         spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)

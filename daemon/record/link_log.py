@@ -11,14 +11,17 @@ from graspd.daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from graspd.drivers.base import Driver
 
 EARLY_MAX: Final = 1000
-"""Most entries that are held until the recorder starts."""
+"""Most entries that are kept until the recorder starts."""
 
 Sink = Callable[[tuple[object, ...], int], None]
 """Function that takes an entry and its monotonic time, ns."""
 
 
 class Tap:
-    """Pass on the traffic of a link; hold it until `connect`."""
+    """Pass on the traffic of a link to the recorder.
+
+    Until `connect` it keeps the newest `EARLY_MAX` entries; older ones are dropped.
+    """
 
     def __init__(
         self,
@@ -26,9 +29,10 @@ class Tap:
         encode: Callable[..., bytes],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`ending`: of the file's name. `encode`: makes the bytes of an entry.
+        """`ending`: end of the log's file name. `encode`: returns the bytes of an entry.
 
-        Arguments of `encode`: monotonic time, ns, offset of the wall clock, ns, parts of the entry.
+        Arguments of `encode`: the entry's monotonic time, ns; what to add to get the wall clock's
+        time, ns; then the parts of the entry as given to `take`.
         """
         self.ending = ending
         self.encode = encode

@@ -44,8 +44,7 @@ class McapCounters(DriverCounters):
 class McapReplayDriver(RecordedDriver[_Item]):
     """Play the files of one run, at most one reading per call of `read_ready`.
 
-    With its `t_ns` a reading is as old as it was when recorded. `recorded_ns` is the recorded
-    `t_ns` less `axis_ns`. A damaged file is played up to the damage, and counted.
+    A damaged file is played up to the damage, and counted.
     """
 
     def __init__(
@@ -59,7 +58,9 @@ class McapReplayDriver(RecordedDriver[_Item]):
     ) -> None:
         """Raises `ValueError` without `paths`, or for a `speed` of 0 or less.
 
-        `speed`: factor of real time; None: as fast as possible.
+        `fingers`: those to play, in this order; each file must have them. `speed`: factor of real
+        time; None: as fast as possible. `axis_ns`: ns subtracted from each recorded `t_ns` to get
+        the `recorded_ns` of its reading; the run's `Pipeline.axis_ns`, from its header.
         """
         super().__init__(paths, speed, clock)
         self._axis_ns = axis_ns

@@ -74,17 +74,23 @@ def _sent(object_name: str | None) -> str | None:
 
 
 class Comparison(Companion):
-    """Judge each judged grasp again in another way, only for the summary."""
+    """Judge each grasp a second time with another pipeline, to compare the two in the summary.
+
+    Nothing of it is published.
+    """
 
     def __init__(self, how: str, pipeline: Pipeline, result: RunSummary) -> None:
-        """`how`: key of `RunSummary.compared`. `pipeline`: takes each reading for a grasp."""
+        """`how`: name of the second way, the key of `RunSummary.compared` in `result`.
+
+        `pipeline`: the second judge; one without a gate, which takes each reading for a grasp.
+        """
         self._how = how
         self._pipeline = pipeline
         self._result = result
         self._grasp: int | None = None
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Count the other way's verdict for the first verdict on a grasp."""
+        """Judge the reading again if its verdict is the first on a grasp; else only watch it."""
         verdict, reading = published.verdict, published.reading
         if reading is None:
             return

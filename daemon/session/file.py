@@ -167,7 +167,12 @@ def kept_now(
     trust: TrustState | None = None,
     rest: tuple[float, ...] | None = None,
 ) -> KeptSession:
-    """Return the session to keep now."""
+    """Return the content of a session file, with the time of the call as its `saved_at`.
+
+    `statistics`: those of the sensors' counts; None: the model needs none. `serials`: serial number
+    of each finger's sensor. `trust`: learner and risk; None: neither. `rest`: count at which each
+    electrode rests; None: not known.
+    """
     learned = None if trust is None else encode(trust)
     return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned, rest)
 
@@ -254,7 +259,11 @@ def read(path: Path) -> KeptSession | None:
 
 
 def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
-    """Return the statistics of `fingers`. Raises `SessionFileError` if they are missing."""
+    """Return the statistics of a kept session's counts, to restore a session from.
+
+    Raises `SessionFileError` if the session is of other `fingers`, or has no statistics because its
+    model needs none.
+    """
     of_fingers(kept, fingers)
     if kept.statistics is None:
         raise SessionFileError("the kept session is of a model that needs no statistics")

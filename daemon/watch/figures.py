@@ -66,7 +66,7 @@ def lift(verdict: Verdict, ended: str | None) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share as percent, with two digits below 10 %."""
+    """Return a share, 0..1, as a text in percent: "9.2 %", "0.31 %", "42 %"."""
     return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 

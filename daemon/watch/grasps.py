@@ -18,7 +18,7 @@ Key = tuple[str, int]
 
 
 class GraspLog:
-    """Takes verdicts and outcomes."""
+    """Counts the grasps of a hand by their last verdict, and lists the latest `GRASPS_MAX`."""
 
     def __init__(self) -> None:
         self._judged: dict[Key, tuple[Verdict, int]] = {}
@@ -32,6 +32,7 @@ class GraspLog:
         self._is_held = False
 
     def take(self, verdict: Verdict, now_ns: int) -> None:
+        """Take in a verdict that arrived at `now_ns`, monotonic."""
         key = verdict.boot_id, verdict.grasp
         self._is_held = verdict.gate not in OPEN
         if self._is_held and verdict.grasp > 0 and key != self._current:
@@ -52,6 +53,7 @@ class GraspLog:
             self._ended.pop(oldest, None)
 
     def end(self, told: OutcomeMessage) -> None:
+        """Take in the outcome of a lift; one of a grasp that is not listed is ignored."""
         key = told.grasp_boot_id or told.boot_id, told.grasp
         if key in self._judged:
             self._ended[key] = told.outcome
@@ -67,7 +69,11 @@ class GraspLog:
         return self._past + Counter([self._decision or Decision.UNKNOWN])
 
     def last(self, now_ns: int, held: Key | None) -> list[JudgedGrasp]:
-        """Return the last judged grasps, the newest first."""
+        """Return the latest judged grasps, at most `GRASPS_MAX`, the newest first.
+
+        `now_ns`: monotonic time from which their ages count. `held`: the grasp that the hand holds
+        now; None: none.
+        """
         return [
             JudgedGrasp(
                 verdict=verdict.verdict.value,

@@ -70,13 +70,17 @@ TONE_CODE = {
 
 
 class History:
-    """Remembers the tones and the highest probability of slip of each second."""
+    """Remembers, for each second of the last `SECONDS`, which tones it had and the highest p_slip.
+
+    A tone is the colour class of the verdict that is shown.
+    """
 
     def __init__(self) -> None:
         self._seconds: dict[int, tuple[str, int]] = {}
-        """By number, the newest last: letters of its tones; highest probability, %."""
+        """By the second's number: what `seconds` returns of it. The newest is last."""
 
     def add(self, now_ns: int, tone: Tone, p_slip: float | None) -> None:
+        """Add what is shown at `now_ns`; a `p_slip` of None adds no probability."""
         second, code = now_ns // SECOND_NS, TONE_CODE[tone]
         share = NO_SHARE if p_slip is None else round(100 * p_slip)
         codes, highest = self._seconds.get(second, ("", NO_SHARE))
@@ -85,7 +89,11 @@ class History:
             del self._seconds[next(iter(self._seconds))]
 
     def seconds(self) -> list[tuple[str, int]]:
-        """Return five minutes, the oldest second first; "" for one without a call."""
+        """Return the tones and the highest probability of slip of each second, the oldest first.
+
+        Tones are letters of `TONE_CODE`, each once, the latest last; "" for a second without any.
+        The probability is in %; `NO_SHARE` if there was none. At most `SECONDS` entries.
+        """
         if not self._seconds:
             return []
         newest = max(self._seconds)

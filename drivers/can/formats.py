@@ -117,7 +117,11 @@ def parse_sweep(data: bytes) -> SweepFrame | Reject:
 
 
 def sample_length(sensors: int, length: int | None) -> int:
-    """Return the length of SynTouch frames, bytes. Raises `ValueError` if `length` is wrong."""
+    """Return the number of data bytes of a SynTouch frame with the samples of `sensors` fingers.
+
+    `length`: length set in the scene, bytes; None: just long enough. Raises `ValueError` for more
+    sensors than `SENSORS_MAX`, and for a `length` that is too short, or over `CLASSIC_DATA_MAX`.
+    """
     if sensors > SENSORS_MAX:
         raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
     used = 1 + WORD_BYTES * sensors

@@ -6,8 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.calibration import Calibration
@@ -117,41 +115,3 @@ def test_a_session_judges_what_is_near_and_learns_from_what_is_twice_as_far(
     found = of_sessions.examine(np.rint(counts).astype(np.uint16), NOTHING, session)
     assert found.reasons == (() if judged else (Reason.NEVER_SEEN,))
     assert (found.grasp is not None) == learned
-
-
-@settings(max_examples=300)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    stretched=st.floats(0.0, 1.3) | st.floats(0.97, 1.03),
-    moved=st.just(0.0) | st.floats(-600.0, 600.0),
-    wrong=st.integers(0, 3),
-    scale=st.floats(0.6, 1.6),
-)
-@example(seed=2, stretched=0.9, moved=0.0, wrong=0, scale=1.0)
-def test_what_is_plainly_well_is_found_to_be_the_same_as_by_the_whole_examination(
-    of_sessions: Plausibility, seed: int, stretched: float, moved: float, wrong: int, scale: float
-) -> None:
-    random, seen = np.random.default_rng(seed), seen_by_sessions()
-    centre = np.array(seen.centre)
-    direction = random.normal(size=72)
-    direction *= stretched * seen.distance_max * np.sqrt(72) / np.linalg.norm(direction)
-    deviations = np.linalg.solve(seen.whitening_matrix().T, direction).reshape(3, 24)
-    deviations[random.integers(3)] += moved
-    for finger, electrode in WRONG[:wrong]:
-        deviations[finger, electrode] += random.normal(0.0, 300.0)
-    own = centre + random.normal(0.0, 100.0, (3, 24))
-    counts = np.clip(np.rint(own + deviations / scale), 1, 4094).astype(np.uint16)
-    nothing = np.zeros(0)
-    session = Calibration(
-        *(nothing, nothing, own, np.ones((3, 24)), centre, np.full((3, 24), scale)),
-        calibrated=True,
-        odd=False,
-        temperature=1.0,
-    )
-    found = of_sessions.examine(counts, None, session)
-    whole = of_sessions.examine(counts, NOTHING, session)
-    assert (found.reasons, found.repaired) == (whole.reasons, whole.repaired)
-    np.testing.assert_array_equal(found.counts, whole.counts)
-    assert (found.grasp is None) == (whole.grasp is None)
-    if found.grasp is not None and whole.grasp is not None:
-        np.testing.assert_array_equal(found.grasp, whole.grasp)
