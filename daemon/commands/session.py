@@ -30,6 +30,7 @@ from graspd.daemon.session.file import (
     load,
     others,
     read,
+    restore_kept,
 )
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
 from graspd.daemon.trust.trust import Trust, TrustState, decode
@@ -87,9 +88,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
-    path, given = wanted.session_path, model.contract.input
+    path = wanted.session_path
     kept = load(path)
-    from_on = given.calibrated_from if isinstance(given, SessionInput) else None
+    calibrated = _is_calibrated(wanted, model, kept)
     if as_json:
         session = None
         if kept is not None:
@@ -97,7 +98,7 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
         former = _former(path)
         document = {
             "file": str(path),
-            "calibrated": kept is not None and from_on is not None and _grasps(kept) >= from_on,
+            "calibrated": bool(calibrated),
             "session": session,
             "former_saved_at": None if former is None else former.saved_at,
             "put_aside": [
@@ -107,7 +108,22 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
         }
         write_json(document)
     else:
-        write_lines(*_lines(path, kept, from_on))
+        write_lines(*_lines(path, kept, model, calibrated))
+
+
+def _is_calibrated(
+    wanted: scene.Scene, model: TactileModel, kept: KeptSession | None
+) -> bool | None:
+    """Return True if a daemon that starts now is calibrated; None: the model needs no session."""
+    session = assembly.build_pipeline(wanted, model).session
+    if session is None:
+        return None
+    try:
+        if kept is not None:
+            restore_kept(kept, wanted.hand.fingers, session)
+    except SessionFileError as error:
+        complain(f"{error}; a new session begins")
+    return session.now.calibrated
 
 
 def _grasps(kept: KeptSession) -> int:
@@ -121,15 +137,17 @@ def _former(path: Path) -> KeptSession | None:
     return None
 
 
-def _lines(path: Path, kept: KeptSession | None, from_on: float | None) -> Iterator[str]:
+def _lines(
+    path: Path, kept: KeptSession | None, model: TactileModel, calibrated: bool | None
+) -> Iterator[str]:
     if kept is None:
         yield f"{printable(str(path))}: no session is kept"
         return
-    grasps, state = _grasps(kept), ""
-    if from_on is not None:
-        state = "calibrated" if grasps >= from_on else "not calibrated yet"
-        state = f", {state} (from {from_on:g} on)"
-    yield f"{printable(str(path))}: {grasps} grasps{state}"
+    state, given = "", model.contract.input
+    if isinstance(given, SessionInput):
+        state = "calibrated" if calibrated else "not calibrated yet"
+        state = f", {state} (from {given.calibrated_from:g} on)"
+    yield f"{printable(str(path))}: {_grasps(kept)} grasps{state}"
     yield f"  saved    {_when(kept)}"
     former = _former(path)
     if former is not None and former != kept:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import select
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -200,9 +199,8 @@ def _foxglove(hands: list[HandFeed], port: int) -> int:
     with StopSignal() as stop, server:
         sys.stdout.write(f"ws://127.0.0.1:{server.port} (Ctrl-C ends)\n")
         sys.stdout.flush()
-        while stop.received is None:
+        while not stop.wait(TICK_S):
             for hand in hands:
                 for topic, payload in hand.feed.take():
                     server.send(topic, payload)
-            select.select([stop.fileno()], [], [], TICK_S)
     return 0

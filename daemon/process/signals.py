@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 from types import FrameType
 from typing import Any, Self
@@ -29,13 +30,18 @@ class StopSignal:
         """Return a descriptor that becomes readable when a signal arrives."""
         return self._read
 
+    def wait(self, seconds: float) -> bool:
+        """Wait up to `seconds` for a signal; return True if one has stopped the process."""
+        select.select([self._read], [], [], seconds)
+        self._empty()
+        return self.received is not None
+
     def take_reload(self) -> bool:
         """Return True if SIGHUP came since the last call."""
         if not self._reload:
             return False
         self._reload = False
-        with contextlib.suppress(BlockingIOError):
-            os.read(self._read, WAKEUPS_MAX)
+        self._empty()
         return True
 
     def __enter__(self) -> Self:
@@ -50,6 +56,10 @@ class StopSignal:
         signal.set_wakeup_fd(self._former_wakeup)
         os.close(self._read)
         os.close(self._write)
+
+    def _empty(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._read, WAKEUPS_MAX)
 
     def _handle(self, signum: int, _frame: FrameType | None) -> None:
         if signum == signal.SIGHUP:

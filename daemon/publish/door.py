@@ -14,13 +14,13 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import zmq
 
 from graspd.daemon.publish.listener import Listener, PublishError
-from graspd.daemon.publish.lookout import EVENTS, Lookout, Seldom
+from graspd.daemon.publish.lookout import EVENTS, Lookout
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
@@ -68,14 +68,12 @@ class Admission:
     secret: bytes
     admitted: Mapping[bytes, str]
     """Names of peers, by public key; may be replaced at any time."""
-    _seldom: Seldom = field(default_factory=Seldom)
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Return True if the key may connect; called in pyzmq's thread."""
         name = self.admitted.get(key)
         if name is None:
-            if self._seldom.is_due(key):
-                log.warning("turned away a peer: its key %s is not on the list", key.decode())
+            log.warning("turned away a peer: its key %s is not on the list", key.decode())
             return False
         log.info("admitted a peer with the key of %s", name)
         return True

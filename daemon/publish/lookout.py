@@ -7,18 +7,13 @@ import os
 import socket
 import struct
 import threading
-import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import zmq
 
 log = logging.getLogger("graspd")
 
-WARN_EACH_S: Final = 60.0
-"""Time between two warnings of the same peer, s: it tries ten times a second."""
-REMEMBERED_MAX: Final = 64
-"""Peers of which the last warning is remembered."""
 EVENTS: Final = int(
     zmq.EVENT_ACCEPTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_DISCONNECTED
 )
@@ -37,26 +32,6 @@ PEERS_MAX: Final = 1024
 UNKNOWN: Final = "an unknown address"
 
 
-class Seldom:
-    """Says of each thing at most once a minute that it is due to be warned of."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` gives monotonic seconds."""
-        self._clock = clock
-        self._last_s: dict[Hashable, float] = {}
-        """The oldest first."""
-
-    def is_due(self, thing: Hashable) -> bool:
-        now_s = self._clock()
-        if now_s - self._last_s.get(thing, -WARN_EACH_S) < WARN_EACH_S:
-            return False
-        self._last_s.pop(thing, None)
-        self._last_s[thing] = now_s
-        if len(self._last_s) > REMEMBERED_MAX:
-            del self._last_s[next(iter(self._last_s))]
-        return True
-
-
 class Lookout(threading.Thread):
     """Reads the monitors of sockets until their context ends, and closes them.
 
@@ -67,7 +42,6 @@ class Lookout(threading.Thread):
         """The thread owns these sockets, made with `EVENTS`, from `start` on."""
         super().__init__(name="lookout", daemon=True)
         self._monitors = monitors
-        self._seldom = Seldom()
         self._addresses: dict[tuple[int, int], str] = {}
         """By number of the monitor and descriptor of the connection."""
         self._problems: dict[int, str] = {}
@@ -100,7 +74,7 @@ class Lookout(threading.Thread):
         else:
             address = self._addresses.pop((number, value), UNKNOWN)
             problem = self._problems.pop(number, None)
-            if problem is not None and self._seldom.is_due(address):
+            if problem is not None:
                 log.warning("turned away a peer from %s: %s", address, problem)
 
 

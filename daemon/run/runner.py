@@ -143,10 +143,9 @@ class Runner:
         """Wait for networks and disks that wake later; return False if asked to stop."""
         log.warning("%s; another try in %g s", error, AWAKE_RETRY_S)
         until_s = time.monotonic() + AWAKE_RETRY_S
-        while self._stop.received is None and time.monotonic() < until_s:
+        while not self._stop.wait(AWAKE_LOOK_S) and time.monotonic() < until_s:
             if self._manager is not None:
                 self._manager.after_round()
-            time.sleep(AWAKE_LOOK_S)
         return self._stop.received is None
 
     def _open_sockets(self, served: scene.Scene) -> Sockets:

@@ -258,27 +258,23 @@ def read(path: Path) -> KeptSession | None:
         raise SessionFileError(f"{path}: not a session: {error}") from error
 
 
-def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
-    """Return the statistics of a kept session's counts, to restore a session from.
-
-    Raises `SessionFileError` if the session is of other `fingers`, or has no statistics because its
-    model needs none.
-    """
-    of_fingers(kept, fingers)
-    if kept.statistics is None:
-        raise SessionFileError("the kept session is of a model that needs no statistics")
-    return kept.statistics
-
-
 def restore(path: Path, fingers: Sequence[str], session: SessionCalibration) -> None:
     """Let `session` go on from the file. Raises `SessionFileError` if that is not possible."""
     kept = load(path)
     if kept is None:
         raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
+    restore_kept(kept, fingers, session)
+
+
+def restore_kept(kept: KeptSession, fingers: Sequence[str], session: SessionCalibration) -> None:
+    """Let `session` go on from a kept one. Raises `SessionFileError` if that is not possible."""
+    of_fingers(kept, fingers)
+    if kept.statistics is None:
+        raise SessionFileError("the kept session is of a model that needs no statistics")
     try:
-        session.restore(statistics_of(kept, fingers))
+        session.restore(kept.statistics)
     except ValueError as error:
-        raise SessionFileError(f"{path}: {error}") from error
+        raise SessionFileError(f"the kept session {error}") from error
 
 
 def of_fingers(kept: KeptSession, fingers: Sequence[str]) -> None:

@@ -23,7 +23,7 @@ from graspd.daemon.session.file import (
     kept_now,
     of_fingers,
     others,
-    statistics_of,
+    restore_kept,
 )
 from graspd.daemon.session.rest import Rest, moved_fingers
 from graspd.daemon.session.sensors import UNTOLD, OnExchange, SensorWatch
@@ -196,8 +196,8 @@ class SessionKeeper(SensorWatch):
                 of_fingers(kept, self._fingers)
                 self._unused = self._unused._replace(statistics=kept.statistics)
             else:
-                self._session.restore(statistics_of(kept, self._fingers))
-        except (SessionFileError, ValueError) as error:
+                restore_kept(kept, self._fingers, self._session)
+        except SessionFileError as error:
             log.warning("%s; a new session begins", error)
             return
         self._serials = dict(kept.serials)

@@ -6,7 +6,6 @@ import base64
 import hashlib
 import logging
 import re
-import select
 import socket
 import sys
 import threading
@@ -190,13 +189,8 @@ def serve(hands: Sequence[HandFeed], port: int) -> None:
         try:
             sys.stdout.write(f"http://{ADDRESS}:{server.server_port}/ (Ctrl-C ends)\n")
             sys.stdout.flush()
-            for seen in snapshots(hands, lambda: _is_asked_to_stop(stop)):
+            for seen in snapshots(hands, lambda: stop.wait(TICK_S)):
                 newest.put(msgspec.json.encode(seen))
         finally:
             server.shutdown()
             thread.join()
-
-
-def _is_asked_to_stop(stop: StopSignal) -> bool:
-    select.select([stop.fileno()], [], [], TICK_S)
-    return stop.received is not None

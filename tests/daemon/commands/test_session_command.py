@@ -12,6 +12,7 @@ import pytest
 
 from graspd.daemon.session.file import SessionFile, kept_now
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.models.session_statistics import SessionState
 from tests.daemon.processes import graspd
 
 SCENE = """
@@ -116,6 +117,25 @@ def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
     assert aside["serials"] == {"ff": "BTSP-2", "th": "BTSP-3"}
 
 
+def test_a_session_that_the_daemon_cannot_use_is_not_shown_as_calibrated(tmp_path: Path) -> None:
+    """One that is of other fingers, and one whose electrodes all rest where no grasp is."""
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[tactile]\ndriver = "spi"\nport = "/nowhere"\n[session]\nfile = "right.session.json"\n'
+    )
+    shown = []
+    for fingers in (("ff", "mf", "rf"), ("ff", "mf", "th")):
+        odd = SessionState(30.0, 30, (4000.0,) * 150, (1e4,) * 150)
+        with SessionFile(tmp_path / "right.session.json") as file:
+            file.save(kept_now(odd, fingers, {}))
+        program = graspd("session", "show", path, "--json")
+        shown.append((json.loads(program.stdout)["calibrated"], program.stderr))
+        assert "30 grasps, not calibrated yet" in graspd("session", "show", path).stdout
+    assert shown[0][0] is shown[1][0] is False
+    assert "is of the fingers ff, mf, rf" in shown[0][1]
+    assert shown[1][1] == ""
+
+
 def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     header = [f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)]
@@ -136,7 +156,7 @@ def test_a_broken_session_file_is_one_line_in_a_replay(tmp_path: Path) -> None:
     path.write_text(json.dumps(kept | {"statistics": statistics}))
     result = graspd("replay", "--session", path)
     assert result.returncode == 2
-    assert result.stderr == f"graspd: {path}: is of 10 values, not of 150\n"
+    assert result.stderr == "graspd: the kept session is of 10 values, not of 150\n"
 
 
 def test_replay_shows_the_collapse_on_another_day_and_the_repair(bts3_dir: Path) -> None:

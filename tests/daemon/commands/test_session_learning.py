@@ -178,7 +178,7 @@ def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damaged", [("right.json",), ("right.json", "right.json.former")])
 def test_what_is_damaged_is_said(tmp_path: Path, damaged: tuple[str, ...]) -> None:
-    path, kept = scene_at(tmp_path), tmp_path / "right.json"
+    path, kept = scene_at(tmp_path, model="mlp"), tmp_path / "right.json"
     with SessionFile(kept) as file:
         file.save(kept_now(None, FINGERS, {}))
         file.save(kept_now(None, FINGERS, {"ff": "A"}))
