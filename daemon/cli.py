@@ -19,8 +19,8 @@ from typing import NoReturn
 from graspd.daemon import __version__
 from graspd.daemon.commands.arguments import Parser
 from graspd.daemon.process import logs
-from graspd.daemon.process.extras import needs
 from graspd.daemon.process.text import complain
+from graspd.extras import needs
 
 COMMANDS = {
     "run": ("graspd.daemon.commands.run", "run the daemon on a scene"),

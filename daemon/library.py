@@ -177,6 +177,7 @@ def judge(
 
 def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
     if assembly.MCAP in {path.suffix for path in paths}:
+        assembly.require_mcap("judging MCAP")
         from graspd.daemon.assembly.recordings import RecordedRun
 
         run = RecordedRun(paths)

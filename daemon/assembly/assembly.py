@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.process.extras import needs
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import (
     CanTactile,
@@ -26,6 +25,7 @@ from graspd.daemon.scene.scene import GateMode
 from graspd.daemon.trust.risk import RiskLimits
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver, DriverError, LinkError
+from graspd.extras import require
 from graspd.models import own, trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
@@ -162,11 +162,24 @@ def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
 
 
 def is_mcap(options: ReplayTactile) -> bool:
-    """Return True for recordings of graspd. Raises `SceneError` if some are CSV files."""
+    """Return True for recordings of graspd.
+
+    Raises `SceneError` if some are CSV files, or if the package that reads MCAP is missing.
+    """
     kinds = {path.suffix == MCAP for path in options.recordings}
     if len(kinds) > 1:
         raise SceneError("tactile.recordings: both CSV and MCAP files")
+    if True in kinds:
+        require_mcap("replaying MCAP")
     return True in kinds
+
+
+def require_mcap(what: str) -> None:
+    """Raise `SceneError`, with advice, if `what` lacks the package of the extra `record`."""
+    try:
+        require("mcap", what, "record")
+    except ModuleNotFoundError as error:
+        raise SceneError(str(error)) from error
 
 
 def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
@@ -287,9 +300,7 @@ def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
         raise ValueError("MCAP files are replayed as they are: no loop, strict or faults")
     if options.outcomes:
         raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
-    try:
-        from graspd.daemon.record.player import McapReplayDriver
-    except ModuleNotFoundError as error:
-        raise ValueError(needs("replaying MCAP", "record", error)) from error
+    from graspd.daemon.record.player import McapReplayDriver
+
     speed = options.speed if options.pace == "realtime" else None
     return McapReplayDriver(options.recordings, scene.hand.fingers, speed=speed, clock=clock)

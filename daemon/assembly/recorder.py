@@ -11,9 +11,8 @@ from msgspec.structs import replace
 from graspd.daemon.assembly import assembly
 from graspd.daemon.judge.memory import encode, remember
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.process.extras import needs
 from graspd.daemon.record.header import RecordingHeader
-from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene import Scene
 from graspd.daemon.trust.trust import encode as encode_trust
 from graspd.models.runtime import TactileModel
 
@@ -29,11 +28,10 @@ def build_recorder(
     directory = scene.record_directory
     if scene.record is None or directory is None:
         return None
-    try:
-        from graspd.daemon.record.files import Retention
-        from graspd.daemon.record.recorder import Recorder
-    except ModuleNotFoundError as error:
-        raise SceneError(needs("[record]", "record", error)) from error
+    assembly.require_mcap("[record]")
+    from graspd.daemon.record.files import Retention
+    from graspd.daemon.record.recorder import Recorder
+
     options = scene.record
     retention = Retention(
         directory,

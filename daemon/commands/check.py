@@ -81,6 +81,8 @@ def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footpri
         limits = assembly.hand_limits(wanted)
         period_ns = _try_drivers(wanted)
         _try_keys(wanted)
+        if wanted.record is not None:
+            assembly.require_mcap("[record]")
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
         return WRONG

@@ -8,11 +8,11 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from graspd.daemon.process.extras import needs
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.process.text import complain, write_lines
 from graspd.daemon.publish.messages import OBJECT_PATTERN
 from graspd.drivers.base import RecordingError
+from graspd.extras import needs
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export

@@ -15,7 +15,6 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.commands.arguments import positive, within
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.process.extras import needs
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.sleep import Sleep
 from graspd.daemon.process.text import complain, printable
@@ -317,10 +316,9 @@ def _source(args: argparse.Namespace) -> Source:
         from graspd.daemon.assembly.link_logs import LinkLogs
 
         return LinkLogs(args.recordings, args.scene)
-    try:
-        from graspd.daemon.assembly.recordings import RecordedRun
-    except ModuleNotFoundError as error:
-        raise SceneError(needs("replaying MCAP", "record", error)) from error
+    assembly.require_mcap("replaying MCAP")
+    from graspd.daemon.assembly.recordings import RecordedRun
+
     return RecordedRun(args.recordings)
 
 

@@ -17,7 +17,6 @@ from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
-from graspd.daemon.process.extras import needs
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
 from graspd.daemon.run.replaying import trained_on
 from graspd.daemon.scene import drivers as scene_drivers
@@ -314,10 +313,8 @@ def _readings(wanted: scene.Scene) -> Iterator[Reading]:
 
 def _recorded_grasps(paths: Sequence[Path], fingers: Sequence[str]) -> Iterator[TactileReading]:
     """Yield grasps with an outcome. Raises `SceneError` or `RecordingError`."""
-    try:
-        from graspd.daemon.record.export import collect
-    except ModuleNotFoundError as error:
-        raise scene.SceneError(needs("seeding from MCAP", "record", error)) from error
+    from graspd.daemon.record.export import collect
+
     export = collect(paths)
     if export.fingers != tuple(fingers):
         theirs, ours = ", ".join(export.fingers), ", ".join(fingers)

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import zmq
 
 from graspd.daemon import scene
-from graspd.daemon.process.extras import needs
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import complain
 from graspd.daemon.publish.keys import KeysError
 from graspd.daemon.scene import SceneError
 from graspd.daemon.watch.feed import Feed, load_keys
 from graspd.daemon.watch.view import TICK_S, HandFeed, View
+from graspd.extras import needs
 
 ENDPOINT = "ipc:///run/graspd/right.ipc"
 """Default endpoint of the daemon."""

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from graspd.daemon.process.extras import needs
 from graspd.daemon.process.text import (
     complain,
     markdown_table,
@@ -24,6 +23,7 @@ from graspd.daemon.process.text import (
     write_json,
     write_lines,
 )
+from graspd.extras import needs
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError

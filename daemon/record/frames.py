@@ -21,6 +21,7 @@ from graspd.drivers.recordings.csv_rows import (
     columns_of,
     electrode_columns,
 )
+from graspd.extras import require
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
@@ -39,6 +40,7 @@ def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
     if path.suffix == PARQUET:
         return pd.read_parquet(path)
     if path.suffix == MCAP:
+        require("mcap", "read_grasps of MCAP", "record")
         from graspd.daemon.record.export import collect
 
         return grasps_of(collect([path]), "unknown")
@@ -64,6 +66,8 @@ def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
     Raises `RecordingError`.
     """
     path = Path(path)
+    if path.suffix == MCAP:
+        require("mcap", "read_recording of MCAP", "record")
     fingers = _fingers(path)
     rows: list[TactileReading] = []
     joints: list[dict[str, float]] = []

@@ -33,6 +33,7 @@ from graspd.drivers.can.frames import (
 )
 from graspd.drivers.can.readings import CanCounters
 from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
+from graspd.extras import installer
 
 FRAMES_PER_DRAIN: Final = 512
 """Most frames of one call: about 100 ms of a full bus. The loop must get its turn."""
@@ -77,7 +78,9 @@ def _what_is_missing(interface: str, error: Exception) -> str:
         return f"python-can's interface {interface!r} does not work here: {error}"
     name = missing[1] or missing[2]
     name = _PACKAGES.get(name, name)
-    return f"python-can's interface {interface!r} needs the package {name}: pip install {name}"
+    return (
+        f"python-can's interface {interface!r} needs the package {name}: run {installer()} {name}"
+    )
 
 
 class CanBus:

@@ -141,3 +141,21 @@ def test_the_example_of_the_page_runs(
     assert "slipped" in said
     assert "Name: ff_biotac_1" in said
     assert re.search(r"^1 (stable|slip|unknown) ", said, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("function", "package", "extra"),
+    [
+        ("read_grasps", "pandas", "pandas"),
+        ("read_recording", "pandas", "pandas"),
+        ("read_grasps", "mcap", "record"),
+        ("read_recording", "mcap", "record"),
+    ],
+)
+def test_a_missing_extra_is_an_error_that_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch, function: str, package: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    advice = re.escape(f"run {sys.executable} -m pip install '.[{extra}]'")
+    with pytest.raises(ModuleNotFoundError, match=rf"{function}.* '{package}': {advice}"):
+        getattr(graspd, function)("run.mcap")

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 import numpy as np
 from sklearn.model_selection import ParameterGrid
 
+from graspd.extras import needs
 from graspd.models.training.commands.common import (
     WrongInputError,
     progress_bar,
@@ -103,12 +104,13 @@ def _check_extras(args: argparse.Namespace) -> None:
     """Now, not after hours of training."""
     if args.table and args.data is None:
         raise WrongInputError("--table compares with the paper's figures: it needs --data")
-    for option, package, extra in (
-        (args.dask, "distributed", "cluster"),
-        (args.plots, "matplotlib", "report"),
+    for option, given, package, extra in (
+        ("--dask", args.dask, "distributed", "cluster"),
+        ("--plots", args.plots, "matplotlib", "report"),
     ):
-        if option and find_spec(package) is None:
-            raise WrongInputError(f"needs the package '{package}': pip install '.[{extra}]'")
+        if given and find_spec(package) is None:
+            absent = ModuleNotFoundError(name=package)
+            raise WrongInputError(needs(option, extra, absent))
 
 
 def _protocols(args: argparse.Namespace, grasps: Grasps) -> list[EvalProtocol]:

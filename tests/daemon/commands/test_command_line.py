@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 import zmq
@@ -16,12 +17,14 @@ from graspd.daemon.cli import COMMANDS, LIBRARIES, whole_parser
 from graspd.daemon.commands.arguments import Parser
 from tests.conftest import ROOT
 from tests.daemon.processes import GRASPD, graspd
+from tests.kit import inside
 
 EXTRAS = (
     "torch", "sklearn", "scipy", "joblib", "threadpoolctl", "onnx", "onnxscript", "skl2onnx",
     "rich", "distributed", "matplotlib", "keras", "mcap", "lz4", "zstandard", "foxglove",
 )  # fmt: skip
 """Packages that only extras bring."""
+LOOP = str(ROOT / "deploy/clients/loop.toml")
 CORE_ONLY = f"""
 import sys
 
@@ -65,7 +68,9 @@ for words in {names!r}:
         (["evaluate", "--data", "absent"], "train"),
         (["report", "worth", "--data", "absent"], "train,report"),
         (["export-grasps", "absent.mcap", "--out", "absent.csv"], "record"),
-        (["run", str(ROOT / "deploy/clients/loop.toml")], "record"),
+        (["run", LOOP], "record"),
+        (["check", LOOP], "record"),
+        (["replay", "absent.mcap"], "record"),
     ],
 )
 def test_a_command_without_its_extra_says_how_to_have_it(arguments: list[str], extra: str) -> None:
@@ -73,7 +78,19 @@ def test_a_command_without_its_extra_says_how_to_have_it(arguments: list[str], e
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert f"pip install '.[{extra}]'" in line
+    assert f"run {sys.executable} -m pip install '.[{extra}]' in " in line
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_scene_that_plays_mcap_without_its_reader_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[tactile]\ndriver = "replay"\nrecordings = ["run.mcap"]\n')
+    done = inside.graspd(command, scene)
+    assert done.returncode == 2
+    assert done.stderr.startswith("graspd: replaying MCAP needs the package 'mcap': run ")
 
 
 def test_every_argument_of_every_command_has_help() -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import sys
 from pathlib import Path
 
 import pytest
 
-from graspd.daemon.process.extras import installer, needs
 from graspd.daemon.process.files import read_regular, write_atomically
 from graspd.daemon.process.text import markdown_table
+from graspd.extras import installer, needs
 
 
 def test_a_file_is_replaced_with_the_mode_that_is_asked_for(tmp_path: Path) -> None:
@@ -72,8 +73,8 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
 def test_a_missing_package_is_named_with_its_extra_and_a_missing_part_of_graspd_is_a_bug() -> None:
     absent = ModuleNotFoundError("No module named 'rich.text'", name="rich.text")
     assert needs("watch", "watch", absent) == (
-        "watch needs the package 'rich': run pip install '.[watch]' in the folder of graspd's "
-        "source"
+        f"watch needs the package 'rich': run {sys.executable} -m pip install '.[watch]' in the "
+        "folder of graspd's source"
     )
     with pytest.raises(ModuleNotFoundError, match=r"graspd\.no"):
         needs("watch", "watch", ModuleNotFoundError("graspd.no", name="graspd.no"))
@@ -82,19 +83,21 @@ def test_a_missing_package_is_named_with_its_extra_and_a_missing_part_of_graspd_
 @pytest.mark.parametrize(
     ("file", "content", "command"),
     [
-        ("pyvenv.cfg", "home = /usr/bin\n", "pip install"),
+        ("pyvenv.cfg", "home = /usr/bin\n", "'{}/bin/python 3' -m pip install"),
         ("pipx_metadata.json", "{}", "pipx runpip graspd install"),
         ("pyvenv.cfg", "home = /usr/bin\nuv = 0.4.0\n", "uv pip install --python {}"),
     ],
 )
 def test_packages_are_added_by_what_made_the_environment(
-    tmp_path: Path, file: str, content: str, command: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, content: str, command: str
 ) -> None:
     environment = tmp_path / "graspd"
     environment.mkdir()
-    assert installer(environment) == "pip install"
+    monkeypatch.setattr(sys, "prefix", str(environment))
+    monkeypatch.setattr(sys, "executable", f"{environment}/bin/python 3")
+    assert installer() == f"'{sys.executable}' -m pip install"
     (environment / file).write_text(content)
-    assert installer(environment) == command.format(environment)
+    assert installer() == command.format(environment)
 
 
 def test_a_table_is_markdown_with_numbers_to_the_right_and_bars_escaped() -> None:

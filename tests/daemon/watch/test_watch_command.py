@@ -272,8 +272,8 @@ def test_without_rich_the_extra_is_named_and_the_page_still_works(endpoint: str,
         errors = process.communicate(timeout=PATIENCE_S)[1]
     assert process.returncode == 0
     assert errors == (
-        "graspd: watch needs the package 'rich': run pip install '.[watch]' in the folder of "
-        "graspd's source; or watch --web, which needs none\n"
+        f"graspd: watch needs the package 'rich': run {sys.executable} -m pip install '.[watch]' "
+        "in the folder of graspd's source; or watch --web, which needs none\n"
     )
 
 

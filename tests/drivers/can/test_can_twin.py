@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -68,7 +69,8 @@ def test_a_package_that_is_missing_is_named(
     monkeypatch.setattr("can.interfaces.udp_multicast.utils.msgpack", None)
     arguments = (iter(()),) if make is CanTwin else ()
     with pytest.raises(
-        DriverError, match=r"needs the package msgpack: pip install msgpack"
+        DriverError,
+        match=rf"needs the package msgpack: run {sys.executable} -m pip install msgpack$",
     ) as raised:
         make("udp_multicast", "239.74.163.2", *arguments).open()
     assert "\n" not in str(raised.value)
@@ -90,5 +92,5 @@ def test_packages_are_named_as_they_are_installed(
         raise can.CanInterfaceNotImplementedError(says)
 
     monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", refuse)
-    with pytest.raises(DriverError, match=f"pip install {package}$"):
+    with pytest.raises(DriverError, match=f"-m pip install {package}$"):
         CanTwin("slcan", "/dev/null", iter(())).open()

@@ -195,9 +195,11 @@ def test_what_is_not_installed_is_said_before_any_training(
     options = ["svm", "--data", str(data), "--out", str(tmp_path)]
     assert graspd_evaluate(*options, "--plots", str(tmp_path)) == 2
     assert graspd_evaluate(*options, "--dask", "tcp://127.0.0.1:9") == 2
+    pip = f"{sys.executable} -m pip install"
+    where = "in the folder of graspd's source"
     assert capsys.readouterr().err.splitlines() == [
-        "graspd evaluate: needs the package 'matplotlib': pip install '.[report]'",
-        "graspd evaluate: needs the package 'distributed': pip install '.[cluster]'",
+        f"graspd evaluate: --plots needs the package 'matplotlib': run {pip} '.[report]' {where}",
+        f"graspd evaluate: --dask needs the package 'distributed': run {pip} '.[cluster]' {where}",
     ]
 
 
