@@ -68,21 +68,21 @@ class ReplayFaultsSection(Section):
     """`[tactile.faults]`: faults of the replayed sensor, to test a controller."""
 
     off_from: Annotated[int, Field(ge=0), unit("readings")] | None = None
-    """Number of the first reading that is lost, with all after it; without it none."""
+    """First reading that is lost, with all after it."""
     stuck_from: Annotated[int, Field(ge=1), unit("readings")] | None = None
-    """Number of the reading from which all repeat the one before; without it none."""
+    """First reading that repeats the one before, as do all after it."""
     garbage_probability: Probability = 0.0
-    """Chance of a reading to have random 16-bit values as counts."""
+    """Share of readings with random 16-bit values."""
     wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX), unit("counts")] = 0
     """Offset added to the counts."""
     slow_every: Annotated[int, Field(ge=1), unit("readings")] = 1
-    """Number n: only every n-th reading arrives."""
+    """Only every n-th reading arrives."""
     delayed_s: Annotated[float, Field(ge=0.0, le=3600.0), unit("s")] = 0.0
     """Delay of all readings."""
     intermittent_probability: Probability = 0.0
-    """Chance of a reading to be lost."""
+    """Share of readings that are lost."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
-    """Fingers with the faults stuck, garbage and wrong; without it all."""
+    """Fingers that are stuck, garbage or wrong; without it all."""
     electrodes: (
         Annotated[
             tuple[Annotated[int, Field(ge=1, le=ELECTRODES), unit()], ...],
@@ -90,9 +90,9 @@ class ReplayFaultsSection(Section):
         ]
         | None
     ) = None
-    """Electrodes 1..24 with the faults stuck, garbage and wrong; without it all."""
+    """Electrodes that are stuck, garbage or wrong; without it all."""
     seed: Annotated[int, Field(ge=0), unit()] = 0
-    """Seed of the chance; the same seed gives the same faults."""
+    """The same seed gives the same faults."""
 
 
 class ReplayTactile(Section):
@@ -101,17 +101,17 @@ class ReplayTactile(Section):
     driver: Literal["replay"]
     """Selects this driver."""
     recordings: Annotated[tuple[FilePath, ...], Field(min_length=1, strict=False)]
-    """Grasp tables or streams (deploy/RECORDING.md), played in this order."""
+    """Grasp tables or streams (deploy/RECORDING.md), in this order."""
     pace: Literal["realtime", "fast"] = "realtime"
-    """`realtime`: as recorded; `fast`: as fast as they can be judged."""
+    """`fast`: as fast as readings can be judged."""
     speed: Annotated[float, Field(ge=1e-3, le=1e3), unit()] = 1.0
-    """Factor of real time: 2 plays twice as fast. Not with pace `fast`."""
+    """Factor of real time; not with pace `fast`."""
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e5), unit("1/s")] = 100.0
-    """Readings per second of a grasp table, which has no times."""
+    """Rate of a grasp table, which has no times."""
     loop: bool = False
-    """True: start again at the end, without end."""
+    """True: start again at the end."""
     outcomes: bool = False
-    """True: tell the recorded outcome of each lift that a verdict allows, as a controller does."""
+    """True: tell the recorded outcome of each lift that a verdict allows."""
     strict: bool = False
     """True: stop at the first value that is not a 12-bit count."""
     faults: ReplayFaultsSection = ReplayFaultsSection()
@@ -124,7 +124,7 @@ class SpiTactile(Section):
     driver: Literal["spi"]
     """Selects this driver."""
     port: Name
-    """Serial port, best by its path in `/dev/serial/by-id/`, or a pyserial URL."""
+    """Path in `/dev/serial/by-id/`, or a pyserial URL."""
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
     ) = None
@@ -141,18 +141,18 @@ class CanTactile(Section):
     interface: Name = "socketcan"
     """Name of a python-can interface."""
     channel: Name = "can0"
-    """Name of the bus at that interface, as `ip link` lists it for socketcan."""
+    """Name of the bus at that interface."""
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
     ) = None
     """Fingers in the order of the board's words (`syntouch`); without it `hand.fingers`."""
     format: Literal["syntouch", "sweep_fd"] = "syntouch"
-    """Format: SynTouch's frame per sample, or graspd's CAN FD frame per sweep and finger."""
+    """SynTouch's frame per sample, or graspd's CAN FD frame per finger and sweep."""
     arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), unit()] | None = None
-    """Id of the samples, or of finger `ff` of the sweep frames. Without it, `syntouch` takes the id
-    of the first sound sample; no public document has that id."""
+    """Id of the samples, or of finger `ff` of `sweep_fd`. Without it `syntouch` takes the id of the
+    first sound sample."""
     sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
-    """Order in which the board samples (`syntouch` only)."""
+    """Order of the samples of `syntouch`: 24, 28 or 54."""
     data_length: Annotated[int, Field(ge=3, le=8), unit("bytes")] | None = None
     """Length of a sample frame if the board pads it."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
@@ -167,9 +167,9 @@ class PalmTactile(Section):
     driver: Literal["palm"]
     """Selects this driver."""
     source: Name
-    """`udp://ADDRESS:PORT` to listen on, or a file of packets, relative to the scene file."""
+    """`udp://ADDRESS:PORT` to listen on, or a file of packets."""
     only_from: Address | None = None
-    """IP address of the relay; without it packets from any address are taken."""
+    """IP address of the relay; without it any may send."""
     heed_finger_bits: bool = True
     """False for a palm that never sets the bits of valid fingers."""
 
@@ -191,7 +191,7 @@ class PalmJoints(Section):
     driver: Literal["palm"]
     """Selects this driver."""
     calibration: FilePath
-    """Calibration file of the hand (TOML, as deploy/calibration/example_hand.toml)."""
+    """Calibration of the hand, as deploy/calibration/example_hand.toml."""
 
 
 class StreamJoints(Section):
@@ -202,7 +202,7 @@ class StreamJoints(Section):
     source: Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
     """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
-    """IP address of the sender; without it messages from any address are taken."""
+    """IP address of the sender; without it any may send."""
 
 
 Joints = Annotated[PalmJoints | StreamJoints, Field(discriminator="driver")]

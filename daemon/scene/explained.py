@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import graspd.drivers.recordings
-from graspd.daemon.process.text import markdown_table
 from graspd.daemon.scene import Scene
 
 EXAMPLES = Path(__file__).parent / "examples"
@@ -17,21 +16,17 @@ EXAMPLES = Path(__file__).parent / "examples"
 SCHEMA = "scene.schema.json"
 """File beside the examples; their first line names it for editors."""
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-COLUMNS = ("key", "type", "unit", "default", "range", "meaning")
 INTRODUCTION = """# The scene, key by key
 
-For anybody who writes a scene. `graspd scene --page` makes this page from the classes that read it.
+This page is for those who write a scene. After it you know each key of its file.
+`graspd scene --page` prints it.
 
 A scene is one TOML file; only `[tactile]` must be there. `graspd scene --example spi > right.toml`
-prints one to edit. `graspd check right.toml` finds mistakes, also keys that contradict each other.
-An unknown key, or a value out of its range, is an error.
+prints one to edit. `graspd check right.toml` finds mistakes: unknown keys, values out of range, and
+keys that contradict each other. Editors with Taplo (VS Code: Even Better TOML) complete the keys.
 
-The default `-` means that the key may be left out; the meaning says what happens without it. The
-default `needed` means that it must be there. Paths are relative to the folder of the scene file.
-
-Editors with Taplo (VS Code: Even Better TOML) complete and explain keys. They use the JSON Schema
-that the first line of an example names. `graspd scene --schema > scene.schema.json` writes it for
-`#:schema ./scene.schema.json`.
+`key = value` shows the default. A key without one may be left out, unless it is *needed*. Paths are
+relative to the folder of the scene file.
 """
 
 
@@ -64,14 +59,17 @@ def schema_text() -> str:
 
 
 def page() -> str:
-    """Return the text of deploy/SCENE.md: a table of keys for each section."""
-    tables = [INTRODUCTION]
+    """Return the text of deploy/SCENE.md: a list of keys for each section."""
+    parts = [INTRODUCTION]
     for section in _sections(schema()):
         title, _, about = _linked(section["description"]).partition(": ")
-        rows = (_row(key, value, section) for key, value in section["properties"].items())
-        table = "\n".join(markdown_table(COLUMNS, rows))
-        tables.append(f"## {title}\n\n{about[0].upper()}{about[1:]}\n\n{table}\n")
-    return "\n".join(tables)
+        lines = [
+            _line(key, value, key in section.get("required", ()))
+            for key, value in section["properties"].items()
+            if "const" not in value and "properties" not in value
+        ]
+        parts.append(f"## {title}\n\n{about[0].upper()}{about[1:]}\n\n{''.join(lines)}")
+    return "\n".join(parts)
 
 
 def _describe(about: dict[str, Any]) -> None:
@@ -121,24 +119,21 @@ def _sections(of: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
                 yield from _sections(section)
 
 
-def _row(key: str, about: Mapping[str, Any], section: Mapping[str, Any]) -> tuple[str, ...]:
-    if "properties" in about:
-        return f"`{key}`", "section", "-", "-", "-", "a section of its own, below"
+def _line(key: str, about: Mapping[str, Any], is_needed: bool) -> str:
+    """Return the line of a key: default, type where no default shows it, unit, range, meaning."""
     item = about.get("items")
-    allowed = ": ".join(filter(None, (_lengths(about), _range(item or about))))
-    if key in section.get("required", ()):
-        default = "needed"
-    else:
-        default = f"`{json.dumps(about['default'])}`" if "default" in about else "-"
-    meaning = about["description"].removesuffix(f" Unit: {_unit(about)}.")
-    return (
-        f"`{key}`",
-        f"list of {_type(item)}s" if item else _type(about),
-        _unit(about) or "-",
-        default,
-        allowed or "-",
-        _linked(meaning),
+    default = f" = {json.dumps(about['default'])}" if "default" in about else ""
+    kind = f"list of {_type(item)}s" if item else _type(about)
+    joint = " of " if item and "enum" in item else ", "
+    facts = (
+        "" if default or "enum" in about else kind,
+        "*needed*" if is_needed else "",
+        _unit(about).removeprefix("-"),
+        joint.join(filter(None, (_lengths(about), _range(item or about)))),
     )
+    given = ", ".join(filter(None, facts))
+    meaning = _linked(about["description"].removesuffix(f" Unit: {_unit(about)}."))
+    return f"- `{key}{default}`{given and f' ({given})'}. {meaning}\n"
 
 
 def _type(about: Mapping[str, Any]) -> str:

@@ -51,7 +51,7 @@ class Hand(Section):
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]{1,32}$")] = "right"
     """Name in the topics and in the default socket."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] = ("ff", "mf", "th")
-    """Fingers with a sensor (first, middle, ring, little, thumb), in the order of the model."""
+    """Fingers with a sensor, in the order of the model."""
 
     @field_validator("fingers")
     @classmethod
@@ -65,15 +65,15 @@ class Model(Section):
     """`[model]`: the network that judges, and its thresholds."""
 
     name: Name | None = None
-    """Model of the zoo, or added by `graspd models add`; without name and path `small-session`. A
-    hand with fewer fingers gets the model's form for these, if it exists."""
+    """Model that `graspd models` lists; without name and path `small-session`. A hand with fewer
+    fingers gets the model's form for these, if it exists."""
     path: FilePath | None = None
-    """Model file of your own, relative to the scene file."""
+    """Model file of your own."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0), unit()] = Limits.slip_threshold
-    """Smallest `p_slip` that is judged as slip."""
+    """Smallest `p_slip` of a slip."""
     min_confidence: Annotated[float, Field(ge=0.0, lt=1.0), unit()] = Limits.min_confidence
-    """Smallest confidence (`p_slip` of a slip, 1 - `p_slip` of `stable`); below it the verdict is
-    `unknown`. To limit how many `stable` lifts slip, use `[risk]`."""
+    """Smallest `p_slip` of a slip, and 1 - `p_slip` of `stable`; below it the verdict is
+    `unknown`."""
 
     @model_validator(mode="after")
     def _one_of_name_and_path(self) -> Self:
@@ -86,14 +86,13 @@ class SessionSection(Section):
     """`[session]`: the calibration of a session model by the grasps since the last exchange."""
 
     keep: bool | None = None
-    """True: keep the session in a file; False: start a new one each time. Without it, only sessions
-    of live sensors are kept."""
+    """True: keep the session in a file. Without it only sessions of live sensors are kept."""
     learn: bool = True
     """True: judged grasps calibrate the session."""
     required: bool = False
     """True: the verdict is `unknown` until the session is calibrated."""
     file: FilePath | None = None
-    """File of the session; without it `/var/lib/graspd/<hand>.session.json`."""
+    """Without it `/var/lib/graspd/<hand>.session.json`."""
 
 
 class RiskSection(Section):
@@ -105,13 +104,12 @@ class RiskSection(Section):
     max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5), unit()] = 0.05
     """Largest share of the `stable` lifts that may slip."""
     warm_up: Annotated[int, Field(ge=0, le=1000), unit("outcomes")] = 50
-    """Number of outcomes before which each grasp that is not `stable` is lifted supervised."""
+    """Until this number of outcomes each grasp that is not `stable` is to be lifted supervised."""
     explore: Annotated[float, Field(ge=0.0, le=1.0), unit()] = 0.05
-    """Share of the grasps that are not `stable` to lift under supervision after that. Only their
-    outcomes can show that the rule is too strict."""
+    """Share of the grasps that are not `stable` to lift supervised after that."""
     outstanding_max: Annotated[int, Field(ge=1, le=100), unit("lifts")] = 5
-    """Most lifts, announced by the question `lift`, whose outcome is not told yet. At this number
-    no grasp is `stable`."""
+    """While this number of announced lifts (question `lift`) has no outcome, no grasp is
+    `stable`."""
 
 
 class Learn(Section):
@@ -129,43 +127,40 @@ class GateSection(Section):
     """`[gate]`: the conditions for judging a grasp."""
 
     mode: GateMode | None = None
-    """`settled`: judge a grasp when it has settled; `request`: when it has settled and the
-    controller asks; `every`: each reading is a grasp, in recordings only. Without it, `every` for
-    grasp tables, else `settled`."""
+    """`settled`: judge a grasp once it has settled; `request`: only if the controller asks, too;
+    `every`: each reading is a grasp, in recordings only. Without it `every` for grasp tables, else
+    `settled`."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
     """Largest age of a reading. An older one, or silence for this time, gives `unknown`."""
     sweeps: Annotated[Literal[1, 3], unit("readings")] | None = None
-    """`1`: judge single readings; `3`: judge the median of three of each electrode. Without it 3,
-    or 1 in mode `every`."""
+    """Judge single readings, or the median of three. Without it 3, in mode `every` 1."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
     """Fingers that must touch; without it all of `hand.fingers`."""
     contact_counts: Annotated[float, Field(ge=5, le=1000), unit("counts")] = ContactLimits.counts
     """A finger touches when three of its electrodes are this far below their baseline, and also
     `contact_sigmas`."""
     contact_sigmas: Annotated[float, Field(ge=3, le=100), unit("sigma")] = ContactLimits.sigmas
-    """The same limit in standard deviations of the finger's noise; both must be reached."""
+    """The same in standard deviations of the finger's noise."""
     false_alarms: Annotated[float, Field(ge=0.001, le=0.3), unit()] = GateLimits.false_alarms
-    """Share of the time in which a settled hand that holds may count as moving. Before it settles,
-    the limit is stricter. With a smaller share, more slow slides count as still
-    (deploy/JUDGING.md)."""
+    """Share of the time in which a settled hand that holds may count as moving. With a smaller
+    share more slow slides count as still (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
-    """True: judge once nothing moves fast, with the mark `early`, and again once nothing slides
-    slowly."""
+    """True: judge once nothing moves fast, marked `early`, and again once nothing slides slowly."""
     joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), unit("rad/s")] = JointLimits.rad_per_s
-    """Speed from which a joint counts as moving; only with `[joints]`."""
+    """Speed from which a joint counts as moving."""
     joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0), unit("ms")] = (
         JointLimits.lost_ns / 1e6
     )
-    """Longest time for which missing joint angles block a verdict; only with `[joints]`."""
+    """Longest time for which missing joint angles block a verdict."""
     request_ms: Milliseconds = GateLimits.request_ns / 1e6
-    """Time after which a question without a judgement is answered with `unknown`."""
+    """Time after which a question is answered with `unknown`."""
     gap_ms: Milliseconds = GateLimits.gap_ns / 1e6
-    """Time without a usable reading after which a grasp must settle again. It must be more than two
-    periods of the readings."""
+    """Time without a usable reading after which a grasp must settle again; more than two periods of
+    the readings."""
     change_counts: Annotated[float, Field(ge=10, le=1000), unit("counts")] = (
         GateLimits.change_counts
     )
-    """Mean change of a finger's electrodes since they were judged that means another grasp."""
+    """Mean change of a finger's electrodes that means another grasp."""
 
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
@@ -179,18 +174,16 @@ class Publish(Section):
     """`[publish]`: the socket of the verdicts."""
 
     endpoint: Endpoint | None = None
-    """Endpoint of the socket; without it `ipc:///run/graspd/<hand>.ipc`. `tcp://` needs `[curve]`,
-    except on loopback addresses."""
+    """Without it `ipc:///run/graspd/<hand>.ipc`. `tcp://` needs `[curve]`, except on loopback."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000), unit("messages")] = 1000
-    """Most messages that wait for a slow subscriber; it loses further ones."""
+    """Most messages that wait for a subscriber; it loses further ones."""
     tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), unit("1/s")] = 25.0
-    """Rate of readings on `tactile.<hand>`; 0: none; the sensor's rate or more: all. Recordings
-    always have all readings."""
+    """Rate of readings on `tactile.<hand>`; 0: none; the sensor's rate or more: all."""
     file_mode: FileMode | None = None
-    """Mode of the file of an `ipc://` socket, as in chmod; users who may write may connect. Without
-    it the umask decides."""
+    """Mode of an `ipc://` socket's file; users who may write may connect. Without it the umask
+    decides."""
     group: Name | None = None
-    """Group of the file of an `ipc://` socket; without it that of the process."""
+    """Group of an `ipc://` socket's file; without it that of the process."""
 
 
 class Curve(Section):
@@ -199,41 +192,41 @@ class Curve(Section):
     secret_key: FilePath
     """The daemon's own `.key_secret` file, of mode 0600."""
     clients: FilePath
-    """Folder with the `.key` files of peers that may connect; it is read again when it changes. No
-    peer may connect while users other than root and the daemon's can write there."""
+    """Folder with the `.key` files of peers that may connect. No peer may connect while users other
+    than root and the daemon's can write there."""
 
 
 class Ask(Section):
     """`[ask]`: the socket for questions of the grasp controller (deploy/wire/README.md)."""
 
     endpoint: Endpoint | None = None
-    """Endpoint of the socket; without it `ipc:///run/graspd/<hand>.ask.ipc`. `tcp://` needs
-    `[curve]`, except on loopback addresses."""
+    """Without it `ipc:///run/graspd/<hand>.ask.ipc`. `tcp://` needs `[curve]`, except on
+    loopback."""
     file_mode: FileMode | None = None
-    """Mode of the file of an `ipc://` socket; users who may write may ask, and tell outcomes.
-    Without it that of `[publish]`, for owner and group only."""
+    """Mode of an `ipc://` socket's file; users who may write may ask, and tell outcomes. Without it
+    that of `[publish]`, for owner and group only."""
     group: Name | None = None
-    """Group of the file of an `ipc://` socket; without it that of `[publish]`."""
+    """Group of an `ipc://` socket's file; without it that of `[publish]`."""
 
 
 class Realtime(Section):
-    """`[realtime]`: run with realtime priority. Without this section it has an ordinary one."""
+    """`[realtime]`: run with realtime priority."""
 
     priority: Annotated[int, Field(ge=1, le=98), unit()] | None = 50
-    """Priority of SCHED_FIFO; choose one below the hand's own controller."""
+    """Priority of SCHED_FIFO; below that of the hand's own controller."""
     cpus: (
         Annotated[tuple[Annotated[int, unit()], ...], Field(min_length=1, strict=False)] | None
     ) = None
-    """Processors to run on, numbered from 0; without it all."""
+    """Processors to run on, from 0; without it all."""
     lock_memory: bool = True
-    """True: lock used memory (mlockall), so that no reading waits for a disk."""
+    """True: lock used memory, so that no reading waits for a disk."""
 
 
 class Record(Section):
     """`[record]`: keep readings, verdicts and outcomes in MCAP files (extra `record`)."""
 
     directory: FilePath | None = None
-    """Folder of the files, created if missing; without it `/var/lib/graspd/record`."""
+    """Folder of the files; without it `/var/lib/graspd/record`."""
     flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0), unit("ms")] = 1000.0
     """Longest time whose data a killed daemon or a power cut loses."""
     rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0), unit("MB")] = 256.0
@@ -245,9 +238,9 @@ class Record(Section):
     keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), unit("MB")] = 4096.0
     """Largest size of all files of this hand together."""
     images_hz: Annotated[float, Field(ge=0.0, le=1000.0), unit("1/s")] = 10.0
-    """Rate of tactile images for viewers; 0: none. All counts are recorded in any case."""
+    """Rate of tactile images for viewers; 0: none."""
     raw: bool = False
-    """True: also record the link (CAN frames as candump text, serial bytes in frames)."""
+    """True: also record the link: CAN frames (candump text) or serial bytes."""
 
 
 class Scene(Section):

@@ -14,6 +14,11 @@
  *   GP26    CS 5     fifth
  *   3V3     supply   3.3 V: the Pico's pins do not bear 5 V
  *   GND     ground
+ *
+ * Build and flash it from the top folder of a checkout:
+ *
+ *   arduino-cli compile --fqbn rp2040:rp2040:rpipico --library deploy/bridge deploy/bridge/rp2040/graspd_bridge
+ *   arduino-cli upload --fqbn rp2040:rp2040:rpipico --port /dev/ttyACM0 deploy/bridge/rp2040/graspd_bridge
  */
 #include <SPI.h>
 #include <bridge.h>
