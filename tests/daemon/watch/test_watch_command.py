@@ -202,7 +202,7 @@ def test_several_scenes_are_seen_in_one_terminal(tmp_path: Path) -> None:
         talker.decision = Decision.SLIP
         terminal.read_until(rb"right .*SLIP .*75 %, do not lift.*left .*no message has come")
         terminal.type(b"\t")
-        terminal.read_until(rb"left .*UNKNOWN .*right .*it is judged to slip")
+        terminal.read_until(rb"left .*NO VERDICT YET .*right .*it is judged to slip")
         terminal.type(b"q")
         assert terminal.end() == 0
 
