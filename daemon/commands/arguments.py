@@ -13,7 +13,10 @@ from graspd.daemon.process.text import did_you_mean
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that answers a mistyped word with the nearest one."""
+    """A parser that takes options and files in any order, and corrects a mistyped word."""
+
+    _is_intermixing = False
+    """True while argparse parses options and files in two passes."""
 
     @property
     def actions(self) -> Sequence[argparse.Action]:
@@ -35,7 +38,13 @@ class Parser(argparse.ArgumentParser):
             known = self._option_string_actions
             if name.startswith("--") and not any(option.startswith(name) for option in known):
                 self.error(f"no such option: {name}{did_you_mean(name, known)}")
-        return super().parse_known_args(args, namespace)
+        if self.subparsers or self._is_intermixing or "--" in words:  # two passes lose the --
+            return super().parse_known_args(args, namespace)
+        self._is_intermixing = True
+        try:
+            return self.parse_known_intermixed_args(args, namespace)
+        finally:
+            self._is_intermixing = False
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:  # noqa: ANN401
         try:

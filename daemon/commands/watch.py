@@ -51,8 +51,7 @@ class UsageError(Exception):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
+    parser.add_argument(
         "scenes",
         type=Path,
         nargs="*",
@@ -60,12 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="scene",
         help="scene file of a daemon (TOML); with several, all their hands are seen",
     )
-    where.add_argument(
+    parser.add_argument(
         "--connect",
         action="append",
         default=[],
         metavar="ENDPOINT",
-        help=f"where a daemon publishes; may be repeated (default: {ENDPOINT})",
+        help=f"where a daemon publishes, instead of scenes; may be repeated (default: {ENDPOINT})",
     )
     parser.add_argument(
         "--keys", type=Path, metavar="FILE", help="own .key_secret file, for a daemon with [curve]"
@@ -121,6 +120,8 @@ def _port(text: str) -> int:
 
 
 def _targets(args: argparse.Namespace) -> list[Target]:
+    if args.connect and args.scenes:
+        raise UsageError("--connect takes the place of scenes: give one or the other")
     endpoints = args.connect or ([] if args.scenes else [ENDPOINT])
     targets = [
         Target(endpoint, None, args.server_key, where_to_look(endpoint)) for endpoint in endpoints

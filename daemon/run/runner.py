@@ -17,6 +17,7 @@ from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets, plan
 from graspd.daemon.run.loop import Ended, Loop, LoopTiming
 from graspd.daemon.run.reload import Reload
+from graspd.daemon.run.run_log import RunLog
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.drivers.base import DriverError
 from graspd.models.contract import ModelError
@@ -93,23 +94,29 @@ class Runner:
         self._manager = manager
         self._sockets: Sockets | None = None
         self._reload = Reload(stop, partial(prepare, path), self._say_reloading)
-        self._running = False
+        self._running = self._has_run = False
         self._former: Parts | None = None
         """Parts of the scene before a reload, until the new scene runs."""
         self._trust: Trust | None = None
         """Trust of the scene that ran last."""
+        self._log = RunLog()
 
     def run(self) -> None:
         """Run until stopped or until a recording ends. Errors of a reload are only logged.
 
         Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`.
         """
+        cause = "an error"
         try:
             self._run(prepare(self._path))
+            received = self._stop.received
+            cause = "the end of the recording" if received is None else received.name
         finally:
             self._reload.close()
             if self._sockets is not None:
                 self._sockets.close()
+            if self._has_run:
+                self._log.write(cause)
         if self._printer is not None:
             self._printer.summary(self._trust)
 
@@ -171,7 +178,7 @@ class Runner:
             around.record()
             controller = _controller(running)
             companions = [
-                *(self._reload, self._manager, *around.companions),
+                *(self._reload, self._manager, self._log, *around.companions),
                 *(self._printer, realtime, controller),
             ]
             loop = Loop(
@@ -184,7 +191,7 @@ class Runner:
                 around.keep,
             )
             stack.callback(loop.close)
-            self._running, self._former = True, None
+            self._running, self._has_run, self._former = True, True, None
             self._trust = parts.pipeline.trust
             log.info("verdict.%s on %s", running.hand.name, running.endpoint)
             if running.ask_endpoint is not None:

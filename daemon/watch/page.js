@@ -263,7 +263,10 @@ class Hand {
     this.drawFingers(images);
   }
   tone() { return gone || this.seen === null ? "silent" : this.seen.tone; }
-  headline() { return gone || this.seen === null ? "unknown" : this.seen.headline; }
+  headline() {
+    if (this.seen === null || this.seen.last_t === null) return "no verdict yet";
+    return gone ? "unknown" : this.seen.headline;
+  }
 
   drawGrasp(none, quiet) {
     const seen = this.seen, gate = none ? null : seen.gate, newest = seen.grasps[0] ?? null;

@@ -64,7 +64,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str
     """`stable`, `slip` or `unknown`."""
     headline: str
-    """The verdict, or that it leans to stable."""
+    """The verdict, that it leans to stable, or that none has come yet."""
     evidence: str
     """Empty before the first message."""
     p_slip: float | None

@@ -44,6 +44,8 @@ HALF = 0.5
 HELD_NS = 1_000_000_000
 """Time for which `slip` stands after its probability has fallen, ns; as the judge has it."""
 HELD = Line("slip, held", "for a second: a moment ago its probability was 50 % or more")
+NO_VERDICT, LEANS = "no verdict yet", "leans to stable"
+"""Headlines beside the verdicts."""
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
 LATE = "the daemon is there and says nothing: top shows whether this computer is too busy"
 SECONDS = 300
@@ -214,7 +216,7 @@ class View:
             last_t=None if last is None else wall_t - (now_ns - self._verdict_ns) / 1e9,
             tone=tone,
             verdict=word,
-            headline="leans to stable" if tone is Tone.LEANS else word,
+            headline=NO_VERDICT if last is None else LEANS if tone is Tone.LEANS else word,
             evidence="" if verdict is None else rests_on(verdict),
             p_slip=p_slip,
             why=why,

@@ -85,7 +85,7 @@ complete -c graspd -n '_shtab_graspd_using replay' -l verbose -d 'of grasp table
 complete -c graspd -n '_shtab_graspd_using replay; and test $_shtab_graspd_npos -ge 0' -ka "(__fish_complete_path (commandline -ct))" -d 'grasp tables or streams (CSV); what `graspd run` has recorded (.mcap); what came over a link (candump text .log, serial bytes .serial); without any, the demo: a synthetic day, with --outcomes and --max-slip-when-stable 0.05'
 complete -c graspd -n '_shtab_graspd_using; and test $_shtab_graspd_npos -eq 0' -a watch -d 'See it live, in a terminal (extra: watch) or a browser.'
 complete -c graspd -n '_shtab_graspd_using watch' -s h -l help -d 'show this help message and exit'
-complete -c graspd -n '_shtab_graspd_using watch' -l connect -xka "(__fish_complete_path (commandline -ct))" -d 'where a daemon publishes; may be repeated (default: ipc:///run/graspd/right.ipc)'
+complete -c graspd -n '_shtab_graspd_using watch' -l connect -xka "(__fish_complete_path (commandline -ct))" -d 'where a daemon publishes, instead of scenes; may be repeated (default: ipc:///run/graspd/right.ipc)'
 complete -c graspd -n '_shtab_graspd_using watch' -l keys -xka "(__fish_complete_path (commandline -ct))" -d 'own .key_secret file, for a daemon with [curve]'
 complete -c graspd -n '_shtab_graspd_using watch' -l server-key -xka "(__fish_complete_path (commandline -ct))" -d 'the daemon'"'"'s .key file (default: as the scene has it)'
 complete -c graspd -n '_shtab_graspd_using watch' -l web -d 'serve a page on this computer instead'

@@ -441,7 +441,7 @@ _shtab_graspd_twin_spi_defaults_added=0
 
 _shtab_graspd_watch_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "*--connect[where a daemon publishes\; may be repeated (default\: ipc\:\/\/\/run\/graspd\/right.ipc)]:ENDPOINT:_files"
+  "*--connect[where a daemon publishes, instead of scenes\; may be repeated (default\: ipc\:\/\/\/run\/graspd\/right.ipc)]:ENDPOINT:_files"
   "--keys[own .key_secret file, for a daemon with \[curve\]]:FILE:_files"
   "--server-key[the daemon\'s .key file (default\: as the scene has it)]:FILE:_files"
   "--web[serve a page on this computer instead]"

@@ -119,6 +119,7 @@ SCENES: Final[Mapping[str, str]] = {
 
 _MASKS: Final = (
     (r" +[0-9]+ us\b", " * us"),
+    (r"(?<=after )[0-9.]+(?= s: )", "*"),
     (r"(readings|verdicts) in [0-9.]+ s", r"\1 in * s"),
     (r'"(p50|p99|max|wall_s|t|t_mono_ns|age_ms|latency_us)": ?[0-9.e+-]+', r'"\1": *'),
     (r'"boot_id": ?"[0-9a-f]{32}"', '"boot_id": *'),

@@ -129,6 +129,25 @@ def test_what_is_mistyped_is_answered_with_the_nearest(arguments: list[str], mea
     assert done.stderr.endswith(f"; did you mean {meant}?\n")
 
 
+@pytest.mark.parametrize(
+    ("files_first", "mixed"),
+    [
+        ("replay A B --json --scene X", "replay A --json --scene X B"),
+        ("replay A B --json --scene X", "replay --json A --scene X B"),
+        ("watch A B --web --port 8", "watch A --port 8 B --web"),
+        ("check A B --json --cost", "check --json A --cost B"),
+        ("export-grasps A B --out X", "export-grasps A --out X B"),
+        ("models add A --name X", "models add --name X A"),
+        ("evaluate svm cnn1 --jobs 2", "evaluate svm --jobs 2 cnn1"),
+        ("report stability svm mlp --quick", "report stability svm --quick mlp"),
+        ("run A --print", "run --print A"),
+    ],
+)
+def test_options_and_files_come_in_any_order(files_first: str, mixed: str) -> None:
+    expected = whole_parser().parse_args(files_first.split())
+    assert whole_parser().parse_args(mixed.split()) == expected
+
+
 def test_a_value_may_look_like_an_option_behind_two_dashes() -> None:
     done = graspd("run", "--", "--scene.toml")
     assert "graspd: --scene.toml: cannot read the scene" in done.stderr

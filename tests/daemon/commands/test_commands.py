@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import zmq
 
+from graspd.daemon import scene as scenes
 from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon import processes
@@ -225,10 +226,15 @@ def loop_scene(folder: Path) -> Path:
     return scene
 
 
+def test_the_demo_and_the_loop_share_no_socket() -> None:
+    demo, loop = (scenes.load(DEPLOY / name) for name in ("scenes/demo.toml", "clients/loop.toml"))
+    assert {demo.endpoint, demo.ask_endpoint}.isdisjoint({loop.endpoint, loop.ask_endpoint})
+
+
 def test_the_controller_in_the_page_of_the_service_asks_and_tells(tmp_path: Path) -> None:
     scene = loop_scene(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", (DEPLOY / "README.md").read_text(), re.DOTALL)
-    assert "/tmp/graspd-demo.ipc" in code
+    assert "/tmp/graspd-loop.ipc" in code
     with start("run", scene) as process:
         controller = subprocess.run(
             [sys.executable, "-c", code.replace("/tmp/graspd-", f"{tmp_path}/")],
@@ -255,7 +261,7 @@ def test_the_scene_of_the_whole_loop_asks_learns_and_records(tmp_path: Path) -> 
         context.socket(zmq.DEALER) as controller,
     ):
         controller.linger = 0
-        controller.connect(f"ipc://{tmp_path}/demo.ask.ipc")
+        controller.connect(f"ipc://{tmp_path}/loop.ask.ipc")
         verdict = asked(controller)
         while verdict.p_slip is None:
             verdict = asked(controller)
@@ -268,7 +274,7 @@ def test_the_scene_of_the_whole_loop_asks_learns_and_records(tmp_path: Path) -> 
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 0
-    replayed = graspd("replay", *(tmp_path / "demo-record").glob("*.mcap"), "--json")
+    replayed = graspd("replay", *(tmp_path / "loop-record").glob("*.mcap"), "--json")
     summary = json.loads(replayed.stderr.splitlines()[-1])
     assert (summary["labelled"], summary["outcomes"]) == (1, 1)
     assert summary["scores"]["f1"] == float(verdict.verdict == "slip")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -18,10 +20,14 @@ from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.messages import State, Status, Verdict
 from graspd.daemon.run import runner
-from graspd.daemon.scene import Scene
+from graspd.daemon.run.loop import Loop
+from graspd.daemon.scene import Scene, SceneError
+from graspd.drivers.base import DriverError
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, put_first
 from tests.kit.messages import decode_status, decode_verdict
+from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S
 
 DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
@@ -135,6 +141,50 @@ def test_ready_comes_when_it_runs_and_the_watchdog_is_fed_from_then_on(running: 
     assert code == 0, said
     assert running.told("STOPPING=1")
     assert running.last_status().state is State.STOPPING
+
+
+def test_the_end_is_logged_with_its_cause_and_the_counts_of_all_reloads(running: Running) -> None:
+    before = running.verdict()
+    running.write(model="cnn1")
+    running.hang_up()
+    running.told("READY=1")
+    after = running.verdict(like=lambda verdict: verdict.model == "cnn1" and verdict.seq >= 20)
+    said = running.stop()[1].splitlines()[-1]
+    ended = re.fullmatch(r"graspd: INFO: ended by SIGTERM after (\S+) s: (\d+) readings, .*", said)
+    assert ended is not None, said
+    assert float(ended[1]) >= (after.t_mono_ns - before.t_mono_ns) / 1e9
+    assert int(ended[2]) >= before.seq + after.seq
+
+
+def test_a_table_that_ends_is_logged_with_a_judgement_a_row(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = len(DEMO_TABLE.read_text().splitlines()) - 1
+    scene = demo_scene(tmp_path, 'pace = "fast"')
+    with caplog.at_level(logging.INFO, logger="graspd"), StopSignal() as stop:
+        runner.Runner(scene, stop).run()
+    *_, last = caplog.messages
+    assert re.match(rf"ended by the end of the recording .*: {rows} readings, {rows} judge", last)
+    counts = re.findall(r"(\d+) (?:stable|slip|unknown)", last)
+    assert sum(map(int, counts)) == rows
+
+
+def test_a_run_that_fails_is_logged_and_a_scene_that_never_ran_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_loop: object) -> None:
+        raise DriverError("broken")
+
+    monkeypatch.setattr(Loop, "run", fail)
+    scene = demo_scene(tmp_path)
+    with caplog.at_level(logging.INFO, logger="graspd"), StopSignal() as stop:
+        with pytest.raises(DriverError):
+            runner.Runner(scene, stop).run()
+        assert caplog.messages[-1].startswith("ended by an error after ")
+        caplog.clear()
+        with pytest.raises(SceneError):
+            runner.Runner(tmp_path / "absent.toml", stop).run()
+    assert not caplog.messages
 
 
 def test_another_model_takes_over_and_another_hand_gets_a_new_socket(running: Running) -> None:

@@ -42,7 +42,7 @@ def figures(lines: list[Line]) -> dict[str, str]:
 
 def test_before_the_first_message_it_is_unknown_and_says_why() -> None:
     seen = a_view().snapshot(0)
-    assert (seen.tone, seen.verdict) == (Tone.SILENT, "unknown")
+    assert (seen.tone, seen.verdict, seen.headline) == (Tone.SILENT, "unknown", "no verdict yet")
     assert "is graspd running" in seen.why[0].advice
     assert seen.why[1] == Line("link", "connecting")
 
@@ -59,7 +59,7 @@ def test_a_verdict_stands_until_the_silence_is_longer_than_it_says(
     assert (seen.tone, seen.verdict, seen.p_slip) == (tone, outcome.value, p_slip)
     seen = view.snapshot(101 * MS)
     assert (seen.tone, seen.verdict, seen.p_slip) == (Tone.SILENT, "unknown", None)
-    assert seen.why[0] == Line("silent", "no message for 101 ms")
+    assert (seen.headline, seen.why[0]) == ("unknown", Line("silent", "no message for 101 ms"))
     assert (seen.gate, seen.contact, seen.fingers, seen.state) == (None, None, [], None)
     assert [(last.verdict, last.held) for last in seen.grasps] == [(outcome.value, False)]
     assert view.snapshot(124_385 * MS).why[0].advice == "no message for 124 s"

@@ -61,6 +61,26 @@ def test_the_page_shows_verdict_images_and_advice(
     browser.wait_for(f"document.querySelector('.clock').innerText > '{first}'")
 
 
+def test_before_the_first_verdict_the_page_says_that_there_is_none(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.decision = None
+    page.stop()
+    page.start()
+    browser.look(1280, 800)
+    browser.go(page.address)
+    browser.wait_for("document.querySelector('.why').innerText.startsWith('silent: no message')")
+    see(browser, "silent")
+    assert text(browser, "verdict") == "NO VERDICT YET"
+    page.stop()
+    browser.wait_for("document.querySelector('.why').innerText.startsWith('no connection')")
+    assert text(browser, "verdict") == "NO VERDICT YET"
+    page.start()
+    talker.decision = Decision.SLIP
+    see(browser, "slip")
+    assert text(browser, "verdict") == "SLIP"
+
+
 def test_a_stable_that_lifts_have_not_earned_is_hollow(
     page: Page, talker: Talker, browser: Browser
 ) -> None:

@@ -202,7 +202,7 @@ def test_several_scenes_are_seen_in_one_terminal(tmp_path: Path) -> None:
         talker.decision = Decision.SLIP
         terminal.read_until(rb"right .*SLIP .*75 %, do not lift.*left .*no message has come")
         terminal.type(b"\t")
-        terminal.read_until(rb"left .*UNKNOWN .*right .*it is judged to slip")
+        terminal.read_until(rb"left .*NO VERDICT YET .*right .*it is judged to slip")
         terminal.type(b"q")
         assert terminal.end() == 0
 
@@ -242,7 +242,7 @@ def test_several_hands_are_one_page_of_one_process(tmp_path: Path, port: int) ->
         (["--connect", "nonsense"], "nonsense: cannot connect there"),
         (["--connect", "tcp://127.0.0.1:1", "--keys", "x"], "--keys needs --server-key"),
         (["--connect", "ipc:///tmp/x", "--port", "0", "--web"], "not a port of 1 to 65535"),
-        (["--connect", "ipc:///tmp/x", "scene.toml"], "not allowed with argument"),
+        (["--connect", "ipc:///tmp/x", "scene.toml"], "give one or the other"),
         (["no-such-scene.toml"], "cannot read the scene"),
         (["--connect", "ipc:///tmp/x"] * 9, "9 hands are more than the 8 that can be watched"),
     ],
