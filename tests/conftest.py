@@ -34,7 +34,6 @@ BEGUN_FIRST = (
     "emulated/test_driver.py",
     "emulated/test_timing.py",
     "bench/test_mutants.py",
-    "bench/test_fuzz.py",
     "stability/test_models.py",
     "daemon/measure/test_error_vs_time.py",
     "daemon/doctor/test_healthy.py",

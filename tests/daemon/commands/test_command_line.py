@@ -6,7 +6,6 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -14,8 +13,8 @@ import pytest
 import zmq
 
 from graspd.daemon.cli import COMMANDS, LIBRARIES, whole_parser
-from graspd.daemon.commands.arguments import Parser
 from tests.conftest import ROOT
+from tests.daemon.commands.shell_files import parsers
 from tests.daemon.processes import GRASPD, graspd
 from tests.kit import inside
 
@@ -36,12 +35,6 @@ class Missing:
 sys.meta_path.insert(0, Missing())
 from graspd.daemon.cli import main
 """
-
-
-def parsers(parser: Parser) -> Iterator[Parser]:
-    yield parser
-    for command in parser.subparsers.values():
-        yield from parsers(command)
 
 
 def test_the_help_of_every_command_needs_no_extra() -> None:

@@ -23,7 +23,6 @@ from graspd.daemon.record.recorder import QUEUE_MAX, Recorder
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.csv_rows import open_recording
-from tests.bench import kill_recorder
 from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
 from tests.kit.waiting import wait_until
 
@@ -242,12 +241,6 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
     recorder.close()
     counted = recorder.counters["record"]
     assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
-
-
-def test_a_daemon_that_is_killed_loses_no_more_than_the_flush_interval(tmp_path: Path) -> None:
-    losses_ms = kill_recorder.kill_often(tmp_path, kills=2, seed=1)
-    assert len(losses_ms) == 2
-    assert max(losses_ms) <= kill_recorder.FLUSH_MS
 
 
 @pytest.mark.parametrize(

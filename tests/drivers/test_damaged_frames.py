@@ -1,0 +1,100 @@
+"""Damaged bytes raise nothing, give no value that was not sent, and hide no later good frame."""
+
+from __future__ import annotations
+
+import itertools
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from graspd.drivers.base import COUNT_MAX, FINGERS
+from graspd.drivers.palm.packet import CAN_RECORD_BYTES, Palm, parse_packet
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.spi.messages import (
+    DELIMITER,
+    DIGEST,
+    ENCODED_MAX_BYTES,
+    FrameParser,
+    encode_frame,
+)
+from graspd.drivers.twins.palm import PalmTwin
+from tests.drivers.twins.signals import GeneratedContact
+
+MS = 1_000_000
+PACKETS_KEPT = 14
+"""Packets of a round: the most that the assembler may hold."""
+PACKETS = [
+    [
+        packet.to_bytes() + appended
+        for packet in PalmTwin(itertools.islice(GeneratedContact(), 4), palm=palm).packets()
+    ]
+    for palm, appended in itertools.product(Palm, (b"", bytes(CAN_RECORD_BYTES)))
+]
+"""Four rounds of each kind of palm."""
+
+
+@st.composite
+def damaged(draw: st.DrawFn, good: bytes, other: bytes) -> bytes:
+    """Draw what a link may make of a frame: parts of it are lost, spoilt, repeated or another's."""
+    data = good
+    for _ in range(draw(st.integers(1, 2))):
+        start, end = sorted(draw(st.tuples(*[st.integers(0, len(data))] * 2)))
+        part = data[start:end]
+        spoilt = st.binary(min_size=len(part), max_size=len(part))
+        instead = draw(
+            st.sampled_from([b"", part * 2, bytes(len(part)), b"\xff" * len(part), other[start:]])
+            | spoilt
+            | st.binary(max_size=300)
+        )
+        data = data[:start] + instead + data[end:]
+    return data
+
+
+FRAMES = st.tuples(
+    st.integers(0, 255),
+    st.binary(max_size=300) | st.sampled_from([b"", bytes(254), b"\xff" * 255]),
+)
+
+
+@settings(max_examples=2000)
+@given(st.data(), FRAMES, FRAMES)
+def test_a_damaged_frame_of_a_bridge_is_nothing_and_the_next_one_is_found(
+    data: st.DataObject, frame: tuple[int, bytes], other: tuple[int, bytes]
+) -> None:
+    good, wire = (encode_frame(*each, DIGEST) for each in (frame, other))
+    bad = data.draw(damaged(good, wire)) + DELIMITER
+    cut = data.draw(st.integers(0, len(bad)))
+    parser, found = FrameParser(DIGEST), list[tuple[int, bytes]]()
+    for piece in (bad[:cut], bad[cut:]):
+        found += parser.feed(piece)
+        assert parser.held_bytes <= ENCODED_MAX_BYTES
+    assert set(found) <= {frame, other}
+    assert parser.feed(wire) == [other]
+
+
+@st.composite
+def spoilt(draw: st.DrawFn) -> tuple[int, dict[int, bytes]]:
+    """Draw a kind of palm, and what some of its packets become."""
+    kind = draw(st.integers(0, len(PACKETS) - 1))
+    places = draw(st.lists(st.integers(14, 41), min_size=1, max_size=3, unique=True))
+    packets = PACKETS[kind]
+    return kind, {at: draw(damaged(packets[at], packets[at - 1])) for at in places}
+
+
+@settings(max_examples=500)
+@given(spoilt())
+def test_no_damaged_packet_of_a_palm_gives_a_count_that_is_none(
+    spoilt: tuple[int, dict[int, bytes]],
+) -> None:
+    """Packets have no checksum: one whose damage leaves it plausible is a packet."""
+    kind, changes = spoilt
+    stream, readings = PalmStream(FINGERS), 0
+    for cycle, good in enumerate(PACKETS[kind]):
+        packet = parse_packet(changes.get(cycle, good), stream.counters)
+        for reading in () if packet is None else stream.push(packet, cycle * MS):
+            assert reading.counts.max() <= COUNT_MAX
+            readings += 1
+        assert sum(kept is not None for kept in stream.packets) <= PACKETS_KEPT
+    assert packet is not None
+    assert packet.to_bytes() == good[: len(packet.to_bytes())]
+    assert readings, "the undisturbed rounds are read"
