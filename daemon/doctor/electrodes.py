@@ -11,19 +11,20 @@ from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, error, 
 from graspd.drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 
 RAIL_COUNTS = 20
-"""A mean this near to 0 or 4095 is a rail; 0.3 % of loaded electrodes come this low."""
+"""Largest distance of a mean from 0 or 4095 that is a rail; 0.3 % of loaded electrodes come
+this low."""
 QUIET_COUNTS = 40.0
-"""An untouched electrode's standard deviation is 3 to 12 counts; beyond this something moves."""
+"""Largest standard deviation of an untouched electrode; 3 to 12 counts were measured."""
 TOUCH_ELECTRODES = 5
-"""A touch moves this many electrodes of a finger; fewer that jump alone are restless."""
+"""Fewest electrodes of a finger that a touch moves. If fewer move, they are restless."""
 STILL_READINGS = 10
-"""Noise of 3 counts never gives this many equal counts in a row."""
+"""Equal counts in a row after which an electrode is frozen; noise of 3 counts prevents that."""
 RESTLESS_READINGS = 30
-"""With fewer readings, one spike would look restless."""
+"""Fewest readings to call an electrode restless; with fewer, one spike would do."""
 FAULTY_FRACTION = 0.5
-"""Share of faulty readings from which an electrode is missing, not unreliable."""
+"""Share of faulty readings from which an electrode is missing instead of unreliable."""
 NAMED_MAX = 6
-"""Most electrodes that are named; more are counted."""
+"""Most electrodes that are named in a finding; further ones are counted."""
 WORDS = ElectrodeFault.PARITY | ElectrodeFault.ERROR_WORD | ElectrodeFault.NOT_A_COUNT
 DEAD = Trouble(
     Cause.ELECTRODE_DEAD,

@@ -25,19 +25,19 @@ class Cause(StrEnum):
     INTERFACE_MISSING = "interface-missing"
     INTERFACE_DOWN = "interface-down"
     ADDRESS = "address"
-    """To be listened on, and not of this computer."""
+    """The address to listen on is not one of this computer."""
     SILENT = "silent"
     LINK_LOST = "link-lost"
     LINK_DOWN = "link-down"
-    """For a reason that is not known here; the finding quotes it."""
+    """The link is down for another reason, which the finding quotes."""
     NOT_A_BRIDGE = "not-a-bridge"
-    """Something else answers, or at another baud rate."""
+    """Another device answers, or a bridge with another baud rate."""
     BITRATE = "bitrate"
     BUS_ERRORS = "bus-errors"
     VERSION = "protocol-version"
     FIRMWARE_OLD = "firmware-old"
     SETTINGS = "settings"
-    """Scene and board do not agree."""
+    """Settings of scene and board differ."""
     FOREIGN_SENDER = "foreign-sender"
     DAMAGED = "damaged-bytes"
     FRAMES_LOST = "frames-lost"
@@ -48,7 +48,7 @@ class Cause(StrEnum):
     SLOW = "slow"
     CLOCK = "clock"
     REPEATED = "repeated"
-    """Old data comes again."""
+    """Old data was sent again."""
     PALM_MODE = "palm-mode"
     JOINTS = "joints"
     RECORDING = "recording"
@@ -90,7 +90,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.JOINTS: frozenset({Cause.FRAMES_LOST}),
     Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
 }
-"""Causes that follow from another one, and are not reported beside it."""
+"""Consequences of each cause. They are not reported beside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class Trouble(NamedTuple):
     level: Level = Level.WARNING
 
     def finding(self, what: str) -> Finding:
-        """Return the finding that `what` is seen."""
+        """Return a finding of this trouble; `what`: text on what was seen."""
         return Finding(self.level, what, self.cause, self.advice)
 
 

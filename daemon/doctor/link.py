@@ -23,9 +23,12 @@ OF_VALUES = frozenset({"not_counts"})
 OF_READINGS = frozenset(
     {"missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
 )
-"""Counters of readings, to which a link may need many frames."""
+"""Counters of readings; a reading may take many frames."""
 JOINING, JOINING_MAX = "unsynchronised", 108
-"""A listener that joins in mid-sweep loses up to two sweeps of 54 samples: no trouble."""
+"""Counter, and its most samples that are no trouble: a listener may join in mid-sweep.
+
+It then loses up to two sweeps of 54 samples.
+"""
 
 FLASH = "flash the firmware of this graspd: deploy/bridge/BUILD.md"
 AGAIN = "look longer (--listen 20); if it goes on"
@@ -69,12 +72,12 @@ NOT_OURS = {
         "what it sends); are sensors connected to it?",
     ),
 }
-"""Why a link brings no readings although something comes, by counters."""
+"""Trouble of a link that receives data but gives no reading, by counters that are not 0."""
 LOSSES = ("link_losses",)
 FLAPS_MIN = 3
-"""Losses of a link while the doctor listens from which they are an error."""
+"""Fewest losses of a link while the doctor listens that are an error."""
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
-"""Causes of a link that comes and goes, at any one moment; its loss explains them all."""
+"""Causes that a link shows between its losses; they are not reported beside the losses."""
 COUNTERS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
     LOSSES: Trouble(Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"),

@@ -25,7 +25,7 @@ BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
 NOT_HEARD = frozenset(
     {Cause.INTERFACE_MISSING, Cause.INTERFACE_DOWN, Cause.LINK_DOWN, Cause.SILENT, Cause.BITRATE}
 )
-"""Causes for which the kernel's state of the interface is asked."""
+"""Causes that the kernel's state of the CAN interface may explain."""
 HELD_BY_GRASPD = (
     "graspd itself runs: graspd watch shows what it sees; to look from here end it first "
     "(systemctl stop 'graspd@*')"

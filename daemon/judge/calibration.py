@@ -1,4 +1,4 @@
-"""Session calibration: what this session's grasps look like, and how much is known of it."""
+"""Session calibration: map counts of today's sensors to those of the model's training."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from graspd.models.session_statistics import SessionState, SessionStatistics, is
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Snapshot of a session's statistics; later grasps make the next one."""
+    """Statistics of a session after some grasps; each further grasp makes new ones."""
 
     features_mean: NDArray[np.float64]
     """Mean of the raw features of a session model, shape (fingers * 26,)."""
     features_spread: NDArray[np.float64]
-    """Standard deviation of the same."""
+    """Standard deviation of the raw features, shape (fingers * 26,)."""
     counts_mean: NDArray[np.float64]
     """Mean of each electrode in this session, counts, shape (fingers, 24)."""
     counts_spread: NDArray[np.float64]
@@ -30,11 +30,11 @@ class Calibration:
     scale: NDArray[np.float64]
     """Spread in the training over that of the session, shape (fingers, 24)."""
     calibrated: bool
-    """True if they are as many as the model's card asks for, and can have been grasps."""
+    """True if the session has the grasps that the model asks for, and is not `odd`."""
     odd: bool
-    """Whether what came cannot have been grasps of these fingers: see `is_odd`."""
+    """True if the session cannot have come from grasps of these fingers: see `is_odd`."""
     temperature: float
-    """Divisor of a verdict's margin, above 1 while the session has few grasps."""
+    """Divisor of the network's log-odds of slip, above 1 while the session has few grasps."""
 
     def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
         """Return counts (fingers, 24) as the training's sensors would read them."""
@@ -49,7 +49,7 @@ class Calibration:
 
 
 class SessionCalibration:
-    """Takes in the session's unlabelled grasps; `now` is what is known by them."""
+    """Learns the statistics of a session from its grasps, without labels; `now` has the latest."""
 
     def __init__(
         self,
@@ -57,7 +57,11 @@ class SessionCalibration:
         counts_mean: NDArray[np.float64],
         counts_spread: NDArray[np.float64],
     ) -> None:
-        """Start with the training's statistics: `wanted`, and of the counts (fingers, 24)."""
+        """Start with the statistics of the training.
+
+        `wanted`: the model's input, with those of its features. `counts_mean`, `counts_spread`:
+        mean and standard deviation of each electrode, counts, shape (fingers, 24).
+        """
         self._wanted = wanted
         self._training_mean = counts_mean
         self._training_spread = counts_spread
@@ -74,7 +78,10 @@ class SessionCalibration:
         return self._statistics.grasps
 
     def observe(self, counts: NDArray[np.generic], *, slip: bool | None = None) -> None:
-        """Take in the counts (fingers, 24) of a grasp; `slip` is how it was judged, if it was."""
+        """Take in the counts of a grasp, shape (fingers, 24).
+
+        `slip`: True if it was judged to slip; None: it was not judged.
+        """
         values = np.concatenate((raw_features(counts), counts.ravel()))
         if self._statistics.observe(values, slip=slip):
             self.now = self._calibration()
@@ -89,7 +96,7 @@ class SessionCalibration:
         return self._statistics.state()
 
     def restore(self, state: SessionState) -> None:
-        """Go on from what was kept. Raises `ValueError` if it cannot be of these counts."""
+        """Continue a kept session. Raises `ValueError` if it does not fit model and counts."""
         counts = np.array(state.mean[len(self._wanted.mean) :])
         if ((counts < 0.0) | (counts > COUNT_MAX)).any():
             raise ValueError("holds means that no counts have")

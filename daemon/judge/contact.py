@@ -1,7 +1,7 @@
-"""Tare and contact: where each electrode rests, how much it wavers, and which finger touches.
+"""Tare and contact: the resting count of each electrode, its noise, and which fingers touch.
 
-A touch lowers the counts of several electrodes (BioTac SP manual, section 5) below where they rest,
-and below the finger as a whole: supply and temperature move all electrodes alike.
+A touch lowers the counts of several electrodes (BioTac SP manual, section 5). They fall below their
+baseline, and below the finger's median electrode. Supply and temperature move all alike.
 """
 
 from __future__ import annotations
@@ -18,41 +18,51 @@ from graspd.daemon.judge.health import Number
 from graspd.drivers.base import COUNT_MAX, ELECTRODES
 
 WINDOW = 100
-"""Untouched sweeps that a baseline is the median of: one second at 100 Hz."""
+"""Untouched sweeps whose median is a baseline: one second at 100 Hz."""
 TARE_EVERY = 25
-"""Sweeps after which a full window is looked at again."""
+"""Untouched sweeps from one tare to the next."""
 FALLEN = 3
-"""The third deepest fall counts: spikes are of one electrode, rarely of two, at a time."""
+"""Rank of the fall that decides: the third deepest. A spike hits one electrode, rarely two."""
 SOUND_MIN = 12
-"""Usable electrodes, of 24, below which it is not known whether a finger touches."""
+"""Fewest usable electrodes, of 24, by which contact of a finger is known."""
 LET_GO = 0.6
-"""A finger that touched has let go when it falls by less than this share of a touch ..."""
+"""Share of a touch's threshold below which a touching finger has let go."""
 RELEASED = 0.25
-"""... or by less than this share of how deep it was held: in a long hold the electrodes of a finger
-drift apart, so what is left when the hand opens may look like a light touch ..."""
+"""Share of the depth of a hold below which a touching finger has let go.
+
+Electrodes drift apart in a long hold, so an open hand may look as if it touched lightly.
+"""
 RELEASED_LONG = 0.5
-"""... and more so the longer it was: this is the share after `LONG_HOLD_NS`."""
+"""Value of `RELEASED` after a hold of `LONG_HOLD_NS`: drift grows with time."""
 DEPTH_FADES_COUNTS_PER_S = 5.0
-"""How fast the depth of a hold follows a lighter touch."""
+"""Speed at which the depth of a hold falls to that of a lighter touch."""
 APART_NS = 50_000_000
-"""A finger touches again this long after it let go at the earliest: while it opens, its electrodes
-rise one sweep after the other, which looks like another touch."""
+"""Shortest time from letting go to the next touch, ns.
+
+The electrodes of an opening finger rise one sweep after the other, which looks like a touch.
+"""
 LONG_HOLD_NS = 60_000_000_000
-"""After a longer hold a finger is tared again: 0.2 counts/s between its electrodes (measured on
-three sensors) have made more than half of a touch."""
+"""Duration of a hold after which a finger is tared again, ns.
+
+Electrodes of one finger drift apart by 0.2 counts/s (measured on three sensors): by then more than
+half of a touch.
+"""
 ALONE_NS = 30_000_000_000
-"""A finger that touches for longer without all the others does not grasp: it is tared again."""
+"""Time for which a finger touches without all others before it is tared again: no grasp, ns."""
 SUSPECT = 0.5
-"""A fall above this share of what a touch takes may be the beginning of one: not for the tare."""
+"""Share of a touch's threshold above which a sweep is not used for the tare."""
 SIGMA_MIN_COUNTS = 1.5
 """Smallest assumed noise of an electrode, counts; a quiet one may show no noise at all."""
 SIGMA_MAX_COUNTS = 10.0
-"""A finger whose median electrode wavers more is not at rest; measured 2.9 to 4.3 counts."""
+"""Largest noise of the median electrode of a finger at rest, counts; measured 2.9 to 4.3."""
 TREND_MAX_COUNTS = 5.0
-"""A finger whose median electrode moves more within a window is not at rest."""
+"""Largest change of the median electrode of a finger at rest within a window, counts."""
 UP_COUNTS_PER_S, DOWN_COUNTS_PER_S = 5.0, 1.5
-"""How fast a baseline follows at most. Warm-up drift is 0.56 to 0.84 counts/s upward (measured on
-three sensors); following a fall any faster would tare a slow touch away."""
+"""Largest speeds at which a baseline rises and falls.
+
+Sensors that warm up drift by 0.56 to 0.84 counts/s upward (measured on three). A baseline that
+falls faster would follow a slow touch.
+"""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a Gaussian over its median absolute deviation."""
 
@@ -61,38 +71,46 @@ Floats = NDArray[np.float64]
 
 @dataclass(slots=True, eq=False)
 class Touch:
-    """Whether one finger touches, by how far it has fallen and how it came there."""
+    """Decides whether one finger touches, from its falls below the baseline."""
 
     threshold: float
-    """Fall that makes a touch, counts."""
+    """Smallest fall of a touch, counts."""
     touching: bool = False
     fall: float = 0.0
-    """Counts by which the third deepest electrode is below its baseline and below the finger's
-    median electrode: the smaller; while it touches the latter, as sensors drift. 0: no baseline."""
+    """Fall of the third deepest electrode, counts; 0 without a baseline.
+
+    Untouched: below its baseline or below the finger's median electrode, whichever is less.
+    Touching: below the median electrode, because sensors drift.
+    """
     depth: float = 0.0
-    """How deep it was held, counts, fading."""
+    """Deepest fall of the hold, counts; it fades."""
     lowest: float = 0.0
-    """Smallest fall since it let go: a new touch falls from there, not from zero."""
+    """Smallest fall since it let go, counts. The next touch is measured from there."""
     let_go_ns: int | None = None
+    """Time of the end of the last touch. None: it never touched."""
     since_ns: int | None = None
-    """Since when it touches."""
+    """Time of the begin of the touch. None: it does not touch."""
     alone_since_ns: int | None = None
-    """Since when it touches without all the others."""
+    """Time since which it touches without all the others. None: it does not."""
     held_long: bool = False
-    """True if it has just let go after a long hold."""
+    """True at the sweep in which a long hold ends."""
     untouched: Number = 0
-    """Sweeps since something touched."""
+    """Sweeps since the last fall that may be a touch."""
     tared_ns: int | None = None
-    """Time of the last tare."""
+    """Time of the last tare. None: never."""
 
     def end(self) -> None:
-        """Note that it is not known where the finger rests."""
+        """End any touch. Call while the finger has no baseline."""
         self.touching = False
         self.fall = self.depth = self.lowest = 0.0
         self.since_ns = self.alone_since_ns = None
 
     def follow(self, t_ns: int, elapsed_s: float, deep: float, relative: float) -> None:
-        """Take in the fall of the third deepest electrode, below its baseline and relative."""
+        """Take in the sweep of `t_ns`, `elapsed_s` after the one before.
+
+        `deep`, `relative`: fall of the third deepest electrode below its baseline, and below the
+        finger's median electrode, counts.
+        """
         touched = self.touching
         is_long = self.since_ns is not None and t_ns - self.since_ns > LONG_HOLD_NS
         if touched:
@@ -132,9 +150,10 @@ class Touch:
 
 
 class Rest(NamedTuple):
-    """How a finger rests; arrays have shape (24,)."""
+    """Tare of one finger; arrays have shape (24,)."""
 
     baseline: Floats
+    """Resting count of each electrode."""
     sigma: float
     """Standard deviation of its median electrode, counts."""
     known: NDArray[np.bool_]
@@ -143,7 +162,7 @@ class Rest(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Window:
-    """The last sweeps of all fingers, written round and round; shape (100, fingers, 24)."""
+    """Ring buffer of the last `WINDOW` sweeps; arrays have shape (100, fingers, 24)."""
 
     counts: NDArray[np.uint16]
     usable: NDArray[np.bool_]
@@ -152,7 +171,7 @@ class Window:
 
     @classmethod
     def of(cls, fingers: int) -> Window:
-        """Return an empty one."""
+        """Return an empty window."""
         shape = (WINDOW, fingers, ELECTRODES)
         return cls(np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.bool_))
 
@@ -164,7 +183,7 @@ class Window:
         self.number += 1
 
     def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
-        """Yield how each of these fingers rests, None for one that moved. The window is full."""
+        """Yield the tare of each of these fingers; None: it moved. Call it with a full window."""
         oldest = self.number % WINDOW
         window = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
         baseline = _median(window)
@@ -188,27 +207,27 @@ class Window:
 
 @dataclass(slots=True, eq=False)
 class ContactMemory:
-    """State of the fingers' rest and touch; arrays have shape (fingers, 24) or (fingers,)."""
+    """State of `Contact`; arrays have shape (fingers, 24) or (fingers,)."""
 
     window: Window
     touches: list[Touch]
     baseline: NDArray[np.float64]
     """Resting count of each electrode; infinite: not known yet."""
     known: list[int]
-    """Electrodes of each finger whose baseline is known."""
+    """Number of electrodes of each finger whose baseline is known."""
     touching: NDArray[np.bool_]
-    """Which fingers touch."""
+    """True for fingers that touch."""
     tared: NDArray[np.bool_]
-    """True for fingers that have a baseline. Without one it is not known whether they touch."""
+    """True for fingers that have a baseline; contact of the others is not known."""
     last_ns: int | None = None
     """Time of the last sweep."""
 
 
 class Contact:
-    """Follows the baselines of all fingers and says which touch. Constant memory, no clock."""
+    """Tares all fingers while they rest, and finds which touch. Constant memory, no clock."""
 
     def __init__(self, fingers: int, limits: ContactLimits) -> None:
-        """Start without a baseline."""
+        """`fingers`: their number. None has a baseline yet."""
         shape = (fingers, ELECTRODES)
         self._limits = limits
         self.memory = ContactMemory(
@@ -221,7 +240,7 @@ class Contact:
         )
 
     def forget(self) -> None:
-        """Forget every tare: the sensors may be others, or have been off."""
+        """Forget every tare. Call when sensors were exchanged, or may have been off."""
         for finger in range(len(self.memory.touches)):
             self._forget(finger)
 
@@ -232,9 +251,9 @@ class Contact:
         median: NDArray[np.uint16],
         usable: NDArray[np.bool_] | None,
     ) -> None:
-        """Take in one sweep and its `FreshMedian`, shape (fingers, 24), read at `t_ns`.
+        """Take in the sweep `counts` of `t_ns`, and the median of the last three.
 
-        Electrodes that are not `usable` count for nothing; None: all are usable.
+        Arrays have shape (fingers, 24). `usable`: False for electrodes to ignore; None: use all.
         """
         memory = self.memory
         falls, numbers = self._falls(median, usable)

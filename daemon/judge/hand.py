@@ -1,7 +1,7 @@
-"""How the hand holds: fresh values, contact, joints and gate of one hand, reading by reading.
+"""One hand, reading by reading: median of fresh values, contact, joints and gate.
 
-One value in a hundred is a spike, 25 to 150 counts deep, and a palm repeats 2 of 7 values at 100
-Hz. The median of three fresh values takes spikes out, and costs one sweep of delay.
+One value in a hundred is a spike, 25 to 150 counts deep. A palm repeats 2 of 7 values at 100 Hz.
+The median of three fresh values removes spikes, and delays by one sweep.
 """
 
 from __future__ import annotations
@@ -29,30 +29,35 @@ if TYPE_CHECKING:
     from graspd.daemon.judge.joint_motion import JointMotion
 
 OUTAGE_NS = 1_000_000_000
-"""After this long without a usable reading the sensors may have been exchanged or powered again."""
+"""Time without a usable reading after which tare and noise are forgotten, ns.
+
+The sensors may have been exchanged or switched off.
+"""
 SLIDE_AFTER_NS = 20_000_000
-"""How long a finger that was still must move before it says `slide`, ns: a quarter of the moments
-in which the wander of a real hold passes the limit are over by then."""
+"""Time for which a still finger must move before its state is `slide`, ns.
+
+A real hold passes the limit of motion for moments; a quarter of them are shorter.
+"""
 
 
 @dataclass(slots=True, eq=False)
 class MedianMemory:
-    """The values of every electrode; arrays have shape (fingers, 24)."""
+    """State of `FreshMedian`; arrays have shape (fingers, 24)."""
 
     fresh: NDArray[np.uint16]
-    """Shape (3, fingers, 24): the last three fresh values, oldest first."""
+    """The last three fresh values, oldest first, shape (3, fingers, 24)."""
     last: NDArray[np.uint16]
     """The last value, fresh or not."""
     held: NDArray[np.bool_]
-    """True where that repeated the one before."""
+    """True where the last value repeated the one before."""
     number: NDArray[np.uint8]
-    """Number of fresh values, up to three."""
+    """Number of fresh values in `fresh`, up to three."""
     all_full: bool = False
-    """True if it is three of each."""
+    """True if `number` is three for all electrodes."""
 
 
 class FreshMedian:
-    """Keeps three fresh values per electrode; constant memory, no clock."""
+    """Median of the last three fresh values of each electrode; constant memory, no clock."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
@@ -76,8 +81,9 @@ class FreshMedian:
     def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_] | None) -> None:
         """Take in one sweep, shape (fingers, 24).
 
-        Electrodes that are not `usable` are forgotten; None: all are usable. A value that repeats
-        the one before is not fresh; a second repetition is, as 71.43 Hz data is never held twice.
+        `usable`: False for electrodes whose values are forgotten; None: all can be used. A value
+        that repeats the one before is not fresh. If it comes a third time it is: a palm's data of
+        71.43 Hz never repeats twice.
         """
         memory = self.memory
         oldest, middle, newest = memory.fresh
@@ -119,15 +125,15 @@ class FreshMedian:
 
 @dataclass(slots=True)
 class FingerMemory:
-    """How a finger has touched; without a touch, or after a gap, as at the start."""
+    """Motion of a finger during its touch; a touch that ends, or a gap, resets it."""
 
     was_still: bool = False
-    """True if it has kept still since it touches."""
+    """True if it has kept still at some time of this touch."""
     moves_since_ns: int | None = None
-    """Since when it moves. None: it does not."""
+    """Time since which it moves. None: it does not."""
 
     def touch(self, t_ns: int, moves: bool | None) -> FingerState | None:
-        """Return in a word what the finger, which touches, feels at `t_ns`.
+        """Return the state at `t_ns` of a finger that touches.
 
         `moves` says whether it moves more than one that holds; None: not known.
         """
@@ -201,19 +207,19 @@ class HandTracker:
         return findings
 
     def forget(self) -> None:
-        """Forget tare and grasp: the sensors are others, or may be."""
+        """Forget tare and grasp. Call when sensors were exchanged, or may have been."""
         self._contact.forget()
         self.gate.motion.forget()
         self._fresh.reset()
         self.restart()
 
     def restart(self) -> None:
-        """Let the current grasp settle again, from the last reading on."""
+        """Have the current grasp settle again, from the last reading on."""
         if self.memory.last_ns is not None:
             self.gate.restart(self.memory.last_ns)
 
     def interrupt(self) -> None:
-        """Let the current grasp settle again: readings are missing before the next one."""
+        """Have the current grasp settle again. Call when readings before the next are missing."""
         self.memory.unsettled = MEDIAN_SWEEPS
 
     def memories(self) -> dict[str, dict[str, Any]]:
@@ -276,7 +282,7 @@ class HandTracker:
         return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else counts
 
     def moment(self) -> Moment:
-        """Return where in a grasp the hand is without a new reading; it is not to be judged."""
+        """Return the state of the grasp without a new reading; it is not to be judged."""
         touching = self._named(self._contact.memory.touching)
         return self.gate.moment(touching, dict.fromkeys(self._fingers))
 

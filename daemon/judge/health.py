@@ -30,11 +30,14 @@ REPAIRABLE = int(
     | ElectrodeFault.PARITY
     | ElectrodeFault.ERROR_WORD
 )
-"""Bits of single electrodes. All others, known or not, speak against the whole reading."""
+"""Bits of faults that concern one electrode. Any other bit makes the whole reading unusable."""
 
 BROKEN_MAX = 12
-"""Electrodes of a hand that may be repaired: twelve at random, repaired, cost `cnn1` 1.2 +- 0.3
-points of F1 and `small-session` 0.6 +- 0.2, eighteen 2.1 and 1.3 (grasps not trained on, `cv`)."""
+"""Most broken electrodes of a hand that are repaired.
+
+Twelve at random cost `cnn1` 1.2 +- 0.3 points of F1 and `small-session` 0.6 +- 0.2; eighteen cost
+2.1 and 1.3 (protocol `cv`).
+"""
 BROKEN_FINGER_MAX = 8
 """Most broken electrodes of one finger that are repaired.
 
@@ -42,45 +45,54 @@ Eight neighbours of the first finger, the worst place, cost 2.4 +- 0.8 and 1.4 +
 cost 4.3 and 2.8. Eight of another finger cost at most 0.6.
 """
 UNCHANGED_MAX = 16
-"""Readings in a row in which a live electrode may keep its count. Its noise is 3 to 4 counts
-(standard deviation), so it keeps it about once in ten readings, 16 times in a row never; and all
-24 of a finger do not even keep it once. Something along the way repeats old data."""
+"""Readings in a row with the same count after which an electrode counts as dead.
+
+The noise of a live one is 3 to 4 counts (standard deviation). It keeps its count about once in ten
+readings, never 16 times in a row.
+"""
 JUMP_COUNTS = 150
-"""A live electrode's spikes are 25 to 150 counts high; a jump is higher ..."""
+"""Smallest step of a jump, counts. Spikes of a live electrode are 25 to 150 counts high."""
 STILL_COUNTS = 30
-"""... while no electrode but itself and three others moves by more than this: a finger that touches
-moves many, and in a table, where each reading is another grasp, nearly all differ."""
+"""Largest step of an electrode that keeps still, counts."""
 STILL = 20
-"""Electrodes of 24 that must keep still."""
+"""Fewest electrodes of a finger, of 24, that must keep still when another one jumps.
+
+A finger that touches moves many electrodes. In a table each reading is another grasp, and nearly
+all differ.
+"""
 JUMPS_MAX = 2.0
-"""An electrode that jumps more than twice within about ten readings has a loose contact."""
+"""Most recent jumps of a sound electrode. More within about ten readings are a loose contact."""
 JUMPS_FADE = 0.9
+"""Factor by which earlier jumps count less with each reading."""
 JUMPS_FORGOTTEN = 1e-9
-"""Remainder of a jump after 200 readings; less counts as no jump."""
+"""Smallest remainder of a jump that still counts; it is reached after 200 readings."""
 LIMITS = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
-"""Above them are a count less 1 that is at a rail, a step and `JUMP_COUNTS` that is far, and a step
-that is one at all. Modulo 2**16, so that what is below zero is large."""
+"""Limits of three 16-bit differences; see `_compare`. Negative ones wrap round, so they are large.
+
+Above the first, `count - 1` is at a rail. Above the second, `step + JUMP_COUNTS` is a jump. Above
+the third, the step is not 0.
+"""
 SWEEPS = 128
-"""Sweeps of each finger that are remembered: rings up to this length are seen at once."""
+"""Number of sweeps of each finger that are remembered. Longer cycles of old data are not found."""
 EQUAL_MIN = 20
-"""Fewest electrodes of 24, equal or not read, that make a sweep an old one that comes again.
+"""Fewest electrodes of 24, equal or not read, by which a sweep repeats an earlier one.
 
 In 1.4 million pairs of real sweeps of a finger, at most 14 electrodes were equal.
 """
 READ_MIN = 12
-"""Electrodes of them that must have been read in both: by chance one in 14 is equal."""
+"""Fewest equal electrodes of a repeated sweep that were read both times."""
 NO_COUNT = 0x8000
-"""In place of a count: far from every one of 12 bits, upwards and, modulo 2**16, downwards."""
+"""Value in place of a count that was not read; by 16-bit differences far from every count."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """Findings about a reading and its electrodes."""
+    """Result of checking a reading."""
 
     reasons: tuple[Reason, ...]
-    """Against using it at all."""
+    """Reasons against using the reading; empty if it can be used."""
     broken: NDArray[np.bool_] | None
-    """Shape (fingers, 24): electrodes that mean nothing in it. None: all are sound."""
+    """True for electrodes whose counts mean nothing, shape (fingers, 24). None: all are sound."""
 
 
 @dataclass(slots=True, eq=False)
@@ -90,13 +102,13 @@ class HealthMemory:
     previous: NDArray[np.uint16]
     """Counts of the last reading."""
     number: Number
-    """Number of the last reading."""
+    """Number of readings until now."""
     changed: NDArray[np.int64]
-    """Number of the reading in which each electrode changed last."""
+    """Number of the reading in which the count of each electrode changed last."""
     jumps: NDArray[np.float64]
-    """Recent jumps of each electrode, fading."""
+    """Recent jumps of each electrode; earlier ones count less."""
     has_jumped: bool
-    """True if there are any."""
+    """True if `jumps` is not all zero."""
     faults: NDArray[np.uint8]
     """Faults that the driver flagged in the last reading."""
     past: NDArray[np.uint16]
@@ -104,7 +116,7 @@ class HealthMemory:
 
 
 class Health:
-    """Follows every electrode from reading to reading: faults, rails, jumps, counts that repeat."""
+    """Finds broken electrodes and repeated sweeps by comparing each reading with those before."""
 
     def __init__(self, fingers: int) -> None:
         self._shape = shape = (fingers, ELECTRODES)
@@ -128,7 +140,7 @@ class Health:
         self._equals = np.empty((fingers, SWEEPS), dtype=np.uint8)
 
     def check(self, reading: TactileReading) -> Checked:
-        """Return what is wrong with a reading and its electrodes, by it and by those before it."""
+        """Take in the next reading; return whether it can be used, and its broken electrodes."""
         counts = reading.counts
         if counts.shape != self._shape:
             return Checked((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
@@ -161,7 +173,7 @@ class Health:
         return Checked((), broken if any_of(broken) else None)
 
     def electrodes(self) -> dict[tuple[int, int], Reason]:
-        """Return what is wrong with which electrode, (finger, 0..23), by the last reading."""
+        """Return why electrodes are broken now, by (finger, electrode 0..23)."""
         findings: dict[tuple[int, int], Reason] = {}
         memory = self.memory
         for where, reason in (
@@ -233,7 +245,7 @@ class Health:
 
 
 def any_of(which: NDArray[np.bool_]) -> bool:
-    """Return True if any is true. To search the bytes takes a tenth of the time of `any()`."""
+    """Return True if any is true, in a tenth of the time of `any()`."""
     return 1 in which.tobytes()
 
 
@@ -246,7 +258,7 @@ def too_many(broken: NDArray[np.bool_]) -> bool:
 
 
 def at_rail(counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Return which counts are 0 or 4095: such electrodes mean nothing."""
+    """Return True for counts of 0 or 4095, in the shape of `counts`; they mean nothing."""
     # One less than 0 is 65535: both rails are on the same side.
     railed: NDArray[np.bool_] = counts - np.uint16(1) >= np.uint16(COUNT_MAX - 1)
     return railed

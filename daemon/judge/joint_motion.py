@@ -12,30 +12,30 @@ from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import JointReading
 
 ANGLES = 16
-"""Angles remembered of a window; of faster readings, some are left out."""
+"""Number of angles remembered of a window; of faster readings, some are left out."""
 LOST_MAX = 64
-"""Names of lost joints that are remembered; a hand has 24."""
+"""Most names of lost joints that are remembered; a hand has 24 joints."""
 SOURCES_MAX = 8
-"""Sets of joints that are told apart: a sender may send one finger at a time, not random names."""
+"""Most sets of joints that are followed apart; a sender may send one finger at a time."""
 
 
 @dataclass(slots=True, eq=False)
 class JointMemory:
-    """Last readings of the joints, by the names of those that are sent together."""
+    """State of `JointMotion`. A set is the tuple of names of joints that are sent together."""
 
     past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]] = field(default_factory=dict)
-    """Times, ns, and angles, rad, oldest first."""
+    """Times, ns, and angles, rad, shape (names,), of each set, oldest first."""
     latest_ns: dict[tuple[str, ...], int] = field(default_factory=dict)
-    """When each set was heard of last."""
+    """Time of the last reading of each set, ns."""
     waits_since_ns: int | None = None
-    """Since when no joint was heard of."""
+    """Time since which no set is known. None: it was always so."""
     changed_ns: int | None = None
-    """When the angle of some joint was seen to change last, by a bit or more."""
+    """Time of the last change of any angle. None: no angle came yet."""
     lost: list[str] = field(default_factory=list)
-    """Joints that came once, and no longer."""
+    """Joints whose angles no longer come."""
 
     def __post_init__(self) -> None:
-        """Raise `ValueError` for what cannot have been heard."""
+        """Raise `ValueError` if the fields contradict each other."""
         for names, past in self.past.items():
             if not past or any(angles.shape != (len(names),) for _, angles in past):
                 raise ValueError("as many angles as names are needed")
@@ -47,14 +47,14 @@ class JointMotion:
     """Follows the joints of one hand. Constant memory, no clock."""
 
     def __init__(self, limits: JointLimits) -> None:
-        """Nothing is known yet; the time for `lost_ns` runs from the first sweep on."""
+        """Start without angles; `lost_ns` counts from the first sweep on."""
         self._limits = limits
         self.memory = JointMemory()
 
     def observe(self, reading: JointReading, t_ns: int) -> None:
-        """Take in the angles of `t_ns`, on the same clock as the sweeps.
+        """Take in the angles of `t_ns`, a time on the clock of the sweeps.
 
-        Joints whose angle is NaN are not heard: the others count as a sender of their own.
+        A joint whose angle is NaN counts as not sent.
         """
         valid = ~np.isnan(reading.position_rad)
         if not valid.any():
@@ -82,7 +82,7 @@ class JointMotion:
                 memory.changed_ns = t_ns
 
     def objection(self, t_ns: int) -> Reason | None:
-        """Return what the joints say against settling at `t_ns`. None: they are still, or lost."""
+        """Return the reason why joints forbid settling at `t_ns`. None: they are still, or lost."""
         self._drop_lost(t_ns)
         memory = self.memory
         if not memory.past:
@@ -101,14 +101,14 @@ class JointMotion:
 
     @property
     def is_frozen(self) -> bool:
-        """True if angles came for too long without a change of any."""
+        """True if angles have come for over `frozen_ns` without any change."""
         memory = self.memory
         if memory.changed_ns is None or not memory.latest_ns:
             return False
         return max(memory.latest_ns.values()) - memory.changed_ns > self._limits.frozen_ns
 
     def is_lost(self, t_ns: int) -> bool:
-        """Return True if judging goes on without any joints at `t_ns`."""
+        """Return True if no joint angle has come for over `lost_ns` at `t_ns`."""
         memory = self.memory
         return (
             not memory.past

@@ -1,6 +1,6 @@
 """Save and restore the judge's state, so that a replay can start in the middle of a run.
 
-Each part has a `memory`, a dataclass of all that readings change in it. One codec serves them all.
+Each part of the judge has a dataclass `memory` with everything that readings change in it.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ KINDS: Final = {np.dtype(kind).str: np.dtype(kind) for kind in ("u1", "u2", "i8"
 
 
 def remember(pipeline: Pipeline) -> bytes:
-    """Return all that a judge knows now but its session, with all grasps that are over learnt."""
+    """Return the state of a judge without its session, after it has learnt from ended grasps."""
     pipeline.learn()
     return _packed(pipeline.memories())
 
 
 def encode(memory: bytes) -> bytes:
-    """Return what `remember` gave as `recall` wants it; some 25 kB."""
+    """Return the compressed result of `remember`, for `recall`; about 25 kB."""
     return zlib.compress(memory)
 
 
 def recall(pipeline: Pipeline, data: bytes, *, same_model: bool) -> None:
-    """Let a judge that has judged nothing yet go on from there.
+    """Restore the state of a judge that has judged nothing yet; `data`: from `encode`.
 
     With another model or gate, the verdict of the current grasp is discarded. Raises `ValueError`,
-    and changes nothing, for what is no memory, or not of these fingers.
+    and changes nothing, if `data` is no such state, or is one of other fingers.
     """
     own = pipeline.memories()
     try:

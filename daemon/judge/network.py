@@ -22,45 +22,52 @@ if TYPE_CHECKING:
     from graspd.daemon.judge.calibration import Calibration
 
 FLAT_SPREAD_COUNTS = 70.0
-"""Standard deviation of a finger's electrodes below which it is not touching, or not working: half
-of the smallest of 4682 real grasps, 148."""
+"""Smallest standard deviation over the electrodes of a finger that touches and works, counts.
+
+It is half of 148, the smallest of 4682 real grasps.
+"""
 ONES = np.ones(ELECTRODES)
 TINY = 1e-12  # for a probability of zero, which has no logarithm
 
 
 class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """Whether counts look like a grasp of the training, with what was broken repaired."""
+    """Counts of a grasp after repair, or reasons why the network must not judge them."""
 
     reasons: tuple[Reason, ...]
-    """Against judging it; empty if it is sound, or has been repaired."""
+    """Reasons against judging; empty if the counts are sound or could be repaired."""
     counts: NDArray[np.generic]
-    """Shape (fingers, 24), with the broken electrodes repaired; as read where there are reasons."""
+    """Counts to judge, shape (fingers, 24): repaired, or as read if there are reasons."""
     repaired: tuple[str, ...] = ()
-    """Electrodes that were replaced, such as `ff_7`."""
+    """Electrodes that were repaired because they contradict the others, such as `ff_7`."""
     grasp: NDArray[np.generic] | None = None
-    """Shape (fingers, 24): what a session may take in, with only certainly broken electrodes
-    repaired. It may be like nothing seen before, as drift begins so. None: nothing to take in."""
+    """Counts that the session may learn from, shape (fingers, 24). None: it must not.
+
+    Only electrodes that are known to be broken are repaired in them. They may be unlike the
+    training: drift begins so.
+    """
 
 
 class Opinion(msgspec.Struct, frozen=True, gc=False):
-    """Answer of the network for a grasp, or why it was not asked."""
+    """Answer of the network for a grasp, or reasons why there is none."""
 
     p_slip: float | None
-    """Probability of slip by the network, softened while its session is young."""
+    """Probability of slip, nearer to the threshold while the session is young; None: no answer."""
     reasons: tuple[Reason, ...]
+    """Reasons why there is no answer; empty if there is one."""
     repaired: tuple[str, ...] = ()
+    """`Examined.repaired` of the counts."""
     margin: float = 0.0
-    """The network's log-odds of slip, before softening; 0 where it was not asked."""
+    """Log-odds of slip as the network gave them; 0 without an answer."""
 
 
 NO_OPINION = Opinion(None, ())
 
 
 class Plausibility:
-    """Compares counts with the training's."""
+    """Repairs counts where electrodes contradict the others; refuses those unlike the training."""
 
     def __init__(self, fingers: Sequence[Finger], seen: SeenCounts, electrodes: Electrodes) -> None:
-        """`seen` is what the model was trained on, `electrodes` what follows from it."""
+        """`seen`: the model's description of its training counts. `electrodes`: made from it."""
         self._fingers = tuple(fingers)
         self._novelty = NoveltyCheck(seen)
         self._electrodes = electrodes
@@ -71,10 +78,11 @@ class Plausibility:
         broken: NDArray[np.bool_] | None,
         session: Calibration | None = None,
     ) -> Examined:
-        """Return reasons against judging these counts, or the counts to judge by.
+        """Return the counts to judge, or reasons against judging them.
 
-        Shapes are (fingers, 24). `broken`: electrodes known to be so; None if all are sound.
-        `session`: how today's sensors differ from the training's.
+        `counts`: as read, shape (fingers, 24). `broken`: True for electrodes that are known to be
+        broken, same shape; None: none. `session`: maps counts of today's sensors to those of the
+        training; None: the model has no session.
         """
         values = counts.astype(np.float64)
         if _is_flat(values, broken):
@@ -127,20 +135,20 @@ class Plausibility:
 
 
 class Network:
-    """Runs one model, softened while its session is young."""
+    """Runs one model. While its session is young, it moves probabilities to the threshold."""
 
     def __init__(self, model: TactileModel, slip_threshold: float) -> None:
-        """`slip_threshold`: probability, 0..1, that softening must not cross."""
+        """`slip_threshold`: probability of slip, 0..1, that a moved probability never crosses."""
         self._model = model
         self._threshold = math.log(slip_threshold) - math.log1p(-slip_threshold)
         has_session = isinstance(model.inputs, SessionBuilder)
         self.features = model.input if has_session else np.empty(0, np.float32)
-        """The network's last input, shape (inputs,), standardised by the session; else empty."""
+        """Last input of a session model, shape (inputs,), standardised; empty for other models."""
 
     def judge(self, examined: Examined, session: Calibration | None = None) -> Opinion:
         """Return the probability of slip of examined counts, or why there is none.
 
-        `session` is what is known of it, for a model that needs one.
+        `session`: statistics that standardise the input; None: the model has no session.
         """
         model, repaired = self._model, examined.repaired
         if examined.reasons:
@@ -166,7 +174,7 @@ class Network:
 
 
 def electrode_name(finger: Finger, place: int) -> str:
-    """Return the name, such as `ff_7`, of the electrode at place 6 of 0..23."""
+    """Return the name of an electrode, counted from 1: `ff_7` for finger `ff` and place 6."""
     return f"{finger}_{place + 1}"
 
 

@@ -2,7 +2,8 @@
 
 A new reason needs a member of `Reason`, a line of `ADVICE`, a row in deploy/wire/README.md, and
 `graspd schema > deploy/wire/messages.schema.json`. The part that notices it adds it to the
-`reasons` of its `Checked`, `Moment`, `Examined` or `Opinion`; any of them makes it `unknown`.
+`reasons` of its `Checked`, `Moment`, `Examined` or `Opinion`. Any reason there makes the verdict
+`unknown`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class Decision(StrEnum):
 
 
 class Reason(StrEnum):
-    """Why a verdict is `unknown`, or a part is not well; `ADVICE` says what to do about each."""
+    """Cause of an `unknown` verdict, or of a part that is not well. `ADVICE` says what to do."""
 
     STALE = "stale"
     SENSOR_MISSING = "sensor-missing"
@@ -113,15 +114,15 @@ UNREADABLE = frozenset(
         Reason.MODEL_MISMATCH,
     }
 )
-"""Reasons with which a reading says nothing of the hand now."""
+"""Reasons for which the sensors cannot be read, so that the state of the hand is not known."""
 WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
-"""Reasons with which a grasp may still be lifted under supervision; with any other it may not."""
+"""Reasons that still permit a supervised lift; any other reason forbids it."""
 
 
 def to_act_on(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return the reasons that tell a person what to do.
+    """Return the reasons to show to a person: without `OF_THE_HAND` if any is `UNREADABLE`.
 
-    If the sensors cannot be read, the state of the hand is old, and closing it does not help.
+    While the sensors cannot be read, to close the hand does not help.
     """
     if UNREADABLE.isdisjoint(reasons):
         return list(reasons)
@@ -140,18 +141,18 @@ class GateState(StrEnum):
     JUDGED = "judged"
     """The verdict stands, and is refreshed while readings confirm that the grasp is the same."""
     RELEASED = "released"
-    """Nothing touches any more, for a moment."""
+    """Nothing touches since less than `GateLimits.release_ns`; a new touch may follow."""
 
 
 class FingerState(StrEnum):
-    """State of a finger in a word: free, in touch or sliding."""
+    """State of a finger: free, in touch or sliding."""
 
     FREE = "free"
     """It does not touch."""
     TOUCH = "touch"
-    """It touches, and nothing moves along it more than along a finger that holds."""
+    """It touches, and its counts move no more than those of a finger that holds."""
     SLIDE = "slide"
-    """It touches and something moves: the object slides, or the finger presses or lets go."""
+    """It touches, and its counts move: the object slides, or the finger presses or lets go."""
 
 
 class GateCause(StrEnum):
@@ -171,10 +172,10 @@ class GateCause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class GateChange:
-    """The gate went from one state to another."""
+    """A change of the gate's state."""
 
     t_ns: int
-    """Time of the reading that made it, ns."""
+    """Time of the reading that caused it, ns."""
     grasp: int
     former: GateState
     state: GateState
@@ -182,7 +183,7 @@ class GateChange:
 
 
 class Moment(NamedTuple):
-    """State of the grasp at a reading; the defaults are for a reading that is a grasp itself."""
+    """State of the grasp at a reading. The defaults fit a daemon without a gate."""
 
     grasp: int
     """Number of the current grasp, from 1; 0 before the first."""
@@ -192,7 +193,7 @@ class Moment(NamedTuple):
     judged: bool = True
     """True for a grasp's first judgement or the answer to a question; False for a periodic refresh.
 
-    If each reading is a grasp it is True for each, sound or not.
+    Without a gate it is True for each reading, sound or not.
     """
     in_contact: bool = True
     """True if all required fingers touch."""
@@ -208,10 +209,10 @@ class Moment(NamedTuple):
     early: bool = False
     """True if it was judged while something might still slide slowly."""
     steady: bool = True
-    """True if motion keeps to the strict limit: else a session learns nothing from the reading."""
+    """True if motion is within the strict limit; only then a session learns from the reading."""
     motion: dict[Finger, float | None] | None = None
-    """How each finger moves, in units of its noise; None where that is not known."""
+    """Motion of each finger, in units of its noise; None: not known."""
     motion_limits: dict[Finger, float] | None = None
-    """Largest motion of a finger that is still."""
+    """Largest motion of each finger that counts as still, in the same units."""
     fingers: dict[Finger, FingerState | None] | None = None
     """State of each finger; None: not known."""

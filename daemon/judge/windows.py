@@ -1,6 +1,6 @@
-"""The windows over which motion is looked for: what is remembered, and what noise makes of them.
+"""Windows in which motion is measured: the steps remembered, and the motion that noise seems to be.
 
-The short one shows fast motion soon; the long one slow slides, which no short one can.
+The short window shows fast motion early. Slow slides show only in the long one.
 """
 
 from __future__ import annotations
@@ -15,22 +15,27 @@ from graspd.daemon.judge.health import Number
 from graspd.drivers.base import ELECTRODES
 
 STEP_NS = 5_000_000
-"""Shortest step of the window, ns; of faster sweeps the mean is kept."""
+"""Shortest step of a window, ns. Faster sweeps are averaged within a step."""
 STEP_SWEEPS_MAX = 10
-"""More sweeps within a step came late, and at once: how the last ones move is not known."""
+"""Most sweeps of a step. More came late and all at once, so their motion is not known."""
 SHORT_NS, LONG_NS = 100_000_000, 240_000_000
 STEPS = LONG_NS // STEP_NS + 2
-"""Steps remembered: the long window, and one at each end of it."""
+"""Number of steps remembered: the long window, and one at each end of it."""
 STEPS_MIN = 3
-"""Steps of a window at least: where sweeps come slowly, windows are longer."""
+"""Fewest steps of a window. With slow sweeps it lasts longer than `SHORT_NS`."""
 APART = 3
-"""Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
-sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
+"""Number of steps after which noise is no longer correlated.
+
+Sensors show a correlation of 0.32 after one sweep and 0.03 after two. A palm's stream at 100 Hz
+also repeats 2 of 7 values.
+"""
 BLOCK_STEPS, BLOCKS = 24, 16
-"""Noise is the lower quartile of 16 blocks of 24 steps (about 4 s at 100 Hz), so that a hand that
-closes or opens does not change it."""
+"""Steps of a block, and blocks remembered: about 4 s at 100 Hz.
+
+The noise is the lower quartile of the blocks, so a hand that closes or opens does not change it.
+"""
 LOST_MAX = 3
-"""Sweeps in a row for which an electrode that is not usable is taken to read what it read."""
+"""Most sweeps in a row for which an unusable electrode keeps its last value."""
 MEAN_ABS = math.sqrt(2.0 / math.pi)
 """Mean absolute value of a Gaussian of standard deviation 1."""
 SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))

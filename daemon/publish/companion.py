@@ -15,18 +15,18 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 Answer = Callable[[str | None], None]
-"""Takes None for yes, or why not."""
+"""Function that answers a peer: with None for yes, with the reason for no."""
 REPEATED = "repeated"
-"""Answers an outcome that is known and kept already."""
+"""Answer for an outcome that was told before, and is on the disk."""
 
 
 def at_once(answer: Answer) -> None:
-    """Answer yes: outcomes are kept nowhere."""
+    """Answer yes at once. Used where outcomes are not saved."""
     answer(None)
 
 
 class LoopEvent(Enum):
-    """Event that a replay needs besides the readings."""
+    """Event that changes later verdicts; a recording has it, besides the readings."""
 
     ASKED = "asked"
     SKIPPED = "skipped"
@@ -45,28 +45,32 @@ class PublishedVerdict(NamedTuple):
     reading: TactileReading | None
     """None after silence."""
     is_answer: bool
-    """True if controllers who ask wait for this verdict."""
+    """True if this verdict answers the controllers that asked."""
     grasp: GraspId
     lifts: LiftBook
 
 
 class Requests(Protocol):
-    """Takes what peers want of the loop."""
+    """Interface of the loop for requests of peers."""
 
     def ask(self) -> None:
         """Ask for a verdict, by which a controller decides whether to lift."""
 
     def outcome(self, report: Report, answer: Answer) -> None:
-        """Tell how a lift has ended; `answer` gets None once that is on the disk.
-        Else `answer` gets `REPEATED`, or why the outcome is refused or not kept."""
+        """Tell the outcome of a lift; `answer` is called with None once it is on the disk.
+
+        Else with `REPEATED`, or with the reason why the outcome is refused or not saved.
+        """
 
 
 class Companion:
-    """Base class: a companion overrides the hooks that concern it.
-    The loop's thread calls them: they must not block, and what they raise ends the loop."""
+    """Base class of the loop's companions; each overrides the hooks that it needs.
+
+    The loop calls them in its own thread. They must not block. An exception ends the loop.
+    """
 
     def before_wait(self, requests: Requests) -> None:
-        """Pass on to `requests` what has come from outside."""
+        """Pass the messages of peers to `requests`."""
 
     def due_ns(self) -> int | None:
         """Latest end of the loop's wait, monotonic ns; None: no limit."""
@@ -77,10 +81,10 @@ class Companion:
         return []
 
     def on_reading(self, reading: Reading) -> None:
-        """A reading has come, and is neither judged nor skipped yet."""
+        """A reading has come. It is judged, or skipped, after this call."""
 
     def on_event(self, event: LoopEvent) -> None:
-        """Something has happened before the next reading."""
+        """An event has come before the next reading."""
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         """A verdict was published."""
@@ -92,18 +96,18 @@ class Companion:
         """A status was published: once a second, and at the end."""
 
     def after_round(self) -> None:
-        """The loop has been once around: drivers, timers and messages."""
+        """One round of the loop is over: its wait, the readings, timers and messages."""
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """Counts since the start, by the name of the part."""
+        """Counts since the start, for the status: by part, then by name of the count."""
         return {}
 
 
 def hooks(
     companions: Iterable[Companion], hook: Callable[Concatenate[Any, P], R]
 ) -> tuple[Callable[P, R], ...]:
-    """Return a hook of `Companion`, bound to each companion that overrides it."""
+    """Return the methods that override `hook`, a method of `Companion`, in their order."""
     name = hook.__name__
     return tuple(
         getattr(companion, name)

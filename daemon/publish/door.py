@@ -1,8 +1,8 @@
-"""The ZeroMQ sockets of a scene. libzmq serves them in threads of its own, beside the loop.
+"""The ZeroMQ sockets of a scene, served in threads beside the loop.
 
-Calls of a PUB, XPUB or ROUTER do not return while peers flood it. The loop has sockets within the
-process (`inproc`) only. `zmq.proxy` copies messages to the subscribers, in C. `Courier` carries few
-questions at a time; `zmq.proxy` takes a thousand, and lets no answer pass meanwhile.
+A call of a PUB, XPUB or ROUTER socket does not return while peers flood it. The loop therefore
+uses only sockets within the process (`inproc`). `zmq.proxy` copies messages to the subscribers, in
+C. Questions go through `Courier`: `zmq.proxy` would take a thousand before it sends an answer.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Frames = list[bytes]
 Socket = zmq.Socket[bytes]
 
 STATUS = b"status."
-"""Topics whose messages come back to the loop; the last of them ends `close`."""
+"""Start of the topics that the loop also receives; `close` waits for the last of them."""
 MESSAGE_MAX_BYTES: Final = 1024
 """Longest frame of a peer. An outcome has 128 bytes, the handshake with keys 257 (RFC 26)."""
 HANDSHAKE_MS: Final = 5000
@@ -41,33 +41,34 @@ HANDSHAKE_MS: Final = 5000
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Time between two heartbeats over TCP, and the silence after which a peer is gone, ms."""
 SUBSCRIPTIONS_QUEUED, ASK_QUEUE = 2, 16
-"""Messages of one peer that wait in the PUB and in the ROUTER socket."""
+"""Most messages of one peer that wait: subscriptions in the PUB, questions in the ROUTER socket."""
 QUESTIONS_MAX: Final = 8
-"""Questions carried, and taken by the loop, at a time: 0.3 ms on a slow computer."""
+"""Most questions that the loop takes in one round: 0.3 ms on a slow computer."""
 PAUSE_MS: Final = 2
-"""Time until more questions are carried, ms."""
+"""Pause of the courier after `QUESTIONS_MAX` questions, ms."""
 FRAMES_MAX: Final = 4
-"""Frames kept of a message: routing id, delimiter, text, and one too many."""
+"""Most frames kept of a message: routing id, delimiter, text, and one that marks it as wrong."""
 ANSWERS_QUEUED: Final = 512
-"""Answers on their way to the ROUTER socket: to 256 questions, and to as many outcomes."""
+"""Most answers that wait for the courier: to 256 questions, and to 256 outcomes."""
 LINGER_MS: Final = 500
-"""How long closing waits for peers to take what is queued, ms."""
+"""Longest wait at closing for peers to take queued messages, ms."""
 CLOSE_S: Final = 1.0
-"""How long closing waits for libzmq's threads, s; the watchdog waits 2 s."""
+"""Longest wait at closing for libzmq's threads, s; the watchdog waits 2 s."""
 SUBSCRIBES_S: Final = 0.1
-"""Time from a peer's handshake to its first subscription, s, at most."""
+"""Longest time from a peer's handshake to its first subscription, s."""
 ZAP_DOMAIN: Final = "graspd"
 """libzmq asks the authenticator only if there is a domain (RFC 27)."""
 
 
 @dataclass(slots=True)
 class Admission:
-    """CURVE keys for `tcp://`, Z85: the daemon's pair, and those of peers that may connect."""
+    """CURVE keys of `tcp://` sockets, in Z85."""
 
     public: bytes
+    """Public key of the daemon."""
     secret: bytes
     admitted: Mapping[bytes, str]
-    """Names of peers, by public key; may be replaced at any time."""
+    """Name of each peer that may connect, by its public key; may be replaced at any time."""
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Return True if the key may connect; called in pyzmq's thread."""
@@ -83,7 +84,7 @@ class Proxy(threading.Thread):
     """Copies messages between two sockets until their context ends, and closes them."""
 
     def __init__(self, endpoint: str, front: Socket, back: Socket) -> None:
-        """The thread owns both sockets from `start` on."""
+        """`front`, `back`: sockets that only this thread may use after `start`."""
         super().__init__(name=f"serve {endpoint}", daemon=True)
         self.endpoint = endpoint
         self._front, self._back = front, back
@@ -137,7 +138,7 @@ class Courier(Proxy):
 
 
 class Door:
-    """The sockets, open until `close`. All methods are for the loop's thread."""
+    """The loop's end of all sockets, open until `close`. Call methods in the loop's thread only."""
 
     def __init__(
         self,
@@ -148,7 +149,12 @@ class Door:
         *,
         awaits_subscriber: bool = False,
     ) -> None:
-        """Queue up to `high_water_mark` messages a subscriber. Raises `PublishError`."""
+        """Raises `PublishError` if an endpoint cannot be had.
+
+        `publish`, `ask`: endpoints of subscribers and of questions; None: no questions.
+        `high_water_mark`: most messages that wait for one subscriber. `admission`: keys of
+        `tcp://`. `awaits_subscriber`: True makes `wait_for_subscriber` possible.
+        """
         self._admission = admission
         self._context: zmq.Context[Socket] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
@@ -241,7 +247,10 @@ class Door:
             raise refusal from error
 
     def fileno(self) -> int:
-        """Return what becomes readable when a question comes; sending quietens it."""
+        """Return a descriptor that becomes readable when a question comes.
+
+        Sending an answer makes it unreadable again, so call `receive` in each round.
+        """
         return int(self._ask.getsockopt(zmq.FD))
 
     def send(self, topic: bytes, payload: bytes) -> bool:

@@ -73,7 +73,10 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
 
 
 def load_own(path: Path) -> tuple[bytes, bytes]:
-    """Do the same for the daemon's file: only its owner may write it and the folders above."""
+    """Return the daemon's pair, as `load_pair` does.
+
+    Also raises `KeysError` if another user may write the file or a folder above it.
+    """
     _refuse_open(path)
     return load_pair(path)
 

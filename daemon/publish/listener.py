@@ -1,4 +1,4 @@
-"""Endpoints to listen on."""
+"""Listen on an endpoint; take over the socket file of a process that has ended."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ BACKLOG = 100
 
 
 class PublishError(Exception):
-    """A socket cannot be had, or has ended."""
+    """An endpoint cannot be opened, or its thread has ended."""
 
     taken: str | None = None
-    """Endpoint that another program holds."""
+    """Endpoint that another program uses; None: the error has another cause."""
 
 
 class Listener:
@@ -31,7 +31,10 @@ class Listener:
     """
 
     def __init__(self, endpoint: str, mode: int | None = None, group: str | None = None) -> None:
-        """`mode` and `group` are those of the file. Raises `PublishError`, and leaves no file."""
+        """Listen. Raises `PublishError`, and then leaves no file behind.
+
+        `mode`, `group`: rights and group of an `ipc://` socket's file; None: those of the process.
+        """
         self.endpoint = endpoint
         self.socket: socket.socket | None = None
         self._mode = mode

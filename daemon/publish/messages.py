@@ -22,7 +22,7 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 Duration = Annotated[float, msgspec.Meta(ge=0.0)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 OBJECT_PATTERN: Final = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
-"""One word of a message and bare cell of a CSV file; no formula, no path."""
+"""Pattern of an object's name; safe as a word of a message and as a cell of a CSV file."""
 ObjectName = Annotated[str, msgspec.Meta(pattern=rf"^{OBJECT_PATTERN}$(?!\n)")]
 _HAND = msgspec.Meta(max_length=5)
 Motion = Annotated[dict[Finger, Duration | None], _HAND]
@@ -33,19 +33,20 @@ DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
     Decision.STABLE: 1,
     Decision.SLIP: 2,
 }
-"""The same as a number, because plotting tools draw numbers and skip text."""
+"""Number of each decision, for plotting tools, which skip text."""
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """How every message begins."""
+    """First fields of every message."""
 
     v: Literal[1] = WIRE_VERSION
     boot_id: str
     """Identifies this start of the daemon, from which `seq` and `grasp` count."""
     seq: Count
-    """Counts up per message of this topic; a gap is a loss, or a `tactile` not wanted."""
+    """Number of the message in its topic. A gap is a loss; for `tactile` it may be the rate limit.
+    """
     t: float
-    """Wall-clock seconds since 1970, for plots and people only."""
+    """Wall-clock time, seconds since 1970, for plots and people only."""
     t_mono_ns: Count
     """Monotonic time, ns."""
 
@@ -54,9 +55,9 @@ class Verdict(_Message, frozen=True, kw_only=True):
     """The verdict on the grasp by one reading, on topic `verdict.<hand>`."""
 
     t_mono_ns: Count
-    """Monotonic time, ns, of the reading's last byte; of the start where none has come yet."""
+    """Monotonic time, ns, of the reading's last byte; before the first reading, of the start."""
     grasp: Count
-    """Counts up per contact episode (with gate mode `every`: per reading), from 1; 0 before."""
+    """Number of the grasp, from 1 (with gate mode `every`, of the reading); 0 before the first."""
     verdict: Decision
     verdict_code: Literal[0, 1, 2]
     """0 unknown, 1 stable, 2 slip."""
@@ -67,44 +68,46 @@ class Verdict(_Message, frozen=True, kw_only=True):
     reasons: list[Reason]
     """Why it is `unknown`; empty otherwise."""
     age_ms: Duration
-    """From `t_mono_ns` to publishing, ms."""
+    """Time from `t_mono_ns` to this message, ms."""
     latency_us: Duration
-    """From the driver handing the reading over to encoding this message, us."""
+    """Time from the reading's arrival in the daemon to this message, us."""
     repaired: Annotated[list[str], msgspec.Meta(max_length=120)] = []
-    """Electrodes that were replaced by what the others let expect, such as `ff_7` (1 to 24)."""
+    """Electrodes whose counts were replaced by an estimate from the others, such as `ff_7`."""
     session_calibrated: bool | None = None
-    """False: the grasps are too few yet, so it is less sure; null: the model needs none."""
+    """False: the session has too few grasps, so the verdict is less sure; null: no session."""
     judged: bool = True
-    """True: the network was asked about this reading. False: it confirms the standing verdict, or
-    is `unknown`."""
+    """True for a grasp's first judgement and for the answer to a question.
+
+    False: the verdict confirms or refreshes the last one, or is `unknown`.
+    """
     gate: GateState | None = None
     """Null: each reading is a grasp of its own."""
     contact: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None
     """Fingers that touch; null with a null `gate`."""
     silence_ms: Duration
-    """If no message comes for longer than this, take the grasp for unknown."""
+    """Time without a message after which a subscriber must take the grasp for unknown, ms."""
     model: str
     model_sha: str
     """First 12 hex digits of the model file's SHA-256."""
     p_slip_model: Probability | None = None
-    """`p_slip` of the network alone, without outcomes; null exactly when `p_slip` is."""
+    """Probability of slip by the network alone, without outcomes; null exactly when `p_slip` is."""
     outcomes: Count = 0
-    """Outcomes since the start of the session that `p_slip` rests on."""
+    """Number of outcomes that `p_slip` has learned from, since the start of the session."""
     supervised: bool = False
-    """Lift it under supervision, whatever the verdict, and tell the outcome: it teaches."""
+    """True: lift under supervision, whatever the verdict, and tell the outcome, to teach."""
     risk: RiskReport | None = None
-    """Outcomes of `stable` lifts so far; null: without learning and without a risk."""
+    """State of the risk; null: without learning and without a risk."""
     early: bool = False
-    """Judged while something might still slide slowly; a surer verdict follows."""
+    """True: something might still slide slowly; a surer verdict follows."""
     still_ms: Duration | None = None
-    """How long the hand has kept still, ms; null with a null `gate`.
+    """Time for which the hand has kept still, ms; null with a null `gate`.
 
     From 100 on nothing moves fast, from 240 on nothing slides; 0 while something moves.
     """
     motion: Motion | None = None
     """Motion of each finger, in units of its noise; null: not known, or nothing touches."""
     motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
-    """Most motion of a finger that is still."""
+    """Largest motion of each finger that counts as still, in the same units."""
     fingers: Annotated[dict[Finger, FingerState | None], _HAND] | None = None
     """State of each finger; null: not known. Null with a null `gate`."""
 
@@ -119,11 +122,11 @@ class GateMessage(_Message, frozen=True, kw_only=True):
     state: GateState
     cause: GateCause
     still_ms: Duration | None = None
-    """By the reading that made the change, as in its verdict; null where none did."""
+    """Value in the verdict of the reading that made the change; null: no reading made it."""
     motion: Motion | None = None
-    """Likewise."""
+    """Value in the same verdict, as `still_ms`."""
     motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
-    """Likewise."""
+    """Value in the same verdict, as `still_ms`."""
 
 
 class Tactile(_Message, frozen=True, kw_only=True):
@@ -136,10 +139,10 @@ class Tactile(_Message, frozen=True, kw_only=True):
     """Monotonic time, ns, of the reading's last byte, as in its verdict."""
     fingers: Annotated[list[Finger], msgspec.Meta(max_length=5)]
     counts: Annotated[list[Annotated[list[Count], msgspec.Meta(max_length=24)]], _HAND]
-    """By finger, electrodes 1 to 24, 0..4095; as read, nothing repaired."""
+    """Counts 0..4095 of electrodes 1 to 24 of each finger, as read, without repair."""
     faults: Annotated[list[Annotated[list[Count], msgspec.Meta(max_length=24)]], _HAND]
-    """By finger and electrode, bits: 1 missing, 2 not a count, 4 parity, 8 error word, 16 held, 32
-    cut off; 0 is well."""
+    """Faults of each electrode, 0 if it is well. Bits: 1 missing, 2 not a count, 4 parity, 8 error
+    word, 16 held, 32 cut off."""
     joints: dict[str, float] = {}
     """Newest angle of each joint that has one, rad."""
 
@@ -155,7 +158,7 @@ class OutcomeMessage(_Message, frozen=True, kw_only=True):
     object: ObjectName | None = None
     """Name of the lifted object; null: not told."""
     grasp_boot_id: str | None = None
-    """The earlier start under which the grasp was judged; null: this one."""
+    """`boot_id` of the earlier start in which the grasp was judged; null: this start."""
 
 
 class State(StrEnum):
@@ -175,15 +178,19 @@ class Lifts(msgspec.Struct, frozen=True, kw_only=True):
     outstanding: Count
     """Grasps whose outcome can still come."""
     unreported: Count
-    """Grasps forgotten before an outcome came. With a risk, announced ones count as slips;
-    others are in no bound."""
+    """Grasps forgotten before an outcome came.
+
+    With a risk, announced ones count as slips; no bound covers the others.
+    """
     announced: Count = 0
-    """`lift` questions that were answered `stable`, one a grasp."""
+    """Grasps for which a `lift` question was answered `stable`."""
     awaited: Count = 0
-    """Those of them whose outcome is out."""
+    """Announced grasps whose outcome is not told yet."""
     covered: bool | None = None
-    """False: no lift was announced, so the risk that is set covers only lifts that were told. Null:
-    no risk is set."""
+    """False: no lift was announced, so the risk covers only lifts whose outcome was told.
+
+    Null: no risk is set.
+    """
 
 
 class LearnerHealth(msgspec.Struct, frozen=True, kw_only=True):
@@ -192,11 +199,11 @@ class LearnerHealth(msgspec.Struct, frozen=True, kw_only=True):
     enabled: bool
     """`[learn] enabled`."""
     outcomes: Count
-    """Learned from since the start of the session."""
+    """Outcomes learned from since the start of the session."""
     told: dict[OutcomeStatus, Count]
-    """Outcomes since the start of the session, by what became of them; only what occurred."""
+    """Outcomes told since the start of the session, by their status; without zeros."""
     uncertainty: Probability
-    """1: nothing is learned yet; towards 0: what is learned hardly changes any more."""
+    """Share of the first uncertainty that is left: 1 at the start, towards 0 with outcomes."""
 
 
 class Status(_Message, frozen=True, kw_only=True):
@@ -214,21 +221,21 @@ class Status(_Message, frozen=True, kw_only=True):
     drivers: dict[str, dict[str, Count]]
     """Counters of each driver, by driver name."""
     repaired: Annotated[dict[str, Count], msgspec.Meta(max_length=120)] = {}
-    """How often each electrode was repaired since start; only those that were."""
+    """Number of repairs of each electrode since start; without zeros."""
     session_grasps: Count | None = None
-    """Grasps by which the session is calibrated; null: the model needs none."""
+    """Grasps that the session has learned from; null: the model has no session."""
     session_calibrated: bool | None = None
-    """Whether they are enough."""
+    """True if these grasps are enough; null: the model has no session."""
     gate: GateState | None = None
     """Null: each reading is a grasp of its own."""
     tared: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None
-    """Fingers of which it is known where they rest; null with a null `gate`."""
+    """Fingers whose resting counts are known; null with a null `gate`."""
     health: Annotated[dict[str, Reason], msgspec.Meta(max_length=130)] = {}
     """Current problems: `ff_7`, `ff`, `link`, `joints`, `model` or `session`, and why."""
     latency_us: dict[Literal["p50", "p99", "max"], Duration]
-    """Reading to publish since start; all zero before the first verdict."""
+    """Time from reading to verdict since start; all zero before the first verdict."""
     jitter_us: dict[Literal["p50", "p99", "max"], Duration] = {}
-    """Time between two readings less the driver's period; empty while that is not known."""
+    """Difference of the time between two readings and the driver's period; empty: not known."""
     late_readings: Count = 0
     """Readings since start whose verdict came more than a period after their last byte."""
     worst_age_ms: Duration = 0.0
@@ -236,11 +243,11 @@ class Status(_Message, frozen=True, kw_only=True):
     skipped_readings: Count = 0
     """Readings since start that were not judged because newer ones were there already."""
     overloaded: bool = False
-    """Whether readings come faster than they are judged, or did within the last five seconds."""
+    """True if readings come faster than they are judged, or did within the last five seconds."""
     lifts: Lifts | None = None
-    """Null where nothing learns and no risk is set."""
+    """Null: without learning and without a risk."""
     learner: LearnerHealth | None = None
-    """Likewise."""
+    """Null: without learning and without a risk."""
     model: str
     model_sha: str
     versions: dict[str, str]

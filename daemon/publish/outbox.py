@@ -1,4 +1,4 @@
-"""Makes messages of judgements, sends them, and counts how late verdicts are."""
+"""Make messages from judgements, send them, and count late verdicts."""
 
 from __future__ import annotations
 
@@ -36,16 +36,17 @@ if TYPE_CHECKING:
 
 SHA_DIGITS = 12
 BUCKET_RATIO = 1.02
-"""A percentile is right to 2 %."""
+"""Ratio of a bucket's two ends, so percentiles are exact to 2 %."""
 FLOOR_US = 0.1
+"""Upper end of the first bucket, us."""
 BUCKETS = math.ceil(math.log(1e8 / FLOOR_US) / math.log(BUCKET_RATIO)) + 1
-"""Enough to reach 100 s."""
+"""Number of buckets, up to 100 s."""
 OUTAGE_PERIODS = 10
-"""A gap of this many periods is silence and no jitter."""
+"""Number of periods without a reading that count as silence instead of jitter."""
 
 
 class LatencyHistogram:
-    """Counts durations in buckets of equal ratio: a year of readings needs no more memory."""
+    """Histogram of durations with buckets of equal ratio, in constant memory."""
 
     def __init__(self) -> None:
         self.buckets = [0] * BUCKETS
@@ -62,7 +63,7 @@ class LatencyHistogram:
             self.max_us = duration_us
 
     def quantile_us(self, fraction: float) -> float:
-        """Return the duration, us, that `fraction` of all do not exceed; 0 if empty."""
+        """Return the quantile at `fraction`, 0..1, of the durations, us; 0 if there are none."""
         rank = math.ceil(fraction * self.count)
         below = 0
         for index, durations in enumerate(self.buckets):
@@ -76,20 +77,23 @@ class LatencyHistogram:
 
 
 class Deadlines:
-    """Counts late readings and jitter since the start."""
+    """Counts late verdicts and the jitter of readings since the start."""
 
     def __init__(self) -> None:
         self.jitter = LatencyHistogram()
         """Time between two readings less the driver's period, us."""
         self.late = 0
-        """Readings that were answered more than a period late."""
+        """Readings whose verdict came more than a period after their last byte."""
         self.worst_age_ms = 0.0
-        """From a reading's last byte to its verdict, ms."""
+        """Longest time from a reading's last byte to its verdict, ms."""
         self._last_seq = -1
         self._last_ns = 0
 
     def add(self, reading: TactileReading, age_ms: float, period_ns: int | None) -> None:
-        """Count a reading, answered `age_ms` after its last byte."""
+        """Count a reading whose verdict came `age_ms` after its last byte.
+
+        `period_ns`: time between two readings of the sensor, ns; None: not known.
+        """
         if age_ms > self.worst_age_ms:
             self.worst_age_ms = age_ms
         if period_ns is not None:
@@ -134,7 +138,10 @@ class Outbox:
         *,
         boot_id: str | None = None,
     ) -> None:
-        """`clock` gives monotonic ns, `wall_clock` seconds since 1970."""
+        """`clock` returns monotonic ns, `wall_clock` seconds since 1970.
+
+        `boot_id`: id of this start in all messages; None: a new one.
+        """
         self._latency = LatencyHistogram()
         self._decisions: Counter[Decision] = Counter()
         self._reasons: Counter[Reason] = Counter()
@@ -222,7 +229,7 @@ class Outbox:
         self._send("outcome", encode(message))
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
-        """Send one reading, with the newest joint angles, where it is wanted."""
+        """Send one reading, with the newest joint angles, to the outputs that want it now."""
         topic = self._topics["tactile"]
         wanting = [output for output in self._outputs if output.wanted(topic)]
         if not wanting:
@@ -273,7 +280,7 @@ class Outbox:
         skipped_readings: int,
         overloaded: bool,
     ) -> Status:
-        """Send one status. `drivers` has the counters of all parts, by name."""
+        """Send and return one status. `drivers`: counters of drivers and companions, by part."""
         session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
         health = pipeline.health()
         if state is State.SILENT:

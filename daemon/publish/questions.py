@@ -1,4 +1,4 @@
-"""Questions of grasp controllers whether they may lift, and what they report of their lifts."""
+"""Answer grasp controllers that ask for a verdict, and take the outcomes of their lifts."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from graspd.daemon.publish.messages import OBJECT_PATTERN
 from graspd.daemon.trust.lift_book import GraspId, Report
 
 JUDGE, LIFT = b"judge", b"lift"
-"""Questions. Only `lift` makes the peer the owner of the grasp."""
+"""Texts that ask for a verdict. `lift` also reserves the grasp's outcome for the peer."""
 CLOCK = b"clock"
-"""Asks for the daemon's monotonic clock: a client on another computer compares it with its own."""
+"""Text that asks for the daemon's monotonic time, to compare with a remote client's clock."""
 OUTCOME = b"outcome"
 WAITING_MAX: Final = 256
-"""Questions that wait, one of each peer. A newer one replaces the oldest."""
+"""Most questions that wait, one of each peer. A newer one replaces the oldest."""
 _REPORT = re.compile(
     rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
 )
@@ -30,33 +30,38 @@ MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
 Peer = bytes
 """Routing id of a connection."""
 NAME_BYTES: Final = 16
-"""Routing ids of a client begin with the same 16 random bytes: its name as an owner."""
+"""Bytes at the start of a routing id that stay the same when a client reconnects."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Waits for an answer."""
+    """A question that waits for an answer."""
 
     envelope: Frames
-    """Routing id, and the delimiter of a REQ socket."""
+    """Frames before the answer's text: routing id, and the delimiter of a REQ socket."""
     due_ns: int
+    """Time of the latest answer, monotonic ns."""
     lifts: bool
+    """True for `lift`, False for `judge`."""
 
 
 class Questions:
-    """Takes questions and outcomes, and answers them."""
+    """Takes questions and outcomes of peers, and answers them."""
 
     def __init__(self, send: Callable[[Sequence[bytes]], bool], patience_ns: int) -> None:
-        """`send` returns False if it drops an answer."""
+        """`send`: sends an answer's frames; returns False if it drops them.
+
+        `patience_ns`: longest time that a question waits for a better verdict, ns.
+        """
         self.counters: Counter[str] = Counter()
-        """By what became of questions and outcomes; `dropped`: answers."""
+        """Questions and outcomes by what became of them; `dropped` counts answers."""
         self._send = send
         self._patience_ns = patience_ns
         self.waiting: dict[Peer, Question] = {}
-        """By the peer's routing id; the oldest first."""
+        """Questions without an answer, by the peer's routing id; the oldest first."""
 
     def take(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> None:
-        """Take the messages of peers, and pass on to `requests` what they want."""
+        """Take messages of peers that arrived by `now_ns`; pass them on to `requests`."""
         asked = 0
         for peer, *envelope, text in messages:
             well_formed = envelope in ([], [b""])
@@ -111,7 +116,10 @@ class Questions:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
     def answer(self, payload: bytes, now_ns: int | None = None) -> list[Peer]:
-        """Answer all, or those due by `now_ns`; return the peers that ask for a lift."""
+        """Answer with this verdict; return the peers that asked to lift.
+
+        `now_ns`: answer only questions that are due by then; None: answer all.
+        """
         lifters = []
         for peer, question in list(self.waiting.items()):
             if now_ns is not None and question.due_ns > now_ns:

@@ -104,7 +104,7 @@ class Sockets(Companion):
             self._counters["dropped"] += 1
 
     def wanted(self, topic: bytes) -> bool:
-        """Return True if a message of this topic is due: readings are sent seldom."""
+        """Return True if a message of this topic is due; readings are sent at `tactile_hz`."""
         if not topic.startswith(TACTILE):
             return True
         if self._tactile_period_ns is None:
@@ -129,7 +129,7 @@ class Sockets(Companion):
                 self.questions.take(messages, self._clock(), requests)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Answer all questions, or only those that can wait no longer for a better answer."""
+        """Answer the questions with an answer; with another verdict only those that are due."""
         if self.questions is None or not self.questions.waiting:
             return
         now_ns = None if published.is_answer else self._clock()

@@ -26,8 +26,10 @@ class DayTable(Companion):
     def __init__(
         self, title: str, published: TactileModel, model: str, warnings: Sequence[str] = ()
     ) -> None:
-        """`published` judges every grasp without session, outcomes or refusal. `model` is the
-        name of the other one. `warnings` are written last."""
+        """`published`: network that judges each grasp without session, outcomes or refusal.
+
+        `model`: name of graspd's model. `warnings`: lines to write at the end.
+        """
         self._published = Network(published, 0.5)
         self._warnings = warnings
         self._part = Tally(), Tally()

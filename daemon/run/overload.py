@@ -18,24 +18,25 @@ import numpy as np
 from graspd.drivers.base import ElectrodeFault, TactileReading
 
 BACKLOG_MAX_NS: Final = 10_000_000
-"""Longest backlog, ns, that is judged completely; one sensor period if that is longer."""
+"""Longest backlog whose readings are all judged, ns; one sensor period if that is longer."""
 COST_SAMPLES: Final = 4
-"""Number of times of which the least is the cost of a reading, so that a stall does not count."""
+"""Number of latest readings whose shortest time is the cost of one; so a stall does not count."""
 REPORT_AFTER_NS: Final = 3_000_000_000
-"""Skipping for this long, ns, is reported as overload."""
+"""Duration of skipping after which overload is reported, ns."""
 PAUSE_NS: Final = 1_000_000_000
-"""A pause of this length, ns, ends a run of skipping."""
+"""Time without a skipped reading that ends a run of skipping, ns."""
 RECOVERED_AFTER_NS: Final = 5_000_000_000
 """Time without a skipped reading, ns, after which the overload is over."""
 YIELD_AFTER_NS: Final = 10_000_000
 YIELD_AFTER_RECORDED_NS: Final = 1_000_000_000
-"""Time without a wait, ns, after which the loop yields the processor; more for recordings."""
+"""Times without a wait after which the loop yields the processor, ns: live, and of recordings."""
 YIELD_SHARE: Final = 10
-YIELD_MAX_NS: Final = 5_000_000
-"""Longest yield, ns. It lasts a tenth of the time worked; else a realtime thread loses 5 % anyway.
+"""Time worked divided by the time of a yield. The kernel would take 5 % of a realtime thread.
 
 See sched(7), sched_rt_runtime_us.
 """
+YIELD_MAX_NS: Final = 5_000_000
+"""Longest yield, ns."""
 
 log = logging.getLogger("graspd")
 
@@ -101,7 +102,7 @@ class LoadShedder:
 
 
 def mark_repeats(newest: TactileReading, skipped: TactileReading) -> TactileReading:
-    """Return `newest` with the fingers flagged HELD that only repeat the skipped reading."""
+    """Return `newest` with `HELD` set for each finger that repeats the skipped reading."""
     sound = (newest.faults | skipped.faults) == 0
     differs = newest.counts != skipped.counts
     held = sound.any(axis=1) & ~(differs & sound).any(axis=1)

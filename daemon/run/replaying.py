@@ -21,7 +21,7 @@ class _Lift(NamedTuple):
     allowed: bool
     """True if the verdict was `stable`, or asked for a supervised lift."""
     over: bool
-    """True if the next reading is another grasp for certain."""
+    """True if the next reading is certainly another grasp."""
 
 
 class Controller(Companion):

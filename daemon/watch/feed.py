@@ -15,16 +15,16 @@ from graspd.daemon.publish.keys import load_pair, load_public
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX: Final = 2000
-"""Messages that wait in the socket: seven seconds of them."""
+"""Most messages that wait in the socket: those of seven seconds."""
 TAKEN_MAX: Final = 5000
-"""Messages taken at once, more than can wait."""
+"""Most messages taken in one call, more than can wait."""
 PAUSE_NS: Final = 1_000_000_000
-"""After a pause of this length, ns, connect again: waiting messages are old."""
+"""Pause of the viewer, ns, after which it reconnects, because waiting messages are old."""
 RETRY_NS: Final = 5_000_000_000
 """Time from a refusal to the next try, ns: the key may be known then."""
 MESSAGE_MAX_BYTES: Final = 1 << 20
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
-"""Heartbeats on TCP, as the daemon's, ms."""
+"""Time between two heartbeats on TCP, and their timeout, as in the daemon, ms."""
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 """Shortest and longest time before connecting again, ms."""
 CONNECTED: Final = "connected"
@@ -45,7 +45,7 @@ EVENTS_WITH_KEYS: Final = EVENTS | {
     int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "turned away: is the daemon's key right?",
 }
 FOLLOW: Final = 2
-"""Events after a refusal that say less: disconnected, retried."""
+"""Number of events after a refusal that must not hide it: disconnected, retried."""
 
 
 class Feed:
@@ -57,7 +57,10 @@ class Feed:
         keys: tuple[bytes, bytes, bytes] | None = None,
         clock: Callable[[], int] = boottime_ns,
     ) -> None:
-        """`keys` as by `load_keys`; `clock` gives ns, with sleep. Raises `zmq.ZMQError`."""
+        """Connect. Raises `zmq.ZMQError` for a wrong endpoint.
+
+        `keys`: from `load_keys`; None: no keys. `clock`: returns ns, and runs on in a sleep.
+        """
         self.link = "connecting"
         self._endpoint = endpoint
         self._keys = keys

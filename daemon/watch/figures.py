@@ -10,7 +10,7 @@ from graspd.daemon.watch.snapshot import Line
 SURE_MS = LONG_NS / 1e6
 """Time without motion, ms, after which a slow slide is excluded."""
 LIKELY = 0.25
-"""A likelier slip is never shown as a promise."""
+"""Largest `p_slip` with which `stable` is shown as a promise."""
 UNCOVERED = Line("risk", "covers only lifts that are told: none was announced")
 NO_OUTCOME = "no outcome told yet"
 SUPERVISED = Line(
@@ -19,7 +19,7 @@ SUPERVISED = Line(
 
 
 def doubt(verdict: Verdict) -> str | None:
-    """Return why `stable` is not a promise yet; None if lifts have shown that it is."""
+    """Return why outcomes do not support this `stable` verdict yet; None: they do."""
     risk, p_slip = verdict.risk, verdict.p_slip
     if verdict.early:
         return "judged early: it may still slide slowly, and is judged once more"
@@ -37,7 +37,7 @@ def doubt(verdict: Verdict) -> str | None:
 
 
 def rests_on(verdict: Verdict) -> str:
-    """Return in one line what the verdict rests on."""
+    """Return one line on the outcomes and the risk behind the verdict."""
     network, risk = verdict.p_slip_model, verdict.risk
     said = "" if network is None else f"slip probability by the network alone {percent(network)}, "
     if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
@@ -59,7 +59,10 @@ def stillness(still_ms: float | None) -> str:
 
 
 def lift(verdict: Verdict, ended: str | None) -> str:
-    """Return how a lift ended; `-`: it was not to be made."""
+    """Return `held`, `slipped` or `not told`; `-`: the verdict did not permit a lift.
+
+    `ended`: outcome told, `stable` or `slip`; None: not told.
+    """
     if ended is not None:
         return "held" if ended == "stable" else "slipped"
     return "not told" if verdict.verdict is Decision.STABLE or verdict.supervised else "-"

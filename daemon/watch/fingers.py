@@ -1,4 +1,4 @@
-"""The tactile image of each finger, and how the finger moves."""
+"""The tactile image and the motion of each finger."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from graspd.models.layout import ELECTRODES
 from graspd.models.levels import PIXELS, RestCounts, fall_of, levels_of
 
 OLD_NS = 1_000_000_000
-"""Older images are not shown."""
+"""Largest age of a reading whose image is shown, ns."""
 
 
 class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
     """Motion of a finger, in units of its own noise."""
 
     now: float | None
-    """None: not known."""
+    """Motion now; None: not known."""
     limit: float
-    """Most motion of a finger that is still."""
+    """Largest motion that counts as still."""
 
 
 class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,23 +31,23 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     touches: bool | None
-    """None: not known."""
+    """True if it touches; None: not known."""
     from_rest: bool
-    """True if levels are falls below the rest."""
+    """True if levels are relative to the resting counts, False: to the finger's median."""
     levels: list[int]
-    """By pixel, 12 rows of 11; see `levels_of`."""
+    """Level of each pixel, 12 rows of 11; see `levels_of`."""
     deepest: int
-    """Largest fall, counts."""
+    """Largest fall of an electrode, counts."""
     marked: list[int]
     """Pixels of electrodes that are faulty or repaired."""
     motion: FingerMotion | None
-    """None if each reading is a grasp."""
+    """Motion; None: the daemon has no gate."""
     state: FingerState | None = None
-    """None: not known."""
+    """State; None: not known."""
 
 
 class Fingers:
-    """Takes readings, learns where fingers rest, and draws the newest reading."""
+    """Learns the resting counts from readings, and draws the newest reading."""
 
     def __init__(self) -> None:
         self._tactile: Tactile | None = None
@@ -55,7 +55,10 @@ class Fingers:
         self._rest = RestCounts()
 
     def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
-        """Take a reading and the fingers at rest; False if its parts do not fit."""
+        """Take in a reading; return False, and ignore it, if its shapes are wrong.
+
+        `resting`: fingers that rest in it, to learn from.
+        """
         lengths = {len(tactile.fingers), len(tactile.counts), len(tactile.faults)}
         rows = [*tactile.counts, *tactile.faults]
         if len(lengths) != 1 or any(len(row) != ELECTRODES for row in rows):
@@ -69,7 +72,7 @@ class Fingers:
         return True
 
     def images(self, verdict: Verdict, now_ns: int) -> list[FingerImage]:
-        """Return images of the newest reading; none if it is old."""
+        """Return the image of each finger in the newest reading; none if it is too old."""
         tactile = self._tactile
         if tactile is None or now_ns - self._tactile_ns > OLD_NS:
             return []

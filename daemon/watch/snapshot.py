@@ -10,40 +10,40 @@ from graspd.daemon.watch.fingers import FingerImage
 
 
 class Tone(StrEnum):
-    """The verdict in seven kinds, each with its own colour."""
+    """Kind of verdict that is shown; each has its own colour."""
 
     STABLE = "stable"
     LEANS = "leans"
-    """`stable`, but lifts have not shown it yet."""
+    """`stable`, but not supported by outcomes of lifts yet."""
     SLIP = "slip"
     LEARNING = "learning"
-    """Unknown, and to be lifted under supervision."""
+    """`unknown`; a supervised lift is asked for."""
     WAITING = "waiting"
-    """Unknown as expected: nothing is grasped, or not settled."""
+    """`unknown`, as expected: nothing is grasped, or the grasp has not settled."""
     TROUBLE = "trouble"
-    """Unknown: something is wrong or unusual."""
+    """`unknown`, because something is wrong or unusual."""
     SILENT = "silent"
-    """Unknown: no message arrives."""
+    """`unknown`, because no message arrives."""
 
 
 class Line(msgspec.Struct, frozen=True):
-    """A reason and advice, or a figure and its value."""
+    """A line of two texts: a reason and advice, or the name of a figure and its value."""
 
     what: str
     advice: str
 
 
 class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
-    """The last verdict of a grasp, which may not hold any more."""
+    """A grasp and its last verdict, which may no longer hold."""
 
     verdict: str
     p_slip: float | None
     boot_id: str
-    """Start of the daemon that numbered it."""
+    """Start of the daemon that `grasp` counts from."""
     grasp: int
     ago_s: float
     ended: str | None
-    """`stable` or `slip`, if it was told."""
+    """Outcome of its lift, `stable` or `slip`; None: not told."""
     lift: str
     """`held`, `slipped`, `not told`, or `-`."""
     supervised: bool
@@ -57,16 +57,16 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     link: str
     hand: str | None
     t: float
-    """Wall-clock seconds since 1970."""
+    """Time of the snapshot, wall-clock seconds since 1970."""
     last_t: float | None
-    """Arrival of the last verdict, and time of a silent hand's figures."""
+    """Time at which the last verdict arrived, as `t`; None: no verdict yet."""
     tone: Tone
     verdict: str
     """`stable`, `slip` or `unknown`."""
     headline: str
-    """The verdict, that it leans to stable, or that none has come yet."""
+    """Largest word on the screen: the verdict, "leans to stable", or that none has come yet."""
     evidence: str
-    """Empty before the first message."""
+    """Result of `figures.rests_on`; empty before the first message."""
     p_slip: float | None
     why: list[Line]
     grasp: int | None
@@ -74,14 +74,14 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     contact: list[str] | None
     """Fingers that touch; None: not known."""
     still: str
-    """In words; `-`: not known."""
+    """Time without motion, as text; `-`: not known."""
     grasps: list[JudgedGrasp]
-    """Judged ones, the newest first."""
+    """Latest judged grasps, the newest first."""
     counts: dict[str, int]
-    """Since watch began, by the last verdict of each."""
+    """Number of grasps since watch began, by their last verdict."""
     fingers: list[FingerImage]
     joints: dict[str, float]
-    """rad."""
+    """Angle of each joint, rad."""
     health: list[Line]
     """Problems, and what to do about each."""
     not_well: str
@@ -96,4 +96,4 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     history: list[str]
     """Tones of the last 300 seconds, the oldest first; see `TONE_CODE`."""
     history_p: list[int]
-    """Highest probability of slip in each, %; -1: none."""
+    """Highest probability of slip in each of these seconds, %; -1: none."""

@@ -25,18 +25,18 @@ STYLES = {
     Tone.TROUBLE: "bold #ffffff on #d98e00",
     Tone.SILENT: "bold #ffffff on #8250df",
 }
-"""They differ in lightness too, for people who cannot tell red from green."""
+"""Style of each tone. Lightness differs too, for people who cannot tell red from green."""
 OLD = "dim italic"
 HAND_COLUMNS = 80
-"""Columns of a hand beside another one."""
+"""Width of a hand that is shown beside another one, columns."""
 HALF_BAR = 10
-"""Columns of a bar up to its mark."""
+"""Width of a bar up to its mark, columns."""
 NAME_MAX = 40
-"""Most characters of a received name."""
+"""Most characters shown of a received name."""
 NAMES_MAX = 1000
-"""Most characters of several received names: a hand's 120 electrodes have 840."""
+"""Most characters shown of several received names: a hand's 120 electrodes have 840."""
 LABEL_COLUMNS = 12
-"""Columns of the longest label, `grasps seen` or `last message`."""
+"""Width of the longest label, `grasps seen` or `last message`, columns."""
 
 Row = tuple[str, str]
 """Label and text."""
@@ -44,16 +44,16 @@ Row = tuple[str, str]
 
 @dataclass(frozen=True)
 class Screen:
-    """Lines and places on the terminal."""
+    """Size of the terminal, and what the user chose to see."""
 
     width: int
-    """Columns."""
+    """Width, columns."""
     height: int | None = None
-    """Lines; None: as many as there are."""
+    """Height, lines; None: no limit."""
     chosen: int = 0
-    """The hand that is shown where there is no room for all."""
+    """Number of the hand that is shown if there is no room for all."""
     page: int = 0
-    """Screens that were skipped, by typing space."""
+    """Number of pages skipped with the space bar."""
 
 
 def draw(hands: Sequence[Snapshot], screen: Screen) -> RenderableType:

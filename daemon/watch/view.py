@@ -40,9 +40,9 @@ SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
 HALF = 0.5
-"""From this probability on a slip is likelier than not."""
+"""Smallest `p_slip` at which a slip is likelier than not."""
 HELD_NS = 1_000_000_000
-"""Time for which `slip` stands after its probability has fallen, ns; as the judge has it."""
+"""Time for which `slip` stands after its probability has fallen, ns; as `Limits.steady_ns`."""
 HELD = Line("slip, held", "for a second: a moment ago its probability was 50 % or more")
 NO_VERDICT, LEANS = "no verdict yet", "leans to stable"
 """Headlines beside the verdicts."""
@@ -51,14 +51,16 @@ LATE = "the daemon is there and says nothing: top shows whether this computer is
 SECONDS = 300
 SECOND_NS = 1_000_000_000
 LATE_UNKNOWNS = 3
-"""An `unknown` stands for this many times its `silence_ms`. It promises nothing, and a daemon
-without readings sends the next one only after `silence_ms`."""
+"""Number of `silence_ms` for which an `unknown` verdict is shown without a newer message.
+
+A daemon without readings sends the next `unknown` only after `silence_ms`.
+"""
 PROMPT_NS = 50_000_000
-"""A message that was taken this soon after it came, ns, tells how the clocks differ."""
+"""Longest wait of a message for this viewer, ns, with which it tells how the clocks differ."""
 CATCHING_UP_NS = 1_000_000_000
-"""Time to connect again after the viewer stood still, ns."""
+"""Time to reconnect after the viewer itself stood still, ns."""
 NO_SHARE = -1
-"""A second without a probability of slip."""
+"""Value in place of a probability for a second that has none."""
 TONE_CODE = {
     Tone.SLIP: "x",
     Tone.TROUBLE: "t",
@@ -105,7 +107,7 @@ class History:
 
 
 class View:
-    """Takes messages and gives a `Snapshot` at any time, in constant memory."""
+    """Makes a `Snapshot` of one hand at any time from its messages, in constant memory."""
 
     def __init__(
         self,
@@ -114,8 +116,10 @@ class View:
         look: str = "",
         wall: Callable[[], float] = time.time,
     ) -> None:
-        """Show one `hand`; None: the first whose message arrives. `look`: where a person looks
-        when no message comes, such as commands."""
+        """`hand`: its name; None: the first whose message arrives.
+
+        `look`: advice for a person if no message comes. `wall`: returns seconds since 1970.
+        """
         self.link = "connecting"
         self.stood_still = 0, 0
         """When the viewer itself last stopped and went on, ns."""
@@ -141,7 +145,10 @@ class View:
     def take(
         self, topic: bytes, payload: bytes, earliest_ns: int, latest_ns: int | None = None
     ) -> None:
-        """Take a message that arrived between these times, monotonic; None: at `earliest_ns`."""
+        """Take in a message that arrived between `earliest_ns` and `latest_ns`, monotonic.
+
+        `latest_ns` None: it arrived at `earliest_ns`.
+        """
         now_ns = earliest_ns
         kind, _, hand = topic.decode("ascii", "replace").partition(".")
         if kind not in MESSAGES or (self._hand is not None and hand != self._hand):
@@ -193,7 +200,7 @@ class View:
         return min(max(sent_ns + self._clocks_ns, earliest_ns), latest_ns)
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return what is to be seen. Call it `SNAPSHOTS_HZ` times a second."""
+        """Return everything to show at `now_ns`. Call it `SNAPSHOTS_HZ` times a second."""
         tone, why = self._verdict_now(now_ns)
         silent = tone is Tone.SILENT
         last, status = self._verdict, self._status

@@ -24,15 +24,15 @@ log = logging.getLogger("graspd.watch")
 
 ADDRESS: Final = "127.0.0.1"
 HOSTS: Final = {"127.0.0.1", "localhost", "[::1]"}
-"""A foreign page may bring another name to reach loopback (DNS rebinding)."""
+"""Accepted host names. A foreign page may reach loopback by another name (DNS rebinding)."""
 SITES: Final = {None, "none", "same-origin"}
-"""`Sec-Fetch-Site` of requests that no other site has made."""
+"""Accepted values of `Sec-Fetch-Site`: the request comes from no other site."""
 CONNECTIONS_MAX: Final = 16
-"""Connections, each with a thread; an open page keeps one."""
+"""Most connections, each with a thread; an open page keeps one."""
 PATIENCE_S: Final = 5.0
 """Longest silence of a browser within a request, and longest wait until it reads on, s."""
 SEND_BUFFER_BYTES: Final = 32 * 1024
-"""Some snapshots. A slow browser misses the later ones."""
+"""Size of a connection's send buffer: a few snapshots. A slow browser misses later ones."""
 RETRY_MS: Final = 1000
 """Time after which a browser connects again, ms."""
 
@@ -53,7 +53,10 @@ class Newest:
             self._changed.notify_all()
 
     def after(self, number: int) -> tuple[int, bytes]:
-        """Wait for one newer than `number`; return its number and payload, b"" if closed."""
+        """Wait for a snapshot newer than `number`; return its number and payload.
+
+        The payload is b"" after `close`.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self.number > number)
             return self.number, b"" if self.closed else self._payload
