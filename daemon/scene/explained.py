@@ -158,7 +158,8 @@ def _range(about: Mapping[str, Any]) -> str:
         ("maximum", "to"),
         ("exclusiveMaximum", "below"),
     )
-    return " ".join(f"{word} {_number(about[key])}" for key, word in words if key in about)
+    bounds = " ".join(f"{word} {_number(about[key])}" for key, word in words if key in about)
+    return bounds.removeprefix("from ") if "maximum" in about else bounds
 
 
 def _number(value: float) -> str:
