@@ -1,4 +1,4 @@
-"""The table of names in the README is right, and both clients have the same bounds."""
+"""The list of names in the README is right, and both clients have the same bounds."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ def in_python() -> Names:
 
 
 def in_readme() -> Names:
-    table = README.partition("## Names")[2].partition("\n\nOnly Python")[0]
-    rows = [row.split("|")[1:4] for row in table.splitlines() if row.startswith("| `")]
-    return {name.strip(" `"): set(re.findall(r"`(\w+)`", has)) for name, _, has in rows}
+    listed = README.partition("## Names")[2].partition("\n\nOnly Python")[0]
+    lines = re.sub(r"\n +", " ", listed).splitlines()
+    rows = [line.removeprefix("- ").split(": ") for line in lines if line.startswith("- `")]
+    return {name.strip("`"): set(re.findall(r"`(\w+)`", has)) for name, has in rows}
 
 
 def minus(names: Names, left_out: set[tuple[str, str]]) -> Names:
@@ -50,7 +51,7 @@ def minus(names: Names, left_out: set[tuple[str, str]]) -> Names:
     }
 
 
-def test_the_table_has_the_public_names() -> None:
+def test_the_list_has_the_public_names() -> None:
     python = in_python()
     assert python.pop(FOR_ASYNCIO) == python["Client"]
     assert in_readme() == minus(python, ONLY_PYTHON)
