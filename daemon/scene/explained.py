@@ -18,12 +18,11 @@ SCHEMA = "scene.schema.json"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INTRODUCTION = """# The scene, key by key
 
-This page is for those who write a scene. After it you know each key of its file.
-`graspd scene --page` prints it.
+This page is for those who write a scene. After it you know each key.
 
 A scene is one TOML file; only `[tactile]` must be there. `graspd scene --example spi > right.toml`
-prints one to edit. `graspd check right.toml` finds mistakes: unknown keys, values out of range, and
-keys that contradict each other. Editors with Taplo (VS Code: Even Better TOML) complete the keys.
+prints one to edit, and `graspd check right.toml` finds mistakes. Editors with Taplo (VS Code: Even
+Better TOML) complete the keys.
 
 `key = value` shows the default. A key without one may be left out, unless it is *needed*. Paths are
 relative to the folder of the scene file.
