@@ -1,6 +1,6 @@
 """Words of a verdict: decisions, reasons for `unknown`, and states of the gate.
 
-A new reason needs a member of `Reason`, a line of `ADVICE`, a row in deploy/wire/README.md, and
+A new reason needs a member of `Reason`, a line of `ADVICE`, a line in deploy/wire/README.md, and
 `graspd schema > deploy/wire/messages.schema.json`. The part that notices it adds it to the
 `reasons` of its `Checked`, `Moment`, `Examined` or `Opinion`. Any reason there makes the verdict
 `unknown`.

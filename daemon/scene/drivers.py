@@ -65,14 +65,14 @@ class Section(BaseModel):
 
 
 class ReplayFaultsSection(Section):
-    """`[tactile.faults]`: faults of the replayed sensor, to test a controller."""
+    """`[tactile.faults]`: faults of the replayed sensor."""
 
     off_from: Annotated[int, Field(ge=0), unit("readings")] | None = None
-    """First reading that is lost, with all after it."""
+    """First of the readings that are lost."""
     stuck_from: Annotated[int, Field(ge=1), unit("readings")] | None = None
-    """First reading that repeats the one before, as do all after it."""
+    """First of the readings that repeat the one before."""
     garbage_probability: Probability = 0.0
-    """Share of readings with random 16-bit values."""
+    """Share of readings with random values."""
     wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX), unit("counts")] = 0
     """Offset added to the counts."""
     slow_every: Annotated[int, Field(ge=1), unit("readings")] = 1
@@ -82,7 +82,7 @@ class ReplayFaultsSection(Section):
     intermittent_probability: Probability = 0.0
     """Share of readings that are lost."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
-    """Fingers that are stuck, garbage or wrong; without it all."""
+    """Fingers with these faults; without it all."""
     electrodes: (
         Annotated[
             tuple[Annotated[int, Field(ge=1, le=ELECTRODES), unit()], ...],
@@ -90,7 +90,7 @@ class ReplayFaultsSection(Section):
         ]
         | None
     ) = None
-    """Electrodes that are stuck, garbage or wrong; without it all."""
+    """Electrodes with these faults; without it all."""
     seed: Annotated[int, Field(ge=0), unit()] = 0
     """The same seed gives the same faults."""
 
@@ -107,7 +107,7 @@ class ReplayTactile(Section):
     speed: Annotated[float, Field(ge=1e-3, le=1e3), unit()] = 1.0
     """Factor of real time; not with pace `fast`."""
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e5), unit("1/s")] = 100.0
-    """Rate of a grasp table, which has no times."""
+    """Rate of a grasp table."""
     loop: bool = False
     """True: start again at the end."""
     outcomes: bool = False
@@ -145,9 +145,9 @@ class CanTactile(Section):
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
     ) = None
-    """Fingers in the order of the board's words (`syntouch`); without it `hand.fingers`."""
+    """Fingers in the order of the words of `syntouch`; without it `hand.fingers`."""
     format: Literal["syntouch", "sweep_fd"] = "syntouch"
-    """SynTouch's frame per sample, or graspd's CAN FD frame per finger and sweep."""
+    """SynTouch's format, or graspd's for CAN FD."""
     arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), unit()] | None = None
     """Id of the samples, or of finger `ff` of `sweep_fd`. Without it `syntouch` takes the id of the
     first sound sample."""
@@ -156,7 +156,7 @@ class CanTactile(Section):
     data_length: Annotated[int, Field(ge=3, le=8), unit("bytes")] | None = None
     """Length of a sample frame if the board pads it."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
-    """Rate of the bus; not with socketcan, where `ip link` sets it."""
+    """Rate of the bus; not with socketcan."""
     data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000), unit("bit/s")] | None = None
     """Rate of the data phase of CAN FD; not with socketcan."""
 

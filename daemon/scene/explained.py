@@ -18,12 +18,11 @@ SCHEMA = "scene.schema.json"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INTRODUCTION = """# The scene, key by key
 
-This page is for those who write a scene. After it you know each key of its file.
-`graspd scene --page` prints it.
+This page is for those who write a scene. After it you know each key.
 
 A scene is one TOML file; only `[tactile]` must be there. `graspd scene --example spi > right.toml`
-prints one to edit. `graspd check right.toml` finds mistakes: unknown keys, values out of range, and
-keys that contradict each other. Editors with Taplo (VS Code: Even Better TOML) complete the keys.
+prints one to edit, and `graspd check right.toml` finds mistakes. Editors with Taplo (VS Code: Even
+Better TOML) complete the keys.
 
 `key = value` shows the default. A key without one may be left out, unless it is *needed*. Paths are
 relative to the folder of the scene file.
@@ -158,7 +157,8 @@ def _range(about: Mapping[str, Any]) -> str:
         ("maximum", "to"),
         ("exclusiveMaximum", "below"),
     )
-    return " ".join(f"{word} {_number(about[key])}" for key, word in words if key in about)
+    bounds = " ".join(f"{word} {_number(about[key])}" for key, word in words if key in about)
+    return bounds.removeprefix("from ") if "maximum" in about else bounds
 
 
 def _number(value: float) -> str:

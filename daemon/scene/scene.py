@@ -65,8 +65,7 @@ class Model(Section):
     """`[model]`: the network that judges, and its thresholds."""
 
     name: Name | None = None
-    """Model that `graspd models` lists; without name and path `small-session`. A hand with fewer
-    fingers gets the model's form for these, if it exists."""
+    """Model that `graspd models` lists; without name and path `small-session`."""
     path: FilePath | None = None
     """Model file of your own."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0), unit()] = Limits.slip_threshold
@@ -83,7 +82,7 @@ class Model(Section):
 
 
 class SessionSection(Section):
-    """`[session]`: the calibration of a session model by the grasps since the last exchange."""
+    """`[session]`: calibration of a session model by its grasps."""
 
     keep: bool | None = None
     """True: keep the session in a file. Without it only sessions of live sensors are kept."""
@@ -104,12 +103,11 @@ class RiskSection(Section):
     max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5), unit()] = 0.05
     """Largest share of the `stable` lifts that may slip."""
     warm_up: Annotated[int, Field(ge=0, le=1000), unit("outcomes")] = 50
-    """Until this number of outcomes each grasp that is not `stable` is to be lifted supervised."""
+    """Outcomes until which each grasp that is not `stable` is to be lifted supervised."""
     explore: Annotated[float, Field(ge=0.0, le=1.0), unit()] = 0.05
     """Share of the grasps that are not `stable` to lift supervised after that."""
     outstanding_max: Annotated[int, Field(ge=1, le=100), unit("lifts")] = 5
-    """While this number of announced lifts (question `lift`) has no outcome, no grasp is
-    `stable`."""
+    """Number of announced lifts without outcome from which no grasp is `stable`."""
 
 
 class Learn(Section):
@@ -131,7 +129,7 @@ class GateSection(Section):
     `every`: each reading is a grasp, in recordings only. Without it `every` for grasp tables, else
     `settled`."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
-    """Largest age of a reading. An older one, or silence for this time, gives `unknown`."""
+    """Largest age of a reading. An older one, or silence, gives `unknown`."""
     sweeps: Annotated[Literal[1, 3], unit("readings")] | None = None
     """Judge single readings, or the median of three. Without it 3, in mode `every` 1."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
@@ -142,8 +140,8 @@ class GateSection(Section):
     contact_sigmas: Annotated[float, Field(ge=3, le=100), unit("sigma")] = ContactLimits.sigmas
     """The same in standard deviations of the finger's noise."""
     false_alarms: Annotated[float, Field(ge=0.001, le=0.3), unit()] = GateLimits.false_alarms
-    """Share of the time in which a settled hand that holds may count as moving. With a smaller
-    share more slow slides count as still (deploy/JUDGING.md)."""
+    """Share of the time in which a settled hand that holds may count as moving. A smaller share
+    finds fewer slow slides (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
     """True: judge once nothing moves fast, marked `early`, and again once nothing slides slowly."""
     joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), unit("rad/s")] = JointLimits.rad_per_s
@@ -160,7 +158,7 @@ class GateSection(Section):
     change_counts: Annotated[float, Field(ge=10, le=1000), unit("counts")] = (
         GateLimits.change_counts
     )
-    """Mean change of a finger's electrodes that means another grasp."""
+    """Mean change of a finger that means another grasp."""
 
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
@@ -176,7 +174,7 @@ class Publish(Section):
     endpoint: Endpoint | None = None
     """Without it `ipc:///run/graspd/<hand>.ipc`. `tcp://` needs `[curve]`, except on loopback."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000), unit("messages")] = 1000
-    """Most messages that wait for a subscriber; it loses further ones."""
+    """Most messages that wait for a subscriber."""
     tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), unit("1/s")] = 25.0
     """Rate of readings on `tactile.<hand>`; 0: none; the sensor's rate or more: all."""
     file_mode: FileMode | None = None

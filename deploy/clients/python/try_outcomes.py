@@ -1,0 +1,35 @@
+"""Ask about each grasp of deploy/clients/loop.toml, and tell the outcome that you type.
+
+`graspd run deploy/clients/loop.toml`, then `python try_outcomes.py` with any Python that has pyzmq.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from graspd_client import Client, Outcome
+
+VERDICTS, QUESTIONS = "ipc:///tmp/graspd-loop.ipc", "ipc:///tmp/graspd-loop.ask.ipc"
+
+
+def main() -> None:
+    """Ask and tell until the input ends."""
+    with Client(VERDICTS, ask_endpoint=QUESTIONS) as client:
+        while True:
+            verdict = client.may_i_lift(10.0).verdict
+            if verdict.p_slip is None:
+                continue
+            said = f"{verdict.decision}, p_slip {verdict.p_slip:.2f} {verdict.risk}"
+            sys.stdout.write(f"grasp {verdict.grasp}: {said}\n")
+            sys.stdout.write(f"{verdict.outcomes} outcomes told. Did it hold? y/n ")
+            sys.stdout.flush()
+            line = sys.stdin.readline()
+            if not line:
+                return
+            outcome = Outcome.HELD if line.strip() == "y" else Outcome.SLIPPED
+            answer = client.tell(verdict, outcome, "mug")
+            sys.stdout.write("told\n" if answer else f"{answer.why}\n")
+
+
+if __name__ == "__main__":
+    main()
