@@ -6,15 +6,14 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from importlib.metadata import version
 
 import pytest
 import zmq
 
 from graspd.daemon.cli import COMMANDS, LIBRARIES, whole_parser
-from graspd.daemon.commands.arguments import Parser
 from tests.conftest import ROOT
+from tests.daemon.commands.shell_files import parsers
 from tests.daemon.processes import GRASPD, graspd
 
 EXTRAS = (
@@ -33,12 +32,6 @@ class Missing:
 sys.meta_path.insert(0, Missing())
 from graspd.daemon.cli import main
 """
-
-
-def parsers(parser: Parser) -> Iterator[Parser]:
-    yield parser
-    for command in parser.subparsers.values():
-        yield from parsers(command)
 
 
 def test_the_help_of_every_command_needs_no_extra() -> None:

@@ -147,23 +147,6 @@ def test_there_are_descriptors_for_all_peers_and_none_is_given_up(
     assert limits == taken
 
 
-def test_a_missing_extra_is_asked_for_from_the_source_and_from_no_index() -> None:
-    code = (
-        "import sys, importlib.abc\n"
-        "class Absent(importlib.abc.MetaPathFinder):\n"
-        "    def find_spec(self, name, path, target=None):\n"
-        "        if name.split('.')[0] == 'sklearn':\n"
-        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
-        "sys.meta_path.insert(0, Absent())"
-    )
-    result = python(code, "train", "cnn1", "--data", "absent")
-    assert result.returncode == 2
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("graspd: train needs the package 'sklearn'")
-    assert "pip install '.[train]'" in line
-    assert "graspd[" not in line
-
-
 def redirected(redirection: str, *arguments: object, **environment: str) -> tuple[int, str, str]:
     """Exit code, output and errors of a command run by a shell."""
     result = subprocess.run(
