@@ -14,6 +14,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.extras import needs
 from graspd.daemon.record.header import RecordingHeader
 from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.trust import encode as encode_trust
 from graspd.models.runtime import TactileModel
 
@@ -23,20 +24,21 @@ if TYPE_CHECKING:
 
 
 def build_recorder(
-    scene: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
-) -> Recorder | None:
-    """Start the recorder; None without `[record]`. Raises `SceneError` without `mcap`."""
-    directory = scene.record_directory
-    if scene.record is None or directory is None:
-        return None
+    scene: Scene,
+    options: Record,
+    model: TactileModel,
+    pipeline: Pipeline,
+    boot_id: str,
+    tap: Tap | None,
+) -> Recorder:
+    """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
     try:
         from graspd.daemon.record.files import Retention
         from graspd.daemon.record.recorder import Recorder
     except ModuleNotFoundError as error:
         raise SceneError(needs("[record]", "record", error)) from error
-    options = scene.record
     retention = Retention(
-        directory,
+        options.folder,
         scene.hand.name,
         boot_id,
         keep_files=options.keep_files,
