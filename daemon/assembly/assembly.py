@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -201,16 +201,15 @@ def joint_limits(scene: Scene) -> JointLimits | None:
     )
 
 
-def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:
+def build_drivers(scene: Scene) -> list[Driver]:
     """Make the drivers, not open yet, the tactile one first. Raises `SceneError`."""
     with _section("tactile"):
-        drivers = [_tactile(scene, clock)]
+        drivers = [_tactile(scene)]
     if isinstance(scene.joints, StreamJoints):
         from graspd.drivers.joints.driver import JointStreamDriver
 
         with _section("joints"):
-            source, only_from = scene.joints.source, scene.joints.only_from
-            drivers.append(JointStreamDriver(source, only_from=only_from, clock=clock))
+            drivers.append(JointStreamDriver(scene.joints.source, only_from=scene.joints.only_from))
     return drivers
 
 
@@ -232,29 +231,27 @@ def _section(name: str) -> Iterator[None]:
         raise SceneError(f"[{name}] {error}") from error
 
 
-def _tactile(scene: Scene, clock: Clock) -> Driver:
+def _tactile(scene: Scene) -> Driver:
     match scene.tactile:
         case ReplayTactile() as options:
-            return _replay(scene, options, clock)
+            return _replay(scene, options)
         case SpiTactile() as options:
             from graspd.drivers.spi.driver import SpiBridgeDriver
 
             arguments = options.model_dump(exclude={"driver"})
-            return SpiBridgeDriver(fingers=scene.hand.fingers, clock=clock, **arguments)
+            return SpiBridgeDriver(fingers=scene.hand.fingers, **arguments)
         case CanTactile() as options:
             from graspd.drivers.can.driver import CanBridgeDriver
 
             arguments = options.model_dump(exclude={"driver"})
-            return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **arguments)
+            return CanBridgeDriver(fingers=scene.hand.fingers, **arguments)
         case PalmTactile() as options:
-            joints = scene.joints
-            calibration = joints.calibration if isinstance(joints, PalmJoints) else None
-            return _palm(options, scene.hand.fingers, calibration, clock)
+            return _palm(scene, options)
 
 
-def _palm(
-    options: PalmTactile, fingers: Sequence[str], calibration: Path | None, clock: Clock
-) -> Driver:
+def _palm(scene: Scene, options: PalmTactile) -> Driver:
+    joints, fingers = scene.joints, scene.hand.fingers
+    calibration = joints.calibration if isinstance(joints, PalmJoints) else None
     heed = options.heed_finger_bits
     if options.source.startswith("udp://"):
         from graspd.drivers.palm.driver import PalmDriver
@@ -265,18 +262,17 @@ def _palm(
             calibration=calibration,
             only_from=options.only_from,
             heed_finger_bits=heed,
-            clock=clock,
         )
     from graspd.drivers.recordings.palm_file import PalmFile
 
-    return PalmFile(
-        Path(options.source), fingers, calibration=calibration, heed_finger_bits=heed, clock=clock
-    )
+    path = Path(options.source)
+    return PalmFile(path, fingers, calibration=calibration, heed_finger_bits=heed)
 
 
-def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
+def _replay(scene: Scene, options: ReplayTactile) -> Driver:
+    speed = options.speed if options.pace == "realtime" else None
     if is_mcap(options):
-        return _replay_mcap(scene, options, clock)
+        return _replay_mcap(scene, options, speed)
     from graspd.drivers.recordings.csv_player import ReplayDriver
     from graspd.drivers.recordings.csv_rows import SLIPPED
     from graspd.drivers.recordings.faults import ReplayFaults
@@ -286,21 +282,19 @@ def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     return ReplayDriver(
         options.recordings,
         scene.hand.fingers,
-        speed=options.speed if options.pace == "realtime" else None,
+        speed=speed,
         rate_hz=options.rate_hz,
         loop=options.loop,
         strict=options.strict,
         faults=ReplayFaults(**options.faults.model_dump()),
-        clock=clock,
     )
 
 
-def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
+def _replay_mcap(scene: Scene, options: ReplayTactile, speed: float | None) -> Driver:
     if options.loop or options.strict or options.faults != ReplayFaultsSection():
         raise ValueError("MCAP files are replayed as they are: no loop, strict or faults")
     if options.outcomes:
         raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
     from graspd.daemon.record.player import McapReplayDriver
 
-    speed = options.speed if options.pace == "realtime" else None
-    return McapReplayDriver(options.recordings, scene.hand.fingers, speed=speed, clock=clock)
+    return McapReplayDriver(options.recordings, scene.hand.fingers, speed=speed)

@@ -121,18 +121,17 @@ class Assembly:
 
     def record(self) -> None:
         """Record if the scene asks for it. Call after `keep_session`. Raises `SceneError`."""
-        parts = self._parts
-        if parts.scene.record is None:
+        parts, options = self._parts, self._parts.scene.record
+        if options is None:
             return
         from graspd.daemon.assembly.recorder import build_recorder
 
         recorder = build_recorder(
-            parts.scene, parts.model, parts.pipeline, self._boot_id, self._tap
+            parts.scene, options, parts.model, parts.pipeline, self._boot_id, self._tap
         )
-        if recorder is not None:
-            self._stack.callback(recorder.close)
-            self._outputs.append(recorder)
-            self.companions.append(recorder)
+        self._stack.callback(recorder.close)
+        self._outputs.append(recorder)
+        self.companions.append(recorder)
 
     def build_outbox(self) -> Outbox:
         hand, model = self._parts.scene.hand, self._parts.model

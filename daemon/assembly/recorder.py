@@ -13,6 +13,7 @@ from graspd.daemon.judge.memory import encode, remember
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.record.header import RecordingHeader
 from graspd.daemon.scene import Scene
+from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.trust import encode as encode_trust
 from graspd.models.runtime import TactileModel
 
@@ -22,19 +23,20 @@ if TYPE_CHECKING:
 
 
 def build_recorder(
-    scene: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
-) -> Recorder | None:
-    """Start the recorder; None without `[record]`. Raises `SceneError` without `mcap`."""
-    directory = scene.record_directory
-    if scene.record is None or directory is None:
-        return None
+    scene: Scene,
+    options: Record,
+    model: TactileModel,
+    pipeline: Pipeline,
+    boot_id: str,
+    tap: Tap | None,
+) -> Recorder:
+    """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
     assembly.require_mcap("[record]")
     from graspd.daemon.record.files import Retention
     from graspd.daemon.record.recorder import Recorder
 
-    options = scene.record
     retention = Retention(
-        directory,
+        options.folder,
         scene.hand.name,
         boot_id,
         keep_files=options.keep_files,

@@ -236,9 +236,9 @@ def _what_is_in(
 
 
 def _record(wanted: Record) -> str:
-    where = wanted.directory or "/var/lib/graspd/record"
     raw = ", and what came over the link" if wanted.raw else ""
-    return f"in {where}, at most {wanted.keep_mb:g} MB, flushed every {wanted.flush_ms:g} ms{raw}"
+    limits = f"at most {wanted.keep_mb:g} MB, flushed every {wanted.flush_ms:g} ms"
+    return f"in {wanted.folder}, {limits}{raw}"
 
 
 def _realtime(wanted: Realtime) -> str:

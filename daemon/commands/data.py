@@ -6,12 +6,8 @@ import argparse
 import hashlib
 import http.client
 import shlex
-import signal
 import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.process.text import complain, printable, write_lines
@@ -21,8 +17,6 @@ MAX_BYTES = 16 * 2**20
 """Longest answer that is read. No file of the set has more than 1 MB."""
 TIMEOUT_S = 30.0
 """Longest silence of a server, s."""
-FETCH_MAX_S = 120.0
-"""Longest time for a whole file, s."""
 MESSAGE_MAX = 320
 """Longest error, characters: it may quote what the server sent."""
 
@@ -70,7 +64,7 @@ def _get(args: argparse.Namespace, file: TableFile) -> str:
             raise DataError(f"{target}: is there and is no regular file")
         if _digest(_read(target)) == file.sha256:
             return f"{target}: is there"
-    content = _from_folder(args.folder, file) if args.folder else fetch(args.url, file)
+    content = _from_folder(args.folder, file) if args.folder else _fetch(args.url, file)
     write_atomically(target, content, mode=0o644)
     return f"{target}: {file.rows} grasps"
 
@@ -86,34 +80,17 @@ def _from_folder(folder: Path, file: TableFile) -> bytes:
     raise DataError(f"{folder}: has neither {' nor '.join(names)}{hint}")
 
 
-def fetch(base: str, file: TableFile, limit_s: float = FETCH_MAX_S) -> bytes:
-    """Return the file, checked. Call it in the main thread. Raises `DataError`."""
+def _fetch(base: str, file: TableFile) -> bytes:
     address = f"{base.rstrip('/')}/{file.upstream_name}"
     if not address.startswith(("https://", "http://")):
         raise DataError(f"{address}: only http and https addresses can be fetched")
     try:
-        with _at_most(limit_s), urllib.request.urlopen(address, timeout=TIMEOUT_S) as answer:
+        with urllib.request.urlopen(address, timeout=TIMEOUT_S) as answer:
             content: bytes = answer.read(MAX_BYTES)
     except (OSError, http.client.HTTPException, ValueError) as error:
         why = printable(str(error) or type(error).__name__, MESSAGE_MAX)
         raise DataError(f"{address}: {why}; or copy the files and use --from DIR") from error
     return _checked(content, file, address)
-
-
-@contextmanager
-def _at_most(limit_s: float) -> Iterator[None]:
-    """Raise `TimeoutError` after `limit_s`: the timeout of a socket restarts with every byte."""
-
-    def give_up(_number: int, _frame: FrameType | None) -> None:
-        raise TimeoutError(f"took longer than {limit_s:g} s")
-
-    former = signal.signal(signal.SIGALRM, give_up)
-    left_s, interval_s = signal.setitimer(signal.ITIMER_REAL, limit_s)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, left_s, interval_s)
-        signal.signal(signal.SIGALRM, former)
 
 
 def _read(path: Path) -> bytes:

@@ -134,7 +134,7 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
         return {}
 
 
-def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
+def file_holders(path: str | Path) -> list[Process]:
     """Return other processes that have locked a file, or else have it open, if /proc may be read.
     The program that made a pseudo-terminal has it open, too, and is left out."""
     try:
@@ -144,35 +144,35 @@ def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
     device = f"{os.major(there.st_dev):02x}:{os.minor(there.st_dev):02x}:{there.st_ino}"
     locked = set()
     with suppress(OSError):
-        for line in (proc / "locks").read_text().splitlines():
+        for line in (PROC / "locks").read_text().splitlines():
             words = line.split()  # 1: FLOCK ADVISORY WRITE 123 00:1a:3 0 EOF
             if len(words) > 5 and words[5] == device:
                 locked.add(int(words[4]))
     own = {os.getpid()}
-    holders = locked - own or _with_open({_identity(there)}, proc) - own
+    holders = locked - own or _with_open({_identity(there)}) - own
     if holders and stat.S_ISCHR(there.st_mode):
         with suppress(OSError):
-            holders -= _with_open({_identity(os.stat(TERMINAL_MAKER))}, proc)
-    return _processes(holders, proc)
+            holders -= _with_open({_identity(os.stat(TERMINAL_MAKER))})
+    return _processes(holders)
 
 
-def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
+def port_holders(protocol: str, port: int) -> list[Process]:
     """Return other processes that listen on a `udp` or `tcp` port, if /proc may be read."""
     inodes = set()
     for table in (protocol, f"{protocol}6"):
         with suppress(OSError):
-            for line in (proc / "net" / table).read_text().splitlines()[1:]:
+            for line in (PROC / "net" / table).read_text().splitlines()[1:]:
                 words = line.split()
                 is_mine = int(words[1].rpartition(":")[2], 16) == port
                 if is_mine and words[3] in LISTENING[protocol]:
                     inodes.add(int(words[9]))
-    return _processes(_with_open(inodes, proc), proc)
+    return _processes(_with_open(inodes))
 
 
-def _with_open(files: Collection[object], proc: Path) -> set[int]:
+def _with_open(files: Collection[object]) -> set[int]:
     """Return processes with one of these files (device, inode) or sockets (inode) open."""
     pids = set()
-    for descriptor in proc.glob("[0-9]*/fd/*"):
+    for descriptor in PROC.glob("[0-9]*/fd/*"):
         with suppress(OSError):
             opened = descriptor.stat()
             is_socket = stat.S_ISSOCK(opened.st_mode)
@@ -185,11 +185,11 @@ def _identity(file: os.stat_result) -> tuple[int, int]:
     return file.st_dev, file.st_ino
 
 
-def _processes(pids: Collection[int], proc: Path) -> list[Process]:
+def _processes(pids: Collection[int]) -> list[Process]:
     processes = []
     for pid in sorted(set(pids) - {os.getpid()}):
         with suppress(OSError):
-            command = (proc / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ")
+            command = (PROC / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ")
             text = command.decode(errors="replace").strip()
             processes.append(Process(pid, text[:COMMAND_MAX] or "(unnamed)"))
     return processes

@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from enum import IntEnum
-from typing import TextIO
 
 from graspd.daemon.process.logs import JOURNAL_ERROR, is_journal
 
@@ -24,10 +23,9 @@ class Colour(IntEnum):
     YELLOW = 33
 
 
-def coloured(text: str, colour: Colour, stream: TextIO | None = None) -> str:
-    """Return coloured text if the stream shows colours (https://no-color.org)."""
-    stream = sys.stdout if stream is None else stream
-    if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+def coloured(text: str, colour: Colour) -> str:
+    """Return coloured text if stdout shows colours (https://no-color.org)."""
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
     return f"\x1b[{colour.value}m{text}\x1b[0m"
 

@@ -6,7 +6,6 @@ import contextlib
 import os
 import re
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -27,11 +26,10 @@ class Retention:
     """Most recordings of the hand; a link log belongs to its recording."""
     keep_bytes: int
     """Largest size of all files of the hand, bytes."""
-    wall_clock: Callable[[], int] = time.time_ns
 
     def path(self, file: int, ending: str) -> Path:
         """Return the path of the run's file number `file`; names sort by time."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.wall_clock() // 1_000_000_000))
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
         return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{file:04}{ending}"
 
     def make_room(self, expected_bytes: int) -> int:

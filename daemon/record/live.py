@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from typing import Final, Self
 
 import foxglove
@@ -26,9 +25,8 @@ CHANNELS_MAX: Final = 128
 class LiveServer:
     """A WebSocket server for viewers; the library runs it in threads."""
 
-    def __init__(self, port: int, wall_clock: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, port: int) -> None:
         """Serve on `port`; 0: any free one. Raises `RuntimeError` if it is in use."""
-        self._wall_clock = wall_clock
         # Logging through Python, its threads could wait for one that waits for their lock.
         foxglove.set_log_level(logging.CRITICAL)
         self._context = foxglove.Context()
@@ -56,7 +54,7 @@ class LiveServer:
             message = msgspec.json.decode(payload)
         except msgspec.DecodeError:
             return
-        now_ns = self._wall_clock()
+        now_ns = time.time_ns()
         self._log(kind, hand, msgspec.json.encode(flat(message)), now_ns)
         if hand not in self._viewers:
             if len(self._viewers) >= CHANNELS_MAX:

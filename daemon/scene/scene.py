@@ -240,6 +240,11 @@ class Record(Section):
     raw: bool = False
     """True: also record the link: CAN frames (candump text) or serial bytes."""
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the files, with the default."""
+        return self.directory or STATE_DIRECTORY / "record"
+
 
 class Scene(Section):
     """The whole scene file."""
@@ -337,13 +342,6 @@ class Scene(Section):
     def session_path(self) -> Path:
         """File of the session, also if none is kept."""
         return self.session.file or STATE_DIRECTORY / f"{self.hand.name}.session.json"
-
-    @property
-    def record_directory(self) -> Path | None:
-        """Folder of the recordings; None: the scene does not record."""
-        if self.record is None:
-            return None
-        return self.record.directory or STATE_DIRECTORY / "record"
 
     @property
     def keeps_session(self) -> bool:

@@ -15,8 +15,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.scene import Scene, parse
-from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
-from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.models.contract import ModelError
 from tests.daemon.fakes import Clock, reading
 
@@ -61,30 +60,6 @@ def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
     assert judgement.decision is (Decision.SLIP if threshold < 0.5 else Decision.STABLE)
     clock.now_ns += 2_000_000
     assert pipeline.judge(reading(clock() - 1_500_000)).decision is Decision.UNKNOWN
-
-
-def test_the_rate_and_the_faults_of_the_scene_arrive_at_the_replay() -> None:
-    tactile = REPLAY | {"rate_hz": 20.0, "speed": 2.0, "faults": {"slow_every": 7}}
-    scene = parse({"tactile": tactile}, Path("scene.toml"))
-    clock = Clock()
-    (driver,) = assembly.build_drivers(scene, clock)
-    assert isinstance(driver, ReplayDriver)
-    driver.open()
-    times_ns = []
-    for _ in range(15):
-        clock.now_ns = max(clock.now_ns, driver.due_ns() or 0)
-        times_ns += [found.t_ns for found in driver.read_ready()]
-    driver.close()
-    assert driver.period_ns == 25_000_000
-    assert [time_ns - times_ns[0] for time_ns in times_ns] == [0, 175_000_000, 350_000_000]
-
-
-def test_the_port_of_the_scene_arrives_at_the_bridge() -> None:
-    tactile = {"driver": "spi", "port": "/dev/serial/by-id/mine", "sensors": ["th", "mf", "ff"]}
-    scene = parse({"tactile": tactile}, Path("scene.toml"))
-    (driver,) = assembly.build_drivers(scene)
-    assert isinstance(driver, SpiBridgeDriver)
-    assert driver.describe()["port"].text == "/dev/serial/by-id/mine"
 
 
 SPI: dict[str, Any] = {"driver": "spi", "port": "/nowhere"}

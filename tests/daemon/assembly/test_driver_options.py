@@ -12,6 +12,7 @@ from graspd.daemon.scene import Scene, SceneError, parse
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
 from graspd.drivers.palm.calibration import CalibrationError
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.faults import ReplayFaults
 from tests.daemon.fakes import Clock, FakeDriver
 
 
@@ -22,40 +23,49 @@ def scene(tactile: dict[str, Any], **sections: dict[str, Any]) -> Scene:
 class Constructed:
     """Takes a driver's place and keeps the arguments."""
 
-    def __init__(self, *positional: object, **named: object) -> None:
-        self.positional, self.named = positional, named
-
-
-def made(monkeypatch: pytest.MonkeyPatch, driver: str, wanted: Scene) -> dict[str, object]:
-    monkeypatch.setattr(driver, Constructed)
-    (constructed,) = assembly.build_drivers(wanted)
-    assert isinstance(constructed, Constructed)
-    return constructed.named
+    def __init__(self, *_positional: object, **named: object) -> None:
+        self.named = named
 
 
 PALM = {"driver": "palm", "source": "udp://127.0.0.1:5555"}
+REPLAY = {"driver": "replay", "recordings": [str(DEMO_TABLE)], "rate_hz": 20.0}
+BEHIND = ("th", "ff", "mf")
 
 
 @pytest.mark.parametrize(
-    ("keys", "address", "heeded"),
+    ("driver", "tactile", "told"),
     [
-        ({}, None, True),
-        ({"only_from": "10.0.0.2", "heed_finger_bits": False}, "10.0.0.2", False),
+        ("palm.driver.PalmDriver", PALM, {"only_from": None, "heed_finger_bits": True}),
+        (
+            "palm.driver.PalmDriver",
+            PALM | {"only_from": "10.0.0.2", "heed_finger_bits": False},
+            {"only_from": "10.0.0.2", "heed_finger_bits": False},
+        ),
+        (
+            "can.driver.CanBridgeDriver",
+            {"driver": "can", "sensors": BEHIND},
+            {"sensors": BEHIND, "fingers": ("ff", "mf", "th")},
+        ),
+        (
+            "spi.driver.SpiBridgeDriver",
+            {"driver": "spi", "port": "/dev/serial/by-id/mine", "sensors": BEHIND},
+            {"port": "/dev/serial/by-id/mine", "sensors": BEHIND},
+        ),
+        (
+            "recordings.csv_player.ReplayDriver",
+            REPLAY | {"speed": 2.0, "faults": {"slow_every": 7}},
+            {"rate_hz": 20.0, "speed": 2.0, "faults": ReplayFaults(slow_every=7)},
+        ),
+        ("recordings.csv_player.ReplayDriver", REPLAY | {"pace": "fast"}, {"speed": None}),
     ],
 )
-def test_the_palm_is_told_whom_to_hear_and_what_to_heed(
-    monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], address: str | None, heeded: bool
+def test_a_driver_is_told_what_the_scene_says(
+    monkeypatch: pytest.MonkeyPatch, driver: str, tactile: dict[str, Any], told: dict[str, Any]
 ) -> None:
-    named = made(monkeypatch, "graspd.drivers.palm.driver.PalmDriver", scene(PALM | keys))
-    assert named["only_from"] == address
-    assert named["heed_finger_bits"] is heeded
-
-
-def test_the_can_bridge_is_told_the_order_of_its_sensors(monkeypatch: pytest.MonkeyPatch) -> None:
-    wanted = scene({"driver": "can", "sensors": ["th", "ff", "mf"]})
-    named = made(monkeypatch, "graspd.drivers.can.driver.CanBridgeDriver", wanted)
-    assert named["sensors"] == ("th", "ff", "mf")
-    assert named["fingers"] == ("ff", "mf", "th")
+    monkeypatch.setattr(f"graspd.drivers.{driver}", Constructed)
+    (constructed,) = assembly.build_drivers(scene(tactile))
+    assert isinstance(constructed, Constructed)
+    assert constructed.named | told == constructed.named
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import os
 import shlex
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any
 
 import pytest
 
-from graspd.daemon.commands.data import DataError, fetch
 from graspd.models.bts3 import TABLES
 from tests.kit.inside import graspd
 
@@ -138,24 +136,6 @@ def test_an_address_that_is_none_is_one_line(tmp_path: Path, address: str) -> No
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
     assert line.startswith("graspd: http:/")
-
-
-@pytest.mark.parametrize("head", [HEAD, HEAD + b"Content-Length: 1000\r\n\r\n"])
-def test_a_server_that_drips_is_given_up(head: bytes) -> None:
-    def drip(client: socket.socket) -> None:
-        client.sendall(head)
-        try:
-            for _ in range(1000):
-                client.sendall(b"a")
-                time.sleep(0.02)
-        except OSError:
-            pass  # given up
-
-    with served(drip) as address:
-        start_s = time.monotonic()
-        with pytest.raises(DataError, match=r"took longer than 0\.3 s; or copy the files"):
-            fetch(address, TABLES[0], limit_s=0.3)
-        assert time.monotonic() - start_s < 5
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])

@@ -142,10 +142,9 @@ class Daemon:
         )
         self.pipeline = assembly.build_pipeline(wanted, model, self._clock)
         self.pipeline.boot_id = BOOT
-        recorder = build_recorder(wanted, model, self.pipeline, BOOT)
-        assert recorder is not None
-        self.recorder = recorder
-        self._outbox = Outbox("right", wanted.hand.fingers, "any", BOOT, [recorder])
+        assert wanted.record is not None
+        self.recorder = build_recorder(wanted, wanted.record, model, self.pipeline, BOOT, None)
+        self._outbox = Outbox("right", wanted.hand.fingers, "any", BOOT, [self.recorder])
 
     def _clock(self) -> int:
         return self._now_ns

@@ -261,11 +261,11 @@ def test_a_wrong_record_section_is_named(tmp_path: Path, text: str, mistake: str
 
 
 def test_recordings_stand_beside_the_scene_or_with_the_state_of_the_service(tmp_path: Path) -> None:
-    head = '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:1"\n'
-    path = tmp_path / "scene.toml"
-    path.write_text(f'{head}[record]\ndirectory = "kept"\n')
-    assert scene.load(path).record_directory == tmp_path / "kept"
-    path.write_text(f"{head}[record]\n")
-    assert scene.load(path).record_directory == Path("/var/lib/graspd/record")
-    path.write_text(head)
-    assert scene.load(path).record_directory is None
+    tactile = {"driver": "palm", "source": "udp://127.0.0.1:1"}
+    for record, folder in (
+        ({"directory": "kept"}, tmp_path / "kept"),
+        ({}, Path("/var/lib/graspd/record")),
+    ):
+        loaded = scene.parse({"tactile": tactile, "record": record}, tmp_path / "scene.toml")
+        assert loaded.record is not None
+        assert loaded.record.folder == folder
