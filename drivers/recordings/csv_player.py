@@ -22,11 +22,11 @@ from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, Repl
 from graspd.drivers.recordings.player import RecordedDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
-"""Table of synthetic grasps, drawn by `graspd.drivers.twins.grasps.synthetic`."""
+"""Table of synthetic grasps. `python -m tests.kit.demos` makes all four demos again."""
 DEMO_DAY = Path(__file__).parent / "demo" / "synthetic_day.csv"
-"""Table of synthetic grasps of sensors that drift, drawn by the same module."""
+"""Table of synthetic grasps of sensors that drift."""
 DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
-"""Stream of whole synthetic grasps, made by `graspd.drivers.twins.grasps.whole_grasps`."""
+"""Stream of whole synthetic grasps."""
 SHOW_RECORDING = Path(__file__).parent / "demo" / "synthetic_show.csv"
 """Stream of synthetic grasps that are each held for two seconds, for people to watch."""
 IGNORED_COLUMNS_LOGGED = 10

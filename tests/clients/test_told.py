@@ -13,9 +13,10 @@ import zmq
 
 from deploy.clients.python.graspd_client import Client, Outcome
 from graspd.drivers.twins.grasps.grasp_script import Durations
-from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from tests.clients.bench import Daemon, until
 from tests.daemon.processes import TIMEOUT_S
+from tests.kit.demos import write_stream
 
 WARM_UP = "[risk]\nmax_slip_when_stable = 0.2\nwarm_up = 50\n"
 """Each grasp is to be lifted under supervision."""

@@ -10,7 +10,8 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
-from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from tests.kit.demos import write_stream
 from tests.system.image import ImageError, run
 from tests.system.lab import GRASPS, RATE_HZ
 

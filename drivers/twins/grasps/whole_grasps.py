@@ -2,25 +2,18 @@
 
 End points are rows of a grasp table, or drawn. The way between them is made up, with measured
 noise. Contact lowers counts, so a plausible end point is not above the rest; see `rest_above`.
-
-`python -m graspd.drivers.twins.grasps.whole_grasps` writes both demo recordings again, byte for
-byte.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count
-from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.drivers.base import COUNT_MAX, ELECTRODES
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
-from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
 from graspd.drivers.twins.grasps import synthetic
 from graspd.drivers.twins.grasps.grasp_script import (
     JOINT_NAMES,
@@ -44,25 +37,6 @@ POSITION_NOISE_RAD = 0.0003
 """Noise (standard deviation) of a joint that stands still, rad."""
 WARM_REST_MAX = COUNT_MAX - 50
 """Highest count after drift; the end of the range would look like a fault."""
-DEMO_GRASPS = 12
-DEMO_DURATIONS = Durations(
-    first_rest_s=(1.2, 1.2),
-    approach_s=(0.25, 0.35),
-    settle_s=(0.6, 0.7),
-    lift_s=(0.35, 0.45),
-    rest_s=(0.15, 0.25),
-)
-"""Phases of the demo, shorter than the default, for a small file."""
-SHOW_GRASPS = 10
-SHOW_DURATIONS = Durations(
-    first_rest_s=(1.2, 1.2),
-    approach_s=(0.25, 0.35),
-    settle_s=(2.0, 2.0),
-    lift_s=(0.35, 0.45),
-    rest_s=(1.0, 1.0),
-)
-"""Held for two seconds, so that a person can read the verdict. In a rest of less than a second the
-gate may lose the resting level of a finger."""
 REST_DRAWS = 1000
 """Number of synthetic grasps whose upper quantile is the rest of synthetic fingers."""
 LOOPED_DRAWS = 200
@@ -243,27 +217,3 @@ def synthetic_grasps(
         loop=loop,
         seed=seed,
     )
-
-
-def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
-    """Write a stream of ff, mf, th; the label is 0 before the first grasp."""
-    electrodes = [name for finger in synthetic.FINGERS for name in electrode_columns(finger)]
-    file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")
-    for row in rows:
-        cells = [f"{row.t_s:.{t_decimals}f}", row.object_name or ""]
-        cells += [str(int(row.slipped or False)), *map(str, row.counts.ravel().tolist())]
-        cells += [f"{angle:.4f}" for angle in row.position_rad.tolist()]
-        file.write(",".join(cells) + "\n")
-
-
-def main(path: Path = DEMO_RECORDING, show: Path = SHOW_RECORDING) -> None:
-    """Write the recordings of the demo: a short one, and one to watch."""
-    stream = synthetic_grasps(DEMO_GRASPS, held=True, durations=DEMO_DURATIONS)
-    watched = synthetic_grasps(SHOW_GRASPS, rate_hz=PALM_RATE_HZ, durations=SHOW_DURATIONS)
-    for grasps, file_path, t_decimals in ((stream, path, 2), (watched, show, 3)):
-        with file_path.open("w", encoding="utf-8", newline="") as file:
-            write_stream(grasps, file, t_decimals)
-
-
-if __name__ == "__main__":
-    main()

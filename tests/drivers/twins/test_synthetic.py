@@ -8,8 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
-from graspd.drivers.twins.grasps import synthetic
+from graspd.drivers.recordings.csv_player import (
+    DEMO_DAY,
+    DEMO_RECORDING,
+    DEMO_TABLE,
+    SHOW_RECORDING,
+)
+from tests.kit import demos
 
 
 def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -20,8 +25,8 @@ def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def test_the_demos_are_made_again_byte_for_byte(tmp_path: Path) -> None:
-    synthetic.main(tmp_path)
-    for demo in (DEMO_TABLE, DEMO_DAY):
+    demos.main(tmp_path)
+    for demo in (DEMO_TABLE, DEMO_DAY, DEMO_RECORDING, SHOW_RECORDING):
         assert (tmp_path / demo.name).read_bytes() == demo.read_bytes()
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING, SHOW_RECORDING
-from graspd.drivers.twins.grasps import whole_grasps
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.whole_grasps import (
     GraspRow,
@@ -18,6 +16,7 @@ from graspd.drivers.twins.grasps.whole_grasps import (
 )
 from tests.drivers.recordings.tables import rows_of
 from tests.drivers.twins.signals import played
+from tests.kit.demos import STREAM_DURATIONS
 
 REST = np.full((3, 24), 3000.0)
 SILENCE = np.zeros((1, 3, 24))
@@ -89,13 +88,6 @@ def test_a_looped_stream_goes_on_with_other_numbers() -> None:
     assert objects == [(1, "thing_0"), (2, "thing_1"), (3, "thing_0"), (4, "thing_1")]
 
 
-def test_the_demo_is_made_again_byte_for_byte(tmp_path: Path) -> None:
-    out, show = tmp_path / "demo.csv", tmp_path / "show.csv"
-    whole_grasps.main(out, show)
-    assert out.read_bytes() == DEMO_RECORDING.read_bytes()
-    assert show.read_bytes() == SHOW_RECORDING.read_bytes()
-
-
 def test_the_demo_is_a_small_stream_of_twelve_synthetic_grasps_half_of_them_slipping() -> None:
     assert DEMO_RECORDING.stat().st_size < 1_200_000
     rows = rows_of(DEMO_RECORDING.read_bytes(), strict=True)
@@ -104,9 +96,7 @@ def test_the_demo_is_a_small_stream_of_twelve_synthetic_grasps_half_of_them_slip
     names = {row.annotation.object_name for row in rows}
     assert all(name is None or name.startswith("synthetic") for name in names)
     assert all(np.isfinite(row.position_rad).all() for row in rows)
-    timetables = list(
-        synthetic_grasps(12, durations=whole_grasps.DEMO_DURATIONS, seed=0).timetables()
-    )
+    timetables = list(synthetic_grasps(12, durations=STREAM_DURATIONS).timetables())
     assert len(timetables) == 12
     assert sum(timetable.slipped for timetable in timetables) == 6
     for timetable in timetables:
