@@ -95,7 +95,10 @@ class Verdict(_Message, frozen=True, kw_only=True):
     risk: RiskReport | None = None
     """Outcomes of `stable` lifts so far; null: without learning and without a risk."""
     early: bool = False
-    """Judged while something might still slide slowly; a surer verdict follows."""
+    """Judged while something might still slide slowly; a surer verdict follows.
+
+    An `unknown` has it only if it is `supervised`.
+    """
     still_ms: Duration | None = None
     """How long the hand has kept still, ms; null with a null `gate`.
 
