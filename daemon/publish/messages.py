@@ -98,7 +98,10 @@ class Verdict(_Message, frozen=True, kw_only=True):
     risk: RiskReport | None = None
     """State of the risk; null: without learning and without a risk."""
     early: bool = False
-    """True: something might still slide slowly; a surer verdict follows."""
+    """True: something might still slide slowly; a surer verdict follows.
+
+    An `unknown` has it only if it is `supervised`.
+    """
     still_ms: Duration | None = None
     """Time for which the hand has kept still, ms; null with a null `gate`.
 

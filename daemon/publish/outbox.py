@@ -199,7 +199,7 @@ class Outbox:
             outcomes=0 if worth is None else worth.outcomes,
             supervised=judgement.supervised,
             risk=None if worth is None else worth.report,
-            early=valid and moment.early,
+            early=(valid or judgement.supervised) and moment.early,
             still_ms=moment.still_ms,
             motion=moment.motion,
             motion_limits=moment.motion_limits,

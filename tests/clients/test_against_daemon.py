@@ -76,6 +76,20 @@ def test_soon_or_sure_is_for_who_lifts_to_choose(tmp_path: Path) -> None:
         assert graspd.counts.malformed == 0
 
 
+def test_a_supervised_grasp_is_never_early(tmp_path: Path) -> None:
+    sections = "[gate]\nearly = true\n[risk]\nmax_slip_when_stable = 0.1\nwarm_up = 50\n"
+    with (
+        Daemon(tmp_path, sections, whole_grasps=True) as daemon,
+        Client(daemon.endpoint) as graspd,
+    ):
+        said = [graspd.wait_for_grasp(30.0, supervised=True) for _ in range(2)]
+        said += [graspd.may_i_lift(30.0, supervised=True).verdict]
+    for verdict in said:
+        assert verdict is not None
+        assert verdict.supervised
+        assert (verdict.still_ms or 0.0) >= 240.0
+
+
 def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: Path) -> None:
     with (
         Daemon(tmp_path) as daemon,

@@ -122,6 +122,7 @@ SUPERVISED: dict[str, tuple[Answer, bool]] = {
     "a number": (told(supervised=1), False),
     "without a risk's bound": (told(risk={"target": 0.05, "lifts": 1, "slips": 0}), False),
     "stable": (of("stable"), False),
+    "early": (told(early=True), False),
 }
 
 
@@ -141,6 +142,18 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
         assert (result.returncode, "\nlift supervised after" in result.stdout) == (not may, may)
         assert not cpp_lifts(lift_gate, places[0], DEADLINE_S, places[2])
         assert not graspd.may_i_lift(DEADLINE_S)
+
+
+def test_a_supervised_lift_waits_until_the_newest_message_is_not_early(
+    lift_gate: Path, tmp_path: Path
+) -> None:
+    places = [f"ipc://{tmp_path}/out", str(DEADLINE_S)]
+    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
+    with false_daemon(tmp_path, told(), "unknown", **more | {"early": True}):
+        with Client(places[0]) as graspd:
+            answer = graspd.may_i_lift(DEADLINE_S, supervised=True)
+            assert (bool(answer), answer.verdict.reasons) == (False, ("not-still",))
+        assert not cpp_lifts(lift_gate, "--supervised", *places)
 
 
 STILL: dict[str, tuple[dict[str, Any], bool, bool]] = {

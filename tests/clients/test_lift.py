@@ -389,11 +389,13 @@ def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     last = newest(world.came)
     assert last is not None
     assert has_been_still(last, still_ms)
+    assert not (answer.supervised and last.early)
     if ask:
         told_so = told(world.asking.answered[-1])
         assert told_so is not None
         assert told_so.teaches == answer.supervised
         assert has_been_still(told_so, still_ms)
+        assert not (answer.supervised and told_so.early)
         assert told_so.verdict == "stable" or answer.supervised
         assert told_so.boot_id == last.boot_id
         assert told_so.grasp == last.grasp

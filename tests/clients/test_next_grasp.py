@@ -49,10 +49,18 @@ def test_a_grasp_that_is_judged_already_is_returned_at_once() -> None:
         assert graspd.wait_for_grasp(0.0) is None
 
 
-def test_what_is_early_is_not_sure() -> None:
-    coming = world(*[("stable", {"early": True})] * 3, ("stable", {"early": False}))
-    with client(coming) as graspd:
-        found = graspd.wait_for_grasp(1.0)
+TEACHES: dict[str, Any] = {"supervised": True, "reasons": ["unproven"], "p_slip_model": None}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "more", "watch"),
+    [("stable", {}, False), ("slip", {}, False), ("unknown", TEACHES, True)],
+    ids=["stable", "slip", "supervised"],
+)
+def test_what_is_early_is_not_sure(outcome: str, more: dict[str, Any], watch: bool) -> None:
+    early = (outcome, more | {"early": True})
+    with client(world(*[early] * 3, (outcome, more | {"early": False}))) as graspd:
+        found = graspd.wait_for_grasp(1.0, supervised=watch)
         assert found is not None
         assert found.seq == 3
 
@@ -105,6 +113,7 @@ def test_in_cpp_each_grasp_is_returned_once(binary: Path, tmp_path: Path) -> Non
         ({"early": True}, 0, "-1"),
         ({"early": False}, 0, "1"),
         ({"supervised": True}, 0, "1"),
+        ({"supervised": True, "early": True}, 1, "-1"),
     ],
 )
 def test_in_cpp_what_is_early_is_not_sure(

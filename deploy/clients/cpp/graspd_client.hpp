@@ -812,10 +812,12 @@ public:
     }
 
 private:
-    // A verdict, unknown if it permits a lift before the hand has been still for so long.
+    // A verdict, unknown if it permits a lift before the hand was still for long enough. A lift
+    // under supervision must not be early; any lift needs `still_ms` of stillness.
     Verdict if_still(Verdict said) const {
-        const bool still = said.still_ms && still_ms_ && *said.still_ms >= *still_ms_;
-        return !still_ms_ || still || !permits(said) ? said : said.unknown({"not-still"});
+        if (!permits(said)) return said;
+        const bool still = !still_ms_ || (said.still_ms && *said.still_ms >= *still_ms_);
+        return still && !(said.supervised && said.early) ? said : said.unknown({"not-still"});
     }
 
     Newest& newest_;
@@ -863,10 +865,10 @@ public:
     // answer and the newest message of the same grasp must both say so; an unknown answer is asked
     // for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
     // person watches: then what graspd wants to learn from (in the warm-up, and now and then after
-    // it) may be lifted too, and the answer says that it is such a lift. With `still_ms` the hand
-    // must have been still for so long as well, and a daemon that does not say so gets a no;
-    // without it, what the daemon calls `stable` is enough, also where it is `early`. Throws
-    // `std::invalid_argument` for a time that is none.
+    // it) may be lifted too if it is not `early`, and the answer says that it is such a lift. With
+    // `still_ms` the hand must have been still for so long as well, and a daemon that does not say
+    // so gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`:
+    // its scene allows that. Throws `std::invalid_argument` for a time that is none.
     LiftAnswer may_i_lift(double deadline_s, bool supervised = false,
                           std::optional<double> still_ms = {}) {
         if (still_ms && !(*still_ms >= 0.0 && *still_ms <= REAL_MAX))
@@ -892,17 +894,17 @@ public:
 
     // The verdict on the next grasp that is surely judged; none if there is none in time.
     //
-    // Waits at most `deadline_s` seconds for a `stable` or a `slip` that is not `early`, of a grasp
-    // that this method has not returned before. With `supervised` it also returns what a person who
-    // watches may lift. It asks nothing: before the lift, ask `may_i_lift`. Throws
+    // Waits at most `deadline_s` seconds for a `stable` or a `slip` of a grasp that this method has
+    // not returned before. With `supervised` it also returns what a person who watches may lift. It
+    // never returns what is `early`. It asks nothing: before the lift, ask `may_i_lift`. Throws
     // `std::invalid_argument` for a time that is none.
     std::optional<Verdict> wait_for_grasp(double deadline_s, bool supervised = false) {
         const Nanoseconds due_ns = detail::now_ns() + duration_ns(deadline_s);
         do {
             const Verdict said = next_verdict(due_ns);
-            const bool is_judged = (said.decision != Decision::unknown && !said.early) ||
-                                   (supervised && said.supervised);
-            if (is_judged && detail::key(said) != returned_) {
+            const bool is_judged =
+                said.decision != Decision::unknown || (supervised && said.supervised);
+            if (is_judged && !said.early && detail::key(said) != returned_) {
                 returned_ = detail::key(said);
                 return said;
             }

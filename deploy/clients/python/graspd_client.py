@@ -359,9 +359,9 @@ class _Hand:
         due_ns = _due_ns("deadline_s", deadline_s)
         while True:
             said = yield from self._verdict(due_ns)
-            is_judged = said.decision != Decision.UNKNOWN and not said.early
+            is_judged = said.decision != Decision.UNKNOWN
             is_judged |= supervised is True and said.supervised
-            if is_judged and _key(said) != self._returned:
+            if is_judged and not said.early and _key(said) != self._returned:
                 self._returned = _key(said)
                 return said
             if self._closed or time.monotonic_ns() >= due_ns:
@@ -531,9 +531,10 @@ class Client(_Hand):
         answer and the newest message of the same grasp must both say so; an unknown answer is asked
         for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
         person watches: then what graspd wants to learn from (in the warm-up, and now and then
-        after it) may be lifted too, and the answer says that it is such a lift. With `still_ms`
-        the hand must have been still for this time as well, ms, and a daemon that does not say so
-        gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
+        after it) may be lifted too if it is not `early`, and the answer says that it is such a
+        lift. With `still_ms` the hand must have been still for this time as well, ms, and a daemon
+        that does not say so gets a no; without it, what the daemon calls `stable` is enough, also
+        where it is `early`: its scene allows that.
         Raises `ValueError` for a time that is none.
         """
         return self._finish(self._may_i_lift(deadline_s, supervised, still_ms))
@@ -541,10 +542,10 @@ class Client(_Hand):
     def wait_for_grasp(self, deadline_s: float, *, supervised: bool = False) -> Verdict | None:
         """The verdict on the next grasp that is surely judged; None if there is none in time.
 
-        Waits at most `deadline_s` seconds for a `stable` or a `slip` that is not `early`, of a
-        grasp that this method has not returned before. With `supervised` it also returns what a
-        person who watches may lift. It asks nothing: before the lift, ask `may_i_lift`. Raises
-        `ValueError` for a time that is none.
+        Waits at most `deadline_s` seconds for a `stable` or a `slip` of a grasp that this method
+        has not returned before. With `supervised` it also returns what a person who watches may
+        lift. It never returns what is `early`. It asks nothing: before the lift, ask `may_i_lift`.
+        Raises `ValueError` for a time that is none.
         """
         return self._finish(self._wait_for_grasp(deadline_s, supervised))
 
@@ -897,11 +898,15 @@ class _Question:
         return replace(said, reasons=tuple(dict.fromkeys([*said.reasons, "no-answer"])))
 
     def _if_still(self, said: Verdict) -> Verdict:
-        """Return a verdict, unknown if it permits a lift before `still_ms` of stillness."""
-        if self._still_ms is None or not self.permits(said):
+        """Return a verdict, unknown if it permits a lift before the hand was still for long enough.
+
+        A lift under supervision must not be early; any lift needs `still_ms` of stillness.
+        """
+        if not self.permits(said):
             return said
-        still = said.still_ms is not None and said.still_ms >= self._still_ms
-        return said if still else said.unknown("not-still")
+        least_ms, is_early = self._still_ms, said.supervised and said.early
+        still = least_ms is None or (said.still_ms is not None and said.still_ms >= least_ms)
+        return said if still and not is_early else said.unknown("not-still")
 
 
 def _reaches(newest: Verdict, answer: Verdict) -> bool:
