@@ -1,4 +1,4 @@
-"""Size and timing of the firmware on the emulated chip; the README of the bridge has some rows.
+"""Size and timing of the firmware on the emulated chip; the README of the bridge has some figures.
 
 `python -m tests.emulated.figures` prints it.
 """
