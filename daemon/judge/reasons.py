@@ -25,7 +25,7 @@ class Decision(StrEnum):
 
 
 class Reason(StrEnum):
-    """Cause of an `unknown` verdict, or of a part that is not well. `ADVICE` says what to do."""
+    """Why a verdict is `unknown`, or a part is not well; `ADVICE` says what to do about each."""
 
     STALE = "stale"
     SENSOR_MISSING = "sensor-missing"
@@ -145,7 +145,7 @@ class GateState(StrEnum):
 
 
 class FingerState(StrEnum):
-    """State of a finger: free, in touch or sliding."""
+    """State of a finger in a word: free, in touch or sliding."""
 
     FREE = "free"
     """It does not touch."""

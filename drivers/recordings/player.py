@@ -111,7 +111,7 @@ class RecordedDriver(Opened, Generic[Item]):
     def hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
         """Return the reading `made`, complete at `at_ns`, moved to now.
 
-        `axis_ns`: zero of `recorded_ns`, on the recording's clock.
+        `axis_ns`: time on the recording's clock that `recorded_ns` counts from.
         """
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import msgspec
 
-from graspd.daemon.publish.messages import MESSAGES, GateMessage, Message, Status, Tactile, Verdict
+from graspd.daemon.publish.messages import MESSAGES, Message, Status, Tactile, Verdict
 
 GOLDEN = Path(__file__).parents[1] / "daemon" / "publish" / "golden"
 
 decode_verdict = msgspec.json.Decoder(Verdict).decode
-decode_gate = msgspec.json.Decoder(GateMessage).decode
 decode_tactile = msgspec.json.Decoder(Tactile).decode
 decode_status = msgspec.json.Decoder(Status).decode
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from graspd.models.training.making.plan import TrainingPlan
 
 MAX_SEED = 2**32 - 1
-"""The largest that scikit-learn takes."""
+"""Largest seed that scikit-learn takes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

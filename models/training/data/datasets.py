@@ -25,7 +25,7 @@ from graspd.models.training.arrays import Bools, Ints
 COUNT_MAX = 4095
 """Largest 12-bit count."""
 MAX_TABLE_BYTES = 64 * 2**20
-"""A larger file is no table of this kind: 2133 grasps take 0.8 MB."""
+"""Largest table that is read, bytes. 2133 grasps take 0.8 MB."""
 QUICK_EVERY = 20
 """A report with `--quick` uses one of this many grasps: enough to see that it runs."""
 FEWEST_GRASPS = 20

@@ -20,8 +20,6 @@ from tests.daemon.judge.fault_bench import network
 MS = 1_000_000
 START_NS = 10**12
 NAMES = ("FFJ1", "FFJ2", "FFJ3")
-HALL_RAD = 0.0006
-"""One count of a Hall sensor."""
 LIMITS = JointLimits()
 
 

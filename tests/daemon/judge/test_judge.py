@@ -38,7 +38,6 @@ OF_AN_ELECTRODE = (
     ElectrodeFault.PARITY,
     ElectrodeFault.ERROR_WORD,
 )
-OF_A_READING = (ElectrodeFault.HELD, ElectrodeFault.CUT_OFF)
 
 
 @pytest.mark.parametrize("fault", OF_AN_ELECTRODE)

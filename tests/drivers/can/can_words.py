@@ -31,10 +31,10 @@ def word(count: int) -> bytes:
     return bytes(int(part + str((part.count("1") + 1) % 2), 2) for part in (high, low))
 
 
-def truth(sweep: int, fingers: int = FINGERS) -> NDArray[np.uint16]:
+def truth(sweep: int) -> NDArray[np.uint16]:
     """Counts, shape (fingers, 24), that no other sweep, finger or electrode has nearby."""
-    flat = 100 + 7 * sweep + np.arange(fingers * 24) * 37
-    return (flat % 4096).astype(np.uint16).reshape(fingers, 24)
+    flat = 100 + 7 * sweep + np.arange(FINGERS * 24) * 37
+    return (flat % 4096).astype(np.uint16).reshape(FINGERS, 24)
 
 
 def words_of(counts: NDArray[np.uint16], channel: int) -> bytes:
@@ -48,10 +48,10 @@ Sample = tuple[int, bytes, int]
 """Channel, words, time in ns."""
 
 
-def samples(sweep: int, sequence: str = "electrodes", start_ns: int = 0) -> list[Sample]:
+def samples(sweep: int, sequence: str = "electrodes") -> list[Sample]:
     """The samples of one sweep, evenly spaced; sweeps follow each other without a gap."""
     channels = SEQUENCES[sequence]
-    at_ns = start_ns + sweep * len(channels) * SLOT_NS
+    at_ns = sweep * len(channels) * SLOT_NS
     counts = truth(sweep)
     return [
         (channel, words_of(counts, channel), at_ns + slot * SLOT_NS)

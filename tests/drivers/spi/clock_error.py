@@ -46,8 +46,8 @@ def tick_of(host_ns: int, way: Way) -> int:
     return int((host_ns - START_NS) * (1.0 + way.drift_ppm * 1e-6) * TICK_HZ // S)
 
 
-def events(way: Way, duration_s: float, rate_hz: float = 100.0) -> Iterator[Event]:
-    """Sweeps and PINGs (eight at the start, then one per second) in order of arrival."""
+def events(way: Way, duration_s: float) -> Iterator[Event]:
+    """Sweeps at 100 Hz and PINGs (eight at the start, then one per second) in order of arrival."""
     rng = random.Random(way.seed)
 
     def delay_ns() -> int:
@@ -59,8 +59,8 @@ def events(way: Way, duration_s: float, rate_hz: float = 100.0) -> Iterator[Even
         return ready_ns if not batch_ns else -(-ready_ns // batch_ns) * batch_ns
 
     made = []
-    for k in range(round(duration_s * rate_hz)):
-        made_ns = START_NS + S + round(k * S / rate_hz)
+    for k in range(round(duration_s * 100)):
+        made_ns = START_NS + S + k * S // 100
         made.append(Event(made_ns, tick_of(made_ns, way), arrival_ns(made_ns)))
     sends_s = [0.05 * k for k in range(8)] + [1.0 + k for k in range(math.floor(duration_s))]
     for send_s in sends_s:

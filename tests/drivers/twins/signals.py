@@ -38,13 +38,12 @@ PALM_STALE_ROWS = 2
 class GeneratedContact:
     """An endless, synthetic contact: rest, a touch that comes and goes, and the measured noise."""
 
-    def __init__(self, fingers: int = 3, rate_hz: float = 100.0, seed: int = 0) -> None:
-        """`rate_hz` is how many readings make a second; the same seed gives the same counts."""
+    def __init__(self, fingers: int = 3, seed: int = 0) -> None:
+        """Readings are at 100 Hz; the same seed gives the same counts."""
         self._random = np.random.default_rng(seed)
         shape = (fingers, ELECTRODES)
         self._rest = self._random.uniform(*UNTOUCHED_COUNTS, shape)
         self._yielding = self._random.uniform(0.0, CONTACT_COUNTS, shape)
-        self._period_s = 1.0 / rate_hz
         self._t_s = 0.0
 
     def __iter__(self) -> Iterator[Counts]:
@@ -56,7 +55,7 @@ class GeneratedContact:
         counts = counts + self._random.normal(0.0, NOISE_COUNTS, counts.shape)
         spiked = self._random.random(counts.shape) < SPIKE_PROBABILITY
         counts = counts - spiked * self._random.uniform(*SPIKE_COUNTS, counts.shape)
-        self._t_s += self._period_s
+        self._t_s += 0.01
         readable: Counts = np.clip(np.rint(counts), 1, COUNT_MAX - 1).astype(np.uint16)
         return readable
 

@@ -8,30 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.daemon.assembly.assembly import build_pipeline, load_model
-from graspd.daemon.scene import parse
-from graspd.drivers.base import TactileReading
+from graspd.models.runtime import TactileModel
 from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.jobs import Job
 from graspd.models.training.making.make_model import make_model
 from graspd.models.training.making.plan import TrainingPlan
 from graspd.models.training.systems.registry import SYSTEMS
 from graspd.models.training.systems.system import digest, with_recipes
+from tests.daemon.judge.test_fewer_fingers import HANDS
 from tests.models.training.samples import sessions
-
-FORMS = {
-    "small-session-ff": ("ff",),
-    "small-session-mf": ("mf",),
-    "small-session-th": ("th",),
-    "small-session-ff-mf": ("ff", "mf"),
-    "small-session-ff-th": ("ff", "th"),
-    "small-session-mf-th": ("mf", "th"),
-}
 
 
 def test_there_is_a_form_of_the_default_system_for_every_smaller_hand() -> None:
     whole = SYSTEMS["small-session"]
-    for name, fingers in FORMS.items():
+    for name, fingers in HANDS.items():
         system = SYSTEMS[name]
         assert system.fingers == fingers
         assert digest(system) != digest(whole)
@@ -58,33 +48,16 @@ def test_what_the_other_fingers_feel_changes_nothing() -> None:
     for name, margins in one.margins.items():
         np.testing.assert_array_equal(margins, two.margins[name])
 
-    assert (
-        one.parameters
-        < jobs.run(
-            Job(with_recipes(SYSTEMS["small-session"], epochs=1), "cv", 0, 0, 3), grasps
-        ).parameters
-    )
+    whole = Job(with_recipes(SYSTEMS["small-session"], epochs=1), "cv", 0, 0, 3)
+    assert one.parameters < jobs.run(whole, grasps).parameters
 
 
-def test_a_model_of_two_fingers_judges_a_hand_of_two(tmp_path: Path) -> None:
+def test_a_model_of_two_fingers_takes_the_features_of_two(tmp_path: Path) -> None:
     grasps = sessions(200)
     system = with_recipes(SYSTEMS["small-session-ff-th"], epochs=1)
     make_model(
         TrainingPlan(system, 3, 0, only="cv"), grasps, tmp_path, tmp_path / "jobs", lambda: None
     )
-    scene = parse(
-        {
-            "hand": {"fingers": ["ff", "th"]},
-            "tactile": {"driver": "replay", "recordings": ["/nowhere.csv"]},
-            "model": {"path": str(tmp_path / "small-session-ff-th.onnx")},
-            "gate": {"mode": "every"},
-        },
-        tmp_path / "scene.toml",
-    )
-    model = load_model(scene)
+    model = TactileModel(tmp_path / "small-session-ff-th.onnx")
     assert model.contract.fingers == ("ff", "th")
     assert model.input.shape == (2 * 26,)
-    pipeline = build_pipeline(scene, model, lambda: 10**9)
-    counts = grasps.counts[:1, [0, 2]][0]
-    judgement = pipeline.judge(TactileReading(10**9, 0, counts, np.zeros((2, 24), dtype=np.uint8)))
-    assert judgement.moment.grasp == 1
