@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.tables import Tables
 from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
 from graspd.daemon.judge.network import Network, Opinion, Plausibility
-from graspd.daemon.scene.scene import Hand
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import COUNT_MAX, ELECTRODES, JointReading
 from graspd.drivers.recordings.csv_rows import electrode_columns
@@ -31,6 +30,7 @@ from graspd.models.electrodes import Electrodes
 if TYPE_CHECKING:
     import pandas as pd
 
+    from graspd.daemon.assembly.recordings import RecordedRun
     from graspd.daemon.judge.calibration import Calibration
     from graspd.daemon.publish.messages import Verdict
     from graspd.models.contract import Finger
@@ -176,25 +176,16 @@ def judge(
 
 
 def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
+    source: Tables | RecordedRun = Tables(paths, {})
     if assembly.MCAP in {path.suffix for path in paths}:
         assembly.require_mcap("judging MCAP")
         from graspd.daemon.assembly.recordings import RecordedRun
 
-        run = RecordedRun(paths)
-        recorded = run.scene({}, model, None)
-        parts = run.parts(recorded, assembly.load_model(recorded), None)
-        run.restore(parts.pipeline)
-        return parts
-    sections = {
-        "tactile": {"driver": "replay", "recordings": [path.absolute() for path in paths]},
-        "model": model,
-        "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS},
-    }
-    sections["tactile"]["pace"] = "fast"
-    wanted = scene.parse(sections, Path("graspd.judge"))
-    loaded = assembly.load_model(wanted)
-    hand = Hand(fingers=loaded.contract.fingers)
-    return Parts.of(wanted.model_copy(update={"hand": hand}), loaded)
+        source = RecordedRun(paths)
+    scene = source.scene({}, model, None)
+    parts = source.parts(scene, assembly.load_model(scene), None)
+    source.restore(parts.pipeline)
+    return parts
 
 
 def _path(model: str | os.PathLike[str], fingers: Sequence[Finger] = ()) -> Path:

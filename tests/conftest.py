@@ -67,6 +67,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of `graspd report stability`, which runs `tests/stability`."""
     parser.addoption("--model", action="append", default=[], help="a model to compare (all)")
     parser.addoption("--data", type=Path, help="folder of the real grasps")
+    parser.addoption("--rows", choices=("markdown", "json"), help="print what was measured")
     parser.addoption("--outcomes", type=int, default=10_000, help="that the learner is told")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.assembly.tables import changed
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
@@ -65,20 +66,6 @@ class LinkLogs:
 
     def tell(self, companion: Companion) -> None:
         """Do nothing: a link log has no outcomes."""
-
-
-def changed(
-    sections: dict[str, dict[str, Any]],
-    publish: dict[str, Any],
-    model: dict[str, Any],
-    mode: str | None,
-) -> dict[str, dict[str, Any]]:
-    """Return `sections` with these values instead; the model's thresholds stay."""
-    former = sections.get("model", {})
-    if model:
-        former = {key: value for key, value in former.items() if key not in ("name", "path")}
-    gate = sections.get("gate", {}) | ({} if mode is None else {"mode": mode})
-    return {**sections, "model": former | model, "gate": gate, "publish": publish}
 
 
 def _driver(replayed: Scene, paths: Sequence[Path], speed: float | None) -> LinkLogDriver[Any]:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.link_logs import changed
 from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.assembly.tables import changed
 from graspd.daemon.judge.memory import recall
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion

@@ -10,9 +10,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.tables import Tables
 from graspd.daemon.commands.arguments import positive, within
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
@@ -26,9 +26,8 @@ from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.run.printer import Printer
 from graspd.daemon.run.replaying import Comparison, Controller, trained_on
 from graspd.daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSummary, trained_on_line
-from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
-from graspd.daemon.scene.scene import Hand
 from graspd.daemon.session import file as session_file
 from graspd.daemon.session.file import SessionFileError
 from graspd.drivers.base import DriverError, RecordingError
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from graspd.daemon.assembly.link_logs import LinkLogs
     from graspd.daemon.assembly.recordings import RecordedRun
 
-Source: TypeAlias = "_Tables | LinkLogs | RecordedRun"
+Source: TypeAlias = "Tables | LinkLogs | RecordedRun"
 """Source of recorded readings. Recordings of graspd contain the scene that judged them."""
 
 WAIT_MAX_S = 3600
@@ -194,7 +193,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         told: list[Companion] = [shown]
     else:
         shown = Printer(as_json=args.json)
-        if isinstance(source, _Tables):
+        if isinstance(source, Tables):
             shown.result.trained_on = trained_on(args.recordings, model)
         told = [shown, *_comparisons(args, source, parts, shown.result)]
     controller = Controller(only_lifted=args.only_lifted)
@@ -202,7 +201,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         told.append(controller)
     source.tell(shown)
     timing = LoopTiming(
-        parts.scene.max_age_ns if isinstance(source, _Tables) else assembly.NO_SILENCE_NS,
+        parts.scene.max_age_ns if isinstance(source, Tables) else assembly.NO_SILENCE_NS,
         sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
     )
     with ExitStack() as stack:
@@ -230,7 +229,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:
     """Return True if each reading is a grasp whose outcome both methods can be held against."""
     fingers = parts.model.contract.fingers
-    if args.json or args.verbose or not isinstance(source, _Tables) or fingers != FINGERS:
+    if args.json or args.verbose or not isinstance(source, Tables) or fingers != FINGERS:
         return False
     if assembly.gate_mode(parts.scene) != "every":
         return False
@@ -248,64 +247,12 @@ def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
     return DayTable(title, published, model.contract.name, warnings)
 
 
-class _Tables:
-    """Grasp tables and streams. They are judged as the command line says."""
-
-    def __init__(self, args: argparse.Namespace) -> None:
-        """Raise `SceneError` for options that do not fit."""
-        if args.scene is not None:
-            raise SceneError("--scene is for what came over a link")
-        if args.max_slip_when_stable is None and (args.warm_up or args.explore) is not None:
-            raise SceneError("--warm-up and --explore need --max-slip-when-stable")
-        self._args = args
-
-    def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the scene that plays them. Raises `SceneError`."""
-        args = self._args
-        model = model or {"name": assembly.DEFAULT_MODEL}
-        if args.min_confidence is not None:
-            model["min_confidence"] = args.min_confidence
-        sections = {
-            "tactile": {
-                "driver": "replay",
-                "recordings": [path.absolute() for path in args.recordings],
-                "pace": "realtime" if args.speed else "fast",
-                "speed": args.speed or 1.0,
-                "rate_hz": args.rate,
-                "loop": args.loop,
-                "strict": args.strict,
-            },
-            "model": model,
-            "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS, "mode": mode},
-            "publish": publish,
-        }
-        if args.max_slip_when_stable is not None:
-            options = {name: getattr(args, name) for name in RISK_OPTIONS}
-            sections["risk"] = {name: value for name, value in options.items() if value is not None}
-        return scene.parse(sections, Path("command line"))
-
-    def parts(self, wanted: Scene, model: TactileModel, _speed: float | None) -> Parts:
-        """Make the parts for the model's fingers. Raises `SceneError` or `RecordingError`."""
-        wanted = wanted.model_copy(update={"hand": Hand(fingers=model.contract.fingers)})
-        for path in self._args.recordings if self._args.outcomes else ():
-            if not columns_of(path, wanted.hand.fingers).has_labels:
-                raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
-        return Parts.of(wanted, model)
-
-    def restore(self, pipeline: Pipeline) -> None:
-        """Nothing: a table does not know the session."""
-
-    def tell(self, companion: Companion) -> None:
-        """Nothing: the controller tells the outcomes of a table."""
-
-
 def _source(args: argparse.Namespace) -> Source:
     """Return what plays the recordings. Imports only what this kind of them needs."""
     endings = {path.suffix for path in args.recordings}
     if endings.isdisjoint({assembly.MCAP, *assembly.LINK_LOGS}):
-        return _Tables(args)
-    given = [getattr(args, name) for name in (*RISK_OPTIONS, "min_confidence")]
-    if args.outcomes or any(value is not None for value in given):
+        return _tables(args)
+    if args.outcomes or args.min_confidence is not None or _risk(args):
         raise SceneError(
             "what graspd has recorded is judged under its own risk: no --outcomes, "
             "--max-slip-when-stable, --warm-up, --explore or --min-confidence"
@@ -322,6 +269,29 @@ def _source(args: argparse.Namespace) -> Source:
     return RecordedRun(args.recordings)
 
 
+def _tables(args: argparse.Namespace) -> Tables:
+    """Return tables that are judged as the command line says."""
+    if args.scene is not None:
+        raise SceneError("--scene is for what came over a link")
+    tactile = {"rate_hz": args.rate, "loop": args.loop, "strict": args.strict}
+    if args.speed is not None:
+        tactile |= {"pace": "realtime", "speed": args.speed}
+    sections = {"tactile": tactile}
+    if args.min_confidence is not None:
+        sections["model"] = {"min_confidence": args.min_confidence}
+    if args.max_slip_when_stable is not None:
+        sections["risk"] = _risk(args)
+    elif _risk(args):
+        raise SceneError("--warm-up and --explore need --max-slip-when-stable")
+    return Tables(args.recordings, sections)
+
+
+def _risk(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the keys of `[risk]` that are given."""
+    given = {name: getattr(args, name) for name in RISK_OPTIONS}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def _parts(args: argparse.Namespace, source: Source) -> Parts:
     """Make what plays and judges. Raises `SessionFileError` for a session of another hand."""
     chosen = {}
@@ -332,6 +302,9 @@ def _parts(args: argparse.Namespace, source: Source) -> Parts:
     session = wanted.session.model_copy(update={"learn": learns})
     wanted = wanted.model_copy(update={"session": session})
     parts = source.parts(wanted, assembly.load_model(wanted), args.speed)
+    for path in args.recordings if args.outcomes else ():
+        if not columns_of(path, parts.scene.hand.fingers).has_labels:
+            raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
     if args.session not in (RUNNING, OFF) and parts.pipeline.session is None:
         raise ModelError(f"the model {parts.model.contract.name} keeps no session")
     _restore_session(args, source, parts.pipeline, wanted.hand.fingers)
@@ -365,7 +338,7 @@ def _comparisons(
         other = assembly.load_model(wanted)
         judge = assembly.build_pipeline(alone, other, pipeline.clock, learns=False)
         yield Comparison(WITHOUT_SESSION, judge, result)
-    if pipeline.trust is not None and (args.outcomes or not isinstance(source, _Tables)):
+    if pipeline.trust is not None and (args.outcomes or not isinstance(source, Tables)):
         other, learns = assembly.load_model(wanted), wanted.session.learn
         judge = assembly.build_pipeline(alone, other, pipeline.clock, learns=learns)
         _restore_session(args, source, judge, wanted.hand.fingers)

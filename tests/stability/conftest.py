@@ -8,18 +8,26 @@ from collections.abc import Callable
 import pytest
 
 from graspd.models import zoo
+from tests.stability.rows import Rows
 
 DEFAULT = "small-session"
 
 
 @pytest.fixture
 def note(record_property: Callable[[str, object], None]) -> Callable[..., None]:
-    """Record a row of `graspd report stability`, which reads it in pytest's JUnit file."""
+    """Record a row of `graspd report stability`."""
 
     def record(**cells: object) -> None:
         record_property("row", json.dumps(cells))
 
     return record
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Print the rows if that is asked for."""
+    if (form := config.getoption("rows")) is not None:
+        outcomes = config.getoption("outcomes")
+        config.pluginmanager.register(Rows(outcomes, as_json=form == "json"))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -16,30 +16,13 @@ pytest.importorskip("torch", reason="the report needs torch, of the extra `train
 
 from graspd.daemon.commands.report import add_arguments
 from graspd.daemon.measure import stability
+from tests.stability.rows import NUMBERS, row_of, text
 
-BROKEN_TESTS = """
-import json
-import pytest
-
-CASE = dict.fromkeys(("readings", "compared", "flips"), 2)
-CASE |= dict.fromkeys(("input_error", "network_error", "chain_error", "mean_error"), float("nan"))
-CASE |= {"model": "mlp", "case": "made up", "reasons": {"flat": 1}}
-CASE |= {"verdicts": {"unknown": 1, "slip": 1}, "problems": ["p_slip nan, bound 1e-04"]}
-
-def test_a_case(record_property):
-    record_property("row", json.dumps(CASE))
-    assert not CASE["problems"]
-
-def test_a_step(record_property):
-    record_property("row", json.dumps({"step": "one", "expected": "1", "found": "1"}))
-
-def test_that_takes_its_time(pytestconfig, record_property):
-    record_property("row", json.dumps({"step": "two", "expected": "2", "found": "2"}))
-    assert pytestconfig.getoption("timeout") == 0
-
-def test_that_ends_early():
-    raise OSError("nothing noted")
-"""
+CASE = {
+    **dict.fromkeys(NUMBERS, float("nan")),
+    **{"model": "mlp", "case": "made up", "reasons": {"flat": 1}},
+    **{"verdicts": {"unknown": 1, "slip": 1}, "problems": ["p_slip nan, bound 1e-04"]},
+}
 
 
 def run(*arguments: str) -> tuple[int, str]:
@@ -53,33 +36,29 @@ def run(*arguments: str) -> tuple[int, str]:
 
 @pytest.mark.timeout(240)
 def test_the_cases_of_a_model_become_two_tables() -> None:
-    code, text = run("small-session-mf", "--quick")
+    code, said = run("small-session-mf", "--quick")
     assert code == 0
-    assert text.startswith("**made with --quick")
-    assert "\n0 of 4" in text
+    assert "\n0 of 4" in said
+    assert "break a bound, 1e+04 outcomes" in said
     for case in ("all 0", "demo table", "random 12-bit counts", "next to the threshold"):
-        assert f"| small-session-mf | {case} |" in text
-    assert "| learner, 1e+04 outcomes, all of these in turns |" in text
+        assert f"| small-session-mf | {case} |" in said
+    assert "| learner, 1e+04 outcomes, all of these in turns |" in said
 
 
-def test_a_broken_bound_makes_the_exit_code_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cases = tmp_path / stability.CASES
-    cases.mkdir(parents=True)
-    (cases / "test_made_up.py").write_text(BROKEN_TESTS)
-    options = ("--model", "--data", "--outcomes")
-    added = "".join(f"    parser.addoption('{name}')\n" for name in options)
-    (tmp_path / "conftest.py").write_text(f"def pytest_addoption(parser):\n{added}")
-    monkeypatch.setattr(stability, "CHECKOUT", tmp_path)
-    code, text = run()
-    assert code == 1
-    assert "| unknown 1, slip 1 | flat 1 | BROKEN p_slip nan, bound 1e-04 |" in text
-    assert "2 of 4 rows break a bound" in text
-    assert "OSError: nothing noted | BROKEN |" in text
-    code, text = run("--json")
-    assert code == 1
-    assert json.loads(text)["rows"][0]["input_error"] is None  # JSON has no NaN
+def test_a_broken_bound_and_a_case_that_ends_early_are_said() -> None:
+    step = json.dumps({"step": "one", "expected": "1", "found": "1"})
+    rows = [
+        row_of(json.dumps(CASE), "test_a_case", "assert not problems"),
+        row_of(step, "test_a_step", None),
+        row_of(None, "test_that_ends_early", "OSError: nothing noted\nand more"),
+    ]
+    assert row_of(None, "test_that_notes_nothing", None) is None
+    told = [row for row in rows if row is not None]
+    lines = text(told, 10_000, as_json=False)
+    assert "| unknown 1, slip 1 | flat 1 | BROKEN p_slip nan, bound 1e-04 |" in lines
+    assert "2 of 3 rows break a bound" in lines
+    assert "OSError: nothing noted | BROKEN |" in lines
+    assert json.loads(text(told, 10_000, as_json=True))["rows"][0]["input_error"] is None
 
 
 def test_what_is_missing_is_said_in_one_line(
@@ -96,13 +75,3 @@ def test_what_is_missing_is_said_in_one_line(
     assert "palm_down.csv" in table
     assert "needs the package 'onnx'" in package
     assert "run it in a checkout" in tests
-
-
-def test_cases_that_cannot_be_run_are_no_result(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / stability.CASES).mkdir(parents=True)
-    monkeypatch.setattr(stability, "CHECKOUT", tmp_path)
-    code, text = run()
-    assert (code, text) == (2, "")
-    assert "unrecognized arguments" in capsys.readouterr().err
