@@ -160,6 +160,8 @@ def run(args: argparse.Namespace) -> int:
             raise SceneError("--wait is for subscribers: it needs --publish")
         if args.only_lifted and args.recordings and not args.outcomes:
             raise SceneError("--only-lifted says which outcomes are told: it needs --outcomes")
+        if args.max_slip_when_stable and args.recordings and not args.outcomes:
+            raise SceneError("--max-slip-when-stable rests on outcomes: it needs --outcomes")
         with StopSignal() as stop:
             return _replay(args, stop)
     except (SceneError, ModelError, DriverError, SessionFileError) as error:

@@ -32,6 +32,11 @@ _MODULES = {
 }
 
 
+def __dir__() -> list[str]:
+    """Return the names for users; they are not loaded yet."""
+    return list(__all__)
+
+
 def __getattr__(name: str) -> object:
     """Load the module of a name."""
     if name == "client":

@@ -61,6 +61,7 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
         (["replay", "--speed", "abc"], "argument --speed: abc is not a positive number"),
         (["replay", "--max-slip-when-stable", "0.6"], "not a number from 0.001 to 0.5"),
         (["replay", "--max-slip-when-stable", "0.1", "--warm-up", "-1"], "risk.warm_up"),
+        (["replay", str(DEMO_TABLE), "--max-slip-when-stable", "0.1"], "it needs --outcomes"),
         (["replay", "--min-confidence", "1"], "not a number from"),
         (["replay", str(DEMO_TABLE), str(DEMO_RECORDING)], "both grasp tables and streams"),
         (["doctor", "--listen", "inf"], "inf is not a number from 0.1 to 3600"),
