@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import GateState
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion
+from graspd.daemon.trust.lift_book import OutcomeStatus
 
 PERIOD_NS: Final = 1_000_000_000
 """Shortest time between two preparations, ns, from start to start."""
@@ -78,3 +81,31 @@ class Reload(Companion):
         self._not_before_ns = time.monotonic_ns() + PERIOD_NS
         if self._worker.submit(self._prepare):
             self._began()
+
+
+def losses(pipeline: Pipeline, *, kept: bool) -> Iterator[str]:
+    """Yield what is lost when another pipeline takes over, for the log.
+
+    `kept`: True if outcomes and session are in a file, from which the other one restores them.
+    """
+    outcomes, session = pipeline.lifts.told[OutcomeStatus.TAKEN], pipeline.session
+    grasps = 0 if session is None else session.grasps
+    if not kept and (outcomes or grasps):
+        yield (
+            f"{outcomes} told outcomes and a session of {grasps} grasps are forgotten: "
+            "only [session] keep = true keeps them"
+        )
+    gate = None if pipeline.hand is None else pipeline.hand.gate.memory
+    if gate is not None and gate.state not in (GateState.IDLE, GateState.RELEASED):
+        yield f"grasp {gate.grasp} was held: release it, because the hand must be tared again"
+
+
+def start_again(pipeline: Pipeline) -> None:
+    """Let a pipeline go on whose successor failed; the hand must be tared again.
+
+    Grasps have other names from now on, so a held grasp whose outcome was told would be judged
+    as if it were another.
+    """
+    pipeline.restart()
+    if pipeline.hand is not None:
+        pipeline.hand.forget()

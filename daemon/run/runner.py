@@ -16,7 +16,7 @@ from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets, plan
 from graspd.daemon.run.loop import Ended, Loop, LoopTiming
-from graspd.daemon.run.reload import Reload
+from graspd.daemon.run.reload import Reload, losses, start_again
 from graspd.daemon.run.run_log import RunLog
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.drivers.base import DriverError
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from graspd.daemon.run.realtime import RealtimeMode
     from graspd.daemon.run.replaying import Controller
     from graspd.daemon.run.systemd import Systemd
-    from graspd.daemon.trust.trust import Trust
 
 log = logging.getLogger("graspd")
 
@@ -94,11 +93,13 @@ class Runner:
         self._manager = manager
         self._sockets: Sockets | None = None
         self._reload = Reload(stop, partial(prepare, path), self._say_reloading)
-        self._running = self._has_run = False
+        self._running = False
         self._former: Parts | None = None
         """Parts of the scene before a reload, until the new scene runs."""
-        self._trust: Trust | None = None
-        """Trust of the scene that ran last."""
+        self._latest: Parts | None = None
+        """Parts of the scene that ran last."""
+        self._keeps_session = False
+        """True if those keep outcomes and session in a file."""
         self._log = RunLog()
 
     def run(self) -> None:
@@ -115,10 +116,10 @@ class Runner:
             self._reload.close()
             if self._sockets is not None:
                 self._sockets.close()
-            if self._has_run:
+            if self._latest is not None:
                 self._log.write(cause)
-        if self._printer is not None:
-            self._printer.summary(self._trust)
+        if self._printer is not None and self._latest is not None:
+            self._printer.summary(self._latest.pipeline.trust)
 
     def _run(self, parts: Parts) -> None:
         woken = False
@@ -134,6 +135,9 @@ class Runner:
                 if self._former is not None:
                     self._refuse(error)
                     parts, self._former = self._former, None
+                    for loss in losses(parts.pipeline, kept=True):
+                        log.warning("%s", loss)
+                    start_again(parts.pipeline)
                 elif not self._waits_for_the_rest(error):
                     return
                 continue
@@ -173,7 +177,7 @@ class Runner:
             sockets = self._open_sockets(running)
             around.add_sockets(sockets)
             around.open_drivers()
-            around.keep_session()
+            keeps_session = around.keep_session()
             realtime = enter_realtime(running, stack)
             around.record()
             controller = _controller(running)
@@ -191,8 +195,8 @@ class Runner:
                 around.keep,
             )
             stack.callback(loop.close)
-            self._running, self._has_run, self._former = True, True, None
-            self._trust = parts.pipeline.trust
+            self._running, self._former = True, None
+            self._take_over(parts, keeps_session=keeps_session)
             log.info("verdict.%s on %s", running.hand.name, running.endpoint)
             if running.ask_endpoint is not None:
                 log.info("questions on %s", running.ask_endpoint)
@@ -203,6 +207,13 @@ class Runner:
             while ended is Ended.RELOAD and (following := self._taken()) is None:
                 ended = loop.run()
             return ended, following
+
+    def _take_over(self, parts: Parts, *, keeps_session: bool) -> None:
+        """Note that these parts run now; log what those before knew and these do not."""
+        if self._latest is not None and self._latest is not parts:
+            for loss in losses(self._latest.pipeline, kept=self._keeps_session):
+                log.warning("%s", loss)
+        self._latest, self._keeps_session = parts, keeps_session
 
     def _say_reloading(self) -> None:
         if self._manager is not None:

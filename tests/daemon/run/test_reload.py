@@ -16,7 +16,9 @@ import pytest
 from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.run import reload
-from graspd.daemon.run.reload import Reload
+from graspd.daemon.run.reload import Reload, losses
+from graspd.daemon.trust.lift_book import GraspId
+from tests.daemon.judge.test_only_stable_if import HELD, Feel, limits, tared
 from tests.kit.waiting import PATIENCE_S, wait_until
 
 PARTS = cast(Parts, object())
@@ -139,3 +141,17 @@ def test_the_loop_is_woken_for_the_next_preparation_only_where_one_is_requested(
         assert due_ns - began_ns >= 60_000_000_000
         assert not found.take_reload()
         assert len(preparing.began) == 1
+
+
+def test_losses_name_outcomes_without_a_file_and_the_held_grasp() -> None:
+    hand = tared(limits())
+    hand.play(HELD)
+    assert list(losses(hand.pipeline, kept=True)) == [
+        "grasp 1 was held: release it, because the hand must be tared again"
+    ]
+    hand.pipeline.outcome(GraspId("", 1), slipped=True)
+    forgotten = next(losses(hand.pipeline, kept=False))
+    assert forgotten.startswith("1 told outcomes and a session of 0 grasps are forgotten: ")
+    hand.play(Feel("rest", times=40))
+    assert list(losses(hand.pipeline, kept=False)) == [forgotten]
+    assert list(losses(hand.pipeline, kept=True)) == []

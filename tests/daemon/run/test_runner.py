@@ -145,13 +145,16 @@ def test_ready_comes_when_it_runs_and_the_watchdog_is_fed_from_then_on(running: 
 
 def test_the_end_is_logged_with_its_cause_and_the_counts_of_all_reloads(running: Running) -> None:
     before = running.verdict()
+    for _ in range(8):  # seconds: two grasps
+        running.told("STATUS=running")
     running.write(model="cnn1")
     running.hang_up()
     running.told("READY=1")
     after = running.verdict(like=lambda verdict: verdict.model == "cnn1" and verdict.seq >= 20)
-    said = running.stop()[1].splitlines()[-1]
-    ended = re.fullmatch(r"graspd: INFO: ended by SIGTERM after (\S+) s: (\d+) readings, .*", said)
-    assert ended is not None, said
+    *said, last = running.stop()[1].splitlines()
+    ended = re.fullmatch(r"graspd: INFO: ended by SIGTERM after (\S+) s: (\d+) readings, .*", last)
+    assert ended is not None, last
+    assert sum("0 told outcomes and a session of" in line for line in said) == 1
     assert float(ended[1]) >= (after.t_mono_ns - before.t_mono_ns) / 1e9
     assert int(ended[2]) >= before.seq + after.seq
 
