@@ -83,10 +83,7 @@ class Heard:
         if verdict.boot_id not in self.boots:
             self.boots.add(verdict.boot_id)
         elif self._last is not None:
-            step = verdict.seq - self._last.seq
-            if step == 0:
-                return  # the last message again, for somebody who has just come
-            self.gaps += abs(step - 1)
+            self.gaps += abs(verdict.seq - self._last.seq - 1)
         self.messages += 1
         former, self._last = self._last, verdict
         if former is None or says_nothing_came(verdict, former):

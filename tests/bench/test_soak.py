@@ -184,7 +184,6 @@ def test_a_subscriber_tells_readings_gaps_pauses_and_restarts_apart() -> None:
         (verdict(1, 500 * ms), 503),
         (verdict(2, 510 * ms), 521),  # later than a period
         (verdict(3, 510 * ms, 0.2), 521),  # came together with the one before
-        (verdict(3, 510 * ms, 0.2), 530),  # repeated for another subscriber
         (verdict(4, 510 * ms, 101.0), 611),
         (verdict(5, 900 * ms), 902),
         (verdict(8, 930 * ms), 932),  # two are missing

@@ -92,12 +92,14 @@ def test_a_reset_session_is_a_new_one() -> None:
         SessionState(1.0, 1, (1.0,), (1.0,)),
         SessionState(1.0, 1, (1.0,) * WIDTH, (1.0,) * (WIDTH + 1)),
         SessionState(1.0, 1, (float("nan"),) * WIDTH, (1.0,) * WIDTH),
+        SessionState(0.0, 30, (1.0,) * WIDTH, (1.0,) * WIDTH),
+        SessionState(30.0, 1000, (1.0,) * WIDTH, (1.0,) * WIDTH),
     ],
 )
 def test_a_state_of_something_else_is_refused(state: SessionState) -> None:
     session = statistics()
     observe(session, grasps(4))
-    with pytest.raises(ValueError, match=r"is of|not finite"):
+    with pytest.raises(ValueError, match=r"is of|not finite|grasps weigh"):
         session.restore(state)
     assert session.grasps == 4
 

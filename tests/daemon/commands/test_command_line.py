@@ -100,19 +100,13 @@ def test_every_argument_of_every_command_has_help() -> None:
 @pytest.mark.parametrize(
     ("arguments", "meant"),
     [
-        (["rnu"], "run"),
         (["--verison"], "--version"),
         (["session", "shwo", "scene.toml"], "show"),
-        (["twin", "spy"], "spi"),
         (["twin", "spi", "--stuk-clock"], "--stuck-clock"),
-        (["watch", "--wbe"], "--web"),
-        (["evaluate", "--dta", "folder"], "--data"),
         (["replay", "--max-slip-when-stabel=0.1"], "--max-slip-when-stable"),
         (["replay", "--gate", "setled"], "settled"),
-        (["replay", "--model", "cnn1-sesion"], "cnn1-session"),
         (["models", "smal-session"], "small-session"),
         (["train", "smal-session"], "small-session"),
-        (["report", "wroth"], "worth"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -46,10 +46,7 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["replay", "--model", "nonsense"], "no model 'nonsense' in the zoo"),
         (["replay", "--model", "absent.onnx"], "absent.onnx: cannot read the model"),
-        (["replay", "--model", __file__ + ".onnx"], "cannot read the model"),
-        (["replay", "--speed", "0"], "0 is not a positive number"),
         (["replay", "--speed", "nan"], "nan is not a positive number"),
         (["replay", "--publish", "tcp://1.2.3.4:5"], "not a loopback address"),
         (["replay", "--publish", "ipc://*"], "needs a path that subscribers can know"),
@@ -57,7 +54,6 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
         (["replay", "--publish", ""], "must start with ipc://"),
         (["replay", "--model", ""], "model.name: string should have at least 1"),
         (["replay", "--wait", "3601"], "3601 is not a number from 0 to 3600"),
-        (["replay", "--wait", "nan"], "nan is not a number from 0 to 3600"),
         (["replay", "--speed", "abc"], "argument --speed: abc is not a positive number"),
         (["replay", "--max-slip-when-stable", "0.6"], "not a number from 0.001 to 0.5"),
         (["replay", "--max-slip-when-stable", "0.1", "--warm-up", "-1"], "risk.warm_up"),

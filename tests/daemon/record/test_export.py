@@ -25,19 +25,12 @@ from graspd.daemon.record.topics import Judged
 from graspd.drivers.base import ElectrodeFault, RecordingError, TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.models.training.data.datasets import read_table
+from tests.daemon.record import recorded
+from tests.daemon.record.recorded import BOOT
 from tests.kit.inside import graspd
 
-BOOT = "0123456789abcdef" * 2
 Ending = Literal["stable", "slip"]
-HEADER = RecordingHeader(
-    fingers=("ff", "mf", "th"),
-    joints=False,
-    boot_id=BOOT,
-    scene={},
-    model="fake",
-    model_sha256="0" * 64,
-    wall_minus_monotonic_ns=10**18,
-)
+HEADER = replace(recorded.HEADER, fingers=("ff", "mf", "th"), wall_minus_monotonic_ns=10**18)
 
 
 class Writer:
@@ -92,7 +85,7 @@ def sweeps(number: int, seed: int = 0) -> list[NDArray[np.uint16]]:
     return [(base + 7 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
 
 
-def recorded(path: Path, counts: NDArray[np.uint16]) -> None:
+def record(path: Path, counts: NDArray[np.uint16]) -> None:
     """A recording of one grasp with these counts; it slips."""
     writer = Writer(path)
     writer.judged(1, counts)
@@ -102,7 +95,7 @@ def recorded(path: Path, counts: NDArray[np.uint16]) -> None:
 
 def test_a_row_is_what_was_judged(tmp_path: Path) -> None:
     (counts,) = sweeps(1)
-    recorded(tmp_path / "a.mcap", counts)
+    record(tmp_path / "a.mcap", counts)
     (grasp,) = collect([tmp_path / "a.mcap"]).grasps.values()
     assert np.array_equal(grasp.counts, counts)
     assert grasp.slipped
@@ -215,7 +208,7 @@ def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
 def test_without_pandas_the_option_names_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recorded(tmp_path / "a.mcap", sweeps(1)[0])
+    record(tmp_path / "a.mcap", sweeps(1)[0])
     monkeypatch.setitem(sys.modules, "pandas", None)
     monkeypatch.delitem(sys.modules, "graspd.daemon.record.frames", raising=False)
     words = "export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "t.parquet", "--parquet"
@@ -226,7 +219,7 @@ def test_without_pandas_the_option_names_its_extra(
 
 
 def test_a_table_that_is_there_is_replaced_only_when_that_is_said(tmp_path: Path) -> None:
-    recorded(tmp_path / "a.mcap", sweeps(1)[0])
+    record(tmp_path / "a.mcap", sweeps(1)[0])
     out = tmp_path / "t.csv"
     out.write_text("of another day")
     words = ("export-grasps", tmp_path / "a.mcap", "--out", out)

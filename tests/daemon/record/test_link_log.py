@@ -15,30 +15,18 @@ from graspd.daemon.record.mcap import header_of
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.can_log import CanLog
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from tests.bench.live import can_id
+from tests.daemon.commands.test_hardware_commands import GROUP, SCENES, filled, twin
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import compared, messages
 
-GROUP = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
-LINKS = {
-    "spi": 'driver = "spi"\nport = "{folder}/bridge"',
-    "can": 'driver = "can"\ninterface = "udp_multicast"\nchannel = "{group}"\n'
-    'sequence = "electrodes"\narbitration_id = 256',
-}
-TWINS = {
-    "spi": ("--path", "{folder}/bridge"),
-    "can": ("--channel", "{group}", "--sequence", "electrodes"),
-}
 FAULTS = ("--drop", "0.0005", "--bit-flip", "0.0005", "--seed", "5")
-
-
-def filled(text: str, folder: Path) -> str:
-    return text.format(folder=folder, group=GROUP)
 
 
 def scene(kind: str, folder: Path) -> Path:
     path = folder / "scene.toml"
     path.write_text(
-        f"[tactile]\n{filled(LINKS[kind], folder)}\n"
+        f"[tactile]\n{filled(SCENES[kind], folder)}\n"
         f'[model]\nname = "cnn1"\n[session]\nkeep = false\n'
         f'[publish]\nendpoint = "ipc://{folder}/graspd"\n'
         '[record]\ndirectory = "record"\nraw = true\n[gate]\nmax_age_ms = 10000\n'
@@ -48,16 +36,14 @@ def scene(kind: str, folder: Path) -> Path:
 
 def record(kind: str, folder: Path) -> tuple[Path, Path]:
     """The recording of a twin that plays the demo grasps under faults, and the link log."""
-    options = [filled(option, folder) for option in TWINS[kind]]
-    path = scene(kind, folder)
-    with start("run", path) as daemon:
+    with start("run", scene(kind, folder)) as daemon:
         wait_for(folder / "graspd")
-        with start("twin", kind, *options, "--recording", DEMO_RECORDING, *FAULTS) as twin:
+        with twin(kind, folder, "--recording", str(DEMO_RECORDING), *FAULTS) as hardware:
             try:
-                twin.wait(9.0)  # three grasps, when it is not busy
+                hardware.wait(9.0)  # three grasps, when it is not busy
             except subprocess.TimeoutExpired:
-                twin.send_signal(signal.SIGTERM)
-            twin.communicate(timeout=TIMEOUT_S)
+                hardware.send_signal(signal.SIGTERM)
+            hardware.communicate(timeout=TIMEOUT_S)
         daemon.terminate()
         _, said = daemon.communicate(timeout=TIMEOUT_S)
     assert daemon.returncode == 0, said
@@ -117,7 +103,7 @@ def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_wer
     decoded: dict[int, TactileReading] = {}
     readings = 0
     fingers = ("ff", "mf", "th")
-    with CanLog([log], fingers, arbitration_id=0x100, sequence="electrodes") as driver:
+    with CanLog([log], fingers, arbitration_id=can_id(GROUP), sequence="electrodes") as driver:
         while not driver.exhausted:
             for reading in driver.read_ready():
                 assert isinstance(reading, TactileReading)
@@ -143,6 +129,6 @@ def test_candump_text_is_what_other_programs_read(of_can: tuple[Path, Path]) -> 
     with can.CanutilsLogReader(log) as reader:
         frames = list(reader)
     assert len(frames) > 5000
-    assert {frame.arbitration_id for frame in frames} == {0x100}
+    assert {frame.arbitration_id for frame in frames} == {can_id(GROUP)}
     stamps = [frame.timestamp for frame in frames]
     assert 5.0 < stamps[-1] - stamps[0] < 20.0

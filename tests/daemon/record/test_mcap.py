@@ -36,8 +36,8 @@ from graspd.daemon.record.player import McapReplayDriver
 from graspd.daemon.record.topics import Joints
 from graspd.drivers.base import FINGERS, JointReading, RecordingError, TactileReading
 from graspd.models.session_statistics import SessionState
+from tests.daemon.record.recorded import BOOT, HEADER
 
-BOOT = "0123456789abcdef" * 2
 OFFSET_NS = 10**18
 START_NS = 5 * 10**12
 PERIOD_NS = 10_000_000
@@ -51,14 +51,9 @@ def counts_of(number: int) -> list[list[int]]:
 
 
 def header(*fingers: str, joints: bool) -> RecordingHeader:
-    return RecordingHeader(
-        fingers=fingers,
-        joints=joints,
-        boot_id=BOOT,
-        scene={"gate": {"mode": "settled"}},
-        model="any",
-        model_sha256="0" * 64,
-        wall_minus_monotonic_ns=OFFSET_NS,
+    scene = {"gate": {"mode": "settled"}}
+    return replace(
+        HEADER, fingers=fingers, joints=joints, scene=scene, wall_minus_monotonic_ns=OFFSET_NS
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,7 +14,6 @@ from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
-from graspd.daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -48,25 +46,6 @@ def test_the_input_follows_the_session() -> None:
     np.testing.assert_allclose(builder.build_batch(fresh)[0], expected, atol=0.5)
     np.testing.assert_allclose(known.counts_mean, counts(200).mean(axis=0), rtol=0.02)
     np.testing.assert_allclose(known.counts_spread, counts(200).std(axis=0), rtol=0.05)
-
-
-def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
-    clock, first = Clock(), calibration()
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(first, sensors(ff="A", mf="B", th="C"), file, clock)
-        observe(first, 30)
-        read_once(keeper)
-        assert load(file.path) is None  # not every second
-        clock.now_ns += SAVE_PERIOD_NS
-        read_once(keeper)
-        keeper.wait(WAIT_S)
-        assert load(file.path) is not None
-        keeper.save()
-    second = calibration()
-    with SessionFile(tmp_path / "right.json") as file:
-        session_keeper(second, sensors(), file, clock)
-    assert second.state() == first.state()
-    assert second.now.calibrated
 
 
 def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
@@ -270,15 +249,6 @@ def test_fingers_exchanged_from_the_first_grasp_are_unknown(
     assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
 
 
-def test_a_grasp_held_fifty_times_leaves_the_session_as_it_was(bts3_dir: Path) -> None:
-    rows = read_table(bts3_dir / "palm_side.csv").counts
-    pipeline = session_pipeline()
-    held = rows[7] + np.random.default_rng(7).normal(0.0, 5.0, (50, 3, 24))
-    judge(pipeline, np.clip(held, 0.0, 4095.0))
-    assert pipeline.session is not None
-    assert pipeline.session.grasps == 1
-
-
 def test_slips_alone_make_no_slip_stable(bts3_dir: Path) -> None:
     """After 900 slips hardly any more of a day's slips are called stable than without them."""
     table = read_table(bts3_dir / "palm_side.csv")
@@ -332,23 +302,6 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
         read_once(keeper)
         keeper.save()
     assert later.grasps == 0
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"weight": 0.0}, "30 grasps weigh 0"),
-        ({"grasps": 1000}, "1000 grasps weigh 30"),
-        ({"mean": (0.0,) * 78 + (5000.0,) * 72}, "means that no counts have"),
-        ({"mean": (0.0,) * 77 + (2000.0,) * 72}, "is of 149 values"),
-    ],
-)
-def test_a_session_that_cannot_be_is_not_restored(change: dict[str, Any], says: str) -> None:
-    session, other = calibration(), calibration()
-    observe(other, 30)
-    with pytest.raises(ValueError, match=says):
-        session.restore(msgspec.structs.replace(other.state(), **change))
-    assert session.grasps == 0
 
 
 def settled_verdicts(pipeline: Pipeline, clock: Clock, seconds: float) -> list[Judgement]:
