@@ -72,6 +72,11 @@ def run(args: argparse.Namespace) -> int:
         learns = wanted.learn.enabled or wanted.risk is not None
         if not (learns or isinstance(model.contract.input, SessionInput)):
             raise ModelError(f"the model {model.contract.name} keeps no session")
+        if args.action != "show" and not _has_file(wanted):
+            raise SessionFileError(
+                f"{args.scene} keeps no session, and {wanted.session_path} may be that of a hand: "
+                "say `[session] keep = true`"
+            )
         if args.action == "show":
             _show(wanted, model, as_json=args.json)
         elif args.action == "reset":
@@ -84,6 +89,12 @@ def run(args: argparse.Namespace) -> int:
         complain(error)
         return 2
     return 0
+
+
+def _has_file(wanted: scene.Scene) -> bool:
+    """Return True if the scene keeps a session, or names the file for one and does not say no."""
+    named = wanted.session.file is not None and wanted.session.keep is None
+    return wanted.keeps_session or named
 
 
 def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:

@@ -83,7 +83,8 @@ ADVICE: dict[Reason, str] = {
     Reason.JOINTS_LATE: "joint angles are late: check their sender; soon judged without them",
     Reason.JOINTS_FROZEN: "no joint angle changes by a bit: restart their sender",
     Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",
-    Reason.NOT_CALIBRATED: "the session has too few grasps: `graspd session seed`, or grasp more",
+    Reason.NOT_CALIBRATED: "the session has too few grasps: grasp more; if it is kept, "
+    "`graspd session seed` also helps",
     Reason.LOW_CONFIDENCE: "too close to call for min_confidence or for [risk]: grasp again",
     Reason.UNPROVEN: "too few outcomes are known for [risk], or too many lifts are out: lift under "
     "supervision, tell outcomes",

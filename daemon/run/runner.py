@@ -181,6 +181,7 @@ class Runner:
             realtime = enter_realtime(running, stack)
             around.record()
             controller = _controller(running)
+            self._note_training(parts)
             companions = [
                 *(self._reload, self._manager, self._log, *around.companions),
                 *(self._printer, realtime, controller),
@@ -207,6 +208,15 @@ class Runner:
             while ended is Ended.RELOAD and (following := self._taken()) is None:
                 ended = loop.run()
             return ended, following
+
+    def _note_training(self, parts: Parts) -> None:
+        """Have the summary say which recordings the model was trained on."""
+        played = parts.scene.tactile
+        if self._printer is None or not isinstance(played, ReplayTactile):
+            return
+        from graspd.daemon.run.replaying import trained_on  # only where recordings are scored
+
+        self._printer.result.trained_on = trained_on(played.recordings, parts.model)
 
     def _take_over(self, parts: Parts, *, keeps_session: bool) -> None:
         """Note that these parts run now; log what those before knew and these do not."""

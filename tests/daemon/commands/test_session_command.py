@@ -81,6 +81,30 @@ def test_check_says_that_the_file_of_a_session_that_is_not_kept_is_not_read(
     assert (f"kept in {tmp_path}/kept.json" in checked.stdout) is (keep is True)
 
 
+def test_a_run_on_grasps_of_the_training_says_so(tmp_path: Path, bts3_dir: Path) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{bts3_dir}/palm_side.csv"]\n'
+        f'[model]\nname = "mlp"\n[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+    )
+    result = graspd("run", path, "--print")
+    assert result.returncode == 0, result.stderr
+    assert "the model was trained on palm_side.csv" in result.stdout
+
+
+@pytest.mark.parametrize("section", ["", '[session]\nkeep = false\nfile = "kept.json"\n'])
+def test_a_scene_that_keeps_no_session_touches_none(section: str, tmp_path: Path) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n{section}')
+    for refused in (
+        graspd("session", "seed", path, DEMO_TABLE),
+        graspd("session", "reset", path),
+    ):
+        assert refused.returncode == 2
+        assert f"{path} keeps no session" in refused.stderr
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3_dir: Path) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(
