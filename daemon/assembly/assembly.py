@@ -223,6 +223,21 @@ def open_driver(driver: Driver) -> None:
         raise SceneError(str(error)) from error
 
 
+def open_file(scene: Scene, driver: Driver) -> None:
+    """Open the tactile driver if it plays files, and read the joints' calibration; no device.
+
+    Raises as `open_driver`, and `DriverError` for a wrong calibration.
+    """
+    tactile = scene.tactile
+    is_packets = isinstance(tactile, PalmTactile) and "://" not in tactile.source
+    if isinstance(tactile, ReplayTactile) or is_packets:
+        open_driver(driver)
+    if isinstance(scene.joints, PalmJoints):
+        from graspd.drivers.palm.calibration import load_calibration
+
+        load_calibration(scene.joints.calibration)
+
+
 @contextmanager
 def _section(name: str) -> Iterator[None]:
     try:

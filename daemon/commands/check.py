@@ -161,17 +161,10 @@ def _absent(tactile: scene_drivers.Tactile) -> str | None:
 
 def _try_drivers(wanted: scene.Scene) -> int | None:
     """Construct the drivers, open those of files; return the period, ns, None if unknown."""
-    tactile, joints = wanted.tactile, wanted.joints
     driver, *_ = assembly.build_drivers(wanted)
-    is_file = isinstance(tactile, scene_drivers.PalmTactile) and "://" not in tactile.source
-    if isinstance(tactile, scene_drivers.ReplayTactile) or is_file:
-        with contextlib.closing(driver):
-            assembly.open_driver(driver)
-    if isinstance(joints, scene_drivers.PalmJoints):
-        from graspd.drivers.palm.calibration import load_calibration
-
-        load_calibration(joints.calibration)
-    return driver.period_ns
+    with contextlib.closing(driver):
+        assembly.open_file(wanted, driver)
+        return driver.period_ns
 
 
 def _try_keys(wanted: scene.Scene) -> None:

@@ -103,7 +103,9 @@ def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[s
     meter.take("scene")
     model = assembly.load_model(wanted)
     meter.take("model")
-    drivers = _drivers(wanted, stack)
+    drivers = assembly.build_drivers(wanted)
+    stack.callback(drivers[0].close)
+    assembly.open_file(wanted, drivers[0])
     meter.take(f"driver {wanted.tactile.driver}")
     pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session.learn)
     meter.take("judge")
@@ -134,22 +136,6 @@ def _apart(wanted: Scene, folder: Path) -> Scene:
     if isinstance(wanted.tactile, ReplayTactile):
         changes["tactile"] = wanted.tactile.model_copy(update={"pace": "fast"})
     return wanted.model_copy(update=changes)
-
-
-def _drivers(wanted: Scene, stack: ExitStack) -> list[Driver]:
-    """Construct the drivers, and open one that plays recordings."""
-    from graspd.daemon.assembly import assembly
-    from graspd.daemon.scene.drivers import PalmJoints, ReplayTactile
-
-    drivers = assembly.build_drivers(wanted)
-    if isinstance(wanted.tactile, ReplayTactile):
-        stack.callback(drivers[0].close)
-        assembly.open_driver(drivers[0])
-    if isinstance(wanted.joints, PalmJoints):
-        from graspd.drivers.palm.calibration import load_calibration
-
-        load_calibration(wanted.joints.calibration)
-    return drivers
 
 
 def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:

@@ -7,6 +7,7 @@ each share of `false_alarms`; then the same of each finger's word, with slides a
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -338,21 +339,21 @@ def main(arguments: Sequence[str]) -> None:
     """Print the table."""
     episodes = int(arguments[0]) if arguments else 60
     shares = [float(share) for share in arguments[1:]] or SHARES
-    sys.stdout.write(
-        "false_alarms | hold stands | of the time since it did | settles | verdict comes | first "
-        "after, p50 / p99 | slide stands | slides that ever do | revoked, p50 / p90\n"
-    )
-    for late in (False, True):
-        for share in shares:
-            sys.stdout.write(f"{'held' if late else 'fresh'} {tell(episodes, share, late)}\n")
-            sys.stdout.flush()
-    sys.stdout.write(
-        "false_alarms | a finger that holds says `slide` | changes of its word | slide along three "
-        "fingers named after, p50 / p90 | along one\n"
-    )
-    for late in (False, True):
-        for share in shares:
-            sys.stdout.write(f"{'held' if late else 'fresh'} {tell_words(episodes, share, late)}\n")
+    for head, line in (
+        (
+            "false_alarms | hold stands | of the time since it did | settles | verdict comes | "
+            "first after, p50 / p99 | slide stands | slides that ever do | revoked, p50 / p90",
+            tell,
+        ),
+        (
+            "false_alarms | a finger that holds says `slide` | changes of its word | slide along "
+            "three fingers named after, p50 / p90 | along one",
+            tell_words,
+        ),
+    ):
+        sys.stdout.write(f"{head}\n")
+        for late, share in itertools.product((False, True), shares):
+            sys.stdout.write(f"{'held' if late else 'fresh'} {line(episodes, share, late)}\n")
             sys.stdout.flush()
 
 

@@ -19,77 +19,50 @@ from tests.kit.inside import graspd
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
 
+
+def ours(*names: str) -> set[str]:
+    """Modules of graspd."""
+    return {f"graspd.{name}" for name in names}
+
+
 NEVER = {
     *("torch", "sklearn", "onnx", "onnxscript", "skl2onnx", "scipy", "pandas", "matplotlib"),
     *("rich", "distributed", "mcap", "msgpack", "pydantic.v1", "pydantic_settings", "yaml"),
-    *(
-        "graspd.models.training",
-        "graspd.models.onnx_file",
-        "graspd.drivers.twins",
-        "graspd.drivers.recordings.can_log",
-    ),
-    *("graspd.drivers.recordings.serial_log", "graspd.drivers.recordings.link_log_player"),
-    *(
-        "graspd.daemon.measure.candidates",
-        "graspd.daemon.measure.picture",
-        "graspd.daemon.measure.stability",
-    ),
-    *("graspd.daemon.measure.streams", "graspd.daemon.measure.worth", "graspd.daemon.measure.cost"),
-    *(
-        "graspd.daemon.run.printer",
-        "graspd.daemon.run.summary",
-        "graspd.daemon.run.realtime",
-        "graspd.daemon.run.systemd",
-    ),
-    *(
-        "graspd.daemon.scene.errors",
-        "graspd.daemon.commands.doctor",
-        "graspd.daemon.watch",
-        "graspd.daemon.judge.memory",
-    ),
-    *(
-        "graspd.daemon.record",
-        "graspd.daemon.assembly.recorder",
-        "graspd.daemon.assembly.recordings",
-    ),
-    *("graspd.daemon.assembly.link_logs", "graspd.daemon.publish.keys", "numpy.ma", "numpy.random"),
-    *("numpy.testing", "jsonschema", "zstandard", "lz4", "zmq.auth", "difflib"),
-}
+    *("numpy.ma", "numpy.random", "numpy.testing", "jsonschema", "zstandard", "lz4", "zmq.auth"),
+    "difflib",
+} | ours(
+    *("models.training", "models.onnx_file", "drivers.twins", "drivers.recordings.can_log"),
+    *("drivers.recordings.serial_log", "drivers.recordings.link_log_player"),
+    *("daemon.measure.candidates", "daemon.measure.picture", "daemon.measure.stability"),
+    *("daemon.measure.streams", "daemon.measure.worth", "daemon.measure.cost"),
+    *("daemon.run.printer", "daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
+    *("daemon.scene.errors", "daemon.commands.doctor", "daemon.watch", "daemon.judge.memory"),
+    *("daemon.record", "daemon.assembly.recorder", "daemon.assembly.recordings"),
+    *("daemon.assembly.link_logs", "daemon.publish.keys"),
+)
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
 for a service, realtime, known keys or a model that is not of the zoo."""
 BUSES = {
-    "replay": {
-        "graspd.drivers.recordings.csv_player",
-        "graspd.drivers.recordings.csv_rows",
-        "graspd.drivers.recordings.faults",
-    },
-    "spi": {"serial", "cobs", "graspd.drivers.spi.driver", "graspd.drivers.spi.line"},
-    "can": {
-        *("can", "asyncio", "sqlite3"),
-        *("graspd.drivers.can.driver", "graspd.drivers.can.bus"),
-    },
-    "palm": {"graspd.drivers.palm.driver", "graspd.drivers.palm.packet"},
+    "replay": ours(
+        *(f"drivers.recordings.{name}" for name in ("csv_player", "csv_rows", "faults"))
+    ),
+    "spi": {"serial", "cobs"} | ours("drivers.spi.driver", "drivers.spi.line"),
+    "can": {"can", "asyncio", "sqlite3"} | ours("drivers.can.driver", "drivers.can.bus"),
+    "palm": ours("drivers.palm.driver", "drivers.palm.packet"),
 }
 """Modules that only this driver needs; python-can brings asyncio and sqlite3."""
-JOINTS = {
-    "graspd.daemon.judge.joint_motion",
-    "graspd.drivers.joints.driver",
-    "graspd.drivers.joints.message",
-}
-HALL = {"graspd.drivers.palm.calibration"}
-GATE = {f"graspd.daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")}
-STATISTICS = {"graspd.daemon.judge.calibration", "graspd.models.session_statistics"}
-KEPT = {"graspd.daemon.session.file", "graspd.daemon.session.keeper"}
-ASK = {"graspd.daemon.publish.questions"}
+JOINTS = ours("daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message")
+HALL = ours("drivers.palm.calibration")
+GATE = ours(*(f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")))
+STATISTICS = ours("daemon.judge.calibration", "models.session_statistics")
+KEPT = ours("daemon.session.file", "daemon.session.keeper")
+ASK = ours("daemon.publish.questions")
 
 FORBIDDEN = {
     # The demo's recording has joints; nothing is kept of a replay.
     "demo": {
-        *(BUSES["spi"] | BUSES["can"] | BUSES["palm"]),
+        *(BUSES["spi"] | BUSES["can"] | BUSES["palm"] | HALL | KEPT | ASK),
         "graspd.drivers.joints.driver",
-        *HALL,
-        *KEPT,
-        *ASK,
     },
     "spi": BUSES["replay"] | BUSES["can"] | BUSES["palm"] | JOINTS | HALL | ASK,
     "can": BUSES["replay"] | BUSES["spi"] | BUSES["palm"] | JOINTS | HALL | ASK,
