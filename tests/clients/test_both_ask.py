@@ -22,7 +22,7 @@ from deploy.clients.python.graspd_client import (
     Verdict,
 )
 from tests.clients.building import asked, cpp_lifts
-from tests.clients.messages import ADDED, TOPIC, verdict
+from tests.clients.messages import TEACHES, TOPIC, verdict
 from tests.clients.probe import Probe
 from tests.threads import at_work
 
@@ -131,9 +131,8 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
     lift_gate: Path, tmp_path: Path, answer: Answer, may: bool
 ) -> None:
     places = [f"ipc://{tmp_path}/out", "30.0" if may else str(DEADLINE_S), f"ipc://{tmp_path}/ask"]
-    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
     with (
-        false_daemon(tmp_path, answer, "unknown", **more),
+        false_daemon(tmp_path, answer, "unknown", **TEACHES),
         Client(places[0], ask_endpoint=places[2]) as graspd,
     ):
         said = graspd.may_i_lift(float(places[1]), supervised=True)
@@ -148,8 +147,7 @@ def test_a_supervised_lift_waits_until_the_newest_message_is_not_early(
     lift_gate: Path, tmp_path: Path
 ) -> None:
     places = [f"ipc://{tmp_path}/out", str(DEADLINE_S)]
-    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
-    with false_daemon(tmp_path, told(), "unknown", **more | {"early": True}):
+    with false_daemon(tmp_path, told(), "unknown", **TEACHES | {"early": True}):
         with Client(places[0]) as graspd:
             answer = graspd.may_i_lift(DEADLINE_S, supervised=True)
             assert (bool(answer), answer.verdict.reasons) == (False, ("not-still",))

@@ -20,7 +20,7 @@ from tests.clients.oracle import has_been_still, is_stable, is_to_be_watched, ne
 
 START_NS = 1000 * MS
 ASK = "ipc:///nowhere.ask"
-TEACHES = ADDED | {"supervised": True}
+WATCHED = ADDED | {"supervised": True}
 TAKEN = b'{"v":1,"ok":true}'
 LOOK_NS = 1000
 """What each look at the clock takes."""
@@ -200,7 +200,7 @@ def watched(outcome: str = "unknown", number: int = 20) -> list[tuple[int, list[
     made = []
     for seq in range(number):
         at_ns = START_NS + seq * 10 * MS
-        known = verdict(seq, at_ns - MS, outcome, **TEACHES)
+        known = verdict(seq, at_ns - MS, outcome, **WATCHED)
         message = supervised(seq, at_ns - MS) if outcome == "unknown" else known
         made.append((at_ns, frames(message)))
     return made

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.clients.messages import MS, frames, supervised, verdict
+from tests.clients.messages import MS, TEACHES, frames, supervised, verdict
 from tests.clients.probe import Probe
 from tests.clients.test_both_ask import false_daemon, told
 from tests.clients.test_lift import START_NS, World, client
@@ -46,9 +46,6 @@ def test_a_grasp_that_is_judged_already_is_returned_at_once() -> None:
         assert graspd.verdict()
         assert graspd.wait_for_grasp(0.0)
         assert graspd.wait_for_grasp(0.0) is None
-
-
-TEACHES: dict[str, Any] = {"supervised": True, "reasons": ["unproven"], "p_slip_model": None}
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from deploy.clients.python.graspd_client import SlideAnswer
-from tests.clients.bench import until
 from tests.clients.messages import MS, frames, verdict
 from tests.clients.probe import Probe
 from tests.clients.test_both_ask import false_daemon, told
 from tests.clients.test_lift import START_NS, World, client
+from tests.kit.waiting import wait_until
 
 Words = Mapping[str, str | None]
 
@@ -148,7 +148,7 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
     fingers = dict(HELD)
     with false_daemon(tmp_path, told(), "unknown", fingers=fingers):
         probe.tell("client", f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask", max_age_ms)
-        until(lambda: probe.ask("slide", 0.01) == "0 1")  # it has heard of them
+        wait_until(lambda: probe.ask("slide", 0.01) == "0 1")  # it has heard of them
         probe.tell("slide", timeout_s)
         probe.flush()
         time.sleep(0.1)

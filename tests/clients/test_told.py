@@ -11,9 +11,10 @@ import zmq
 from deploy.clients.python.graspd_client import Client, Outcome
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
-from tests.clients.bench import Daemon, until
+from tests.clients.bench import Daemon
 from tests.clients.probe import Probe
 from tests.daemon.processes import TIMEOUT_S
+from tests.kit.waiting import wait_until
 
 WARM_UP = "[risk]\nmax_slip_when_stable = 0.2\nwarm_up = 50\n"
 """Each grasp is to be lifted under supervision."""
@@ -131,4 +132,4 @@ def told_while_held(
             listener.listen()
         return listener.held_on >= enough
 
-    until(is_enough)
+    wait_until(is_enough)
