@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.ports import free_port
 
-PATIENCE_S = 100.0
 REST, GRASP = slice(0, 160), slice(1484, 1770)
 """Rows of the demo recording: the open hand, and a whole grasp that is stable."""
 RATE_HZ = 100
@@ -84,14 +81,4 @@ def _one_grasp(path: Path) -> Path:
 
 def free_endpoint() -> str:
     """A place on the loopback address that nobody has just now."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return f"tcp://127.0.0.1:{found.getsockname()[1]}"
-
-
-def until(wanted: Callable[[], bool], patience_s: float = PATIENCE_S) -> float:
-    """Look until it is so; seconds that it took."""
-    began_s = time.monotonic()
-    while not wanted():
-        assert time.monotonic() - began_s < patience_s, "it did not come"
-    return time.monotonic() - began_s
+    return f"tcp://127.0.0.1:{free_port()}"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.clients.building import compiled, compiled_probe
+from tests.clients.probe import Probe, probing
 
 
 @pytest.fixture(scope="session")
@@ -19,3 +21,10 @@ def lift_gate() -> Path:
 def binary() -> Path:
     """The probe that tells what the header's rules say."""
     return compiled_probe()
+
+
+@pytest.fixture
+def probe(binary: Path) -> Iterator[Probe]:
+    """The running probe."""
+    with probing(binary) as made:
+        yield made

@@ -26,6 +26,8 @@ ADDED: dict[str, Any] = {
     "motion_limits": {"ff": 1.5, "th": 1.0}, "fingers": {"ff": "touch", "th": None},
 }  # fmt: skip
 """What older daemons leave out, as it is of a known grasp."""
+TEACHES = ADDED | {"p_slip_model": None, "supervised": True, "reasons": ["unproven"]}
+"""The same of an unknown grasp that is to be lifted under supervision."""
 
 
 def verdict(
@@ -63,10 +65,9 @@ def verdict(
     }
 
 
-def supervised(seq: int = 0, read_ns: int = 0, **more: Any) -> dict[str, Any]:  # noqa: ANN401
+def supervised(seq: int = 0, read_ns: int = 0) -> dict[str, Any]:
     """One of the warm-up: unknown, to be lifted while a person watches."""
-    added = ADDED | {"p_slip_model": None, "supervised": True, "reasons": ["unproven"]}
-    return verdict(seq, read_ns, "unknown", **added | more)
+    return verdict(seq, read_ns, "unknown", **TEACHES)
 
 
 def frames(message: dict[str, Any]) -> list[bytes]:

@@ -14,7 +14,8 @@ import zmq
 from deploy.clients.python.graspd_client import Client, Keys, Outcome
 from graspd.daemon.publish.keys import make
 from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome
-from tests.clients.bench import Daemon, free_endpoint, until
+from tests.clients.bench import Daemon, free_endpoint
+from tests.kit.waiting import wait_until
 
 SILENCE_S = 0.1
 """`silence_ms` of a daemon at 100 Hz with the default age limit."""
@@ -27,8 +28,8 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_p
         Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as asking,
         Client(daemon.endpoint, ask_endpoint=f"{daemon.ask_endpoint}.nobody") as unanswered,
     ):
-        until(lambda: bool(asking.may_i_lift(0.5)))
-        until(lambda: bool(listening.verdict(0.1)))
+        wait_until(lambda: bool(asking.may_i_lift(0.5)))
+        wait_until(lambda: bool(listening.verdict(0.1)))
         answer = unanswered.may_i_lift(0.2)
         # Before it, what the hand does by now on a slow machine.
         assert (bool(answer), answer.verdict.reasons[-1]) == (False, "no-answer")
@@ -48,8 +49,8 @@ def test_a_client_on_another_computer_asks_for_the_clock(tmp_path: Path) -> None
             remote.verdict(0.1)
             return remote._newest._bound is not None  # noqa: SLF001
 
-        until(compared)
-        until(lambda: bool(remote.may_i_lift(0.5)))
+        wait_until(compared)
+        wait_until(lambda: bool(remote.may_i_lift(0.5)))
         assert remote.counts.malformed == 0
 
 
@@ -67,7 +68,7 @@ def test_soon_or_sure_is_for_who_lifts_to_choose(tmp_path: Path) -> None:
                 assert still_ms is None or not (answer and answer.verdict.early)
                 return bool(answer) and answer.verdict.early == early
 
-            until(may_i_lift)
+            wait_until(may_i_lift)
         soon, sure = lifted.values()
         assert 100.0 <= (soon.still_ms or 0.0) < 240.0 <= (sure.still_ms or 0.0)
         assert soon.motion is not None
@@ -101,7 +102,7 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
         listener.connect(daemon.endpoint)
         for topic in ("outcome.right", "verdict.right"):
             listener.subscribe(topic)
-        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
         assert listener.poll(100_000)  # so its first subscription has been taken, too
         lifted_on = graspd.verdict()
         assert graspd.tell(lifted_on, Outcome.SLIPPED, "mug", wait_s=10.0)
@@ -126,13 +127,13 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
 
 def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Client(daemon.endpoint) as graspd:
-        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
         daemon.send(signal.SIGSTOP)
         time.sleep(SILENCE_S)
         silent = graspd.verdict()
         answer = graspd.may_i_lift(0.2)
         daemon.send(signal.SIGCONT)
-        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
     assert silent.reasons == ("silent",)
     assert (bool(answer), answer.verdict.reasons) == (False, ("silent",))
 
@@ -143,7 +144,7 @@ def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
         Daemon(tmp_path, endpoint=endpoint),
         Client(endpoint, same_computer=False) as graspd,
     ):
-        until(lambda: bool(graspd.may_i_lift(1.0)))
+        wait_until(lambda: bool(graspd.may_i_lift(1.0)))
         assert graspd.counts.lost == 0
 
 
@@ -157,7 +158,7 @@ def test_only_who_has_keys_is_told(tmp_path: Path) -> None:
         Client(endpoint, keys=Keys.load(public, own_secret)) as admitted,
         Client(endpoint) as stranger,
     ):
-        until(lambda: admitted.verdict(0.1).p_slip is not None)
+        wait_until(lambda: admitted.verdict(0.1).p_slip is not None)
         assert stranger.verdict(0.2).reasons == ("no-message",)
     with pytest.raises(ValueError, match="no secret key"):
         Keys.load(public, own_public)

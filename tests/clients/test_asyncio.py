@@ -82,14 +82,3 @@ def test_a_call_meanwhile_is_refused_and_a_cancelled_one_ends(tmp_path: Path) ->
 
     with false_daemon(tmp_path, of("unknown")):
         asyncio.run(overlaps())
-
-
-def test_a_wrong_call_is_refused(tmp_path: Path) -> None:
-    async def asks() -> None:
-        async with made(tmp_path) as graspd:
-            with pytest.raises(ValueError, match="deadline_s"):
-                await graspd.may_i_lift(-1.0)
-            with pytest.raises(ValueError, match="no grasp"):
-                await graspd.tell(await graspd.verdict(), "held")
-
-    asyncio.run(asks())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +22,8 @@ from deploy.clients.python.graspd_client import (
     Verdict,
 )
 from tests.clients.building import asked, cpp_lifts
-from tests.clients.messages import ADDED, TOPIC, verdict
+from tests.clients.messages import TEACHES, TOPIC, verdict
+from tests.clients.probe import Probe
 from tests.threads import at_work
 
 PERIOD_MS = 5
@@ -131,9 +131,8 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
     lift_gate: Path, tmp_path: Path, answer: Answer, may: bool
 ) -> None:
     places = [f"ipc://{tmp_path}/out", "30.0" if may else str(DEADLINE_S), f"ipc://{tmp_path}/ask"]
-    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
     with (
-        false_daemon(tmp_path, answer, "unknown", **more),
+        false_daemon(tmp_path, answer, "unknown", **TEACHES),
         Client(places[0], ask_endpoint=places[2]) as graspd,
     ):
         said = graspd.may_i_lift(float(places[1]), supervised=True)
@@ -148,8 +147,7 @@ def test_a_supervised_lift_waits_until_the_newest_message_is_not_early(
     lift_gate: Path, tmp_path: Path
 ) -> None:
     places = [f"ipc://{tmp_path}/out", str(DEADLINE_S)]
-    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
-    with false_daemon(tmp_path, told(), "unknown", **more | {"early": True}):
+    with false_daemon(tmp_path, told(), "unknown", **TEACHES | {"early": True}):
         with Client(places[0]) as graspd:
             answer = graspd.may_i_lift(DEADLINE_S, supervised=True)
             assert (bool(answer), answer.verdict.reasons) == (False, ("not-still",))
@@ -343,34 +341,22 @@ def test_an_outcome_needs_a_grasp_somebody_to_tell_and_an_open_client(tmp_path: 
 
 
 def test_in_cpp_a_lift_that_was_never_told_is_counted_and_warned_of(
-    binary: Path, tmp_path: Path
+    probe: Probe, tmp_path: Path
 ) -> None:
-    places = [f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask"]
-    with (
-        false_daemon(tmp_path, told(), messages_each=10),
-        subprocess.Popen(
-            [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        ) as probe,
-    ):
-        assert probe.stdin is not None
-        assert probe.stdout is not None
-        probe.stdin.write(f"client {places[0]} {places[1]}\n")
-        grasps: dict[str, bool] = {}
-        warned = []
+    grasps: dict[str, bool] = {}
+    warned = []
+    with false_daemon(tmp_path, told(), messages_each=10):
+        probe.tell("client", f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask")
         while len(grasps) < 24:
             tell = len(grasps) % 4 == 3
-            probe.stdin.write("lift\ntell\n" if tell else "lift\n")
-            probe.stdin.flush()
-            line = probe.stdout.readline().split()
+            line = probe.ask("lift").split()
             while line[0] == "warn":
                 warned.append(line[1])
-                line = probe.stdout.readline().split()
+                line = probe.line().split()
             may, grasp, unreported = line
             assert may == "1"
             before = [told_of for each, told_of in grasps.items() if each != grasp]
             assert int(unreported) == before.count(False)
             grasps[grasp] = grasps.get(grasp, False) or tell
-            assert not tell or probe.stdout.readline() == "told\n"
-        probe.communicate(timeout=200)
-        assert probe.returncode == 0, "the sanitizers found something"
+            assert not tell or probe.ask("tell") == "told"
     assert warned == ["1", "11"]

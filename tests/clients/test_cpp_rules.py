@@ -2,54 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple
-from pathlib import Path
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python.graspd_client import Newest
 from tests.clients.messages import MS, TOPIC, Event, events, frames, verdict
 from tests.clients.oracle import MAX_AGE_NS
+from tests.clients.probe import Probe
 
 START_NS = 1000 * MS
-
-
-class Probe:
-    """The C++ rules, in a process of their own."""
-
-    def __init__(self, binary: Path) -> None:
-        self._process = subprocess.Popen(
-            [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-
-    def tell(self, *words: object) -> None:
-        """Give it a line."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(" ".join(map(str, words)) + "\n")
-
-    def at(self, now_ns: int) -> str:
-        """What it says at a time."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self.tell("at", now_ns)
-        self._process.stdin.flush()
-        return self._process.stdout.readline().rstrip("\n")
-
-    def close(self) -> int:
-        """End it; its exit code."""
-        self._process.communicate(timeout=100)
-        return self._process.returncode
-
-
-@pytest.fixture
-def probe(binary: Path) -> Iterator[Probe]:
-    made = Probe(binary)
-    yield made
-    assert made.close() == 0, "the sanitizers found something"
 
 
 def said(newest: Newest, now_ns: int) -> str:
@@ -98,9 +62,9 @@ def test_both_clients_say_the_same(
     for event in sequence:
         newest.take(event.frames, empty_ns, now_ns)
         probe.tell("take", empty_ns, now_ns, *map(as_hex, event.frames))
-        assert probe.at(now_ns) == said(newest, now_ns)
+        assert probe.ask("at", now_ns) == said(newest, now_ns)
         empty_ns, now_ns = now_ns, now_ns + event.wait_ns
-        assert probe.at(now_ns) == said(newest, now_ns)
+        assert probe.ask("at", now_ns) == said(newest, now_ns)
 
 
 def test_both_clients_limit_how_far_the_clocks_of_two_computers_drift(probe: Probe) -> None:
@@ -113,7 +77,7 @@ def test_both_clients_limit_how_far_the_clocks_of_two_computers_drift(probe: Pro
         message = frames(verdict(seq, sent_ns))
         newest.take(message, sent_ns, now_ns)
         probe.tell("take", sent_ns, now_ns, *map(as_hex, message))
-        assert probe.at(now_ns) == said(newest, now_ns)
+        assert probe.ask("at", now_ns) == said(newest, now_ns)
         unknown.append(newest.at(now_ns).reasons == ("clock",))
     assert unknown == [False] * 24 + [True] * 11 + [False]
 
@@ -134,4 +98,4 @@ def test_both_clients_count_age_by_a_clock_that_was_told(
         message = frames(verdict(seq, sent_ns + 77_000 * MS))
         newest.take(message, now_ns, now_ns)
         probe.tell("take", now_ns, now_ns, *map(as_hex, message))
-        assert probe.at(now_ns) == said(newest, now_ns)
+        assert probe.ask("at", now_ns) == said(newest, now_ns)

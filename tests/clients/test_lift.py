@@ -20,7 +20,7 @@ from tests.clients.oracle import has_been_still, is_stable, is_to_be_watched, ne
 
 START_NS = 1000 * MS
 ASK = "ipc:///nowhere.ask"
-TEACHES = ADDED | {"supervised": True}
+WATCHED = ADDED | {"supervised": True}
 TAKEN = b'{"v":1,"ok":true}'
 LOOK_NS = 1000
 """What each look at the clock takes."""
@@ -159,13 +159,17 @@ def test_stable_that_came_after_the_deadline_is_late() -> None:
     assert (bool(answer), answer.verdict.reasons) == (False, ("late",))
 
 
-@pytest.mark.parametrize("deadline_s", [-1.0, float("nan"), float("inf"), "half", None])
-def test_a_deadline_that_is_none_is_refused(deadline_s: Any) -> None:  # noqa: ANN401
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf"), "half", None])
+def test_a_time_that_is_none_is_refused(seconds: Any) -> None:  # noqa: ANN401
     with client(World([])) as graspd:
-        with pytest.raises(ValueError, match="deadline"):
-            graspd.may_i_lift(deadline_s)
-        with pytest.raises(ValueError, match="wait_s"):
-            graspd.verdict(deadline_s)
+        for call, name in (
+            (graspd.verdict, "wait_s"),
+            (graspd.may_i_lift, "deadline_s"),
+            (graspd.wait_for_grasp, "deadline_s"),
+            (graspd.wait_for_slide, "timeout_s"),
+        ):
+            with pytest.raises(ValueError, match=name):
+                call(seconds)
 
 
 @pytest.mark.parametrize("max_age_ms", [0.0, float("nan"), float("inf"), "long", None])
@@ -196,7 +200,7 @@ def watched(outcome: str = "unknown", number: int = 20) -> list[tuple[int, list[
     made = []
     for seq in range(number):
         at_ns = START_NS + seq * 10 * MS
-        known = verdict(seq, at_ns - MS, outcome, **TEACHES)
+        known = verdict(seq, at_ns - MS, outcome, **WATCHED)
         message = supervised(seq, at_ns - MS) if outcome == "unknown" else known
         made.append((at_ns, frames(message)))
     return made

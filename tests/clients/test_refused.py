@@ -18,9 +18,8 @@ import pytest
 from deploy.clients.python.graspd_client import Client, Newest
 from tests.clients.messages import ADDED, MS, TOPIC, verdict
 from tests.clients.oracle import MAX_AGE_NS
-from tests.clients.test_cpp_rules import START_NS, Probe, as_hex, probe, said
-
-__all__ = ["probe"]
+from tests.clients.probe import Probe
+from tests.clients.test_cpp_rules import START_NS, as_hex, said
 
 CASES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parent / "golden" / "refused.json").read_text()
@@ -86,7 +85,7 @@ def told_to(probe: Probe, messages: list[list[bytes]], ended: Grasps = ()) -> st
         probe.tell("end", *grasp)
     for frames in messages:
         probe.tell("take", START_NS, NOW_NS, *map(as_hex, frames))
-    return probe.at(NOW_NS)
+    return probe.ask("at", NOW_NS)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case["name"]))

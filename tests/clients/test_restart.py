@@ -12,8 +12,8 @@ from pathlib import Path
 
 from deploy.clients.python.graspd_client import Client, Decision
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from tests.clients.bench import PATIENCE_S
 from tests.daemon.processes import start
+from tests.kit.waiting import PATIENCE_S
 from tests.threads import at_work
 
 UNIT = Path(__file__).parents[2] / "deploy" / "systemd" / "graspd@.service"

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from deploy.clients.python import graspd_client
-from tests.clients.bench import until
 from tests.clients.building import CPP
 from tests.clients.test_both_ask import false_daemon, told
+from tests.kit.waiting import wait_until
 
 EXAMPLE = CPP.parent / "ros2" / "grasp_node.py"
 
@@ -101,15 +101,15 @@ def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> Non
     publish()
     assert decisions == ["unknown no-message"]
     with false_daemon(tmp_path, told()):
-        until(is_stable)
-        until(lambda: node.ask("~/may_i_lift") == (True, "stable"))
-        until(lambda: node.ask("~/held", data=True) == (True, ""))
+        wait_until(is_stable)
+        wait_until(lambda: node.ask("~/may_i_lift") == (True, "stable"))
+        wait_until(lambda: node.ask("~/held", data=True) == (True, ""))
         assert node.ask("~/may_i_lift") == (False, "unknown outcome-told")
     node.graspd.close()  # type: ignore[attr-defined]
 
 
 def test_the_node_says_why_it_is_no(node: Node, tmp_path: Path) -> None:
     with false_daemon(tmp_path, told(), "unknown", reasons=["moving"]):
-        until(lambda: node.ask("~/may_i_lift") == (False, "unknown moving"))
+        wait_until(lambda: node.ask("~/may_i_lift") == (False, "unknown moving"))
         assert node.ask("~/held", data=True) == (False, "no lift was allowed")
     node.graspd.close()  # type: ignore[attr-defined]

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +11,11 @@ import zmq
 from deploy.clients.python.graspd_client import Client, Outcome
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
-from tests.clients.bench import Daemon, until
+from tests.clients.bench import Daemon
+from tests.clients.probe import Probe
 from tests.daemon.processes import TIMEOUT_S
 from tests.kit.demos import write_stream
+from tests.kit.waiting import wait_until
 
 WARM_UP = "[risk]\nmax_slip_when_stable = 0.2\nwarm_up = 50\n"
 """Each grasp is to be lifted under supervision."""
@@ -29,37 +28,18 @@ ENOUGH = 20
 
 
 class InCpp:
-    """The C++ client, in a process of its own."""
+    """The C++ client."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self._process = process
+    def __init__(self, probe: Probe, daemon: Daemon) -> None:
+        self._probe = probe
+        probe.tell("client", daemon.endpoint, daemon.ask_endpoint)
 
     def may_i_lift(self, deadline_s: float) -> int | None:
-        may, grasp, _ = self._told(f"watch {deadline_s}").split()
+        may, grasp, _ = self._probe.ask("watch", deadline_s).split()
         return int(grasp) if may == "1" else None
 
     def slipped(self) -> bool:
-        return self._told("slipped") == "told"
-
-    def _told(self, order: str) -> str:
-        process = self._process
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(f"{order}\n")
-        process.stdin.flush()
-        return process.stdout.readline().strip()
-
-
-@contextmanager
-def in_cpp(binary: Path, daemon: Daemon) -> Iterator[InCpp]:
-    with subprocess.Popen(
-        [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdin is not None
-        process.stdin.write(f"client {daemon.endpoint} {daemon.ask_endpoint}\n")
-        yield InCpp(process)
-        process.communicate(timeout=TIMEOUT_S)
-        assert process.returncode == 0, "the sanitizers found something"
+        return self._probe.ask("slipped") == "told"
 
 
 class InPython:
@@ -111,16 +91,15 @@ class Listener:
                 self.held_on += self.is_held
 
 
-def test_a_told_grasp_is_offered_no_more_in_either_language(binary: Path, tmp_path: Path) -> None:
+def test_a_told_grasp_is_offered_no_more_in_either_language(probe: Probe, tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, WARM_UP, recording=long_holds(tmp_path / "held.csv")) as daemon,
         zmq.Context() as context,
         context.socket(zmq.SUB) as socket,
         Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as python,
         Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as nobody,
-        in_cpp(binary, daemon) as cpp,
     ):
-        listener = Listener(socket, daemon)
+        listener, cpp = Listener(socket, daemon), InCpp(probe, daemon)
         for lifts, asks_too in ((InPython(python), cpp), (cpp, InPython(nobody))):
             told_while_held(listener, lifts, asks_too)
 
@@ -154,4 +133,4 @@ def told_while_held(
             listener.listen()
         return listener.held_on >= enough
 
-    until(is_enough)
+    wait_until(is_enough)

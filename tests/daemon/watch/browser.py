@@ -12,6 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Self
 
+from graspd.daemon.judge.reasons import Decision
+from tests.daemon.watch.pages import Page
+from tests.daemon.watch.watch_fakes import Talker
 from tests.kit.waiting import PATIENCE_S
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
@@ -145,3 +148,11 @@ def see(browser: Browser, tone: str) -> None:
 def text(browser: Browser, element: str) -> str:
     """Return the text of the first element of a class."""
     return str(browser.value(f"document.querySelector('.{element}').innerText"))
+
+
+def show(browser: Browser, page: Page, talker: Talker, decision: Decision) -> None:
+    """Open the page of a daemon that says `decision`, and wait until it is shown."""
+    talker.decision = decision
+    browser.look(1280, 800)
+    browser.go(page.address)
+    see(browser, decision.value)

@@ -9,7 +9,7 @@ import pytest
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.watch.snapshot import Snapshot
 from graspd.daemon.watch.view import View
-from tests.daemon.watch.browser import CHROMIUM, Browser, see, text
+from tests.daemon.watch.browser import CHROMIUM, Browser, see, show, text
 from tests.daemon.watch.pages import Page, serving_hands
 from tests.daemon.watch.watch_fakes import Talker, whole_hand
 
@@ -47,10 +47,7 @@ def test_panels_of_two_hands_line_up_whatever_they_say(browser: Browser) -> None
 def test_a_chosen_grasp_shows_its_image_until_the_page_goes_back(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    browser.look(1280, 800)
-    browser.go(page.address)
-    talker.decision = Decision.STABLE
-    see(browser, "stable")
+    show(browser, page, talker, Decision.STABLE)
     browser.wait_for("document.querySelectorAll('figure canvas').length == 2")
     talker.decision = Decision.UNKNOWN
     see(browser, "waiting")
@@ -71,10 +68,7 @@ def test_a_chosen_grasp_shows_its_image_until_the_page_goes_back(
 def test_the_timeline_is_read_by_pointing_and_can_be_paused(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    browser.look(1280, 800)
-    browser.go(page.address)
-    talker.decision = Decision.SLIP
-    see(browser, "slip")
+    show(browser, page, talker, Decision.SLIP)
     browser.wait_for("/slip [2-9] s/.test(document.querySelector('.timeline').ariaLabel)")
     browser.value("document.querySelector('.pause').click()")
     assert re.fullmatch(r"Paused: five minutes until \d\d:\d\d:\d\d", text(browser, "minutes"))
