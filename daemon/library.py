@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class GraspModel:
-    """A trained model with the checks that the daemon makes before it asks the network."""
+    """A trained model that judges grasps; it refuses those that the daemon would refuse."""
 
     classes = ("stable", "slip")
     """Columns of `predict_proba`."""

@@ -23,7 +23,7 @@ _SECTIONS = ("hand", "tactile", "model", "gate", "session")
 
 
 class LinkLogs:
-    """One or more link logs of one kind, in the order of time."""
+    """Link logs of one kind, in order of time, to judge again."""
 
     def __init__(self, paths: Sequence[Path], scene_path: Path | None) -> None:
         """`scene_path`: the scene; None: defaults. Raises `SceneError` for two kinds of files."""

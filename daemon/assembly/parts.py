@@ -66,7 +66,7 @@ class Assembly:
         self.companions.append(sockets)
 
     def open_drivers(self) -> None:
-        """Open the drivers; tap the link if it is recorded. Raises as `open_driver`."""
+        """Open the drivers; tap a recorded link. Raises `LinkError` or `SceneError`."""
         record, drivers = self._parts.scene.record, self._parts.drivers
         if record is not None and record.raw:
             from graspd.daemon.record.link_log import tap_of

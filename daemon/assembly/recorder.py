@@ -53,7 +53,7 @@ def build_recorder(
 
 
 def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
-    """Return the header of a run's files, without the state of judge and session."""
+    """Return the header of a recording, without the state of judge and session."""
     network = scene.model.model_dump(mode="json", exclude_none=True)
     if scene.model.path is not None:
         network["path"] = str(scene.model.path.absolute())

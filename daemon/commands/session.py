@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0, or 2 if scene, model, recording or the kept session is wrong."""
+    """Show, reset or seed the kept session; return 2 if an input is wrong."""
     try:
         wanted = scene.load(args.scene)
         model = assembly.load_model(wanted)

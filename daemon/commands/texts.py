@@ -16,7 +16,7 @@ SHELLS = ("bash", "zsh", "fish")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `scene` and `completion`; the other commands have none."""
+    """Declare the arguments of `parser.prog`; only `scene` and `completion` have any."""
     if parser.prog == "graspd scene":
         _add_scene_arguments(parser)
     elif parser.prog == "graspd completion":

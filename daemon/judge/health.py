@@ -250,7 +250,7 @@ def any_of(which: NDArray[np.bool_]) -> bool:
 
 
 def too_many(broken: NDArray[np.bool_]) -> bool:
-    """Return True if more than 12 electrodes of the hand, or 8 of one finger, are broken."""
+    """Return True if over 12 electrodes of the hand, or over 8 of one finger, are broken."""
     if np.count_nonzero(broken) <= BROKEN_FINGER_MAX:
         return False
     per_finger = broken.sum(axis=1)

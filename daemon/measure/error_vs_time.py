@@ -39,7 +39,7 @@ COLUMNS = (
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, write and print; return 2 if data, a model or the folder is wrong."""
+    """Measure models' error and time, write and print; return 2 for wrong input."""
     try:
         grasps = read_all(args.data)
         measured = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)

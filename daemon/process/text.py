@@ -39,7 +39,7 @@ def did_you_mean(wrong: str, words: Iterable[str]) -> str:
 
 
 def printable(text: str, length_max: int | None = None) -> str:
-    """Return the text with escaped control characters, at most `length_max` long."""
+    """Cut the text to `length_max`, then escape what is not printable."""
     if length_max is not None and len(text) > length_max:
         text = text[: length_max - 3] + "..."
     if text.isprintable():

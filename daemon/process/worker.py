@@ -52,7 +52,7 @@ class Worker(Generic[R]):
         return [self._ended] if self.busy else []
 
     def take(self, wait_s: float = 0.0) -> R | Exception | None:
-        """Return the result of the job or its exception; None if it runs on after `wait_s`."""
+        """Return the job's result or exception; None without one or if it still runs."""
         if not self.busy:
             return None
         poll = select.poll()

@@ -70,7 +70,7 @@ class Companion:
     """
 
     def before_wait(self, requests: Requests) -> None:
-        """Pass the messages of peers to `requests`."""
+        """Act before the loop waits, such as on `requests`, the messages of peers."""
 
     def due_ns(self) -> int | None:
         """Latest end of the loop's wait, monotonic ns; None: no limit."""

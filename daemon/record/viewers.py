@@ -93,7 +93,7 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Viewer:
-    """Make log lines and images from the messages of one hand."""
+    """Makes Foxglove's log lines and images from the messages of one hand."""
 
     def __init__(self, images_hz: float) -> None:
         """Draw at most `images_hz` images a second; 0 draws none."""

@@ -76,7 +76,7 @@ def _controller(wanted: scene.Scene) -> Controller | None:
 
 
 class Runner:
-    """Runner of a scene file, with reloads."""
+    """Runs a scene file; SIGHUP reloads it."""
 
     def __init__(
         self,

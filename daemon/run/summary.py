@@ -89,7 +89,7 @@ class Tally:
         )
 
     def worth(self) -> dict[str, float] | None:
-        """Return how good `stable` is, by lifts with a known outcome; None: no lift."""
+        """Return coverage and slip rates of `stable`; None: no lift has a known outcome."""
         if not self.labelled:
             return None
         (stable, slips), held = self.stable, self.confusion[False, False]

@@ -117,7 +117,7 @@ class JointStream:
         return JointMessage(seq, t_s, tuple(angles), np.array(list(angles.values()), dtype=float))
 
     def admits(self, message: JointMessage) -> bool:
-        """Return True if the message is newer than all before, by number or time."""
+        """Return True if it is newer than the last, by number, else by time."""
         counted = message.seq is not None
         now = message.seq if counted else message.t_s
         if now is None:

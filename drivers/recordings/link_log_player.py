@@ -38,7 +38,7 @@ class LinkLogDriver(RecordedDriver[Record]):
 
     @abstractmethod
     def begin(self) -> None:
-        """Start with a new decoder. Raises `DriverError`."""
+        """Make a new `stream`. Raises `DriverError`."""
 
     @abstractmethod
     def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:

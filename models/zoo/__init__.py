@@ -29,7 +29,7 @@ def for_hand(name: str, fingers: Collection[Finger]) -> str:
 
 
 def judging(fingers: Collection[Finger]) -> list[str]:
-    """Names of the models that judge these fingers and no others. Raises `ModelError`."""
+    """Names of the models of exactly these fingers. Raises `ModelError`: a wrong card."""
     return [name for name in names() if set(card(name)["contract"]["fingers"]) == set(fingers)]
 
 

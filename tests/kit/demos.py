@@ -18,7 +18,7 @@ from graspd.drivers.recordings.csv_player import (
 from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
 from graspd.drivers.twins.grasps import synthetic
 from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES, Durations
-from graspd.drivers.twins.grasps.synthetic import COUNTS, GraspModel, SyntheticGrasps
+from graspd.drivers.twins.grasps.synthetic import COUNTS, GraspMixtures, SyntheticGrasps
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, GraspRow, synthetic_grasps
 
 TABLE_GRASPS = 200
@@ -51,7 +51,7 @@ SHOW_DURATIONS = Durations(
 gate may lose the resting level of a finger."""
 
 
-def draw_day(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
+def draw_day(model: GraspMixtures, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
     """Draw grasps of sensors that drift until slips look like the stable grasps of the morning.
 
     The first grasps are those of `synthetic.draw`. Real sensors drift by hundreds of counts from

@@ -45,8 +45,8 @@ class GraspClass:
     components: tuple[Component, ...]
 
 
-class GraspModel(msgspec.Struct):
-    """Model of each class."""
+class GraspMixtures(msgspec.Struct):
+    """Gaussian mixtures of the counts of both classes, fitted to real grasps."""
 
     stable: GraspClass
     slip: GraspClass
@@ -62,8 +62,8 @@ class SyntheticGrasps:
     """Shape (grasps,): mixture component, from 0, instead of an object."""
 
 
-def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
-    """Draw grasps in random order, half of them slips, with counts in the real range."""
+def draw(model: GraspMixtures, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
+    """Sample grasps from the mixtures of both classes, half of them slips, shuffled."""
     slipped = rng.permutation(np.arange(grasps) % 2 == 1)
     counts = np.zeros((grasps, COUNTS), dtype=np.uint16)
     component = np.zeros(grasps, dtype=np.int64)
@@ -73,9 +73,9 @@ def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticG
     return SyntheticGrasps(counts, slipped, component)
 
 
-def read_model() -> GraspModel:
+def read_model() -> GraspMixtures:
     """Read the model of real grasps."""
-    return msgspec.json.decode(MODEL.read_bytes(), type=GraspModel, dec_hook=_to_array)
+    return msgspec.json.decode(MODEL.read_bytes(), type=GraspMixtures, dec_hook=_to_array)
 
 
 def _to_array(_kind: type, numbers: list[float]) -> NDArray[np.float64]:

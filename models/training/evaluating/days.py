@@ -62,7 +62,7 @@ def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]
 
 
 class Day:
-    """Findings of the daemon's `Plausibility` in sound readings."""
+    """The daemon's `Plausibility`, for readings with no fault."""
 
     def __init__(self, trained: Trained) -> None:
         seen = trained.seen()

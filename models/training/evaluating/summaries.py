@@ -61,7 +61,7 @@ class ObjectFigures:
 
 @dataclass(frozen=True, slots=True)
 class AgeFigures:
-    """Figures of the grasps at one age of a running session."""
+    """Figures of grasps by the number before in a session."""
 
     grasps_before: int
     """Lowest age of the group, grasps; it ends below that of the next group."""

@@ -31,7 +31,7 @@ from graspd.models.training.systems.system import BlendConfig, System
 
 
 class Fitted(Protocol):
-    """A trained system of any kind."""
+    """A trained system: what gives margins, and what is exported to ONNX."""
 
     @property
     def parameters(self) -> int:

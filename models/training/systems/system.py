@@ -22,7 +22,7 @@ CLIP = 3.0
 
 @dataclass(frozen=True, slots=True)
 class SessionFeatures:
-    """Input of a session model; the statistics come from the grasps that it is trained on."""
+    """Input of a session model: features standardised by session, clipped to +-`clip`."""
 
     clip: float = CLIP
 
@@ -82,7 +82,7 @@ class System:
 
 
 def digest(system: System) -> str:
-    """Return the SHA-256 of everything that decides a result, without name and description."""
+    """Return the SHA-256 of how it is trained, without name, texts, fingers and tables."""
     parts = configuration(system, "input", "estimator", "recipe", "augmentation", "standardise")
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
