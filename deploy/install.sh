@@ -194,7 +194,24 @@ check_host() {
         /home/* | /root/*) [ -n "$root" ] ||
             fail "the service cannot see $python (ProtectHome); choose another" ;;
     esac
+    check_extras
     [ -z "$wheelhouse" ] || check_wheelhouse
+}
+
+# pip only warns of a part that graspd does not have.
+check_extras() {
+    "$python" -I - "$source/pyproject.toml" >"$scratch/extras" <<'END'
+import sys, tomllib
+with open(sys.argv[1], "rb") as file:
+    print(" ".join(tomllib.load(file)["project"]["optional-dependencies"]))
+END
+    known=$(cat "$scratch/extras")
+    for extra in $(printf '%s' "$extras" | tr , ' '); do
+        case " $known " in
+            *" $extra "*) ;;
+            *) wrong "--extras: graspd has no part $extra; it has: $known" ;;
+        esac
+    done
 }
 
 check_wheelhouse() {

@@ -289,6 +289,14 @@ def test_what_was_installed_where_others_may_write_can_be_removed(staged: Path) 
     assert set(content(staged)) == {"/etc/graspd/right.toml"}
 
 
+def test_unknown_extra_is_refused_before_anything_is_made(staged: Path, wheels: Path) -> None:
+    before = content(staged)
+    done = installer("--root", staged, "--wheelhouse", wheels, "--extras", "record,nosuch")
+    assert (done.returncode, content(staged)) == (2, before), done.stdout + done.stderr
+    assert "no part nosuch; it has: train " in done.stderr
+    assert " record " in done.stderr
+
+
 def test_can0_is_brought_up_only_for_those_who_ask(staged: Path, wheels: Path) -> None:
     install(staged, wheels, "--can")
     file = staged / NETWORK.lstrip("/")
