@@ -31,7 +31,8 @@ Run it again to bring an installation up to date; where there is nothing to do i
                     and not what the hands have learned in /var/lib/graspd
   --purge           with --uninstall: remove those, recordings and the user graspd too
 
-Exit codes: 0 done; 1 failed, what was installed before still works; 2 wrong command line.
+Exit codes: 0 done; 1 failed, and what was installed before still works; 2 wrong command line.
+With --uninstall 1 means that something is left, which the message names.
 END
 }
 
@@ -504,7 +505,7 @@ purge() {
         fi
     done
     if [ -z "$root" ] && id graspd >/dev/null 2>&1; then
-        userdel graspd
+        userdel graspd || fail "the user graspd stays; end its processes, then run this again"
         did "removed the user graspd"
     fi
 }

@@ -249,6 +249,11 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
         /usr/local/bin/graspd
         echo again
         {install}
+        echo busy
+        setpriv --reuid graspd --regid graspd --clear-groups sleep 300 &
+        sh {INSTALLER} --uninstall --purge && exit 6 || [ $? = 1 ] || exit 7
+        kill $!
+        wait $! || true
         echo purge
         sh {INSTALLER} --uninstall --purge
         ls -d /usr/local/share /usr/local/lib
@@ -258,7 +263,7 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
     """
     done = in_a_chroot(tmp_path / "copy", script)
     assert done.returncode == 0, done.stdout + done.stderr
-    first, again, purge = re.split("again\n|purge\n", done.stdout)
+    first, again, _, purge = re.split("again\n|busy\n|purge\n", done.stdout)
     assert first.splitlines()[-8:] == [
         "graspd: installed in /opt/graspd",
         "graspd: graspd@right is enabled: it runs after every boot",
@@ -270,6 +275,7 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
         "graspd 0.1.0",
     ], done.stdout + done.stderr
     assert again.startswith("graspd: nothing to change in /opt/graspd\n")
+    assert "the user graspd stays; end its processes" in done.stderr
     assert purge.splitlines()[-3:] == ["graspd: uninstalled", "/usr/local/lib", "/usr/local/share"]
     assert content(tmp_path) == {}
 
@@ -329,11 +335,11 @@ def test_a_python_that_is_too_old_is_refused(tmp_path: Path, wheels: Path) -> No
 
 def test_python_in_a_home_is_staged_only_if_named(tmp_path: Path, wheels: Path) -> None:
     python = tmp_path / "python3"
-    answer = 'case $* in *base_prefix*) echo /root/python ;; '
+    answer = "case $* in *base_prefix*) echo /root/python ;; "
     python.write_text(f'#!/bin/sh\n{answer}*) exec {sys.executable} "$@" ;; esac\n')
     python.chmod(0o755)
     root = tmp_path / "root"
-    stage = [INSTALLER, "--root", root, "--wheelhouse", wheels]
+    stage: list[str | Path] = [INSTALLER, "--root", root, "--wheelhouse", wheels]
     path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
     by_default = subprocess.run(stage, env=path, capture_output=True, text=True, check=False)
     assert (by_default.returncode, content(root)) == (1, {}), by_default.stdout
