@@ -114,18 +114,20 @@ class View:
         endpoint: str,
         hand: str | None = None,
         look: str = "",
+        doctor: str = "graspd doctor SCENE",
         wall: Callable[[], float] = time.time,
     ) -> None:
         """`hand`: its name; None: the first whose message arrives.
 
-        `look`: advice for a person if no message comes. `wall`: returns seconds since 1970.
+        `look`, `doctor`: advice for a person if no message, or no reading, comes.
+        `wall`: returns seconds since 1970.
         """
         self.link = "connecting"
         self.stood_still = 0, 0
         """When the viewer itself last stopped and went on, ns."""
         self._endpoint = endpoint
         self._hand = hand
-        self._look = look
+        self._look, self._doctor = look, doctor
         self._wall = wall
         self._verdict: Verdict | None = None
         self._verdict_ns = 0
@@ -258,6 +260,8 @@ class View:
             return Tone.SILENT, [self._silence(now_ns), *self._where_to_look()]
         if verdict.verdict is Decision.UNKNOWN:
             why = [Line(reason.value, ADVICE[reason]) for reason in to_act_on(verdict.reasons)]
+            if Reason.STALE in verdict.reasons:
+                why.append(Line("look", self._doctor))
             if verdict.supervised and WATCHED_LIFT.issuperset(verdict.reasons):
                 return Tone.LEARNING, [SUPERVISED, *why]
             is_expected = OF_THE_HAND.issuperset(verdict.reasons)
