@@ -23,6 +23,7 @@ from graspd.daemon.publish.messages import (
     MESSAGES,
     GateMessage,
     OutcomeMessage,
+    State,
     Status,
     Tactile,
     Verdict,
@@ -46,6 +47,8 @@ HELD_NS = 1_000_000_000
 HELD = Line("slip, held", "for a second: a moment ago its probability was 50 % or more")
 NO_VERDICT, LEANS = "no verdict yet", "leans to stable"
 """Headlines beside the verdicts."""
+NO_READINGS = "no readings"
+"""State of a daemon that says `silent`: here that word means that no message comes."""
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
 LATE = "the daemon is there and says nothing: top shows whether this computer is too busy"
 SECONDS = 300
@@ -239,7 +242,7 @@ class View:
             joints={} if silent else self._fingers.joints,
             health=health,
             not_well=_not_well(health),
-            state=None if status is None or silent else status.state.value,
+            state=None if status is None or silent else _state(status),
             model=None if last is None else f"{last.model} {last.model_sha}",
             learning=figures.learning(last, status),
             timing=figures.timing(last, status, self._rate_hz(), self._lost, self._unreadable),
@@ -324,6 +327,10 @@ class View:
         (first_ns, before), (last_ns, received) = self._rate_marks[0], self._rate_marks[-1]
         elapsed_s = (last_ns - first_ns) / 1e9
         return (received - before) / elapsed_s if elapsed_s > 0.0 else 0.0
+
+
+def _state(status: Status) -> str:
+    return NO_READINGS if status.state is State.SILENT else status.state.value
 
 
 def _health(status: Status) -> list[Line]:

@@ -8,9 +8,10 @@ import pytest
 
 from graspd.daemon.commands.watch import where_to_examine, where_to_look
 from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
+from graspd.daemon.publish.messages import State
 from graspd.daemon.watch.snapshot import Line, Tone
 from graspd.daemon.watch.view import View
-from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, verdict
+from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, text_of, verdict
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,16 @@ def test_a_dead_link_does_not_look_like_a_dead_daemon() -> None:
     view = after((b"verdict.right", verdict(0, reasons=[Reason.STALE])))
     assert view.snapshot(120 * MS).why[0].what == "stale"
     assert view.snapshot(301 * MS).why[0].what == "silent"
+
+
+def test_daemon_without_readings_is_not_called_silent() -> None:
+    view = after(
+        (b"status.right", status(0, state=State.SILENT)),
+        (b"verdict.right", verdict(0, reasons=[Reason.STALE])),
+    )
+    seen = view.snapshot(0)
+    assert seen.state == "no readings"
+    assert "silent" not in " ".join(text_of(seen))
 
 
 def test_a_viewer_held_up_goes_by_the_times_in_messages() -> None:
