@@ -19,7 +19,8 @@ Run it again to bring an installation up to date; where there is nothing to do i
                     them. On a computer with network and the same Python: pip wheel -w DIR .
                     (with extras: pip wheel -w DIR '.[record]')
   --extras LIST     optional parts of graspd, such as record (those that are there already; none: -)
-  --python PROGRAM  the Python to use, 3.11 or newer (python3)
+  --python PROGRAM  the Python to use, 3.11 or newer (python3); not one below /home or /root, which
+                    the service cannot see (with --root a warning)
   --can             also have systemd-networkd bring up can0; an update keeps it
   --rebuild         make the virtual environment anew even if graspd has not changed
   --enable NAME     start graspd@NAME now and at boot, with the scene /etc/graspd/NAME.toml; where
@@ -30,7 +31,8 @@ Run it again to bring an installation up to date; where there is nothing to do i
                     and not what the hands have learned in /var/lib/graspd
   --purge           with --uninstall: remove those, recordings and the user graspd too
 
-Exit codes: 0 done; 1 failed, what was installed before still works; 2 wrong command line.
+Exit codes: 0 done; 1 failed, and what was installed before still works; 2 wrong command line.
+With --uninstall 1 means that something is left, which the message names.
 END
 }
 
@@ -44,7 +46,7 @@ units=/usr/local/lib/systemd/system
 command_link=/usr/local/bin/graspd
 network_file=/usr/local/lib/systemd/network/80-graspd-can.network
 
-prefix='' root='' wheelhouse='' extras='' python=python3 enable=''
+prefix='' root='' wheelhouse='' extras='' python='' enable=''
 can='' rebuild='' uninstall='' purge=''
 live='' # systemd runs here
 changed=''
@@ -185,16 +187,40 @@ check_host() {
     [ -n "$root" ] || command -v systemd-sysusers >/dev/null ||
         fail "there is no systemd-sysusers: apt install systemd"
     check_prefix
+    asked_python=$python
+    python=${python:-python3}
     command -v "$python" >/dev/null || fail "there is no $python"
     "$python" -I -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
         fail "$python is $("$python" --version 2>&1); graspd needs Python 3.11 or newer (--python)"
     "$python" -I -c 'import ensurepip, venv' 2>/dev/null ||
         fail "$python has no venv: apt install python3-venv"
     case $("$python" -I -c 'import sys; print(sys.base_prefix)')/ in
-        /home/* | /root/*) [ -n "$root" ] ||
-            fail "the service cannot see $python (ProtectHome); choose another" ;;
+        /home/* | /root/*)
+            hidden="the service cannot see $python (ProtectHome); choose another, such as"
+            hidden="$hidden --python /usr/bin/python3"
+            # A build may have its reasons, but has to name such a Python itself.
+            if [ -z "$root" ] || [ -z "$asked_python" ]; then fail "$hidden"; fi
+            say "warning: $hidden" >&2
+            ;;
     esac
+    check_extras
     [ -z "$wheelhouse" ] || check_wheelhouse
+}
+
+# pip only warns of a part that graspd does not have.
+check_extras() {
+    "$python" -I - "$source/pyproject.toml" >"$scratch/extras" <<'END'
+import sys, tomllib
+with open(sys.argv[1], "rb") as file:
+    print(" ".join(tomllib.load(file)["project"]["optional-dependencies"]))
+END
+    known=$(cat "$scratch/extras")
+    for extra in $(printf '%s' "$extras" | tr , ' '); do
+        case " $known " in
+            *" $extra "*) ;;
+            *) wrong "--extras: graspd has no part $extra; it has: $known" ;;
+        esac
+    done
 }
 
 check_wheelhouse() {
@@ -479,7 +505,7 @@ purge() {
         fi
     done
     if [ -z "$root" ] && id graspd >/dev/null 2>&1; then
-        userdel graspd
+        userdel graspd || fail "the user graspd stays; end its processes, then run this again"
         did "removed the user graspd"
     fi
 }

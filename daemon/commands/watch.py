@@ -43,6 +43,8 @@ class Target(NamedTuple):
     server_key: Path | None
     look: str
     """Place to look at if it is silent, for people."""
+    doctor: str
+    """Place to look at if it has no readings, for people."""
 
 
 class UsageError(Exception):
@@ -96,7 +98,8 @@ def run(args: argparse.Namespace) -> int:
             for target in _targets(args):
                 keys = _keys(args, target.server_key)
                 feed = stack.enter_context(_feed(target.endpoint, keys))
-                hands.append(HandFeed(feed, View(target.endpoint, target.hand, target.look)))
+                view = View(target.endpoint, target.hand, target.look, target.doctor)
+                hands.append(HandFeed(feed, view))
             if args.foxglove:
                 return _foxglove(hands, args.port or FOXGLOVE_PORT)
             return _page(hands, args.port or PORT) if args.web else _terminal(hands)
@@ -124,15 +127,16 @@ def _targets(args: argparse.Namespace) -> list[Target]:
         raise UsageError("--connect takes the place of scenes: give one or the other")
     endpoints = args.connect or ([] if args.scenes else [ENDPOINT])
     targets = [
-        Target(endpoint, None, args.server_key, where_to_look(endpoint)) for endpoint in endpoints
+        Target(endpoint, None, args.server_key, where_to_look(endpoint), where_to_examine(endpoint))
+        for endpoint in endpoints
     ]
     for path in args.scenes:
         wanted = scene.load(path)
         server = args.server_key
         if server is None and wanted.curve is not None:
             server = wanted.curve.secret_key.with_suffix(".key")
-        look = where_to_look(wanted.endpoint, path)
-        targets.append(Target(wanted.endpoint, wanted.hand.name, server, look))
+        look, doctor = where_to_look(wanted.endpoint, path), where_to_examine(wanted.endpoint, path)
+        targets.append(Target(wanted.endpoint, wanted.hand.name, server, look, doctor))
     if len(targets) > HANDS_MAX:
         raise UsageError(f"{len(targets)} hands are more than the {HANDS_MAX} that can be watched")
     return targets
@@ -152,6 +156,16 @@ def where_to_look(endpoint: str, scene_path: Path | None = None) -> str:
     else:
         return "is it started? graspd run SCENE"
     return f"systemctl status graspd@{name}; journalctl -u graspd@{name}"
+
+
+def where_to_examine(endpoint: str, scene_path: Path | None = None) -> str:
+    """Return the command that shows why the daemon of an endpoint has no readings."""
+    socket = Path(endpoint.removeprefix("ipc://"))
+    if scene_path is None and socket.parent == SOCKETS:
+        scene_path = SCENES / f"{socket.stem}.toml"
+    is_far = scene_path is None and endpoint.startswith("tcp://")
+    where = "on the daemon's computer: " if is_far else ""
+    return f"{where}graspd doctor {scene_path or 'SCENE'}; the daemon's log says why"
 
 
 def _keys(args: argparse.Namespace, server_key: Path | None) -> tuple[bytes, bytes, bytes] | None:

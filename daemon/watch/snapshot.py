@@ -87,7 +87,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     not_well: str
     """Problems in a few words; empty: no problem, or not known."""
     state: str | None
-    """`running`, `silent` or `stopping`."""
+    """`running`, `no readings` or `stopping`; None: not known."""
     model: str | None
     learning: list[Line]
     timing: list[Line]

@@ -23,6 +23,7 @@ from graspd.daemon.publish.messages import (
     MESSAGES,
     GateMessage,
     OutcomeMessage,
+    State,
     Status,
     Tactile,
     Verdict,
@@ -46,6 +47,8 @@ HELD_NS = 1_000_000_000
 HELD = Line("slip, held", "for a second: a moment ago its probability was 50 % or more")
 NO_VERDICT, LEANS = "no verdict yet", "leans to stable"
 """Headlines beside the verdicts."""
+NO_READINGS = "no readings"
+"""State of a daemon that says `silent`: here that word means that no message comes."""
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
 LATE = "the daemon is there and says nothing: top shows whether this computer is too busy"
 SECONDS = 300
@@ -114,18 +117,20 @@ class View:
         endpoint: str,
         hand: str | None = None,
         look: str = "",
+        doctor: str = "graspd doctor SCENE",
         wall: Callable[[], float] = time.time,
     ) -> None:
         """`hand`: its name; None: the first whose message arrives.
 
-        `look`: advice for a person if no message comes. `wall`: returns seconds since 1970.
+        `look`, `doctor`: advice for a person if no message, or no reading, comes.
+        `wall`: returns seconds since 1970.
         """
         self.link = "connecting"
         self.stood_still = 0, 0
         """When the viewer itself last stopped and went on, ns."""
         self._endpoint = endpoint
         self._hand = hand
-        self._look = look
+        self._look, self._doctor = look, doctor
         self._wall = wall
         self._verdict: Verdict | None = None
         self._verdict_ns = 0
@@ -237,7 +242,7 @@ class View:
             joints={} if silent else self._fingers.joints,
             health=health,
             not_well=_not_well(health),
-            state=None if status is None or silent else status.state.value,
+            state=None if status is None or silent else _state(status),
             model=None if last is None else f"{last.model} {last.model_sha}",
             learning=figures.learning(last, status),
             timing=figures.timing(last, status, self._rate_hz(), self._lost, self._unreadable),
@@ -258,6 +263,8 @@ class View:
             return Tone.SILENT, [self._silence(now_ns), *self._where_to_look()]
         if verdict.verdict is Decision.UNKNOWN:
             why = [Line(reason.value, ADVICE[reason]) for reason in to_act_on(verdict.reasons)]
+            if Reason.STALE in verdict.reasons:
+                why.append(Line("look", self._doctor))
             if verdict.supervised and WATCHED_LIFT.issuperset(verdict.reasons):
                 return Tone.LEARNING, [SUPERVISED, *why]
             is_expected = OF_THE_HAND.issuperset(verdict.reasons)
@@ -320,6 +327,10 @@ class View:
         (first_ns, before), (last_ns, received) = self._rate_marks[0], self._rate_marks[-1]
         elapsed_s = (last_ns - first_ns) / 1e9
         return (received - before) / elapsed_s if elapsed_s > 0.0 else 0.0
+
+
+def _state(status: Status) -> str:
+    return NO_READINGS if status.state is State.SILENT else status.state.value
 
 
 def _health(status: Status) -> list[Line]:

@@ -249,6 +249,11 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
         /usr/local/bin/graspd
         echo again
         {install}
+        echo busy
+        setpriv --reuid graspd --regid graspd --clear-groups sleep 300 &
+        sh {INSTALLER} --uninstall --purge && exit 6 || [ $? = 1 ] || exit 7
+        kill $!
+        wait $! || true
         echo purge
         sh {INSTALLER} --uninstall --purge
         ls -d /usr/local/share /usr/local/lib
@@ -258,7 +263,7 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
     """
     done = in_a_chroot(tmp_path / "copy", script)
     assert done.returncode == 0, done.stdout + done.stderr
-    first, again, purge = re.split("again\n|purge\n", done.stdout)
+    first, again, _, purge = re.split("again\n|busy\n|purge\n", done.stdout)
     assert first.splitlines()[-8:] == [
         "graspd: installed in /opt/graspd",
         "graspd: graspd@right is enabled: it runs after every boot",
@@ -270,6 +275,7 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
         "graspd 0.1.0",
     ], done.stdout + done.stderr
     assert again.startswith("graspd: nothing to change in /opt/graspd\n")
+    assert "the user graspd stays; end its processes" in done.stderr
     assert purge.splitlines()[-3:] == ["graspd: uninstalled", "/usr/local/lib", "/usr/local/share"]
     assert content(tmp_path) == {}
 
@@ -287,6 +293,14 @@ def test_what_was_installed_where_others_may_write_can_be_removed(staged: Path) 
     (staged / "opt").chmod(0o777)
     assert installer("--root", staged, "--uninstall").returncode == 0
     assert set(content(staged)) == {"/etc/graspd/right.toml"}
+
+
+def test_unknown_extra_is_refused_before_anything_is_made(staged: Path, wheels: Path) -> None:
+    before = content(staged)
+    done = installer("--root", staged, "--wheelhouse", wheels, "--extras", "record,nosuch")
+    assert (done.returncode, content(staged)) == (2, before), done.stdout + done.stderr
+    assert "no part nosuch; it has: train " in done.stderr
+    assert " record " in done.stderr
 
 
 def test_can0_is_brought_up_only_for_those_who_ask(staged: Path, wheels: Path) -> None:
@@ -317,6 +331,25 @@ def test_a_python_that_is_too_old_is_refused(tmp_path: Path, wheels: Path) -> No
     assert done.returncode == 1
     assert "Python 3.10.0; graspd needs Python 3.11 or newer" in done.stderr
     assert content(root) == {}
+
+
+def test_python_in_a_home_is_staged_only_if_named(tmp_path: Path, wheels: Path) -> None:
+    python = tmp_path / "python3"
+    answer = "case $* in *base_prefix*) echo /root/python ;; "
+    python.write_text(f'#!/bin/sh\n{answer}*) exec {sys.executable} "$@" ;; esac\n')
+    python.chmod(0o755)
+    root = tmp_path / "root"
+    stage: list[str | Path] = [INSTALLER, "--root", root, "--wheelhouse", wheels]
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    by_default = subprocess.run(stage, env=path, capture_output=True, text=True, check=False)
+    assert (by_default.returncode, content(root)) == (1, {}), by_default.stdout
+    assert "such as --python /usr/bin/python3" in by_default.stderr
+    named = subprocess.run(
+        [*stage, "--python", python], capture_output=True, text=True, check=False
+    )
+    assert named.returncode == 0, named.stderr
+    assert f"warning: the service cannot see {python} (ProtectHome)" in named.stderr
+    assert version_below(root) == "graspd 0.1.0"
 
 
 def test_wheels_without_graspd_are_refused(tmp_path: Path) -> None:

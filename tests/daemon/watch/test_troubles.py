@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from graspd.daemon.commands.watch import where_to_look
+from graspd.daemon.commands.watch import where_to_examine, where_to_look
 from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
+from graspd.daemon.publish.messages import State
 from graspd.daemon.watch.snapshot import Line, Tone
 from graspd.daemon.watch.view import View
-from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, verdict
+from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, text_of, verdict
 
 
 @pytest.mark.parametrize(
@@ -19,7 +20,16 @@ from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, 
 def test_a_dead_link_never_asks_to_close_the_hand(unreadable: Reason) -> None:
     reasons = [unreadable, Reason.NOT_TARED, Reason.NO_CONTACT]
     seen = after((b"verdict.right", verdict(0, reasons=reasons))).snapshot(0)
-    assert (seen.tone, seen.why) == (Tone.TROUBLE, [Line(unreadable.value, ADVICE[unreadable])])
+    assert (seen.tone, seen.why[0]) == (Tone.TROUBLE, Line(unreadable.value, ADVICE[unreadable]))
+    assert {line.what for line in seen.why[1:]} <= {"look"}
+
+
+def test_outage_names_the_command_that_examines_the_link() -> None:
+    view = View(ENDPOINT, doctor="graspd doctor right.toml")
+    view.take(b"verdict.right", verdict(0, reasons=[Reason.STALE, Reason.NO_CONTACT]), 0)
+    assert view.snapshot(0).why[1:] == [Line("look", "graspd doctor right.toml")]
+    view.take(b"verdict.right", verdict(1, reasons=[Reason.NO_CONTACT]), 0)
+    assert "look" not in {line.what for line in view.snapshot(0).why}
 
 
 def test_a_dead_link_does_not_look_like_a_dead_daemon() -> None:
@@ -27,6 +37,16 @@ def test_a_dead_link_does_not_look_like_a_dead_daemon() -> None:
     view = after((b"verdict.right", verdict(0, reasons=[Reason.STALE])))
     assert view.snapshot(120 * MS).why[0].what == "stale"
     assert view.snapshot(301 * MS).why[0].what == "silent"
+
+
+def test_daemon_without_readings_is_not_called_silent() -> None:
+    view = after(
+        (b"status.right", status(0, state=State.SILENT)),
+        (b"verdict.right", verdict(0, reasons=[Reason.STALE])),
+    )
+    seen = view.snapshot(0)
+    assert seen.state == "no readings"
+    assert "silent" not in " ".join(text_of(seen))
 
 
 def test_a_viewer_held_up_goes_by_the_times_in_messages() -> None:
@@ -95,3 +115,17 @@ def test_where_to_look_is_a_command_of_this_daemon(
     assert said.startswith(look)
     if "graspd@" in look:
         assert "graspd@*" in said or f"journalctl -u {look.split()[2].rstrip(';')}" in said
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "scene", "command"),
+    [
+        ("ipc:///tmp/x.ipc", "deploy/scenes/demo.toml", "graspd doctor deploy/scenes/demo.toml;"),
+        ("ipc:///run/graspd/left.ipc", None, "graspd doctor /etc/graspd/left.toml;"),
+        ("tcp://10.0.0.2:5556", None, "on the daemon's computer: graspd doctor SCENE;"),
+        ("ipc:///tmp/x.ipc", None, "graspd doctor SCENE;"),
+    ],
+)
+def test_where_to_examine_names_the_scene(endpoint: str, scene: str | None, command: str) -> None:
+    said = where_to_examine(endpoint, None if scene is None else Path(scene))
+    assert said.startswith(command)
