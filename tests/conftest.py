@@ -68,7 +68,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--model", action="append", default=[], help="a model to compare (all)")
     parser.addoption("--data", type=Path, help="folder of the real grasps")
     parser.addoption("--rows", choices=("markdown", "json"), help="print what was measured")
-    parser.addoption("--outcomes", type=int, default=10_000, help="that the learner is told")
+    parser.addoption("--outcomes", type=int, default=3_000, help="that the learner is told")
 
 
 @pytest.fixture(scope="session")

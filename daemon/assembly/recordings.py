@@ -20,7 +20,7 @@ from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Exchanged, Topic
 from graspd.daemon.scene import Scene, SceneError, parse
 from graspd.daemon.trust.lift_book import GraspId, Report
-from graspd.daemon.trust.trust import decode
+from graspd.daemon.trust.trust import FormatError, decode
 from graspd.models.runtime import TactileModel
 
 log = logging.getLogger("graspd")
@@ -99,6 +99,8 @@ class RecordedRun:
                 learned = decode(header.trust)
                 if pipeline.trust.fits(learned):
                     pipeline.trust.restore(learned)
+        except FormatError as error:
+            log.warning("%s: what was learned %s; replayed without it", self._paths[0], error)
         except ValueError as error:
             raise SceneError(f"{self._paths[0]}: the session in it {error}") from error
 

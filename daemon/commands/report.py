@@ -51,7 +51,7 @@ def _stability(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help="folder of the real grasps: all of them too"
     )
-    parser.add_argument("--quick", action="store_true", help="10^4 outcomes instead of 10^6")
+    parser.add_argument("--quick", action="store_true", help="3000 outcomes instead of 10^5")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
 
 

@@ -199,7 +199,7 @@ def _learned(kept: KeptSession) -> dict[str, Any] | None:
         "max_slip_when_stable": state.risk.max_slip_when_stable,
         "lifts": state.risk.lifts,
         "slips": state.risk.slips,
-        "outstanding": state.lifts.outstanding,
+        "outstanding": sum(lift.is_outstanding for lift in state.lifts.records),
         "unreported": state.lifts.unreported,
         "proven": state.risk.proven,
     }

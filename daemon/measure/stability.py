@@ -19,7 +19,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 CASES = Path("tests/stability")
 PACKAGES = ("pytest", "hypothesis", "onnx", "torch")
 BROKEN, WRONG = 1, 2
-OUTCOMES, QUICK_OUTCOMES = 1_000_000, 10_000
+OUTCOMES, QUICK_OUTCOMES = 100_000, 3_000
 """Outcomes that the learner is told."""
 
 

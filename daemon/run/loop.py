@@ -27,16 +27,17 @@ from graspd.daemon.publish.messages import State, Verdict
 from graspd.daemon.publish.outbox import Deadlines, Outbox
 from graspd.daemon.run.overload import LoadShedder, mark_repeats
 from graspd.daemon.run.reload import Reload
-from graspd.daemon.trust.lift_book import (
-    NOT_YOURS,
-    REFUSALS,
-    UNKNOWN_START,
-    GraspId,
-    OutcomeStatus,
-    Report,
-)
+from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus, Report
 from graspd.drivers.base import Driver, JointReading, Reading, TactileReading
 
+NOT_YOURS: Final = "not yours: another peer asks whether it may lift here"
+UNKNOWN_START: Final = "unknown boot_id: of a start whose grasps are not known any more"
+"""Why an outcome is refused, besides `REFUSALS`."""
+REFUSALS: Final = {
+    OutcomeStatus.UNKNOWN: "unknown grasp: not judged, or too long ago",
+    OutcomeStatus.CONTRADICTS: "contradicts: another outcome of this grasp was told before",
+}
+"""Why an outcome is refused, for the peer that told it."""
 STATUS_PERIOD_NS: Final = 1_000_000_000
 """Time between two status messages, ns."""
 SILENCE_PERIODS: Final = 10

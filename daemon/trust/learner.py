@@ -14,13 +14,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-TEMPERATURE: Final = 1.5
+from graspd.daemon.trust.residual import GRASPS_MAX, Matrix, Residual, Vector
+
+TEMPERATURE: Final = 2.0
 """Divisor of the model's margin; networks are too sure of another day's grasps."""
-SCALE: Final = 1.6
+SCALE: Final = 2.9
 """Factor of moderated log-odds, which are too timid on days, objects and poses that are new.
 
 With it, a tenth of the grasps with a `p_slip` of 0.1 slips. Fitted on the sessions of three
-quarters of the objects it is 1.61 to 1.69. The slope of outcomes on scaled log-odds is 1.00 on the
+quarters of the objects it is 2.86 to 2.89. The slope of outcomes on scaled log-odds is 1.00 on the
 others (`graspd report worth`, `worth` on the card of `small-session`).
 """
 MARGIN_MAX: Final = 30.0
@@ -28,15 +30,14 @@ MARGIN_MAX: Final = 30.0
 float32 output is taken for."""
 INPUT_MAX: Final = 1e3
 """Larger inputs are refused: standardised features have a few units."""
-MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.3, 0.5, 0.3
+MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.5, 0.5, 0.2
 """Standard deviations of the prior: of the margin's weight, the bias, and each feature's weight."""
 DRIFT: Final = 2e-3
 """Share of the prior's variances by which an outcome widens the posterior: what was learned fades
 within some hundred lifts."""
-MEAN_SPREADS_MAX: Final = 50.0
-"""A weight stays within this many standard deviations of its prior, whatever is told."""
-
-Vector = NDArray[np.float64]
+MEAN_MAX: Final = 25.0
+"""Largest mean of a weight, and of the residual in log-odds, whatever is told: 50 times the
+margin's standard deviation, 8 times the residual's."""
 
 
 class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,47 +46,48 @@ class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outcomes: Annotated[int, msgspec.Meta(ge=0)]
     mean: bytes
     covariance: bytes
+    grasps: bytes = b""
+    """Inputs of the told grasps whose residual is in the state; former recordings have none."""
 
 
 class Learner:
     """Turns a model's margin and input into log-odds of slip, and learns from outcomes.
 
-    Bounded for ever: no variance exceeds its prior's, no weight leaves `MEAN_SPREADS_MAX`. The
-    covariance stays exactly symmetric, because every step multiplies symmetric pairs by the same
-    number. It stays positive definite: subtracting what an outcome tells leaves it so, adding the
-    drift lifts its smallest eigenvalue to `DRIFT` of the smallest prior variance, 10^11 times what
-    rounding can take, and the cap scales rows and columns alike, by no less than
-    1 / sqrt(1 + DRIFT).
+    The state is of the weights, then of the residual at the latest told grasps. It is bounded for
+    ever: an outcome lowers the covariance, then mixes `DRIFT` of the prior's into it. Hence no
+    variance exceeds its prior's, and no eigenvalue is below `DRIFT` times the prior's smallest,
+    10^8 times what rounding can take. The covariance stays exactly symmetric, because every step
+    changes symmetric pairs alike. No mean exceeds `MEAN_MAX`.
     """
 
     def __init__(self, inputs: int) -> None:
-        """Start at the prior of a model with `inputs` features."""
-        self._width = inputs + 2
-        self.scale = SCALE
-        """Factor on the moderated log-odds."""
-        self._prior_mean = np.zeros(self._width)
-        self._prior_mean[0] = 1.0
-        spread = np.full(self._width, FEATURE_SPREAD)
+        """Start at the prior of a model with `inputs` features; without any, no residual."""
+        self.inputs = inputs
+        """Number of features of the model."""
+        self.scale = SCALE if inputs else TEMPERATURE
+        """Factor on the moderated log-odds. Without a residual the model's own are the start."""
+        spread = np.full(inputs + 2, FEATURE_SPREAD)
         spread[:2] = MARGIN_SPREAD, BIAS_SPREAD
-        self._prior_variance = spread**2
-        self._drift = DRIFT * self._prior_variance
-        self._low = self._prior_mean - MEAN_SPREADS_MAX * spread
-        self._high = self._prior_mean + MEAN_SPREADS_MAX * spread
+        self._weights_prior = np.diag(spread**2)
         self.reset()
 
     def reset(self) -> None:
         """Forget all outcomes: a sensor was exchanged."""
         self.outcomes = 0
         """Number of outcomes learned since the start or the last reset."""
-        self._mean = self._prior_mean.copy()
-        self._covariance = np.diag(self._prior_variance)
-        self._is_prior = True
+        mean = np.zeros(self.inputs + 2)
+        mean[0] = 1.0
+        self._set(Residual(np.empty((0, self.inputs))), mean, self._weights_prior)
+
+    def _set(self, residual: Residual, mean: Vector, covariance: Matrix) -> None:
+        self._residual, self._mean, self._covariance = residual, mean, covariance
+        self._projected = residual.projected(mean, covariance)
 
     @property
     def uncertainty(self) -> float:
         """Mean ratio of the weights' variances to the prior's, from 1 at first towards 0."""
-        ratio = self._covariance.diagonal() / self._prior_variance
-        return min(float(ratio.mean()), 1.0)
+        prior = self._weights_prior.diagonal()
+        return min(float((self._covariance.diagonal()[: len(prior)] / prior).mean()), 1.0)
 
     def judge(self, margin: float, inputs: NDArray[np.floating]) -> tuple[float, Vector]:
         """Return log-odds of slip, nearer to 0 the less is known of such grasps, and features.
@@ -95,54 +97,64 @@ class Learner:
         features once the outcome is known. Raises `ValueError` for another shape, and for what is
         not finite or too large.
         """
-        if inputs.shape != (self._width - 2,):
-            raise ValueError(f"inputs are of shape {inputs.shape}, not ({self._width - 2},)")
+        if inputs.shape != (self.inputs,):
+            raise ValueError(f"inputs are of shape {inputs.shape}, not ({self.inputs},)")
         is_within = (np.abs(inputs) <= INPUT_MAX).all()  # false for NaN
         if not (is_within and math.isfinite(margin)):
             raise ValueError("margin or inputs are not finite, or too large")
         limited = min(max(margin, -MARGIN_MAX), MARGIN_MAX)
         features = np.concatenate(([limited / TEMPERATURE, 1.0], inputs))
-        # The prior's covariance is diagonal: the same in a third of the time.
-        prior = self._prior_variance if self._is_prior else None
-        seen = self._covariance @ features if prior is None else prior * features
-        variance = float(features @ seen)
+        known = np.concatenate((features, self._residual.shared(features[2:])))
+        mean, covariance = self._projected
+        variance = float(known @ (covariance @ known)) + self._residual.variance
         moderation = math.sqrt(1.0 + math.pi / 8.0 * variance)  # MacKay's moderated output
-        return self.scale * float(features @ self._mean) / moderation, features
+        return self.scale * float(known @ mean) / moderation, features
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
         """Take in how the lift of a grasp with these features ended."""
-        seen = self._covariance @ features
-        variance = float(features @ seen)
-        p_slip = sigmoid(float(features @ self._mean))
+        residual, mean, covariance = self._residual, self._mean, self._covariance
+        observed = features
+        if self.inputs:
+            residual, mean, covariance = residual.told(features[2:], mean, covariance)
+            others = np.zeros(len(mean) - len(features) - 1)
+            observed = np.concatenate((features, others, [1.0]))
+        seen = covariance @ observed
+        p_slip = sigmoid(float(observed @ mean))
         weight = p_slip * (1.0 - p_slip)
-        gain = 1.0 / (1.0 + weight * variance)
-        self._mean += gain * (slipped - p_slip) * seen
-        np.minimum(np.maximum(self._mean, self._low, out=self._mean), self._high, out=self._mean)
-        self._covariance -= weight * gain * np.outer(seen, seen)
-        diagonal = np.einsum("ii->i", self._covariance)  # a view
-        diagonal += self._drift
-        scale = np.sqrt(np.minimum(self._prior_variance / diagonal, 1.0))
-        self._covariance *= np.outer(scale, scale)
-        self._is_prior = False
+        gain = 1.0 / (1.0 + weight * float(observed @ seen))
+        mean = np.clip(mean + gain * (slipped - p_slip) * seen, -MEAN_MAX, MEAN_MAX)
+        covariance = covariance - weight * gain * np.outer(seen, seen)
+        covariance = (1.0 - DRIFT) * covariance + DRIFT * self._prior(residual)
+        self._set(residual, mean, covariance)
         self.outcomes += 1
+
+    def _prior(self, residual: Residual) -> Matrix:
+        """Return the covariance of weights and residual before any outcome."""
+        apart = np.zeros((self.inputs + 2, len(residual.grasps)))
+        return np.block([[self._weights_prior, apart], [apart.T, residual.prior]])
 
     def state(self) -> LearnerState:
         """Return the state for `restore`."""
-        mean, covariance = self._mean.astype("<f8"), self._covariance.astype("<f8")
-        return LearnerState(self.outcomes, mean.tobytes(), covariance.tobytes())
+        arrays = self._mean, self._covariance, self._residual.grasps
+        return LearnerState(self.outcomes, *(each.astype("<f8").tobytes() for each in arrays))
 
     def restore(self, state: LearnerState) -> None:
         """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
-        mean = vector(state.mean, self._width)
-        covariance = vector(state.covariance, self._width**2).reshape(self._width, self._width)
-        if not ((mean >= self._low) & (mean <= self._high)).all():
-            raise ValueError("holds weights that no outcomes lead to")
-        if not (covariance.diagonal() <= self._prior_variance * (1.0 + 1e-9)).all():
-            raise ValueError("knows less than before the first outcome")
-        if (covariance != covariance.T).any() or not _is_positive_definite(covariance):
-            raise ValueError("holds a matrix that is no covariance")
-        self.outcomes, self._mean, self._covariance = state.outcomes, mean, covariance
-        self._is_prior = False
+        count = min(state.outcomes, GRASPS_MAX) if self.inputs else 0
+        size = self.inputs + 2 + count
+        grasps = vector(state.grasps, count * self.inputs, INPUT_MAX).reshape(count, self.inputs)
+        mean = vector(state.mean, size, MEAN_MAX)
+        covariance = vector(state.covariance, size**2).reshape(size, size)
+        residual = Residual(grasps)
+        highest = self._prior(residual).diagonal() * (1.0 + 1e-9)
+        if (covariance != covariance.T).any() or (covariance.diagonal() > highest).any():
+            raise ValueError("holds a matrix that is no covariance, or knows less than the prior")
+        try:
+            np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError as error:
+            raise ValueError("holds a matrix that is no covariance") from error
+        self.outcomes = state.outcomes
+        self._set(residual, mean, covariance)
 
 
 def sigmoid(log_odds: float) -> float:
@@ -151,19 +163,14 @@ def sigmoid(log_odds: float) -> float:
     return (1.0 if log_odds >= 0.0 else small) / (1.0 + small)
 
 
-def vector(data: bytes, width: int) -> Vector:
-    """Return float64 values (width,). Raises `ValueError` if not finite or of another length."""
+def vector(data: bytes, width: int, limit: float = math.inf) -> Vector:
+    """Return float64 values (width,).
+
+    Raises `ValueError` for another length, and for what is not finite or beyond +-`limit`.
+    """
     if len(data) != 8 * width:
         raise ValueError(f"is of {len(data) // 8} values, not of {width}")
     values = np.frombuffer(data, "<f8").astype(np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError("holds numbers that are not finite")
+    if not (np.isfinite(values) & (np.abs(values) <= limit)).all():
+        raise ValueError("holds numbers that are not finite, or too large")
     return values
-
-
-def _is_positive_definite(matrix: NDArray[np.float64]) -> bool:
-    try:
-        np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        return False
-    return True

@@ -9,13 +9,10 @@ from typing import Annotated, Final, Literal, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from graspd.daemon.trust.learner import vector
+from graspd.daemon.trust.learner import INPUT_MAX, vector
 
 LIFTS_MAX: Final = 256
 """Grasps in the book: those of an hour and more. Outcomes of older ones are refused."""
-NOT_YOURS: Final = "not yours: another peer asks whether it may lift here"
-UNKNOWN_START: Final = "unknown boot_id: of a start whose grasps are not known any more"
-"""Why an outcome is refused, besides `REFUSALS`."""
 NOT_ASSESSED: Final = b""
 """Stands for the features of a grasp that nothing can be learned from: the model refused it, or
 the scene has no learner and no risk."""
@@ -53,13 +50,6 @@ class OutcomeStatus(StrEnum):
     """The grasp was not judged or is too old; the outcome is refused."""
 
 
-REFUSALS: Final = {
-    OutcomeStatus.UNKNOWN: "unknown grasp: not judged, or too long ago",
-    OutcomeStatus.CONTRADICTS: "contradicts: another outcome of this grasp was told before",
-}
-"""Why an outcome is refused, for the peer that told it."""
-
-
 class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One judged grasp."""
 
@@ -78,6 +68,11 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """True once a `lift` question was answered `stable`."""
 
     @property
+    def is_outstanding(self) -> bool:
+        """True if the grasp was called `stable` and its outcome can still come."""
+        return self.stable and self.slipped is None
+
+    @property
     def is_awaited(self) -> bool:
         """True if the lift was announced and its outcome is out."""
         return self.announced and self.slipped is None
@@ -90,17 +85,7 @@ class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Oldest first."""
     told: dict[OutcomeStatus, Annotated[int, msgspec.Meta(ge=0)]]
     unreported: Annotated[int, msgspec.Meta(ge=0)]
-    announced: Annotated[int, msgspec.Meta(ge=0)] = 0
-
-    @property
-    def outstanding(self) -> int:
-        """Number of grasps called `stable` whose outcome can still come."""
-        return sum(each.stable and each.slipped is None for each in self.records)
-
-    @property
-    def awaited(self) -> int:
-        """Number of announced lifts whose outcome is out."""
-        return sum(each.is_awaited for each in self.records)
+    announced: Annotated[int, msgspec.Meta(ge=0)]
 
 
 class LiftBook:
@@ -159,12 +144,11 @@ class LiftBook:
             if lift.slipped is not None or not (first_stable or first_assessed):
                 return False
             stable = stable or lift.stable
-            self.outstanding -= lift.stable
         announced = lift is not None and lift.announced
         self._lifts[grasp] = Lift(grasp, stable, features, announced=announced)
-        self.outstanding += stable
         if len(self._lifts) > LIFTS_MAX:
             self._forget(next(iter(self._lifts)))
+        self._count()
         return True
 
     def claim(self, grasp: GraspId, owner: bytes) -> None:
@@ -180,12 +164,13 @@ class LiftBook:
             return
         self._lifts[lift.id] = replace(lift, announced=True)
         self.announced += 1
-        self.awaited += 1
+        self._count()
 
     def withdraw(self) -> None:
         """Take back all announcements: another risk is set, which counts from the start."""
         self._lifts = {grasp: replace(lift, announced=False) for grasp, lift in self._lifts.items()}
-        self.announced = self.awaited = 0
+        self.announced = 0
+        self._count()
 
     def may_report(self, grasp: GraspId, peer: bytes | None) -> bool:
         """True if this peer may tell the outcome: the owner of the grasp, or the daemon itself.
@@ -207,10 +192,9 @@ class LiftBook:
             status = OutcomeStatus.UNKNOWN
         elif lift.slipped is None:
             status = OutcomeStatus.TAKEN
-            self.outstanding -= lift.stable
-            self.awaited -= lift.announced
             self._lifts[grasp] = replace(lift, features=None, slipped=slipped)
             self._unkept.add(grasp)
+            self._count()
         elif lift.slipped == slipped:
             status = OutcomeStatus.REPEATED
         else:
@@ -246,22 +230,22 @@ class LiftBook:
             raise ValueError("holds a grasp twice")
         for lift in state.records:
             if lift.features:
-                vector(lift.features, width)
+                vector(lift.features, width, INPUT_MAX)
             if lift.features is not None and lift.slipped is not None:
                 raise ValueError("would learn from a grasp twice")
         self._lifts = lifts
         self._unkept.clear()
         self.told = Counter(state.told)
-        self.unreported = state.unreported
-        self.outstanding = state.outstanding
-        self.announced, self.awaited = state.announced, state.awaited
+        self.unreported, self.announced = state.unreported, state.announced
+        self._count()
 
     def _forget(self, grasp: GraspId) -> None:
         """Drop the oldest grasp: its outcome is refused from now on."""
         lift = self._lifts.pop(grasp)
         self._unkept.discard(grasp)
-        forgotten = lift.stable and lift.slipped is None
-        self.unreported += forgotten
-        self.outstanding -= forgotten
-        self.awaited -= lift.is_awaited
+        self.unreported += lift.is_outstanding
         self.abandoned += lift.is_awaited
+
+    def _count(self) -> None:
+        self.outstanding = sum(lift.is_outstanding for lift in self._lifts.values())
+        self.awaited = sum(lift.is_awaited for lift in self._lifts.values())

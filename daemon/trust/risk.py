@@ -18,7 +18,7 @@ BUDGET_MAX: Final = 8.0
 SHARE_YOUNG: Final = 1.5
 """Probability of slip that may be called `stable` before an outcome, in units of the share that is
 set: with a full budget the surest grasps slip much less often than the threshold says."""
-SHARE_PROVEN: Final = 4.25
+SHARE_PROVEN: Final = 4.0
 """The same once `PROVEN_FROM` outcomes are known. From 3 to 5 both the good lifts that are kept and
 the sessions above the target rise; deploy/JUDGING.md has the curve."""
 PROVEN_FROM: Final = 40
@@ -95,15 +95,14 @@ class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
         return self.bound - self.target * self.lifts
 
 
-class RiskState(msgspec.Struct, frozen=True):
-    """State of `Risk`; see its attributes. Fields of the former rule are ignored."""
+class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """State of `Risk`; see its attributes."""
 
     max_slip_when_stable: float | None
     lifts: Count
     slips: Count
     proven: Count
-    budget: float | None = None
-    """None: of the former rule, which had a threshold and no budget."""
+    budget: float
 
 
 class Risk:
@@ -234,9 +233,8 @@ class Risk:
             raise ValueError("counts more slips than lifts")
         earned = 0.0 if alpha is None else alpha * state.lifts - state.slips
         highest = min(BUDGET_START + earned, BUDGET_MAX)
-        budget = highest if state.budget is None else state.budget
         rounding = ROUNDING * (state.lifts + 1)
-        if not -float(state.slips) <= budget <= highest + rounding:  # also true for NaN
+        if not -float(state.slips) <= state.budget <= highest + rounding:  # also true for NaN
             raise ValueError("has a budget that these outcomes do not lead to")
-        self.budget, self.lifts, self.slips = budget, state.lifts, state.slips
+        self.budget, self.lifts, self.slips = state.budget, state.lifts, state.slips
         self.proven = state.proven

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -25,9 +25,15 @@ from graspd.daemon.trust.lift_book import (
 )
 from graspd.daemon.trust.risk import Permission, Risk, RiskLimits, RiskReport, RiskState
 
+VERSION: Final = 2
+"""Format of a state. In format 1 the learner had no residual."""
 MAX_BYTES: Final = 1 << 20
-"""Largest uncompressed state, bytes; three fingers with all outcomes still out take 240 kB."""
+"""Largest uncompressed state, bytes; three fingers with all outcomes still out take 620 kB."""
 DIGEST_BYTES: Final = 32
+
+
+class FormatError(ValueError):
+    """A state is of another format: another graspd kept it."""
 
 
 class Assessment(msgspec.Struct, frozen=True):
@@ -47,12 +53,13 @@ class Assessment(msgspec.Struct, frozen=True):
     """Learner's features, float64, for the lift book."""
 
 
-class TrustState(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"lifts": "ledger"}
-):
+class _Versioned(msgspec.Struct, frozen=True):
+    version: int
+
+
+class TrustState(_Versioned, frozen=True, forbid_unknown_fields=True):
     """All that is learned; useless with another model or other fingers."""
 
-    version: Literal[1]
     model: str
     learner: LearnerState
     risk: RiskState
@@ -71,7 +78,6 @@ class Trust:
         `learns` false outcomes move only the risk's budget.
         """
         self._model = model
-        self._inputs = inputs
         self.learns = learns
         self._report: RiskReport | None = None
         self.learner = Learner(inputs)
@@ -122,7 +128,7 @@ class Trust:
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
         """Enter the verdict on a grasp in the book. Raises `ValueError` if it was not allowed."""
         # Nothing is learned from an assessment of another model.
-        is_ours = len(assessment.features) == 8 * (self._inputs + 2)
+        is_ours = len(assessment.features) == 8 * (self.learner.inputs + 2)
         features = assessment.features if is_ours else NOT_ASSESSED
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
@@ -170,7 +176,7 @@ class Trust:
     def state(self) -> TrustState:
         """Return what `restore` needs; later outcomes do not change it."""
         parts = self.learner.state(), self.risk.state(), self.lifts.state()
-        return TrustState(1, self._model, *parts)
+        return TrustState(VERSION, self._model, *parts)
 
     def fits(self, state: TrustState) -> bool:
         """Return True if a state is of this model."""
@@ -180,10 +186,10 @@ class Trust:
         """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
         if not self.fits(state):
             raise ValueError("is of another model")
-        learner, risk = Learner(self._inputs), Risk(self.risk.limits)
+        learner, risk = Learner(self.learner.inputs), Risk(self.risk.limits)
         learner.restore(state.learner)
         risk.restore(state.risk)
-        self.lifts.restore(state.lifts, self._inputs + 2)
+        self.lifts.restore(state.lifts, learner.inputs + 2)
         if state.risk.max_slip_when_stable != risk.limits.max_slip_when_stable:
             self.lifts.withdraw()
         self.learner, self.risk = learner, risk
@@ -199,12 +205,15 @@ def encode(state: TrustState) -> bytes:
 
 
 def decode(data: bytes) -> TrustState:
-    """Reverse `encode`. Raises `ValueError` for what is too long, damaged or no state."""
+    """Reverse `encode`. Raises `ValueError` for what is damaged or no state, or `FormatError`."""
     digest, content = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
     if len(data) > MAX_BYTES or hashlib.sha256(content).digest() != digest:
         raise ValueError("is damaged, or nothing that was learned")
     try:
         plain = zlib.decompressobj().decompress(content, MAX_BYTES)
+        version = msgspec.msgpack.decode(plain, type=_Versioned).version
+        if version != VERSION:
+            raise FormatError(f"is of format {version}; this graspd reads only {VERSION}")
         return msgspec.msgpack.decode(plain, type=TrustState)
     except (zlib.error, msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"is nothing that was learned: {error}") from error

@@ -270,7 +270,7 @@ complete -c graspd -n '_shtab_graspd_using report error-vs-time' -l json -d 'pri
 complete -c graspd -n '_shtab_graspd_using report; and test $_shtab_graspd_npos -eq 0' -a stability -d 'Numerical error of the whole chain on stiff and extreme readings.'
 complete -c graspd -n '_shtab_graspd_using report stability' -s h -l help -d 'show this help message and exit'
 complete -c graspd -n '_shtab_graspd_using report stability' -l data -xka "(__fish_complete_path (commandline -ct))" -d 'folder of the real grasps: all of them too'
-complete -c graspd -n '_shtab_graspd_using report stability' -l quick -d '10^4 outcomes instead of 10^6'
+complete -c graspd -n '_shtab_graspd_using report stability' -l quick -d '3000 outcomes instead of 10^5'
 complete -c graspd -n '_shtab_graspd_using report stability' -l json -d 'one JSON object on stdout'
 complete -c graspd -n '_shtab_graspd_using report stability; and test $_shtab_graspd_npos -ge 0' -ka "cnn1 cnn1-session mlp rf small-electrodes small-session small-session-ff small-session-ff-mf small-session-ff-th small-session-mf small-session-mf-th small-session-th svm" -d 'names in the zoo (default: all)'
 complete -c graspd -n '_shtab_graspd_using report; and test $_shtab_graspd_npos -eq 0' -a worth -d 'What `stable` is worth on another day, by how many outcomes were told.'

@@ -242,7 +242,7 @@ _shtab_graspd_report_error_vs_time_defaults_added=0
 _shtab_graspd_report_stability_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--data[folder of the real grasps\: all of them too]:DIR:_files"
-  "--quick[10\^4 outcomes instead of 10\^6]"
+  "--quick[3000 outcomes instead of 10\^5]"
   "--json[one JSON object on stdout]"
   "(*)::names in the zoo (default\: all):(cnn1 cnn1-session mlp rf small-electrodes small-session small-session-ff small-session-ff-mf small-session-ff-th small-session-mf small-session-mf-th small-session-th svm)"
 )

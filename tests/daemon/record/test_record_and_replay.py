@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import zlib
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import jsonschema.validators
+import msgspec
 import pytest
 from mcap.reader import make_reader
+from msgspec.structs import replace
 
 from graspd import judge, read_recording
+from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.models.training.data.datasets import read_table
@@ -163,6 +168,21 @@ def test_files_that_do_not_follow_each_other_are_named(
     assert not caplog.records
     RecordedRun([first, third])
     assert f"{third}: does not go on where the file before it ends" in caplog.text
+
+
+def test_what_another_graspd_had_learned_is_left_out_with_a_warning(
+    rotated: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = RecordedRun(rotated.files[1:2])
+    state = {"version": 1, "model": run.header.model_sha256, "learner": {}}
+    content = zlib.compress(msgspec.msgpack.encode(state))
+    run.header = replace(run.header, trust=hashlib.sha256(content).digest() + content)
+    recorded = run.scene({}, {}, None)
+    pipeline = run.parts(recorded, assembly.load_model(recorded), None).pipeline
+    run.restore(pipeline)
+    assert pipeline.trust is not None
+    assert pipeline.trust.learner.outcomes == 0
+    assert "what was learned is of format 1; this graspd reads only 2" in caplog.text
 
 
 def test_questions_and_announcements_are_in_the_recording_and_repeated(tmp_path: Path) -> None:

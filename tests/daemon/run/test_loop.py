@@ -22,9 +22,9 @@ from graspd.daemon.publish.companion import (
     hooks,
 )
 from graspd.daemon.publish.messages import Lifts, State
-from graspd.daemon.run.loop import Ended
+from graspd.daemon.run.loop import UNKNOWN_START, Ended
 from graspd.daemon.session.sensors import SensorWatch
-from graspd.daemon.trust.lift_book import UNKNOWN_START, GraspId, OutcomeStatus, Report
+from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus, Report
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import (
     DriverError,

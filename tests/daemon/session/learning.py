@@ -49,8 +49,7 @@ def trust(model: str = "model", inputs: int = INPUTS) -> Trust:
 def judge(part: Trust, grasp: int, boot: str = BOOT) -> None:
     """Judge and note a grasp; about half are likely to hold."""
     draw = np.random.default_rng(grasp)
-    width = part.learner.state().mean
-    inputs = np.clip(draw.normal(0.0, 1.0, len(width) // 8 - 2), -3.0, 3.0).astype(np.float32)
+    inputs = np.clip(draw.normal(0.0, 1.0, part.learner.inputs), -3.0, 3.0).astype(np.float32)
     margin = float(draw.normal(0.0, 4.0))
     name = GraspId(boot, grasp)
     found = part.judge(name, sigmoid(margin), margin, inputs)

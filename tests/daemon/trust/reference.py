@@ -1,74 +1,81 @@
-"""The learner once more, independently: in information form, in long double, by plain loops."""
+"""The learner once more, independently: the weights and the residual at all grasps of a stream.
+
+It knows all grasps from the start, is dense, and in long double.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 Number = np.longdouble
-SPREADS = (0.3, 0.5)
-FEATURE_SPREAD, TEMPERATURE, DRIFT = 0.3, 1.5, 2e-3
-SCALE = Number("1.6")
-MODERATION = np.longdouble("0.392699081698724154807830422909937860524646174921888")
-"""Pi / 8."""
+Exact = NDArray[np.longdouble]
+MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = Number("0.5"), Number("0.5"), Number("0.2")
+TEMPERATURE, SCALE, DRIFT = Number("2"), Number("2.9"), Number("0.002")
+SHARED, OWN, REACH = Number("9"), Number("0.009"), Number("0.5")
+"""Variances of the residual, shared and a grasp's own, and how far it reaches."""
+PI = Number("3.14159265358979323846264338327950288")
 
 
 class Reference:
-    """Weights with mean `mean` and covariance `covariance`, lists of long doubles."""
+    """Mean and covariance of the weights, then of the residual at each grasp of the stream."""
 
-    def __init__(self, inputs: int, drift: float = DRIFT) -> None:
-        spreads = [*SPREADS, *([FEATURE_SPREAD] * inputs)]
-        self.prior = [Number(spread) ** 2 for spread in spreads]
-        self.drift = Number(drift)
-        self.mean = [Number(1), *([Number(0)] * (inputs + 1))]
-        size = range(inputs + 2)
-        self.covariance = [[self.prior[i] if i == j else Number(0) for j in size] for i in size]
+    def __init__(
+        self, margins: list[float], inputs: NDArray[np.float32], drift: Number = DRIFT
+    ) -> None:
+        exact = inputs.astype(Number)
+        count, width = exact.shape
+        linear = np.hstack((np.array(margins, Number)[:, None] / TEMPERATURE, np.ones((count, 1))))
+        self.features = np.hstack((linear, exact, np.eye(count, dtype=Number)))
+        spreads = [MARGIN_SPREAD, BIAS_SPREAD, *[FEATURE_SPREAD] * width]
+        self.prior = np.diag(np.array([*spreads, *[Number(0)] * count]) ** 2)
+        for i in range(count if width else 0):
+            for j in range(count):
+                mean_square = ((exact[i] - exact[j]) ** 2).mean()
+                alike = SHARED * np.exp(-mean_square / (2 * REACH**2))
+                self.prior[width + 2 + i, width + 2 + j] = alike + OWN * (i == j)
+        self.mean = np.zeros(len(self.prior), Number)
+        self.mean[0] = 1
+        self.covariance = self.prior.copy()
+        self.scale = SCALE if width else TEMPERATURE
+        self.weights, self.drift = list(range(width + 2)), drift
 
-    def features(self, margin: float, inputs: list[float]) -> list[Number]:
-        return [Number(margin) / Number(TEMPERATURE), Number(1), *map(Number, inputs)]
+    def log_odds(self, grasp: int) -> float:
+        h = self.features[grasp]
+        variance = h @ (self.covariance @ h)
+        return float(self.scale * (h @ self.mean) / np.sqrt(1 + PI / 8 * variance))
 
-    def log_odds(self, features: list[Number]) -> Number:
-        size = range(len(features))
-        variance = sum(
-            (features[i] * self.covariance[i][j] * features[j] for i in size for j in size),
-            Number(0),
-        )
-        moderated: Number = SCALE * self._middle(features) / np.sqrt(1 + MODERATION * variance)
-        return moderated
+    def learn(self, grasp: int, slipped: bool) -> None:
+        h = self.features[grasp]
+        p = 1 / (1 + np.exp(-(h @ self.mean)))
+        seen = self.covariance @ h
+        # Kalman's gain, with the information p (1 - p) of an outcome as its inverse noise.
+        gain = seen / (h @ seen + 1 / (p * (1 - p)))
+        self.covariance -= np.outer(gain, seen)
+        self.mean += gain * (slipped - p) / (p * (1 - p))
+        self.covariance += self.drift * (self.prior - self.covariance)
 
-    def learn(self, features: list[Number], slipped: bool) -> None:
-        size = range(len(features))
-        p = 1 / (1 + np.exp(-self._middle(features)))
-        information = inverse(self.covariance)
-        for i in size:
-            for j in size:
-                information[i][j] += p * (1 - p) * features[i] * features[j]
-        covariance = inverse(information)
-        error = Number(slipped) - p
-        for i in size:
-            step = sum((covariance[i][j] * features[j] for j in size), Number(0))
-            self.mean[i] += step * error
-        for i in size:
-            covariance[i][i] += self.drift * self.prior[i]
-        scale = [
-            np.sqrt(min(self.prior[i] / covariance[i][i], Number(1))) if self.drift else Number(1)
-            for i in size
-        ]
-        self.covariance = [[scale[i] * covariance[i][j] * scale[j] for j in size] for i in size]
+    def keep(self, told: list[int]) -> None:
+        """Keep the weights and the residual at these grasps; what they say of others is left."""
+        kept = [*self.weights, *(len(self.weights) + grasp for grasp in told)]
+        here = np.ix_(kept, kept)
+        links = self.prior[:, kept] @ inverse(self.prior[here])
+        left = self.prior - links @ self.prior[kept]
+        self.mean = links @ self.mean[kept]
+        self.covariance = links @ self.covariance[here] @ links.T + left
 
-    def _middle(self, features: list[Number]) -> Number:
-        pairs = zip(self.mean, features, strict=True)
-        return sum((weight * value for weight, value in pairs), Number(0))
+    def state(self, told: list[int]) -> tuple[Exact, Exact]:
+        """Mean and covariance of the weights and of the residual at these grasps."""
+        kept = [*self.weights, *(len(self.weights) + grasp for grasp in told)]
+        return self.mean[kept], self.covariance[np.ix_(kept, kept)]
 
 
-def inverse(matrix: list[list[Number]]) -> list[list[Number]]:
+def inverse(matrix: Exact) -> Exact:
     """By Gauss and Jordan, of a positive definite matrix: no pivoting is needed."""
     size = len(matrix)
-    rows = [[*row, *(Number(i == j) for j in range(size))] for i, row in enumerate(matrix)]
+    rows = np.hstack((matrix, np.eye(size, dtype=Number)))
     for k in range(size):
-        pivot = rows[k][k]
-        rows[k] = [value / pivot for value in rows[k]]
-        for i in range(size):
-            if i != k:
-                factor = rows[i][k]
-                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
-    return [row[size:] for row in rows]
+        rows[k] /= rows[k, k]
+        others = np.arange(size) != k
+        rows[others] -= np.outer(rows[others, k], rows[k])
+    return rows[:, size:]

@@ -1,0 +1,90 @@
+"""The residual against scikit-learn's Gaussian processes, and against a dense long double."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+from graspd.daemon.trust import residual as module
+from graspd.daemon.trust.learner import Learner
+from graspd.daemon.trust.residual import Residual
+from tests.daemon.trust.reference import Reference
+from tests.daemon.trust.streams import learn, lifts
+
+INPUTS = 26
+LENGTH = 0.5 * INPUTS**0.5
+"""Length of the kernel: 0.5 an input."""
+SHARED, OWN = 9.0, 0.009
+
+
+def grasps(number: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    return 0.3 * np.random.default_rng(1).normal(size=(number, INPUTS))
+
+
+def process() -> GaussianProcessRegressor:
+    """The same prior; no parameter is fitted."""
+    kernel = ConstantKernel(SHARED) * RBF(LENGTH) + WhiteKernel(OWN)
+    return GaussianProcessRegressor(kernel, alpha=0.0, optimizer=None)
+
+
+def test_the_prior_is_scikit_learns_kernel() -> None:
+    told = grasps(40)
+    expected = process().kernel(told)
+    np.testing.assert_allclose(Residual(told).prior, expected, rtol=1e-12)
+    apart = (ConstantKernel(SHARED) * RBF(LENGTH))(told[:5], told)
+    np.testing.assert_allclose([Residual(told).shared(x) for x in told[:5]], apart, rtol=1e-12)
+
+
+def test_a_new_grasp_has_the_mean_and_variance_of_a_gaussian_process() -> None:
+    told, new = grasps(30)[:-1], grasps(30)[-1]
+    values = np.sin(told).sum(axis=1)
+    expected = process().fit(told, values)
+    mean, variance = expected.predict(new[None], return_cov=True)
+    certain = np.zeros((len(told), len(told)))
+    residual, means, covariance = Residual(told).told(new, values, certain)
+    np.testing.assert_array_equal(residual.grasps, grasps(30))
+    np.testing.assert_allclose(means, [*values, mean[0]], rtol=1e-9)
+    assert covariance[-1, -1] == pytest.approx(variance[0, 0], rel=1e-9)
+
+
+@pytest.mark.parametrize("kept", [128, 7])
+def test_learning_is_that_of_all_grasps_known_from_the_start(
+    kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "GRASPS_MAX", kept)
+    stream = list(lifts(60, INPUTS, spread=0.5))
+    learner = Learner(INPUTS)
+    reference = Reference([m for m, *_ in stream], np.array([x for _, x, _ in stream]))
+    for grasp, (margin, x, slipped) in enumerate(stream[:40]):
+        learner.learn(learner.judge(margin, x)[1], slipped=slipped)
+        reference.learn(grasp, slipped)
+        if grasp >= kept:
+            reference.keep(list(range(grasp - kept + 1, grasp + 1)))
+        for other in range(grasp + 1, len(stream), 5):
+            found = learner.judge(*stream[other][:2])[0]
+            assert found == pytest.approx(reference.log_odds(other), abs=1e-9)
+
+
+def test_outcomes_of_grasps_alike_say_what_linear_weights_cannot() -> None:
+    """Slips lie within a ball, and what holds lies around it."""
+    random = np.random.default_rng(0)
+    stream = []
+    for _ in range(400):
+        slipped = bool(random.random() < 0.5)
+        x = random.normal(0.0, 0.2 if slipped else 0.8, INPUTS).astype(np.float32)
+        stream.append((0.0, x, slipped))
+    learner = Learner(INPUTS)
+    learn(learner, stream[:300])
+    right = [(learner.judge(m, x)[0] > 0.0) == slipped for m, x, slipped in stream[300:]]
+    assert sum(right) > 90
+
+
+def test_a_thousandfold_repeated_grasp_leaves_a_covariance() -> None:
+    learner = Learner(INPUTS)
+    x = grasps(1)[0]
+    for index in range(3 * module.GRASPS_MAX):
+        learner.learn(learner.judge(0.0, x)[1], slipped=index % 2 == 0)
+    Learner(INPUTS).restore(learner.state())
+    assert abs(learner.judge(0.0, x)[0]) < 1.0
