@@ -30,7 +30,14 @@ def test_picotool_is_fetched_if_the_option_asks_for_it(image: Image, tmp_path: P
     nowhere = tmp_path / "nowhere"
     options = {"PICO_NO_PICOTOOL": 0, "PICOTOOL_GIT_REPOSITORY_URL": nowhere}
     settings = [f"-D{name}={value}" for name, value in options.items()]
-    command = ["cmake", "-S", build.BRIDGE / "pico", "-B", tmp_path / "build", *settings]
+    command: list[str | Path] = [
+        "cmake",
+        "-S",
+        build.BRIDGE / "pico",
+        "-B",
+        tmp_path / "build",
+        *settings,
+    ]
     command.append(f"-DPICO_SDK_PATH={build.pico_sdk()}")
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode != 0, done.stdout
