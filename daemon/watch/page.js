@@ -211,6 +211,7 @@ class Hand {
     this.say("clock", clock(Date.now() / 1000));
     this.part("banner").dataset.tone = tone;
     this.say("verdict", this.headline());
+    this.part("verdict").classList.toggle("words", this.headline().includes(" "));
     const p = none ? null : seen.p_slip, last = none ? null : seen.grasps[0] ?? null;
     const was = last !== null && (tone === "waiting" || tone === "learning") && last.verdict !== "unknown";
     this.say("was", was && last.grasp === seen.grasp ? `${last.held ? "judged" : "past:"} ${called(last)}` : "");

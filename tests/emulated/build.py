@@ -70,7 +70,7 @@ def image(
     check_tools()
     FOLDER.mkdir(parents=True, exist_ok=True)
     with _alone(FOLDER / "lock"):
-        sdk = _sdk()
+        sdk = pico_sdk()
         options = {
             "PICO_SDK_PATH": str(sdk),
             "CMAKE_PROJECT_graspd_bridge_INCLUDE": str(SKETCH),
@@ -120,8 +120,11 @@ def flash_and_ram(image: Path) -> tuple[int, int]:
     return image.stat().st_size, sum(held)
 
 
-def _sdk() -> Path:
-    """The pico-sdk that `PICO_SDK_PATH` names, or the subset, unpacked."""
+def pico_sdk() -> Path:
+    """Return the pico-sdk that `PICO_SDK_PATH` names, or the subset, unpacked.
+
+    Raises `MissingError` if there is none.
+    """
     named = os.environ.get("PICO_SDK_PATH")
     if named is not None:
         if not (Path(named) / "pico_sdk_init.cmake").is_file():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,26 @@ def test_an_image_leaves_most_of_the_chip_free(port: str, image: Image) -> None:
     flash, ram = build.flash_and_ram(image(port))
     assert 10_000 < flash < 64 * 1024, "of 2 MB"
     assert 4_000 < ram < 64 * 1024, "of 264 kB"
+
+
+def test_picotool_is_fetched_if_the_option_asks_for_it(image: Image, tmp_path: Path) -> None:
+    image("pico")  # or skip: no tools, no SDK
+    nowhere = tmp_path / "nowhere"
+    options = {"PICO_NO_PICOTOOL": 0, "PICOTOOL_GIT_REPOSITORY_URL": nowhere}
+    settings = [f"-D{name}={value}" for name, value in options.items()]
+    command: list[str | Path] = [
+        "cmake",
+        "-S",
+        build.BRIDGE / "pico",
+        "-B",
+        tmp_path / "build",
+        *settings,
+    ]
+    command.append(f"-DPICO_SDK_PATH={build.pico_sdk()}")
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode != 0, done.stdout
+    assert "Downloading Picotool" in done.stderr
+    assert str(nowhere) in done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("program", build.NEEDED)

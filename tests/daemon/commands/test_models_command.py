@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from graspd import drivers
 from graspd.daemon.assembly import assembly
 from graspd.daemon.commands import models
 from graspd.daemon.scene import Scene, parse
@@ -88,6 +89,19 @@ def test_an_added_model_is_found_by_its_name_until_it_is_removed(
     assert not list(kept.parent.iterdir())
     with pytest.raises(ModelError, match=f"no model 'mine' .*{kept.parent}"):
         assembly.model_path(scene_with("mine"))
+
+
+def test_check_names_an_added_model_as_the_scene_does(
+    home: Path, trained: Path, tmp_path: Path
+) -> None:
+    assert command("add", trained, "--name", "mine", "--user") == 0
+    recording = Path(drivers.__file__).parent / "recordings" / "demo" / "synthetic_show.csv"
+    tactile = f'[tactile]\ndriver = "replay"\nrecordings = ["{recording}"]\n'
+    for name, said in (("mine", "mine, trained as mlp ("), ("mlp", "mlp (")):
+        (tmp_path / "right.toml").write_text(f'{tactile}[model]\nname = "{name}"\n')
+        result = graspd("check", tmp_path / "right.toml", "--json")
+        assert result.returncode == 0, result.stderr
+        assert json.loads(result.stdout)["in"]["model"].startswith(said)
 
 
 def test_a_model_without_a_card_is_shown_and_kept_by_its_contract(

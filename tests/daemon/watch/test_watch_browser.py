@@ -69,9 +69,17 @@ def test_before_the_first_verdict_the_page_says_that_there_is_none(
     page.start()
     browser.look(1280, 800)
     browser.go(page.address)
+    lines = (
+        "(word => Math.round(word.clientHeight / parseFloat(getComputedStyle(word).lineHeight)))"
+        "(document.querySelector('.verdict'))"
+    )
     browser.wait_for("document.querySelector('.why').innerText.startsWith('silent: no message')")
     see(browser, "silent")
     assert text(browser, "verdict") == "NO VERDICT YET"
+    for width in (1280, 400):
+        browser.look(width, 800)
+        assert browser.value(lines) == 1, width
+        assert browser.value(f"{BANNER}.offsetTop <= document.querySelector('.verdict').offsetTop")
     page.stop()
     browser.wait_for("document.querySelector('.why').innerText.startsWith('no connection')")
     assert text(browser, "verdict") == "NO VERDICT YET"
