@@ -6,8 +6,8 @@
 //                                                     hand must have been still for so long
 //     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]
 //                                                     `boot` and `grasp` are those of the answer to
-                                                     a question without ASK_ENDPOINT: who asks
-                                                     there must tell too
+//                                                     a question without ASK_ENDPOINT: who asks
+//                                                     there must tell too
 //     lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]
 //                                                     each change of the verdict, until it is killed
 #include "graspd_client.hpp"

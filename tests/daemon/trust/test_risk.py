@@ -132,13 +132,13 @@ def test_the_threshold_rises_with_outcomes_and_falls_with_the_budget() -> None:
     assert probability() == pytest.approx(1.5 * 0.05)
     for _ in range(20):
         rule.take(stable=False, slipped=True, proves=True)
-    assert probability() == pytest.approx(2.75 * 0.05)
+    assert probability() == pytest.approx(2.25 * 0.05)
     for _ in range(80):
         rule.take(stable=False, slipped=False, proves=True)
-    assert probability() == pytest.approx(4.0 * 0.05)
+    assert probability() == pytest.approx(3.0 * 0.05)
     rule.take(stable=True, slipped=True, proves=True)
-    # The odds, 1 to 4, shrink with what is left over one slip: 3.1 of 4.05.
-    assert probability() == pytest.approx(1.0 / (1.0 + 4.0 * 4.05 / 3.1))
+    # The odds, 15 to 85, shrink with what is left over one slip: 3.1 of 4.05.
+    assert probability() == pytest.approx(1.0 / (1.0 + 85.0 / 15.0 * 4.05 / 3.1))
 
 
 def test_stable_is_said_only_up_to_the_threshold_and_never_of_what_is_no_number() -> None:
