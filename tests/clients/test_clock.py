@@ -1,4 +1,4 @@
-"""When a client asks another computer's daemon for its clock."""
+"""When a client asks another computer's daemon for its clock, and when it connects again."""
 
 from __future__ import annotations
 
@@ -53,3 +53,16 @@ def test_a_clock_that_is_not_understood_is_malformed(answer: bytes) -> None:
     with client(world, ask=True, same=False) as graspd:
         graspd.verdict(0.01)
         assert graspd.counts.malformed == 1
+
+
+def test_who_hears_nothing_at_all_connects_anew_ever_more_seldom() -> None:
+    world = World([])
+    times_s = []
+    with client(world) as graspd:
+        for _ in range(400):
+            before = world.renewed
+            graspd.verdict(0.1)
+            if world.renewed > before:
+                times_s.append((world.now_ns - START_NS) / 1e9)
+    gaps = [after - before for before, after in zip([0.0, *times_s], times_s, strict=False)]
+    assert gaps == pytest.approx([1.0, 2.0, 4.0, 8.0, 10.0, 10.0], abs=0.15)
