@@ -39,6 +39,10 @@ MEAN_MAX: Final = 25.0
 """Largest mean of a weight, and of the residual in log-odds, whatever is told: 50 times the
 margin's standard deviation, 8 times the residual's."""
 
+TOLD_MAX: Final = 5.0
+"""Log-odds of its own grasp beyond which one outcome does not move the mean. Without it, one lift
+that held though the network was sure of a slip would turn unlike grasps `stable`."""
+
 
 class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of a learner; arrays are float64, little-endian, row by row."""
@@ -119,10 +123,16 @@ class Learner:
             others = np.zeros(len(mean) - len(features) - 1)
             observed = np.concatenate((features, others, [1.0]))
         seen = covariance @ observed
-        p_slip = sigmoid(float(observed @ mean))
+        log_odds, variance = float(observed @ mean), float(observed @ seen)
+        p_slip = sigmoid(log_odds)
         weight = p_slip * (1.0 - p_slip)
-        gain = 1.0 / (1.0 + weight * float(observed @ seen))
-        mean = np.clip(mean + gain * (slipped - p_slip) * seen, -MEAN_MAX, MEAN_MAX)
+        gain = 1.0 / (1.0 + weight * variance)
+        step = gain * (slipped - p_slip)
+        if slipped:
+            step = min(step, max(TOLD_MAX - log_odds, 0.0) / variance)
+        else:
+            step = max(step, min(-TOLD_MAX - log_odds, 0.0) / variance)
+        mean = np.clip(mean + step * seen, -MEAN_MAX, MEAN_MAX)
         covariance = covariance - weight * gain * np.outer(seen, seen)
         covariance = (1.0 - DRIFT) * covariance + DRIFT * self._prior(residual)
         self._set(residual, mean, covariance)

@@ -39,10 +39,10 @@ def test_the_cases_of_a_model_become_two_tables() -> None:
     code, said = run("small-session-mf", "--quick")
     assert code == 0
     assert "\n0 of 4" in said
-    assert "break a bound, 1e+04 outcomes" in said
+    assert "break a bound, 3e+03 outcomes" in said
     for case in ("all 0", "demo table", "random 12-bit counts", "next to the threshold"):
         assert f"| small-session-mf | {case} |" in said
-    assert "| learner, 1e+04 outcomes, all of these in turns |" in said
+    assert "| learner, 3e+03 outcomes, all of these in turns |" in said
 
 
 def test_a_broken_bound_and_a_case_that_ends_early_are_said() -> None:

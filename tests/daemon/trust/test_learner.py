@@ -215,11 +215,18 @@ def test_no_mean_exceeds_its_limit_whatever_is_told() -> None:
         found, features = learner.judge(30.0 * sign, np.array([-1000.0 * sign, 3.0]))
         learner.learn(features, slipped=found < 0.0)
     assert (np.abs(np.frombuffer(learner.state().mean)) <= 25.0).all()
-    found, features = learner.judge(0.0, np.array([1000.0, 0.0]))
-    learner.learn(features, slipped=found < 0.0)
-    assert np.abs(np.frombuffer(learner.state().mean)[2]) == 25.0
     assert np.isfinite(learner.judge(0.0, np.array([1000.0, 0.0]))[0])
     Learner(2).restore(learner.state())
+
+
+@pytest.mark.parametrize("margin", [12.0, 16.0, 27.6, 30.0])
+def test_one_lift_that_held_makes_no_sure_slip_stable(margin: float) -> None:
+    """At a target of 0.05 nothing above three times as much is ever `stable`."""
+    inputs = np.random.default_rng(1).normal(size=(20, 78))
+    learner = Learner(78)
+    learner.learn(learner.judge(margin, inputs[0])[1], slipped=False)
+    unlike = [sigmoid(learner.judge(margin, each)[0]) for each in inputs[1:]]
+    assert min(unlike) > 3 * 0.05
 
 
 def test_a_reset_learner_is_a_new_one() -> None:
