@@ -217,7 +217,8 @@ class SessionKeeper(SensorWatch):
                 self._trust.restore(learned)
                 log.info("%d outcomes restored", learned.learner.outcomes)
         except ValueError as error:
-            log.warning("%s: what was learned %s; learning starts again", self._file.path, error)
+            lost = "learning and the count of the risk begin again"
+            log.warning("%s: what was learned %s; %s", self._file.path, error, lost)
 
     def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
         """Change to the session of sensors with other serial numbers."""
