@@ -22,7 +22,7 @@ SCALE: Final = 2.9
 """Factor of moderated log-odds, which are too timid on days, objects and poses that are new.
 
 With it, a tenth of the grasps with a `p_slip` of 0.1 slips. Fitted on the sessions of three
-quarters of the objects it is 2.86 to 2.89. The slope of outcomes on scaled log-odds is 1.00 on the
+quarters of the objects it is 2.87 to 2.90. The slope of outcomes on scaled log-odds is 1.00 on the
 others (`graspd report worth`, `worth` on the card of `small-session`).
 """
 MARGIN_MAX: Final = 30.0
