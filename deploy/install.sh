@@ -207,8 +207,9 @@ check_host() {
     [ -z "$wheelhouse" ] || check_wheelhouse
 }
 
-# pip only warns of a part that graspd does not have.
+# pip only warns of a part that graspd does not have; so it stays with wheels alone.
 check_extras() {
+    [ -f "$source/pyproject.toml" ] || return 0
     "$python" -I - "$source/pyproject.toml" >"$scratch/extras" <<'END'
 import sys, tomllib
 with open(sys.argv[1], "rb") as file:
