@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TextIO
 
@@ -40,13 +41,7 @@ STREAM_DURATIONS = Durations(
 )
 """Phases of the stream, shorter than the default, for a small file."""
 SHOW_GRASPS = 10
-SHOW_DURATIONS = Durations(
-    first_rest_s=(1.2, 1.2),
-    approach_s=(0.25, 0.35),
-    settle_s=(2.0, 2.0),
-    lift_s=(0.35, 0.45),
-    rest_s=(1.0, 1.0),
-)
+SHOW_DURATIONS = replace(STREAM_DURATIONS, settle_s=(2.0, 2.0), rest_s=(1.0, 1.0))
 """Held for two seconds, so that a person can read the verdict. In a rest of less than a second the
 gate may lose the resting level of a finger."""
 
