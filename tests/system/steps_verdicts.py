@@ -22,8 +22,10 @@ P_SLIP_ERROR_MAX: Final = 0.05
 CAN_MODEL: Final = "small-electrodes"
 """As in `can.toml`."""
 GRASPS: Final = 3
-QUOTAS: Final = (20, 10, 5)
-"""Percent of a processor that the daemon gets; the first that overloads it is taken."""
+QUOTAS: Final = (20, 10, 5, 2)
+"""Percent of a processor that the daemon gets; the first that overloads it is taken.
+
+The smallest is for a host so busy that the twin sends few sweeps."""
 BURST_HZ: Final = 30.0
 """Sweeps/s that are to overload it: the twin on a busy host can send them."""
 OVERLOADS_IN_S: Final = 15.0
