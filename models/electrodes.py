@@ -8,6 +8,7 @@ electrode i with the residual `(P d)_i / P_ii` and the standard deviation `1 / s
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,22 @@ electrodes. This limit refuses 19 of 20 of these, and a tenth of the real readin
 """
 
 
+class Deviations(NamedTuple):
+    """How a reading deviates from the training; arrays have shape (electrodes,)."""
+
+    counts: NDArray[np.float64]
+    """Deviation d of each electrode from its mean in the training, counts."""
+    residuals: NDArray[np.float64]
+    """P d: deviation from what the other electrodes predict, times P_ii, 1/counts."""
+
+    def mean_square(self, repaired: int = 0) -> float:
+        """Return d . P d over the number of electrodes: the mean square whitened deviation.
+
+        `repaired`: number of repaired electrodes, which are left out of the mean.
+        """
+        return float(self.counts.dot(self.residuals)) / (len(self.counts) - repaired)
+
+
 class Electrodes:
     """Find and repair broken electrodes of readings that look like the training's."""
 
@@ -58,22 +75,25 @@ class Electrodes:
         self.spread = np.sqrt(np.diag(np.linalg.inv(self._precision))).reshape(self.centre.shape)
         """Training standard deviation of each electrode, counts, shape (fingers, 24)."""
 
+    def compare(self, values: NDArray[np.float64]) -> Deviations:
+        """Compare counts, shape (fingers, 24), with what the training makes likely."""
+        deviations = values.ravel() - self._centre
+        return Deviations(deviations, self._precision.dot(deviations))
+
     def implausible(
-        self, values: NDArray[np.float64], broken: NDArray[np.bool_], at_most: int
+        self, deviations: Deviations, broken: NDArray[np.bool_], at_most: int
     ) -> NDArray[np.bool_]:
         """Return `broken` and the electrodes that do not fit the others, shape (fingers, 24).
 
-        `values`: counts, shape (fingers, 24); those of `broken` are ignored. The worst electrode is
-        removed first and the rest checked again, until all fit or `at_most` are broken.
+        Deviations of `broken` are ignored. The worst electrode is removed first and the rest
+        checked again, until all fit or `at_most` are broken.
         """
-        deviations = values.ravel() - self._centre
-        if np.count_nonzero(broken):
-            deviations[broken.ravel()] = 0.0
-        residuals = self._precision @ deviations
-        fit = np.abs(residuals) <= self._limits
-        if np.count_nonzero(fit) == fit.size and not np.count_nonzero(broken):
+        bad, residuals = broken.ravel(), deviations.residuals
+        if 1 in broken.tobytes():
+            residuals = self._precision.dot(np.where(bad, 0.0, deviations.counts))
+        elif 0 not in (np.abs(residuals) <= self._limits).tobytes():
             return broken
-        bad = broken.ravel().copy()
+        bad = bad.copy()
         others = _Others(self._precision, residuals)
         for electrode in np.flatnonzero(bad).tolist():
             others.forget(electrode)
@@ -85,14 +105,14 @@ class Electrodes:
             others.forget(worst)
         return bad.reshape(broken.shape)
 
-    def moved_finger(self, values: NDArray[np.float64]) -> bool:
+    def moved_finger(self, deviations: Deviations) -> bool:
         """Return True if all electrodes of a finger seem shifted by one offset.
 
-        `values`: counts, shape (fingers, 24). The offset is estimated from all electrodes, and must
-        be over `IMPLAUSIBLE` standard deviations. No single electrode need contradict the others.
+        The offset is estimated from all electrodes, and must be over `IMPLAUSIBLE` standard
+        deviations. No single electrode need contradict the others.
         """
-        residuals = (self._precision @ (values.ravel() - self._centre)).reshape(self._shape)
-        return not bool((np.abs(residuals.sum(axis=1)) <= self._finger_limits).all())
+        of_fingers = np.add.reduce(deviations.residuals.reshape(self._shape), axis=1)
+        return 0 in (np.abs(of_fingers) <= self._finger_limits).tobytes()
 
     def repaired(
         self, values: NDArray[np.float64], broken: NDArray[np.bool_]
@@ -184,14 +204,6 @@ class NoveltyCheck:
     def is_learned(self, square: float) -> bool:
         """Return True if a session may learn from a mapped reading of this `square`."""
         return square <= LEARNED_DISTANCES**2 * self._square_max
-
-    def square(self, values: NDArray[np.float64], repaired: int = 0) -> float:
-        """Return the mean square whitened deviation of counts, shape (fingers, 24).
-
-        `repaired`: number of repaired electrodes, which are left out of the mean.
-        """
-        deviations = (values.ravel() - self._centre) @ self._whitening
-        return float(deviations @ deviations) / (self._electrodes - repaired)
 
     def _squares(self, values: NDArray[np.float64], repaired: int) -> NDArray[np.float64]:
         deviations = (values.reshape(len(values), -1) - self._centre) @ self._whitening

@@ -91,21 +91,27 @@ class Plausibility:
             values = session.to_training(values)
         if broken is None:
             broken = np.zeros(counts.shape, dtype=np.bool_)
-        grasp, values = self._repair(counts, values, broken, session)
+        grasp: NDArray[np.generic] = counts
         known = int(np.count_nonzero(broken))
+        if known:
+            grasp, values = self._repair(counts, values, broken, session)
+        deviations = self._electrodes.compare(values)
         at_most = known + CONTRADICTING_MAX + 1
-        implausible = self._electrodes.implausible(values, broken, at_most)
+        implausible = self._electrodes.implausible(deviations, broken, at_most)
         number = int(np.count_nonzero(implausible))
+        repaired = grasp
         # With more than that, the reading as a whole is like nothing in the training.
         seen = learned = number < at_most and not too_many(implausible)
         if seen:
-            repaired, values = self._repair(counts, values, implausible, session)
+            if number > known:
+                repaired, values = self._repair(counts, values, implausible, session)
+                deviations = self._electrodes.compare(values)
             if session is None:
-                seen = not self._novelty.never_seen(values[np.newaxis], number).any()
-            elif self._electrodes.moved_finger(values):
+                seen = not self._novelty.never_seen(values[np.newaxis], number)[0]
+            elif self._electrodes.moved_finger(deviations):
                 seen = learned = False
             else:
-                square = self._novelty.square(values, number)
+                square = deviations.mean_square(number)
                 learned = self._novelty.is_learned(square)
                 seen = self._novelty.is_near(square, number - known) and not session.odd
         if not seen:
@@ -123,8 +129,6 @@ class Plausibility:
         session: Calibration | None,
     ) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Return counts, and their values with the training's sensors, with `broken` repaired."""
-        if not broken.any():
-            return counts, values
         values = self._electrodes.repaired(values, broken)
         expected = values if session is None else session.from_training(values)
         return np.where(broken, np.clip(expected, 0.0, COUNT_MAX), counts), values

@@ -20,6 +20,12 @@ SHAPE = (3, 24)
 NOTHING = np.zeros(SHAPE, dtype=np.bool_)
 
 
+def implausible(
+    electrodes: Electrodes, values: NDArray[np.float64], broken: NDArray[np.bool_], at_most: int
+) -> NDArray[np.bool_]:
+    return electrodes.implausible(electrodes.compare(values), broken, at_most)
+
+
 def correlated(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], SeenCounts]:
     """Mean (72,) and covariance (72, 72) of made-up electrodes, and the contract's words for it."""
     random = np.random.default_rng(seed)
@@ -82,7 +88,7 @@ def test_an_electrode_is_implausible_from_eight_conditional_deviations_on(
     values = mean.copy()
     expected, variance = conditional(mean, covariance, values, out)
     values[30] = expected[0] + deviations * IMPLAUSIBLE * np.sqrt(variance[0])
-    marked = Electrodes(seen).implausible(values.reshape(SHAPE), NOTHING, 12)
+    marked = implausible(Electrodes(seen), values, NOTHING, 12)
     assert marked.sum() == found
     assert marked.ravel()[30] == found
 
@@ -109,7 +115,7 @@ def test_the_search_takes_out_the_worst_of_those_left_one_by_one(seed: int) -> N
         if off.max() <= IMPLAUSIBLE:
             break
         out[off.argmax()] = True
-    marked = Electrodes(seen).implausible(values.reshape(SHAPE), broken.reshape(SHAPE), 6)
+    marked = implausible(Electrodes(seen), values, broken.reshape(SHAPE), 6)
     assert np.flatnonzero(marked).tolist() == np.flatnonzero(out).tolist()
 
 
@@ -121,7 +127,7 @@ def test_what_is_known_to_be_broken_is_not_looked_at() -> None:
     electrodes = Electrodes(seen)
     for reads in (0.0, 4095.0, 2000.0):
         values[1, 7] = reads
-        np.testing.assert_array_equal(electrodes.implausible(values, broken, 12), broken)
+        np.testing.assert_array_equal(implausible(electrodes, values, broken, 12), broken)
 
 
 @settings(max_examples=60)
@@ -137,7 +143,7 @@ def test_the_search_ends_and_never_forgets_what_is_known(
     random = np.random.default_rng(seed)
     values = random.uniform(0.0, 4095.0, SHAPE)
     broken = (random.permutation(72) < known).reshape(SHAPE)
-    marked = Electrodes(seen).implausible(values, broken, at_most)
+    marked = implausible(Electrodes(seen), values, broken, at_most)
     assert (marked | ~broken).all()
     assert marked.sum() <= max(at_most, known)
 
@@ -150,10 +156,10 @@ def side(bts3_dir: Path) -> Grasps:
 def test_a_stuck_electrode_of_a_real_grasp_is_found_and_hardly_any_sound_one(side: Grasps) -> None:
     electrodes = Electrodes(TactileModel(zoo.find("cnn1")).contract.seen)
     values = side.counts[::4].astype(np.float64)
-    alarms = [electrodes.implausible(reading, NOTHING, 13).any() for reading in values]
+    alarms = [implausible(electrodes, reading, NOTHING, 13).any() for reading in values]
     assert np.mean(alarms) < 0.12
     values[:, 1, 9] = 0.0
-    found = [electrodes.implausible(reading, NOTHING, 13)[1, 9] for reading in values]
+    found = [implausible(electrodes, reading, NOTHING, 13)[1, 9] for reading in values]
     assert np.mean(found) > 0.95
 
 
@@ -180,7 +186,7 @@ def test_a_finger_that_moved_as_a_whole_is_noticed_and_no_electrode_of_it() -> N
     precision: NDArray[np.float64] = np.linalg.inv(covariance).astype(np.float64)
     for reading in random.multivariate_normal(mean, covariance, 20):
         values = reading.reshape(SHAPE)
-        assert not electrodes.moved_finger(values)
+        assert not electrodes.moved_finger(electrodes.compare(values))
         # By generalised least squares: what was added to a finger, and how far that may be off.
         for finger, chosen in enumerate(of_finger):
             spread = 1.0 / np.sqrt(chosen @ precision @ chosen)
@@ -190,7 +196,7 @@ def test_a_finger_that_moved_as_a_whole_is_noticed_and_no_electrode_of_it() -> N
                 moved[finger] += (IMPLAUSIBLE + excess) * spread - known
                 others = [o for o in range(3) if o != finger]
                 if all(_moved_by(moved, mean, precision, of_finger[o]) < 7.9 for o in others):
-                    assert electrodes.moved_finger(moved) is expected
+                    assert electrodes.moved_finger(electrodes.compare(moved)) is expected
 
 
 def _moved_by(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graspd.models.contract import ModelContract, ModelError, SeenCounts, SessionInput, Sharpness
-from graspd.models.electrodes import NoveltyCheck
+from graspd.models.electrodes import Electrodes, NoveltyCheck
 from tests.daemon.fakes import contract
 
 
@@ -98,13 +98,15 @@ def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
 ) -> None:
     check = NoveltyCheck(seen(spread=1 / 100))
     values = np.full((3, 24), 2000.0 + 100.0 * distance)
-    assert check.is_near(check.square(values)) is near
-    assert check.is_near(check.square(values, 2), 1) is near_though_contradicted
-    assert check.is_learned(check.square(values)) is learned
+    deviations = Electrodes(seen(spread=1 / 100)).compare(values)
+    assert check.is_near(deviations.mean_square()) is near
+    assert check.is_near(deviations.mean_square(2), 1) is near_though_contradicted
+    assert check.is_learned(deviations.mean_square()) is learned
 
 
 def test_a_reading_that_is_not_finite_is_neither_near_nor_learned() -> None:
     check, values = NoveltyCheck(seen(spread=1 / 100)), np.full((3, 24), 2000.0)
     values[0, 0] = np.nan
-    assert not check.is_near(check.square(values))
-    assert not check.is_learned(check.square(values))
+    square = Electrodes(seen(spread=1 / 100)).compare(values).mean_square()
+    assert not check.is_near(square)
+    assert not check.is_learned(square)

@@ -121,7 +121,12 @@ class _Fold:
         values = self._trained.mapped(counts, self._table_of)
         nothing = np.zeros(counts.shape[1:], dtype=np.bool_)
         return np.array(
-            [self._electrodes.implausible(reading, nothing, LOOKED_FOR_MAX) for reading in values]
+            [
+                self._electrodes.implausible(
+                    self._electrodes.compare(reading), nothing, LOOKED_FOR_MAX
+                )
+                for reading in values
+            ]
         )
 
     def repair(self, counts: Numbers, broken: Bools) -> Numbers:

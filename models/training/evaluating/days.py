@@ -77,19 +77,21 @@ class Day:
         now = session or Standards(self.electrodes.centre, self.electrodes.spread)
         scale = self.electrodes.spread / now.spread
         values = self.electrodes.centre + (counts.astype(np.float64) - now.mean) * scale
-        found = self.electrodes.implausible(values, self._sound, CONTRADICTING_MAX + 1)
+        deviations = self.electrodes.compare(values)
+        found = self.electrodes.implausible(deviations, self._sound, CONTRADICTING_MAX + 1)
         number = int(found.sum())
         if number > CONTRADICTING_MAX:
             return counts, False, False
         if number:
             values = self.electrodes.repaired(values, found)
+            deviations = self.electrodes.compare(values)
             expected = now.mean + (values - self.electrodes.centre) / scale
             counts = np.where(found, np.clip(expected, 0.0, COUNT_MAX), counts)
         if session is None:
             return counts, not self._novelty.never_seen(values[np.newaxis], number).any(), True
-        if self.electrodes.moved_finger(values):
+        if self.electrodes.moved_finger(deviations):
             return counts, False, False
-        square = self._novelty.square(values, number)
+        square = deviations.mean_square(number)
         return counts, self._novelty.is_near(square, number), self._novelty.is_learned(square)
 
 
