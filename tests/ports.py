@@ -1,8 +1,11 @@
-"""Ports of this computer for one test alone: others may run beside it."""
+"""Ports and multicast groups for one test alone: others may run beside it."""
 
 from __future__ import annotations
 
+import os
 import socket
+
+from graspd.drivers.base import FINGERS
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
@@ -11,3 +14,17 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def multicast_group() -> str:
+    """A group of python-can's `udp_multicast` for this process."""
+    return f"239.74.{os.getpid() % 250}.{2 + os.getpid() // 250 % 250}"
+
+
+def can_id(group: str) -> int:
+    """Arbitration id of finger `ff` in a group: one that no other group's frames have.
+
+    A socket of python-can hears all groups that any process of this computer has joined.
+    """
+    _, _, third, fourth = map(int, group.split("."))
+    return 0x10000 + (third << 8 | fourth) * len(FINGERS)

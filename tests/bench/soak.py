@@ -1,9 +1,8 @@
 """Whether graspd lives for months: a daemon under faults and outages, watched for what it loses.
 
 `python -m tests.bench.soak --seconds 120` prints what was found beside its limits, and exits 1 if
-one is broken. The daemon, the twin and the subscribers are processes of their own, the link is a
-serial line (`spi`) or multicast (`can`). With `--rate 1000` an hour's worth of readings takes six
-minutes.
+one is broken. The daemon, the SPI twin and a second subscriber are processes of their own. With
+`--rate 1000` an hour's worth of readings takes six minutes.
 """
 
 from __future__ import annotations
@@ -13,11 +12,12 @@ import dataclasses
 import itertools
 import random
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,18 +31,13 @@ from tests.bench.live import (
     PATIENCE_S,
     STOP_S,
     TALLIED,
-    Kind,
-    Subscriber,
+    Child,
     TwinPlan,
     Usage,
     end_children_at_sigterm,
-    new_tally,
-    start_daemon,
-    start_listener,
-    start_twin,
-    tactile_section,
+    running,
+    spi_section,
     usage,
-    where_of,
 )
 from tests.bench.soak_judge import Found, Heard, judge
 
@@ -61,22 +56,24 @@ AWAY_S = (0.1, 2.0)
 """How long a killed twin stays away."""
 STOPPED_S = (1.0, 5.0)
 """How long a subscriber is stopped: less than its queue holds at 100 Hz."""
-FAULTS: Mapping[Kind, LinkFaults] = {
-    "spi": LinkFaults(
-        bit_flip_probability=0.002,
-        drop_probability=0.002,
-        duplicate_probability=0.002,
-        disconnect_every_frames=500,
-        dead_electrodes=((0, 3), (2, 17)),
-    ),
-    # A CAN controller drops a damaged frame, and a bus does not break in the middle of one.
-    "can": LinkFaults(
-        drop_probability=0.002,
-        duplicate_probability=0.002,
-        reorder_probability=0.002,
-        dead_electrodes=((0, 3), (2, 17)),
-    ),
-}
+FAULTS = LinkFaults(
+    bit_flip_probability=0.002,
+    drop_probability=0.002,
+    duplicate_probability=0.002,
+    disconnect_every_frames=500,
+    dead_electrodes=((0, 3), (2, 17)),
+)
+LISTENER = """
+import sys, zmq
+socket = zmq.Context().socket(zmq.SUB)
+socket.connect(sys.argv[1])
+socket.subscribe("verdict.")
+socket.recv_multipart()
+print("hears", flush=True)
+while True:
+    socket.recv_multipart()
+"""
+"""A subscriber that does nothing with what it hears, and says when that begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +81,6 @@ class Plan:
     """What a soak shall do."""
 
     seconds: float
-    kind: Kind = "spi"
     rate_hz: float = 100.0
     seed: int = 0
 
@@ -94,67 +90,54 @@ class Soak:
 
     def __init__(self, folder: Path, plan: Plan) -> None:
         self._plan = plan
+        self._folder = folder
         self._random = random.Random(plan.seed)
-        self._endpoint = f"ipc://{folder}/graspd"
-        self._scene = folder / "scene.toml"
-        self._log = folder / "daemon.log"
-        self._tally = new_tally(folder / "tally")
-        where = where_of(plan.kind, folder)
-        self._scene.write_text(
-            f"{tactile_section(plan.kind, where)}"
-            f'[session]\nfile = "{folder}/session.json"\n'
-            f'[publish]\nendpoint = "{self._endpoint}"\n'
+        self._tally, self._ends_ns = (
+            np.memmap(folder / name, dtype=np.int64, mode="w+", shape=shape)
+            for name, shape in (
+                ("tally", len(TALLIED)),
+                ("ends", round(plan.rate_hz * (plan.seconds + PATIENCE_S))),
+            )
         )
-        self._twin_plan = TwinPlan(
-            kind=plan.kind,
-            where=where,
-            tally=str(folder / "tally"),
-            rate_hz=plan.rate_hz,
-            faults=FAULTS[plan.kind],
-        )
-        # The path of a serial bridge alone: on CAN the numbers go on, so that all is counted.
-        self._ends_ns = np.zeros(0, dtype=np.int64)
-        if plan.kind == "spi":
-            sweeps = round(plan.rate_hz * (plan.seconds + PATIENCE_S))
-            ends = folder / "ends"
-            self._ends_ns = np.memmap(ends, dtype=np.int64, mode="w+", shape=sweeps)
-            self._twin_plan = msgspec.structs.replace(self._twin_plan, ends=str(ends))
         self._heard = Heard()
         self._samples: list[Usage] = []
         self._sample_s = time.monotonic()
         self._deeds: deque[tuple[float, Callable[[], None]]] = deque()
         self._kills = self._stops = 0
-        self._ended_early = False
 
     def run(self) -> Found:
         """Do it. Raises `RuntimeError` if the daemon does not start, with what it said."""
+        sections = f'{spi_section(self._folder)}[session]\nfile = "{self._folder}/session.json"\n'
+        endpoint = f"ipc://{self._folder}/v"
+        listener = [sys.executable, "-c", LISTENER, endpoint]
         topics = ("verdict.", "status.")
         with (
-            Subscriber(self._endpoint, topics=topics) as self._subscriber,
-            start_daemon(self._scene, self._log) as self._daemon,
-            start_listener(self._endpoint) as self._other,
+            running(self._folder, sections, topics=topics) as (self._daemon, self._subscriber),
+            Child(listener, stdout=subprocess.PIPE) as self._other,
             ExitStack() as self._twins,
         ):
             self._hear(lambda: self._has_begun() or self._has_ended(), PATIENCE_S)
             if not self._has_begun():
-                raise RuntimeError(f"no word of the daemon: {self._log.read_text()}")
-            self._other.line()
+                said = (self._folder / "log").read_text()
+                raise RuntimeError(f"no word of the daemon: {said}")
+            if self._other.stdout is not None:
+                self._other.stdout.readline()
             self._add_twin()
             self._hear(lambda: self._heard.readings > 0 or self._has_ended(), PATIENCE_S)
             self._samples.clear()
             self._plan_deeds()
             self._hear(self._has_ended, self._plan.seconds)
-            self._ended_early = self._has_ended()
-            self._twin.process.terminate()
-            self._hear(lambda: self._twin.process.poll() is not None, STOP_S)
+            ended_early = self._has_ended()
+            self._twin.terminate()
+            self._hear(lambda: self._twin.poll() is not None, STOP_S)
             self._hear(lambda: False, SETTLED_S)
-            return self._end()
+            return self._end(ended_early)
 
     def _has_begun(self) -> bool:
         return self._heard.status is not None and self._heard.messages > 1
 
     def _has_ended(self) -> bool:
-        return self._daemon.process.poll() is not None
+        return self._daemon.poll() is not None
 
     def _hear(self, done: Callable[[], bool], seconds: float) -> None:
         """Listen, do what is due and look at the daemon, so long at most."""
@@ -169,27 +152,24 @@ class Soak:
                 self._samples.append(usage(self._daemon.pid))
                 self._sample_s = now_s + SAMPLE_S
 
-    def _end(self) -> Found:
+    def _end(self, ended_early: bool) -> Found:
         began_s = time.monotonic()
-        code, _ = self._daemon.terminate()
+        self._daemon.terminate()
+        code = self._daemon.wait(STOP_S)
         stop_s = time.monotonic() - began_s
         self._hear(lambda: False, SETTLED_S)
         status = self._heard.status
-        self._wake_other()  # if the daemon ended while it was stopped
-        _, missed = self._other.terminate()
         return Found(
             samples=self._samples,
             heard=self._heard,
             twin=dict(zip(TALLIED, map(int, self._tally), strict=True)),
             ends_ns=self._ends_ns[self._ends_ns > 0],
-            driver={} if status is None else status.drivers[self._plan.kind],
-            missed_by_stopped=int(missed or 0),
-            kills=self._kills,
-            stops=self._stops,
+            driver={} if status is None else status.drivers["spi"],
+            outages=self._kills + self._stops,
             exit_code=code,
             stop_s=stop_s,
             planned=self._plan.rate_hz * self._plan.seconds,
-            ended_early=self._ended_early,
+            ended_early=ended_early,
         )
 
     def _plan_deeds(self) -> None:
@@ -213,24 +193,29 @@ class Soak:
     def _kill_twin(self) -> None:
         # As with a real adapter its path goes with it: else it leads to the next terminal that gets
         # this number, and that may be anybody's.
-        self._twin.process.send_signal(signal.SIGSTOP)
-        if self._plan.kind == "spi":
-            Path(self._twin_plan.where).unlink(missing_ok=True)
+        self._twin.send_signal(signal.SIGSTOP)
+        (self._folder / "bridge").unlink(missing_ok=True)
         self._twin.kill()
+        self._twin.wait()
         self._kills += 1
 
     def _add_twin(self) -> None:
-        seed = self._plan.seed + self._kills
-        faults = dataclasses.replace(self._twin_plan.faults, seed=seed)
-        plan = msgspec.structs.replace(self._twin_plan, faults=faults)
-        self._twin = self._twins.enter_context(start_twin(plan))
+        plan = TwinPlan(
+            path=f"{self._folder}/bridge",
+            tally=f"{self._folder}/tally",
+            ends=f"{self._folder}/ends",
+            rate_hz=self._plan.rate_hz,
+            faults=dataclasses.replace(FAULTS, seed=self._plan.seed + self._kills),
+        )
+        command = [sys.executable, "-m", "tests.bench.live", msgspec.json.encode(plan).decode()]
+        self._twin = self._twins.enter_context(Child(command))
 
     def _stop_other(self) -> None:
-        self._other.process.send_signal(signal.SIGSTOP)
+        self._other.send_signal(signal.SIGSTOP)
         self._stops += 1
 
     def _wake_other(self) -> None:
-        self._other.process.send_signal(signal.SIGCONT)
+        self._other.send_signal(signal.SIGCONT)
 
 
 def soak(plan: Plan) -> Found:
@@ -244,11 +229,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.soak", description=__doc__)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--rate", type=float, default=100.0, metavar="HZ")
-    parser.add_argument("--link", choices=tuple(FAULTS), default="spi")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     end_children_at_sigterm()
-    rows = judge(soak(Plan(given.seconds, given.link, given.rate, given.seed)))
+    rows = judge(soak(Plan(given.seconds, given.rate, given.seed)))
     head = ("", "found", "at most")
     lines = markdown_table(head, [row.cells() for row in rows], right=head[1:])
     sys.stdout.write("\n".join(lines) + "\n")

@@ -13,7 +13,7 @@ import pytest
 
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.publish.messages import Verdict, encode
-from tests.bench.live import TALLIED, Kind, Usage
+from tests.bench.live import TALLIED, Usage
 from tests.bench.soak import Plan, soak
 from tests.bench.soak_judge import Found, Heard, Row, judge
 from tests.daemon.processes import before_others
@@ -32,14 +32,12 @@ def broken(rows: list[Row]) -> set[str]:
     return {row.name for row in rows if row.broken}
 
 
-@pytest.mark.parametrize("kind", ["spi", "can"])
-def test_a_short_soak_finds_nothing(kind: Kind) -> None:
+def test_a_short_soak_finds_nothing() -> None:
     with before_others():
-        found = soak(Plan(SECONDS, kind))
+        found = soak(Plan(SECONDS))
     rows = judge(found)
     assert broken(rows) <= SPEED, [row for row in rows if row.broken]
-    assert found.kills >= 1
-    assert found.stops >= 1
+    assert found.outages >= 2
     assert found.heard.readings > 100
 
 
@@ -47,7 +45,7 @@ def samples(kib: Callable[[float], float], seconds: float = HOUR_S) -> list[Usag
     """Of a daemon whose memory is a function of time, s, with the noise of an allocator."""
     noise = np.random.default_rng(0).integers(-20, 21, round(2 * seconds))
     return [
-        Usage(t_s, 0.03 * t_s, 80_000 + round(kib(t_s)) + 4 * int(n), 14, 3)
+        Usage(t_s, 80_000 + round(kib(t_s)) + 4 * int(n), 14, 3)
         for t_s, n in zip(np.arange(0.0, seconds, 0.5), noise, strict=True)
     ]
 
@@ -67,9 +65,7 @@ def well() -> Found:
         twin=twin,
         ends_ns=np.arange(MADE, dtype=np.int64) * 10_000_000,
         driver={"readings": readings, "missed_readings": COUNTED, "link_losses": 2},
-        missed_by_stopped=0,
-        kills=2,
-        stops=2,
+        outages=4,
         exit_code=0,
         stop_s=0.2,
     )

@@ -1,21 +1,12 @@
-"""One thing that an attacker or a broken board tries, and what came of it."""
+"""What an attack is given, and what comes of it."""
 
 from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
-
-
-class Aim(Enum):
-    """What would be lost."""
-
-    FALSE_STABLE = "a false `stable`"
-    FALLS = "the daemon falls or is late"
-    WHO_MAY = "a peer gets what it may not have"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,23 +41,8 @@ class Outcome:
     """What came of it."""
 
     tried: int
-    """How often."""
+    """How often: readings, connections, bytes or what else the attack counts."""
     happened: str
     """In plain words with figures, such as "0 of 995 verdicts `stable`"."""
     held: bool
     """Whether graspd did what it must."""
-
-
-@dataclass(frozen=True, slots=True)
-class Attack:
-    """Something to try over a door of the daemon."""
-
-    name: str
-    """Such as `ring-spi`."""
-    aim: Aim
-    what: str
-    """What is tried, in one sentence without its full stop."""
-    unit: str
-    """What `tried` counts, such as "connections"."""
-    run: Callable[[Plan], Outcome]
-    """Tries it. What it raises counts as broken."""

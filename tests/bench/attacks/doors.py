@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import random
 import resource
 import socket
@@ -19,8 +18,8 @@ import zmq
 
 from graspd.daemon.publish.keys import make
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
-from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon
+from tests.bench.attacks.attack import Outcome, Plan
+from tests.bench.live import PATIENCE_S, Child, Subscriber, memory_mib, peak_mib, running
 from tests.ports import free_port
 from tests.threads import at_work
 
@@ -68,14 +67,7 @@ class Hand:
     publish: str
     ask: str
     friend: Subscriber
-    rest_mib: float = 0.0
-    peak_mib: float = 0.0
-
-    def look(self) -> None:
-        """Note its memory; what is gone has none."""
-        with contextlib.suppress(OSError, IndexError):
-            pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
-            self.peak_mib = max(self.peak_mib, pages * os.sysconf("SC_PAGESIZE") / 2**20)
+    rest_mib: float
 
     @property
     def doors(self) -> tuple[Connect, Connect]:
@@ -85,48 +77,42 @@ class Hand:
     def outcome(self, tried: int, well: bool = True, said: str = "") -> Outcome:
         """What became of it: whether it lives, is heard, and has little memory."""
         self.friend.drain()
-        self.look()
-        grown_mib = self.peak_mib - self.rest_mib
-        lives = self.process.process.poll() is None
+        grown_mib = peak_mib(self.process.pid) - self.rest_mib
+        lives = self.process.poll() is None
         heard = lives and self.friend.take(2.0) is not None
         happened = f"{said}memory {self.rest_mib:.0f} + {grown_mib:.1f} MiB, "
         happened += "the others hear it" if heard else "no subscriber hears it"
         if not lives:
-            happened += f", it has ended with {self.process.process.returncode}"
+            happened += f", it has ended with {self.process.returncode}"
         return Outcome(tried, happened, well and heard and grown_mib < MEMORY_MAX_MIB)
 
 
 @contextlib.contextmanager
-def hand(folder: Path, scheme: str) -> Iterator[Hand]:
-    """A daemon at rest."""
+def hand(folder: Path, *, curve: bool = False) -> Iterator[Hand]:
+    """A daemon at rest: on Unix sockets, or with keys on TCP."""
     publish, ask = f"ipc://{folder}/v", f"ipc://{folder}/ask"
     keys = ""
-    if scheme == "curve":
+    if curve:
         make(folder, "daemon")
         make(folder / "clients", "friend")
         keys = '[curve]\nsecret_key = "daemon.key_secret"\nclients = "clients"\n'
-    if scheme != "ipc":
         publish, ask = (f"tcp://127.0.0.1:{port}" for port in (free_port(), free_port()))
-    scene = folder / "scene.toml"
-    scene.write_text(
+    sections = (
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[gate]\nmode = "every"\nrequest_ms = {PATIENCE_MS}.0\n[model]\nname = "cnn1"\n'
-        f'[publish]\nendpoint = "{publish}"\n[ask]\nendpoint = "{ask}"\n{keys}'
+        f'[ask]\nendpoint = "{ask}"\n{keys}'
     )
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    with (
-        start_daemon(scene, folder / "log") as process,
-        Subscriber(publish, keys=folder if keys else None) as friend,
+    with running(folder, sections, endpoint=publish, keys=folder if keys else None) as (
+        process,
+        friend,
     ):
-        made = Hand(process, publish, ask, friend)
         if friend.take(PATIENCE_S) is None:
             raise TimeoutError("the daemon says nothing")
         for _ in range(100):
             friend.take(1.0)
-        made.look()
-        made.rest_mib = made.peak_mib
-        yield made
+        yield Hand(process, publish, ask, friend, memory_mib(process.pid))
 
 
 def connect(endpoint: str) -> socket.socket:
@@ -149,31 +135,29 @@ def connect(endpoint: str) -> socket.socket:
 def connections(plan: Plan) -> Outcome:
     """Many, that say nothing or half of what they must, or are subscribers and do not read."""
     tried = 0
-    with hand(plan.folder, "curve") as daemon:
+    with hand(plan.folder, curve=True) as daemon:
         for _ in plan.rounds():
             for door in daemon.doors:
                 for says in (b"", GREETING[:12], AS_SUB + b"\x00\x01\x01"):
-                    tried += _many(daemon, door, says, CONNECTIONS)
+                    tried += _many(door, says)
         return daemon.outcome(tried)
 
 
-def _many(daemon: Hand, door: Connect, says: bytes, number: int) -> int:
+def _many(door: Connect, says: bytes) -> int:
     with contextlib.ExitStack() as stack:
         made = 0
-        for attempt in range(number):
+        for attempt in range(CONNECTIONS):
             if attempt % OPEN_MAX == OPEN_MAX - 1:
                 stack.close()
-                daemon.look()
             with contextlib.suppress(OSError):
                 connection = stack.enter_context(door())
                 made += 1
                 connection.send(says)
-        daemon.look()
         return made
 
 
-def _flood(daemon: Hand, door: Connect, first: bytes, then: Callable[[], bytes]) -> int:
-    """Send as fast as can be, with some connections, for a while; how many bytes it was."""
+def _flood(door: Connect, numbers: random.Random) -> int:
+    """Send noise as fast as can be, with some connections, for a while; how many bytes it was."""
     sent, until_s = 0, time.monotonic() + FLOOD_S
     left: list[bytes] = [b""] * FLOODERS
     flooders: list[socket.socket | None] = [None] * FLOODERS
@@ -181,9 +165,9 @@ def _flood(daemon: Hand, door: Connect, first: bytes, then: Callable[[], bytes])
         for number, flooder in enumerate(flooders):
             try:
                 if flooder is None:
-                    flooders[number], left[number] = door(), first
+                    flooders[number], left[number] = door(), b""
                     continue
-                left[number] = left[number] or then()
+                left[number] = left[number] or numbers.randbytes(numbers.randrange(1, 300))
                 size = flooder.send(left[number])
                 left[number] = left[number][size:]
                 sent += size
@@ -193,7 +177,6 @@ def _flood(daemon: Hand, door: Connect, first: bytes, then: Callable[[], bytes])
                 if flooder is not None:
                     flooder.close()
                 flooders[number] = None
-        daemon.look()
     for flooder in flooders:
         if flooder is not None:
             flooder.close()
@@ -203,22 +186,17 @@ def _flood(daemon: Hand, door: Connect, first: bytes, then: Callable[[], bytes])
 def noises(plan: Plan) -> Outcome:
     """Anything, by many peers."""
     sent = 0
-    with hand(plan.folder, "ipc") as daemon:
+    with hand(plan.folder) as daemon:
         for _ in plan.rounds():
             for door in daemon.doors:
-                sent += _flood(daemon, door, b"", partial(noise, plan.random))
+                sent += _flood(door, plan.random)
         return daemon.outcome(sent)
-
-
-def noise(numbers: random.Random) -> bytes:
-    """Anything."""
-    return numbers.randbytes(numbers.randrange(1, 300))
 
 
 def flood(plan: Plan) -> Outcome:
     """Eight peers that keep every rule, as fast as can be."""
     tried, added_ms, share = 0, 0.0, 1.0
-    with hand(plan.folder, "ipc") as daemon:
+    with hand(plan.folder) as daemon:
         for _ in plan.rounds():
             rest_ms, rest_hz = _cost(daemon)
             peers = [
@@ -276,7 +254,7 @@ def forged(plan: Plan) -> Outcome:
         return bool(who.poll(2000)) and bool(json.loads(who.recv())["ok"])
 
     with (
-        hand(plan.folder, "ipc") as daemon,
+        hand(plan.folder) as daemon,
         zmq.Context() as context,
         context.socket(zmq.DEALER) as controller,
         context.socket(zmq.DEALER) as liar,
@@ -306,38 +284,3 @@ def forged(plan: Plan) -> Outcome:
         well = forged_well == 0 and told_well == tried > 0
         said = f"{forged_well} of {lies} forged, {told_well} of {tried} true ones taken, "
         return daemon.outcome(lies + tried, well, said)
-
-
-ATTACKS: tuple[Attack, ...] = (
-    Attack(
-        "connections-curve",
-        Aim.FALLS,
-        "connections that say nothing, half a greeting, or subscribe and do not read, up to "
-        f"{OPEN_MAX} at a time, on both sockets",
-        "connections",
-        connections,
-    ),
-    Attack(
-        "noise-ipc",
-        Aim.FALLS,
-        f"noise, by {FLOODERS} peers to both sockets as fast as can be",
-        "bytes",
-        noises,
-    ),
-    Attack(
-        "flood",
-        Aim.FALLS,
-        "8 peers that keep every rule as fast as can be: questions, malformed outcomes, two bytes, "
-        "SUBSCRIBE and CANCEL in turns",
-        "peers",
-        flood,
-    ),
-    Attack(
-        "forged-outcomes",
-        Aim.WHO_MAY,
-        "another peer tells outcomes of grasps that the controller asked about, first and last, "
-        "and of others, and the controller itself changes its word",
-        "outcomes",
-        forged,
-    ),
-)

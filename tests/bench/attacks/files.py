@@ -10,19 +10,25 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
-from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon, usage
+from tests.bench.attacks.attack import Outcome, Plan
+from tests.bench.live import (
+    PATIENCE_S,
+    STOP_S,
+    Child,
+    Subscriber,
+    memory_mib,
+    peak_mib,
+    running,
+)
 from tests.models.hostile import giant
 from tests.threads import at_work
 
-MIB = 1024
-"""KiB."""
 GROWTH_MAX_MIB = 32
 """Memory that no file may cost a running daemon for good, or a refused scene ever, MiB."""
 GAP_MAX_S = 0.5
@@ -43,20 +49,12 @@ recordings = ["{recording}"]
 loop = true
 [model]
 {model}
-[publish]
-endpoint = "ipc://{folder}/v"
 """
 
 
-def scene(folder: Path, model: str = 'name = "small-session"') -> str:
-    """A scene whose readings never end."""
-    return SCENE.format(recording=DEMO_RECORDING, model=model, folder=folder)
-
-
-def _peak_mib(pid: int) -> float:
-    """Most memory that a process has had; 0 of one that has ended."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int((status.partition("VmHWM:")[2].split() or ["0"])[0]) / MIB
+def scene(model: str = 'name = "small-session"') -> str:
+    """The sections of a scene whose readings never end."""
+    return SCENE.format(recording=DEMO_RECORDING, model=model)
 
 
 DOTTED: dict[str, Callable[[int], str]] = {
@@ -85,39 +83,18 @@ class Reloaded:
     """Longest time without a verdict."""
 
 
+@dataclass(slots=True)
 class Running:
-    """A daemon on `folder`'s scene, with a service manager and somebody who hears its verdicts."""
+    """A daemon, its service manager, and somebody who hears its verdicts."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.scene = folder / "scene.toml"
-        self.log = folder / "log"
-        self.scene.write_text(scene(folder))
-
-    def __enter__(self) -> Running:
-        with contextlib.ExitStack() as stack:
-            self.manager = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-            self.manager.bind(str(self.folder / "notify"))
-            stack.callback((self.folder / "notify").unlink)
-            self.manager.setblocking(False)
-            with (  # in the folder, where weights of other files would be looked for
-                contextlib.chdir(self.folder),
-                patch.dict(os.environ, NOTIFY_SOCKET=str(self.folder / "notify")),
-            ):
-                self.daemon: Child = stack.enter_context(start_daemon(self.scene, self.log))
-            self.ears = stack.enter_context(Subscriber(f"ipc://{self.folder}/v"))
-            if self.ears.take(PATIENCE_S) is None:
-                raise TimeoutError("no verdict at the start")
-            self.hear(1.0)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self._stack.close()
+    folder: Path
+    manager: socket.socket
+    process: Child
+    ears: Subscriber
 
     @property
     def alive(self) -> bool:
-        return self.daemon.process.poll() is None
+        return self.process.poll() is None
 
     def hear(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
         """The longest time without a verdict, s, from now until so long or `until`."""
@@ -140,9 +117,14 @@ class Running:
                     return status.partition("\n")[0]
         return ""
 
-    def reload(self, text: str, patience_s: float = END_MAX_S) -> Reloaded:
-        """Put a scene in the place of the former one and tell the daemon."""
-        self.scene.write_text(text)
+    def put(self, sections: str) -> None:
+        """Put a scene in the place of the former one, and tell the daemon."""
+        text = f'{sections}[publish]\nendpoint = "ipc://{self.folder}/v"\n'
+        (self.folder / "scene.toml").write_text(text)
+        self.process.send_signal(signal.SIGHUP)
+
+    def reload(self, sections: str) -> Reloaded:
+        """Put a scene in the place of the former one, and wait for what becomes of it."""
         said: list[str] = []
 
         def is_told() -> bool:
@@ -151,73 +133,82 @@ class Running:
 
         while self.told():
             pass  # of former reloads
-        self.daemon.process.send_signal(signal.SIGHUP)
-        gap_s = self.hear(patience_s, is_told)
+        self.put(sections)
+        gap_s = self.hear(END_MAX_S, is_told)
         gap_s = max(gap_s, self.hear(0.3))
         return Reloaded(self.alive, "".join(said), gap_s)
 
-    def rss_mib(self) -> float:
-        return usage(self.daemon.pid).rss_kib / MIB if self.alive else 0.0
-
-    def forget_peak(self) -> None:
-        Path(f"/proc/{self.daemon.pid}/clear_refs").write_text("5")
-
-    def peak_mib(self) -> float:
-        """Most memory since `forget_peak`."""
-        return _peak_mib(self.daemon.pid) if self.alive else 0.0
-
     def stops_in_s(self) -> float:
-        """How long it takes from SIGTERM to its end, s; it is killed after five."""
+        """How long it takes from SIGTERM to its end, s; at most five."""
         began_s = time.monotonic()
+        self.process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self.daemon.terminate()
+            self.process.wait(STOP_S)
         return time.monotonic() - began_s
 
 
-def _dotted(plan: Plan) -> Outcome:
+@contextlib.contextmanager
+def start(folder: Path) -> Iterator[Running]:
+    """Run a daemon on the scene, in a folder where weights of other files would be looked for."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager, contextlib.ExitStack() as on:
+        address = folder / "notify"
+        manager.bind(str(address))
+        on.callback(address.unlink)
+        manager.setblocking(False)
+        with contextlib.chdir(folder), patch.dict(os.environ, NOTIFY_SOCKET=str(address)):
+            process, ears = on.enter_context(running(folder, scene()))
+        if ears.take(PATIENCE_S) is None:
+            raise TimeoutError("no verdict at the start")
+        made = Running(folder, manager, process, ears)
+        made.hear(1.0)
+        yield made
+
+
+def nested_scenes(plan: Plan) -> Outcome:
+    """SIGHUP with scenes of 32 to 96 kB that nest: dotted keys, arrays, inline tables."""
     tried, gap_s, growth_mib, held = 0, 0.0, 0.0, True
     ways = [(way, size) for size in SIZES for way in DOTTED]
-    with Running(plan.folder) as running:
-        rest_mib = running.rss_mib()
+    with start(plan.folder) as daemon:
+        rest_mib = memory_mib(daemon.process.pid)
         end_s = time.monotonic() + max(plan.seconds, 1.0)
         for way, size in itertools.cycle(ways):
-            running.forget_peak()
-            found = running.reload(DOTTED[way](size) + "\n" + scene(plan.folder))
+            found = daemon.reload(DOTTED[way](size) + "\n" + scene())
             tried += 1
             gap_s = max(gap_s, found.gap_s)
-            growth_mib = max(growth_mib, running.peak_mib() - rest_mib)
-            fits = found.gap_s < GAP_MAX_S and growth_mib < GROWTH_MAX_MIB
-            held = held and found.alive and found.told == REFUSED and fits
             if not found.alive:
                 return Outcome(tried, f"the daemon is gone after {way}, {size} bytes", False)
+            growth_mib = peak_mib(daemon.process.pid) - rest_mib
+            fits = found.gap_s < GAP_MAX_S and growth_mib < GROWTH_MAX_MIB
+            held = held and found.told == REFUSED and fits
             if tried >= len(ways) and time.monotonic() > end_s:
                 break
-        held = held and running.stops_in_s() < STOP_MAX_S
+        held = held and daemon.stops_in_s() < STOP_MAX_S
     happened = (
         f"longest gap in the verdicts {gap_s * 1e3:.0f} ms, memory at most +{growth_mib:.0f} MiB"
     )
     return Outcome(tried, happened, held)
 
 
-def _storm(plan: Plan) -> Outcome:
+def sighup_storm(plan: Plan) -> Outcome:
+    """SIGHUP every half millisecond."""
     sent, gap_s = 0, 0.0
-    with Running(plan.folder) as running:
-        running.hear(3.0)  # all that it needs it has by then
-        rest_mib = running.rss_mib()
+    with start(plan.folder) as daemon:
+        daemon.hear(3.0)  # all that it needs it has by then
+        rest_mib = memory_mib(daemon.process.pid)
 
         def hang_up(stop: threading.Event) -> None:
             nonlocal sent
             while not stop.wait(0.0005):
                 with contextlib.suppress(ProcessLookupError):
-                    os.kill(running.daemon.pid, signal.SIGHUP)
+                    os.kill(daemon.process.pid, signal.SIGHUP)
                 sent += 1
 
         with at_work(hang_up):
-            gap_s = running.hear(max(plan.seconds, 4.0))
-        growth_mib = running.rss_mib() - rest_mib
-        running.hear(2.0)  # the last one was late
-        other = running.reload(scene(plan.folder, 'name = "mlp"'))
-        stops_s = running.stops_in_s()
+            gap_s = daemon.hear(max(plan.seconds, 4.0))
+        growth_mib = memory_mib(daemon.process.pid) - rest_mib
+        daemon.hear(2.0)  # the last one was late
+        other = daemon.reload(scene('name = "mlp"'))
+        stops_s = daemon.stops_in_s()
     taken = other.alive and other.told.endswith("mlp")
     held = taken and gap_s < SWAP_MAX_S and growth_mib < GROWTH_MAX_MIB
     happened = (
@@ -227,40 +218,21 @@ def _storm(plan: Plan) -> Outcome:
     return Outcome(sent, happened, held and stops_s < STOP_MAX_S)
 
 
-def _model(plan: Plan) -> Outcome:
-    text = scene(plan.folder, f'path = "{giant(plan.folder)}"')
+def giant_model(plan: Plan) -> Outcome:
+    """A model that multiplies matrices for minutes, at SIGHUP."""
+    text = scene(f'path = "{giant(plan.folder)}"')
     tried, gap_s, stops_s, held = 0, 0.0, 0.0, True
     for _ in plan.rounds():
         tried += 1
-        with Running(plan.folder) as running:
-            reloaded = running.reload(text)
+        with start(plan.folder) as daemon:
+            reloaded = daemon.reload(text)
             gap_s = max(gap_s, reloaded.gap_s)
             held = held and reloaded.alive and reloaded.told == REFUSED
-            running.scene.write_text(text)
-            running.daemon.process.send_signal(signal.SIGHUP)
-            running.hear(0.5)  # SIGTERM comes while it is read
-            stops_s = max(stops_s, running.stops_in_s())
+            daemon.put(text)
+            daemon.hear(0.5)  # SIGTERM comes while it is read
+            stops_s = max(stops_s, daemon.stops_in_s())
     happened = (
         f"the reload is {'refused' if held else 'not refused'}, longest gap in the verdicts "
         f"{gap_s * 1e3:.0f} ms, ends {stops_s:.1f} s after SIGTERM"
     )
     return Outcome(tried, happened, held and gap_s < GAP_MAX_S and stops_s < STOP_MAX_S)
-
-
-ATTACKS = (
-    Attack(
-        "scene-nested",
-        Aim.FALLS,
-        "SIGHUP with scenes of 32 to 96 kB that nest: dotted keys, arrays, inline tables",
-        "scenes",
-        _dotted,
-    ),
-    Attack("sighup-storm", Aim.FALLS, "SIGHUP every half millisecond", "signals", _storm),
-    Attack(
-        "model-giant",
-        Aim.FALLS,
-        "a model that multiplies matrices for minutes, at SIGHUP",
-        "models",
-        _model,
-    ),
-)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import operator
 import socket
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,23 +18,14 @@ from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.scene import load as load_scene
 from graspd.daemon.session.file import SessionFile, kept_now, load
 from graspd.drivers.spi.messages import Hello
-from graspd.drivers.twins.grasps.grasps import Counts
-from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
 from graspd.drivers.twins.palm import PalmTwin
 from graspd.drivers.twins.spi import SpiTwin
-from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
-from tests.bench.live import (
-    HELD,
-    SEED,
-    Subscriber,
-    judged_counts,
-    start_daemon,
-    tactile_section,
-)
+from tests.bench.attacks.attack import Outcome, Plan
+from tests.bench.live import SEED, STOP_S, Subscriber, held_grasp, running, spi_section
 from tests.ports import free_port
 from tests.threads import at_work
 
-PALM_HZ = 1000.0 / 14.0
 SILENCE_S = 0.16
 """Above the 140 ms after which the palm's link is given up."""
 HELD_S = 2.0
@@ -42,20 +33,6 @@ KEPT_GRASPS = 30
 SPI_VERDICTS = 60
 UP_S = 15.0
 """Longest wait for a daemon's first verdict, s."""
-
-
-@contextmanager
-def daemon_of(folder: Path, tactile: str, model: str, more: str = "") -> Iterator[Subscriber]:
-    """A daemon that judges settled grasps, and who hears it."""
-    endpoint = f"ipc://{folder}/verdicts"
-    scene = folder / "scene.toml"
-    scene.write_text(
-        f'{tactile}[hand]\nname = "right"\n[model]\nname = "{model}"\n'
-        f'[publish]\nendpoint = "{endpoint}"\ntactile_hz = 10000\n{more}'
-    )
-    with start_daemon(scene, folder / "log") as daemon, Subscriber(endpoint) as subscriber:
-        yield subscriber
-        daemon.terminate()
 
 
 def hear(
@@ -71,15 +48,9 @@ def hear(
     return heard
 
 
-def grasped() -> Iterator[Counts]:
-    """An open hand that closes and holds."""
-    return (
-        moment.counts for moment in synthetic_grasps(1, rate_hz=PALM_HZ, durations=HELD, seed=SEED)
-    )
-
-
-def sending(counts: Iterator[Counts], port: int) -> AbstractContextManager[object]:
-    """A palm's relay, on a socket of its own, for as long as the block."""
+def sending(port: int) -> AbstractContextManager[object]:
+    """A palm that closes and holds, whose relay sends from a socket of its own in the block."""
+    counts = held_grasp(PALM_RATE_HZ)
     return at_work(partial(PalmTwin(counts).serve, f"udp://127.0.0.1:{port}"))
 
 
@@ -89,14 +60,17 @@ def second_palm(plan: Plan) -> Outcome:
     for folder in plan.folders():
         tried += 1
         port = free_port(socket.SOCK_DGRAM)
-        tactile = f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{port}"\n'
-        with daemon_of(folder, tactile, "cnn1", "[session]\nkeep = false\n") as subscriber:
-            with sending(grasped(), port):
+        sections = (
+            f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{port}"\n'
+            '[model]\nname = "cnn1"\n[session]\nkeep = false\n'
+        )
+        with running(folder, sections) as (_, subscriber):
+            with sending(port):
                 first = hear(subscriber, any_valid, UP_S)
             known += any_valid(first)
             time.sleep(SILENCE_S)
             hear(subscriber, never, 0.02)
-            with sending(judged_counts(), port):
+            with sending(port):
                 second = hear(subscriber, never, HELD_S)
             told += len(second)
             stable += sum(verdict.valid for verdict in second)
@@ -105,27 +79,24 @@ def second_palm(plan: Plan) -> Outcome:
 
 
 class MisreadTwin(SpiTwin):
-    """A bridge that reads some serial numbers wrong."""
+    """A bridge that reads a serial number wrong by a character in one HELLO."""
 
-    def __init__(self, path: Path, misread: Callable[[int], bool]) -> None:
-        """`misread` says whether the HELLO of this number, from 0, is wrong by a character."""
+    def __init__(self, path: Path, misread: int) -> None:
+        """`misread`: number of that HELLO, from 0."""
         self._misread = misread
-        self.hellos = 0
-        super().__init__(path, judged_counts())
+        self._hellos = 0
+        super().__init__(path, held_grasp())
+
+    def work(self, stop: threading.Event) -> None:
+        """Serve until `stop`."""
+        self.serve(stop.is_set)
 
     def _hello(self, nonce: int) -> Hello:
         hello = super()._hello(nonce)
-        wrong = self._misread(self.hellos)
-        self.hellos += 1
+        is_wrong = self._misread == self._hellos
+        self._hellos += 1
         first, *others = hello.serials
-        return replace(hello, serials=(first.replace("W", "V"), *others)) if wrong else hello
-
-
-@contextmanager
-def bridge(twin: SpiTwin) -> Iterator[None]:
-    """A twin at work in a thread."""
-    with twin, at_work(lambda stop: twin.serve(stop.is_set)):
-        yield
+        return replace(hello, serials=(first.replace("W", "V"), *others)) if is_wrong else hello
 
 
 def keep_grasps(folder: Path, text: str) -> SessionFile:
@@ -156,15 +127,17 @@ def misread_serial(plan: Plan) -> Outcome:
     wiped, tried = 0, 0
     for folder in plan.folders():
         tried += 1
-        tactile = tactile_section("spi", str(folder / "bridge"))
-        session = f'[session]\nfile = "{folder}/session.json"\n'
-        file = keep_grasps(folder, tactile + session)
+        sections = f'{spi_section(folder)}[session]\nfile = "{folder}/session.json"\n'
+        file = keep_grasps(folder, sections)
         wrong = 1 + plan.random.randrange(8)
         with (
-            bridge(MisreadTwin(folder / "bridge", partial(operator.eq, wrong))),
-            daemon_of(folder, tactile, "small-session", session) as subscriber,
+            MisreadTwin(folder / "bridge", wrong) as twin,
+            at_work(twin.work),
+            running(folder, sections) as (daemon, subscriber),
         ):
             heard = hear(subscriber, lambda heard: len(heard) >= SPI_VERDICTS, UP_S)
+            daemon.terminate()
+            daemon.wait(STOP_S)
         wiped += kept_grasps(file) < KEPT_GRASPS or len(heard) < SPI_VERDICTS
     happened = f"{wiped} of {tried} kept sessions of {KEPT_GRASPS} grasps wiped"
     return Outcome(tried, happened, wiped == 0)
@@ -177,21 +150,3 @@ def any_valid(heard: list[Verdict]) -> bool:
 
 def never(_heard: list[Verdict]) -> bool:
     return False
-
-
-ATTACKS = (
-    Attack(
-        "second-palm",
-        Aim.FALSE_STABLE,
-        "a second palm sends after 160 ms of silence of the first, and holds something",
-        "times",
-        second_palm,
-    ),
-    Attack(
-        "misread-serial",
-        Aim.FALLS,
-        "a bridge misreads one character of a serial number in one of its first HELLOs",
-        "times",
-        misread_serial,
-    ),
-)

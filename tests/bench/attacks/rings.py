@@ -21,20 +21,10 @@ from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.joints.message import JointMessage
 from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES
 from graspd.drivers.twins.grasps.grasps import Counts
-from graspd.drivers.twins.grasps.whole_grasps import (
-    PALM_RATE_HZ,
-    RATE_HZ,
-    synthetic_grasps,
-)
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ
 from graspd.drivers.twins.spi import SpiTwin
-from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
-from tests.bench.live import (
-    HELD,
-    SEED,
-    Subscriber,
-    start_daemon,
-    tactile_section,
-)
+from tests.bench.attacks.attack import Outcome, Plan
+from tests.bench.live import held_grasp, running, spi_section
 from tests.ports import free_port
 from tests.threads import at_work
 
@@ -64,8 +54,7 @@ class Ring:
         self.begin = threading.Event()
         self.turned_ns: int | None = None
         """When the first sweep after turn and grace was asked for, monotonic ns."""
-        moments = synthetic_grasps(1, durations=HELD, seed=SEED, rate_hz=rate_hz)
-        self._held = (moment.counts for moment in moments)
+        self._held = held_grasp(rate_hz)
 
     def counts(self) -> Iterator[Counts]:
         """What the board sends."""
@@ -90,42 +79,30 @@ def ringed(old: Counts, fresh: Counts, finger: int | None) -> Counts:
     return counts
 
 
-def over_spi(folder: Path, counts: Iterator[Counts], rate_hz: float) -> tuple[str, Send]:
+def serving(folder: Path, counts: Iterator[Counts], rate_hz: float) -> Send:
     twin = SpiTwin(folder / "bridge", counts, rate_hz=rate_hz)
 
     def serve(stop: threading.Event) -> None:
         with twin:
             twin.serve(stop.is_set)
 
-    return tactile_section("spi", str(folder / "bridge")), serve
-
-
-def scene_in(folder: Path, sections: str) -> Path:
-    """The scene of a daemon whose verdicts are heard there."""
-    scene = folder / "scene.toml"
-    endpoint = f"ipc://{folder}/graspd"
-    scene.write_text(f'{sections}[model]\nname = "cnn1"\n[publish]\nendpoint = "{endpoint}"\n')
-    return scene
+    return serve
 
 
 def under_attack(
     folder: Path,
-    sections: str,
     serve: Sequence[Send],
     begin: threading.Event,
     since_ns: Callable[[], int | None],
+    joints: str = "",
 ) -> tuple[int, int]:
     """Verdicts of readings since then, and how many of them were `stable`.
 
-    The attack begins when the grasp has been `stable` for a while.
+    The attack begins when the grasp has been `stable` for a while. `joints`: a section.
     """
     stable = itertools.count(1)
-    scene = scene_in(folder, sections)
-    with (
-        Subscriber(f"ipc://{folder}/graspd") as subscriber,
-        start_daemon(scene, folder / "log"),
-        contextlib.ExitStack() as within,
-    ):
+    sections = f'{spi_section(folder)}{joints}[model]\nname = "cnn1"\n'
+    with running(folder, sections) as (_, subscriber), contextlib.ExitStack() as within:
         subscriber.wait_for(lambda _: True)  # it is there, and sees the hand at rest
         within.enter_context(at_work(*serve))
         subscriber.wait_for(
@@ -169,8 +146,8 @@ def ring_over_spi(plan: Plan) -> Outcome:
     def one(folder: Path, sweeps: int, finger: int | None) -> tuple[int, int]:
         rate_hz = plan.random.choice(RATES_HZ)
         ring = Ring(sweeps, finger, rate_hz)
-        section, serve = over_spi(folder, ring.counts(), rate_hz)
-        return under_attack(folder, section, [serve], ring.begin, lambda: ring.turned_ns)
+        serve = serving(folder, ring.counts(), rate_hz)
+        return under_attack(folder, [serve], ring.begin, lambda: ring.turned_ns)
 
     return tallied(one(*each) for each in rings(plan))
 
@@ -181,9 +158,8 @@ def joints_frozen(plan: Plan) -> Outcome:
     def one(folder: Path) -> tuple[int, int]:
         port, begin = free_port(socket.SOCK_DGRAM), threading.Event()
         frozen_ns: list[int] = []
-        counts = Ring(1, None, RATE_HZ).counts()
-        section, serve = over_spi(folder, counts, RATE_HZ)
-        section += f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{port}"\n'
+        serve = serving(folder, held_grasp(), RATE_HZ)
+        joints = f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{port}"\n'
         rng = np.random.default_rng(plan.random.randrange(1 << 32))
 
         def send_joints(stop: threading.Event) -> None:
@@ -202,24 +178,6 @@ def joints_frozen(plan: Plan) -> Outcome:
         def since_ns() -> int | None:
             return frozen_ns[0] + round(JOINTS_MAY_STAND_S * 1e9) if frozen_ns else None
 
-        return under_attack(folder, section, [serve, send_joints], begin, since_ns)
+        return under_attack(folder, [serve, send_joints], begin, since_ns, joints)
 
     return tallied(one(folder) for folder in plan.folders())
-
-
-ATTACKS = (
-    Attack(
-        "ring-spi",
-        Aim.FALSE_STABLE,
-        "the last 2 to 64 sweeps of a held grasp, of a finger or all, for ever over SPI",
-        "rings",
-        ring_over_spi,
-    ),
-    Attack(
-        "joints-frozen",
-        Aim.FALSE_STABLE,
-        "joint angles that stay equal to the bit beside sweeps that go on",
-        "rounds",
-        joints_frozen,
-    ),
-)

@@ -21,8 +21,8 @@ from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.drivers.twins.spi import SpiTwin
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
-from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
-from tests.bench.live import HELD, PATIENCE_S, Subscriber, start_daemon, tactile_section
+from tests.bench.attacks.attack import Outcome, Plan
+from tests.bench.live import HELD, PATIENCE_S, Subscriber, running, spi_section
 from tests.kit.messages import decode_tactile, decode_verdict
 from tests.threads import at_work
 
@@ -135,14 +135,6 @@ class Told:
         return verdict.t_mono_ns - self._said[0][0]
 
 
-def scene_text(folder: Path) -> str:
-    return (
-        tactile_section("spi", str(folder / "bridge"))
-        + f'[model]\nname = "{MODEL}"\n[session]\nkeep = false\n[gate]\nearly = true\n'
-        f'[publish]\nendpoint = "ipc://{folder}/v"\ntactile_hz = 10000\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
-    )
-
-
 def drifts(plan: Plan) -> Outcome:
     """Ask all the while that a held grasp drifts to what the network calls slip."""
     told = Told()
@@ -158,16 +150,16 @@ def drifts(plan: Plan) -> Outcome:
 
 
 def _drift_once(folder: Path, told: Told) -> None:
-    scene = folder / "scene.toml"
-    scene.write_text(scene_text(folder))
-    sweeps = drifting()
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    sections = (
+        f'{spi_section(folder)}[model]\nname = "{MODEL}"\n[session]\nkeep = false\n'
+        f'[gate]\nearly = true\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
+    )
+    topics = ("verdict.", "tactile.")
     with (
-        start_daemon(scene, folder / "log"),
-        Subscriber(f"ipc://{folder}/v", topics=("verdict.", "tactile.")) as subscriber,
-        context,
+        running(folder, sections, publish="tactile_hz = 10000\n", topics=topics) as (_, subscriber),
+        zmq.Context() as context,
         context.socket(zmq.DEALER) as asker,
-        SpiTwin(folder / "bridge", sweeps) as twin,
+        SpiTwin(folder / "bridge", drifting()) as twin,
         at_work(lambda stop: twin.serve(stop.is_set)),
     ):
         asker.linger = 0
@@ -197,14 +189,3 @@ def _hear(subscriber: Subscriber, asker: zmq.Socket[bytes], twin: SpiTwin, told:
         for answer in [each for each in waiting if each.t_mono_ns <= newest_ns]:
             told.take_answer(answer)
             waiting.remove(answer)
-
-
-ATTACKS = (
-    Attack(
-        "drift-early",
-        Aim.FALSE_STABLE,
-        f"a held grasp drifts by {DRIFT_COUNTS:.0f} counts to slip, `early = true`, with questions",
-        "verdicts",
-        drifts,
-    ),
-)

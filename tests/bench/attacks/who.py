@@ -11,7 +11,7 @@ from pathlib import Path
 import zmq
 
 from graspd.daemon.publish.keys import load_pair, make
-from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
+from tests.bench.attacks.attack import Outcome, Plan
 from tests.clients.bench import Daemon, free_endpoint
 
 HEARD_S = 20.0
@@ -126,15 +126,3 @@ def _nobody_connects(endpoint: str) -> bool:
     path = endpoint.removeprefix("ipc://")
     command = [sys.executable, "-I", "-c", CONNECTING, path, str(NOBODY)]
     return subprocess.run(command, check=False, timeout=HEARD_S).returncode == 0
-
-
-ATTACKS = (
-    Attack(
-        "revoked-half-copied",
-        Aim.WHO_MAY,
-        "remove a key beside a half-copied one",
-        "removed keys",
-        removed_key,
-    ),
-    Attack("other-user", Aim.WHO_MAY, "ask as another user", "connections", other_user),
-)

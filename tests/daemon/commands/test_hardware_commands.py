@@ -16,15 +16,15 @@ import pytest
 from graspd.daemon.publish.messages import Tactile, Verdict
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
-from tests.bench.live import Subscriber, can_id, where_of
+from tests.bench.live import Subscriber
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict
-from tests.ports import free_port
+from tests.ports import can_id, free_port, multicast_group
 
 WANTED = 150
 """Readings to wait for, of the 200 rows of the recording."""
 
-GROUP = where_of("can", Path())
+GROUP = multicast_group()
 SCENES = {
     "spi": 'driver = "spi"\nport = "{folder}/bridge"',
     "can": 'driver = "can"\ninterface = "udp_multicast"\nchannel = "{group}"\n'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -22,7 +22,6 @@ from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
 from graspd.drivers.twins.palm import PalmTwin
-from tests.bench.recurrence import TABLES, UNTOUCHED, again
 from tests.daemon.fakes import FINGERS, MS, Clock
 from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
@@ -217,11 +216,18 @@ def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
         assert Reason.FROZEN not in reasons
 
 
-def test_no_real_sweep_comes_again(bts3_dir: Path) -> None:
-    """A grasp in each row of the tables, and 9.8 s of sensors that nothing touches."""
-    untouched = bts3_dir.parent / UNTOUCHED
-    streams = [bts3_dir / f"{name}.csv" for name in TABLES]
-    for path in [*streams, untouched] if untouched.is_file() else streams:
-        number, found = again(recorded_counts(path))
-        assert number > 900
-        assert found == 0
+@pytest.mark.parametrize("table", ["palm_45", "palm_down", "palm_side"])
+def test_no_real_grasp_comes_again(bts3_dir: Path, table: str) -> None:
+    assert again(recorded_counts(bts3_dir / f"{table}.csv")) == 0
+
+
+def test_no_real_sweep_of_untouched_sensors_comes_again(untouched: NDArray[np.uint16]) -> None:
+    assert again(untouched) == 0
+
+
+def again(sweeps: Iterable[NDArray[np.uint16]]) -> int:
+    """Return the number of sweeps in which a finger comes again, of more than 900."""
+    health, faults = Health(3), np.zeros((3, 24), dtype=np.uint8)
+    readings = [TactileReading(place, place, counts, faults) for place, counts in enumerate(sweeps)]
+    assert len(readings) > 900
+    return sum(Reason.FROZEN in health.check(reading).reasons for reading in readings)

@@ -15,10 +15,10 @@ from graspd.daemon.record.mcap import header_of
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.can_log import CanLog
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from tests.bench.live import can_id
 from tests.daemon.commands.test_hardware_commands import GROUP, SCENES, filled, twin
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import compared, messages
+from tests.ports import can_id
 
 FAULTS = ("--drop", "0.0005", "--bit-flip", "0.0005", "--seed", "5")
 

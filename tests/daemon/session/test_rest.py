@@ -25,7 +25,6 @@ from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
-from tests.bench.recurrence import TABLES, UNTOUCHED
 from tests.daemon.fakes import FINGERS, MS, Clock, reading
 from tests.daemon.session.learning import NOBODY, calibration, observe, sensors
 
@@ -43,7 +42,10 @@ OUTAGE_NS = 2_000_000_000
 @pytest.fixture(scope="module")
 def tables(bts3_dir: Path) -> dict[str, NDArray[np.uint16]]:
     """The published grasps of each day, shape (grasps, 3, 24)."""
-    return {name: np.stack(list(recorded_counts(bts3_dir / f"{name}.csv"))) for name in TABLES}
+    return {
+        name: np.stack(list(recorded_counts(bts3_dir / f"{name}.csv")))
+        for name in ("palm_45", "palm_down", "palm_side")
+    }
 
 
 def test_every_published_day_rests_otherwise_and_no_half_of_one_does(
@@ -57,7 +59,7 @@ def test_every_published_day_rests_otherwise_and_no_half_of_one_does(
 
 
 def test_untouched_sensors_rest_as_they_did(bts3_dir: Path) -> None:
-    sweeps = np.stack(list(recorded_counts(bts3_dir.parent / UNTOUCHED)))
+    sweeps = np.stack(list(recorded_counts(bts3_dir.parent / "untouched" / "untouched.csv")))
     first, last = (np.median(part, axis=0) for part in (sweeps[:100], sweeps[-100:]))
     assert moved_fingers(first, last) == []
     assert moved_fingers(first, np.roll(last, 1, axis=0)) != []
