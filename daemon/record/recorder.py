@@ -5,13 +5,16 @@ The loop appends to a bounded queue, and a thread writes. A slow disk costs entr
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import re
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
 import msgspec
@@ -19,11 +22,8 @@ from msgspec.structs import replace
 
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
-from graspd.daemon.record.files import RecordingFile, Retention
-from graspd.daemon.record.flat import flat
-from graspd.daemon.record.header import RecordingHeader
-from graspd.daemon.record.mcap import McapWriter
-from graspd.daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
+from graspd.daemon.record.mcap import McapWriter, RecordingFile, RecordingHeader
+from graspd.daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic, flat
 from graspd.daemon.record.viewers import Viewer
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.base import JointReading, Reading
@@ -46,6 +46,7 @@ FLUSH_AFTER: Final = 0.8
 """Share of the flush interval after which a flush is due; a round and the writing follow."""
 CLOSE_S: Final = 0.5
 """Longest wait of `close` for the thread, s."""
+_STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 MakeHeader = Callable[[], RecordingHeader]
 """Function that makes the header of a copied state; called in the thread."""
@@ -57,6 +58,54 @@ NEXT_FILES: Final = b"next"
 
 _Entry = tuple[int, bytes, object]
 """Monotonic time, ns, topic, and payload or a function that makes it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """Name the files of one run; delete the oldest files of the hand."""
+
+    directory: Path
+    hand: str
+    boot_id: str
+    keep_files: int
+    """Most recordings of the hand; a link log belongs to its recording."""
+    keep_bytes: int
+    """Largest size of all files of the hand, bytes."""
+
+    def path(self, file: int, ending: str) -> Path:
+        """Return the path of the run's file number `file`; names sort by time."""
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{file:04}{ending}"
+
+    def make_room(self, expected_bytes: int) -> int:
+        """Delete the oldest recordings until `expected_bytes` fit; return their number.
+
+        Raises `OSError`.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        recordings = self._recordings()
+        total = expected_bytes + sum(size for _, size in recordings.values())
+        removed = 0
+        while recordings and (len(recordings) >= self.keep_files or total > self.keep_bytes):
+            paths, size = recordings.pop(min(recordings))
+            for path in paths:
+                path.unlink(missing_ok=True)
+            total -= size
+            removed += 1
+        return removed
+
+    def _recordings(self) -> dict[str, tuple[list[Path], int]]:
+        """Return paths and total size of each recording, by the stamp in its name."""
+        pattern = re.compile(rf"{re.escape(self.hand)}-({_STAMP})\.(mcap|can\.log|serial)")
+        recordings: dict[str, tuple[list[Path], int]] = {}
+        for path in self.directory.iterdir():
+            match = pattern.fullmatch(path.name)
+            if match is None:
+                continue
+            with contextlib.suppress(FileNotFoundError):
+                paths, size = recordings.get(match[1], ([], 0))
+                recordings[match[1]] = ([*paths, path], size + path.stat().st_size)
+        return recordings
 
 
 @dataclass(slots=True, eq=False)

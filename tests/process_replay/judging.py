@@ -17,9 +17,8 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
 from graspd.daemon.publish.outbox import Outbox
-from graspd.daemon.record.files import Retention
-from graspd.daemon.record.header import RecordingHeader
-from graspd.daemon.record.recorder import Recorder
+from graspd.daemon.record.mcap import RecordingHeader
+from graspd.daemon.record.recorder import Recorder, Retention
 from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Record
