@@ -32,18 +32,12 @@ def build_recorder(
 ) -> Recorder:
     """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
     assembly.require_mcap("[record]")
-    from graspd.daemon.record.recorder import Recorder, Retention
+    from graspd.daemon.record.recorder import Recorder
 
-    retention = Retention(
-        options.folder,
+    recorder = Recorder(
+        options,
         scene.hand.name,
         boot_id,
-        keep_files=options.keep_files,
-        keep_bytes=round(options.keep_mb * 1e6),
-    )
-    recorder = Recorder(
-        retention,
-        options,
         take_header=partial(header_now, pipeline, header_of(scene, model, boot_id)),
         tap=tap,
     )

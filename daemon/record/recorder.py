@@ -60,54 +60,6 @@ _Entry = tuple[int, bytes, object]
 """Monotonic time, ns, topic, and payload or a function that makes it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Retention:
-    """Name the files of one run; delete the oldest files of the hand."""
-
-    directory: Path
-    hand: str
-    boot_id: str
-    keep_files: int
-    """Most recordings of the hand; a link log belongs to its recording."""
-    keep_bytes: int
-    """Largest size of all files of the hand, bytes."""
-
-    def path(self, file: int, ending: str) -> Path:
-        """Return the path of the run's file number `file`; names sort by time."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{file:04}{ending}"
-
-    def make_room(self, expected_bytes: int) -> int:
-        """Delete the oldest recordings until `expected_bytes` fit; return their number.
-
-        Raises `OSError`.
-        """
-        self.directory.mkdir(parents=True, exist_ok=True)
-        recordings = self._recordings()
-        total = expected_bytes + sum(size for _, size in recordings.values())
-        removed = 0
-        while recordings and (len(recordings) >= self.keep_files or total > self.keep_bytes):
-            paths, size = recordings.pop(min(recordings))
-            for path in paths:
-                path.unlink(missing_ok=True)
-            total -= size
-            removed += 1
-        return removed
-
-    def _recordings(self) -> dict[str, tuple[list[Path], int]]:
-        """Return paths and total size of each recording, by the stamp in its name."""
-        pattern = re.compile(rf"{re.escape(self.hand)}-({_STAMP})\.(mcap|can\.log|serial)")
-        recordings: dict[str, tuple[list[Path], int]] = {}
-        for path in self.directory.iterdir():
-            match = pattern.fullmatch(path.name)
-            if match is None:
-                continue
-            with contextlib.suppress(FileNotFoundError):
-                paths, size = recordings.get(match[1], ([], 0))
-                recordings[match[1]] = ([*paths, path], size + path.stat().st_size)
-        return recordings
-
-
 @dataclass(slots=True, eq=False)
 class _Open:
     """Files that are being written."""
@@ -127,8 +79,9 @@ class Recorder(Companion):
 
     def __init__(
         self,
-        retention: Retention,
         options: Record,
+        hand: str,
+        boot_id: str,
         *,
         take_header: Callable[[], MakeHeader],
         tap: Tap | None = None,
@@ -140,7 +93,9 @@ class Recorder(Companion):
         `take_header`: copies the state for a file's header. It is called here and after a status,
         when no reading is being judged.
         """
-        self._retention = retention
+        self._options = options
+        self._hand = hand
+        self._boot_id = boot_id
         self._rotate_bytes = round(options.rotate_mb * 1e6)
         self._rotate_ns = round(options.rotate_minutes * 60e9)
         self._flush_ns = round(options.flush_ms * 1e6)
@@ -149,7 +104,7 @@ class Recorder(Companion):
         self._clock = clock
         self._wall_clock = wall_clock
         self._queue: deque[_Entry] = deque()
-        self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
+        self._names = {topic: f"{topic}.{hand}".encode() for topic in Topic}
         self._last_topic = b""
         self._viewer = Viewer(options.images_hz)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
@@ -183,7 +138,7 @@ class Recorder(Companion):
     def on_verdict(self, published: PublishedVerdict) -> None:
         judgement = published.judgement
         if judgement.moment.judged and judgement.judged_counts is not None:
-            making = partial(Judged.of, self._retention.boot_id, judgement)
+            making = partial(Judged.of, self._boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 
     def on_event(self, event: LoopEvent) -> None:
@@ -266,10 +221,13 @@ class Recorder(Companion):
     def _begin(self, now_ns: int, header: RecordingHeader) -> None:
         offset_ns = self._wall_clock() - now_ns
         header = replace(header, file=self._number, wall_minus_monotonic_ns=offset_ns)
-        path = self._retention.path(self._number, ".mcap")
+        # Names sort by time.
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        name = f"{self._hand}-{stamp}-{self._boot_id[:8]}-{self._number:04}"
+        path = self._options.folder / f"{name}.mcap"
         files: list[RecordingFile] = []
         try:
-            self._counted["removed"] += self._retention.make_room(self._rotate_bytes)
+            self._counted["removed"] += make_room(self._options, self._hand)
             files.append(McapWriter(path, header))
             if self._tap is not None:
                 files.append(RecordingFile(path.with_suffix(self._tap.ending)))
@@ -344,5 +302,37 @@ class Recorder(Companion):
         is_first = self._retry_due_ns is None
         self._retry_due_ns = self._clock() + RETRY_NS
         say = log.warning if is_first else log.debug
-        where = self._retention.directory
+        where = self._options.folder
         say("record: %s: %s; nothing is recorded", where, error.strerror or error)
+
+
+def make_room(options: Record, hand: str) -> int:
+    """Delete the hand's oldest recordings until another file fits; return their number.
+
+    A link log belongs to its recording. Raises `OSError`.
+    """
+    options.folder.mkdir(parents=True, exist_ok=True)
+    recordings = _recordings(options.folder, hand)
+    total_mb = options.rotate_mb + sum(size for _, size in recordings.values()) / 1e6
+    removed = 0
+    while recordings and (len(recordings) >= options.keep_files or total_mb > options.keep_mb):
+        paths, size = recordings.pop(min(recordings))
+        for path in paths:
+            path.unlink(missing_ok=True)
+        total_mb -= size / 1e6
+        removed += 1
+    return removed
+
+
+def _recordings(folder: Path, hand: str) -> dict[str, tuple[list[Path], int]]:
+    """Return paths and total size, bytes, of each recording, by the stamp in its name."""
+    pattern = re.compile(rf"{re.escape(hand)}-({_STAMP})\.(mcap|can\.log|serial)")
+    recordings: dict[str, tuple[list[Path], int]] = {}
+    for path in folder.iterdir():
+        match = pattern.fullmatch(path.name)
+        if match is None:
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            paths, size = recordings.get(match[1], ([], 0))
+            recordings[match[1]] = ([*paths, path], size + path.stat().st_size)
+    return recordings

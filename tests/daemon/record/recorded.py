@@ -13,7 +13,7 @@ import zmq
 
 from graspd.daemon.publish.messages import Status, Verdict
 from graspd.daemon.record.mcap import McapReader, RecordingHeader
-from graspd.daemon.record.recorder import MakeHeader, Recorder, Retention
+from graspd.daemon.record.recorder import MakeHeader, Recorder
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.drivers.recordings.csv_rows import open_recording
@@ -71,18 +71,14 @@ def files(folder: Path) -> list[Path]:
     return sorted((folder / "record").glob("*.mcap"))
 
 
-def retention(folder: Path, keep_files: int = 100, keep_bytes: int = 10**9) -> Retention:
-    return Retention(folder / "record", "right", BOOT, keep_files, keep_bytes)
-
-
 def recorder(
     folder: Path,
     take_header: Callable[[], MakeHeader] = lambda: lambda: HEADER,
     **options: Any,  # noqa: ANN401
 ) -> Recorder:
     """A recorder that flushes after 100 ms unless the options say otherwise."""
-    wanted = Record(**{"flush_ms": 100.0, **options})
-    return Recorder(retention(folder), wanted, take_header=take_header)
+    wanted = Record(**{"directory": folder / "record", "flush_ms": 100.0, **options})
+    return Recorder(wanted, "right", BOOT, take_header=take_header)
 
 
 def scene(folder: Path, record: str = "", more: str = "", gate: str = "") -> Path:

@@ -18,10 +18,11 @@ import pytest
 from graspd.daemon import scene
 from graspd.daemon.record import recorder as recorder_module
 from graspd.daemon.record.mcap import McapReader, McapWriter
-from graspd.daemon.record.recorder import QUEUE_MAX, Recorder
+from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, make_room
 from graspd.daemon.scene import SceneError
+from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.csv_rows import open_recording
-from tests.daemon.record.recorded import BOOT, NO_STATUS, files, messages, recorder, retention
+from tests.daemon.record.recorded import BOOT, NO_STATUS, files, messages, recorder
 from tests.kit.waiting import wait_until
 
 TOPIC = b"verdict.right"
@@ -118,7 +119,7 @@ def test_the_oldest_files_make_room_and_nothing_else_is_removed(tmp_path: Path) 
     strangers = [folder / "right-notes.mcap", folder / "left-20200101T000000Z-00000000-0000.mcap"]
     for path in strangers:
         path.write_bytes(b"")
-    assert retention(tmp_path, keep_files=4).make_room(0) == 2
+    assert make_room(Record(directory=folder, keep_files=4), "right") == 2
     assert not paths[0].exists()
     assert not beside.exists()
     assert not paths[1].exists()
@@ -127,10 +128,10 @@ def test_the_oldest_files_make_room_and_nothing_else_is_removed(tmp_path: Path) 
 
 def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
     for hour in range(5):
-        old(tmp_path / "record", hour, 1000)
-    assert retention(tmp_path, keep_bytes=4500).make_room(1000) == 2
-    assert retention(tmp_path, keep_bytes=10).make_room(1000) == 3
-    assert retention(tmp_path, keep_bytes=10).make_room(1000) == 0
+        old(tmp_path, hour, 10**6)
+    for keep_mb, removed in ((4.5, 2), (1.0, 3), (1.0, 0)):
+        options = Record(directory=tmp_path, keep_mb=keep_mb, rotate_mb=1.0)
+        assert make_room(options, "right") == removed
 
 
 class StalledDisk:
