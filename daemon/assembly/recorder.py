@@ -11,7 +11,6 @@ from msgspec.structs import replace
 from graspd.daemon.assembly import assembly
 from graspd.daemon.judge.memory import encode, remember
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.record.header import RecordingHeader
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.trust import encode as encode_trust
@@ -19,6 +18,7 @@ from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from graspd.daemon.record.link_log import Tap
+    from graspd.daemon.record.mcap import RecordingHeader
     from graspd.daemon.record.recorder import Recorder
 
 
@@ -32,19 +32,12 @@ def build_recorder(
 ) -> Recorder:
     """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
     assembly.require_mcap("[record]")
-    from graspd.daemon.record.files import Retention
     from graspd.daemon.record.recorder import Recorder
 
-    retention = Retention(
-        options.folder,
+    recorder = Recorder(
+        options,
         scene.hand.name,
         boot_id,
-        keep_files=options.keep_files,
-        keep_bytes=round(options.keep_mb * 1e6),
-    )
-    recorder = Recorder(
-        retention,
-        options,
         take_header=partial(header_now, pipeline, header_of(scene, model, boot_id)),
         tap=tap,
     )
@@ -54,6 +47,8 @@ def build_recorder(
 
 def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
     """Return the header of a recording, without the state of judge and session."""
+    from graspd.daemon.record.mcap import RecordingHeader
+
     network = scene.model.model_dump(mode="json", exclude_none=True)
     if scene.model.path is not None:
         network["path"] = str(scene.model.path.absolute())

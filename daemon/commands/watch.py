@@ -180,7 +180,7 @@ def _terminal(hands: list[HandFeed]) -> int:
     if not sys.stdout.isatty():
         raise UsageError("watch draws on a terminal; see --web, or `graspd run --print` for a pipe")
     try:
-        from graspd.daemon.watch.screen import can_draw, show
+        from graspd.daemon.watch.terminal import can_draw, show
     except ModuleNotFoundError as error:
         advice = needs("watch", "watch", error)
         raise UsageError(f"{advice}; or watch --web, which needs none") from None

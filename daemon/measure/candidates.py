@@ -1,14 +1,17 @@
-"""Candidates of the report: graspd's models, and the published code around the network `cnn1`.
+"""Candidates of the report, and their time: graspd's models, and the published code around `cnn1`.
 
-The network is not trained here, because its time does not depend on its weights.
+The published network is not trained here, because its time does not depend on its weights. Steps
+are timed in a hot loop and paced, one candidate after the other in every round.
 """
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from graspd.daemon.measure.picture import Row
-from graspd.daemon.measure.timing import Step
+from graspd.daemon.process.text import progress
 from graspd.models.bts3 import FINGERS
 from graspd.models.contract import ModelError
 from graspd.models.layout import D1
@@ -27,6 +29,19 @@ from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.estimators.configs import CNN1
 
 CONFIDENCE = 0.95
+WARM_UP = 20
+ROUNDS = 10
+"""Rounds of the hot loop, so that a busy second spoils only one."""
+PERIOD_S = 0.01
+"""Time between paced readings, s. Other work in between makes caches cold."""
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
+
+Row = dict[str, Any]
+"""One candidate of a report: `name`, `kind` (`model` or `peer`), `fingers`, `error`, `time`."""
+Step = Callable[[int], object]
+"""Does the timed work for the reading of this number."""
+Times = dict[str, float]
+"""`hot_p50_us`, `paced_p99_us` and so on, and `cpu_percent_at_100_hz`, the share of a core."""
 Candidate = tuple[Row, Step]
 """Name, kind, fingers and error of a model or a peer, and what is timed."""
 
@@ -137,3 +152,57 @@ def _published(counts: NDArray[np.uint16]) -> Step:
     return lambda index: model.predict(
         loop_image(counts[index % len(counts)])[np.newaxis], verbose=0
     )
+
+
+def measure(steps: Mapping[str, Step], readings: int, paced: int) -> dict[str, Times]:
+    """Time each step on `readings` readings hot and `paced` readings at 100 Hz."""
+    for step in steps.values():
+        for index in range(WARM_UP):
+            step(index)
+    gc.disable()  # as timeit does
+    try:
+        hot = _hot(steps, readings // ROUNDS)
+        cold, cpu = _paced(steps, paced)
+    finally:
+        gc.enable()
+    return {name: _quantiles(hot[name], cold[name], cpu[name]) for name in steps}
+
+
+def _hot(steps: Mapping[str, Step], readings: int) -> dict[str, list[int]]:
+    """Wall time of readings right after each other, ns."""
+    times: dict[str, list[int]] = {name: [] for name in steps}
+    for done in range(ROUNDS):
+        for name, step in steps.items():
+            progress(f"one reading after the other, round {done + 1} of {ROUNDS}: {name}")
+            for index in range(readings):
+                began_ns = time.perf_counter_ns()
+                step(index)
+                times[name].append(time.perf_counter_ns() - began_ns)
+    return times
+
+
+def _paced(
+    steps: Mapping[str, Step], readings: int
+) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+    """Wall and processor time of readings that are 10 ms apart, ns."""
+    wall: dict[str, list[int]] = {name: [] for name in steps}
+    cpu: dict[str, list[int]] = {name: [] for name in steps}
+    due_s = time.perf_counter()
+    for index in range(readings):
+        progress(f"paced at 100 Hz: {index} of {readings} readings each")
+        for name, step in steps.items():
+            due_s += PERIOD_S
+            time.sleep(max(due_s - time.perf_counter(), 0.0))
+            used_ns, began_ns = time.thread_time_ns(), time.perf_counter_ns()
+            step(index)
+            wall[name].append(time.perf_counter_ns() - began_ns)
+            cpu[name].append(time.thread_time_ns() - used_ns)
+    return wall, cpu
+
+
+def _quantiles(hot_ns: list[int], paced_ns: list[int], cpu_ns: list[int]) -> Times:
+    times = {"cpu_percent_at_100_hz": float(np.mean(cpu_ns)) * 1e-9 / PERIOD_S * 100.0}
+    for kind, values_ns in (("hot", hot_ns), ("paced", paced_ns)):
+        for name, share in QUANTILES.items():
+            times[f"{kind}_{name}_us"] = float(np.quantile(values_ns, share)) / 1e3
+    return times

@@ -65,17 +65,10 @@ def measure(scene: Path) -> Footprint:
     Nothing is published, and no device or kept session is touched."""
     with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
         # -P, so that the files in the folder at hand are not taken for modules.
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "graspd.daemon.measure.footprint",
-            str(scene),
-            folder,
-        ]
+        command = [sys.executable, "-P", "-m", "graspd.daemon.measure.footprint"]
         try:
             result = subprocess.run(
-                [*command, str(time.monotonic_ns())],
+                [*command, str(scene), folder, str(time.monotonic_ns())],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 text=True,

@@ -7,20 +7,34 @@ noisy, so compare ratios.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-from graspd.daemon.measure.candidates import candidates
-from graspd.daemon.measure.picture import DEFAULT, PANELS, Report, Row, draw, error_of
-from graspd.daemon.measure.timing import measure
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from graspd.daemon.measure.candidates import Row, candidates, measure
 from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
 from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.training.data.datasets import DatasetError, Grasps, read_all
-from graspd.models.training.evaluating.style import QUICK
+from graspd.models.training.evaluating.style import (
+    BLUE,
+    ORANGE,
+    PAPER,
+    QUICK,
+    QUIET,
+    mark_quick,
+    style,
+    to_svg,
+)
 
 READINGS, PACED = 2000, 300
 QUICK_READINGS, QUICK_PACED = 100, 5
@@ -36,6 +50,28 @@ COLUMNS = (
     "paced p50 / p99, us",
     "CPU at 100 Hz",
 )
+DEFAULT = "small-session"
+PANELS = (
+    (("cv",), "known objects"),
+    (("objects", "objects-whole"), "other objects"),
+    (("session",), "another day"),
+)
+"""Protocols and their question; a model has at most one of a group.
+Without the first it was measured on two palm poses only, and is drawn hollow."""
+COLOURS = {"model": BLUE, "peer": ORANGE}
+MARKERS = {"model": "o", "peer": "s"}
+SIZE_IN = (9.5, 9.6)
+ERROR_MAX = 104.0
+"""Upper end of an axis, %: a point at 100 is seen whole."""
+KEY = (
+    "circles: graspd's models, squares: peers, line: the front, bars: 95 %, "
+    "hollow: two palm poses only"
+)
+FONT_PT = 8.5
+MARKER_PT = 8.0
+
+Report = dict[str, Any]
+"""Figures in `error-vs-time.json`."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -132,3 +168,110 @@ def _processor() -> str:
         lines = []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.machine())
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One candidate in one panel."""
+
+    name: str
+    kind: str
+    """`model` or `peer`."""
+    us: float
+    """Time of a paced reading, p50."""
+    error: float
+    """1 - F1, in %."""
+    reach: tuple[float, float]
+    """From the error down and up to the ends of its 95 % interval, in %."""
+    hollow: bool
+
+
+def error_of(row: Row, protocols: Sequence[str]) -> dict[str, float]:
+    """Return the figures of the first of these protocols that a row has; empty: none."""
+    return next((row["error"][name] for name in protocols if name in row["error"]), {})
+
+
+def points(rows: Sequence[Row], protocols: Sequence[str]) -> Iterator[Point]:
+    """Yield the candidates for the whole hand that have figures of one of these protocols."""
+    most = max(len(row["fingers"]) for row in rows)
+    for row in rows:
+        error = error_of(row, protocols)
+        if error and len(row["fingers"]) == most:
+            yield Point(
+                row["name"],
+                row["kind"],
+                row["time"]["paced_p50_us"],
+                100.0 * (1.0 - error["f1"]),
+                (100.0 * (error["high"] - error["f1"]), 100.0 * (error["f1"] - error["low"])),
+                row["error"].get(protocols[0]) is not error,
+            )
+
+
+def front(several: Sequence[Point]) -> list[Point]:
+    """Return the models without another that is both faster and more exact, fastest first."""
+    best: list[Point] = []
+    for point in sorted(several, key=lambda point: (point.us, point.error)):
+        if point.kind == "model" and (not best or point.error < best[-1].error):
+            best.append(point)
+    return best
+
+
+def draw(report: Report, figures: Sequence[str]) -> str:
+    """Return the picture, as SVG; `figures` are the report's table."""
+    with style():
+        figure = Figure(figsize=SIZE_IN, dpi=72, layout="constrained")
+        panels = figure.subplots(len(PANELS), 1, sharex=True)
+        drawn = [list(points(report["rows"], protocols)) for protocols, _ in PANELS]
+        times = [point.us for point in itertools.chain(*drawn)]
+        panels[-1].set_xscale("log")
+        panels[-1].set_xlim(min(times) / 1.5, max(times) * 1.5)
+        for axes, several, (_, asked) in zip(panels, drawn, PANELS, strict=True):
+            _draw_panel(axes, several, asked)
+        panels[-1].set_xlabel("time of a reading, input and network, paced at 100 Hz, p50, us")
+        title = f"Error against run time, on {report['machine']['processor']}"
+        figure.suptitle(f"{title}\n{KEY}", fontsize=11)
+        if report["quick"]:
+            mark_quick(figure)
+        return to_svg(figure, title, figures)
+
+
+def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
+    for point in several:
+        colour = COLOURS[point.kind]
+        reach = [[each] for each in point.reach]
+        axes.errorbar(
+            point.us, point.error, yerr=reach, ecolor=colour, alpha=0.6, lw=1.4, capsize=3
+        )
+        marker = "*" if point.name == DEFAULT else MARKERS[point.kind]
+        axes.plot(
+            point.us, point.error, marker, color=colour,
+            markersize=MARKER_PT * (2.0 if marker == "*" else 1.0),
+            markerfacecolor=PAPER if point.hollow else colour, zorder=5,
+        )  # fmt: skip
+    best = front(several)
+    axes.plot(
+        [point.us for point in best], [point.error for point in best],
+        color=COLOURS["model"], lw=1.6, alpha=0.5, zorder=1,
+    )  # fmt: skip
+    if several:
+        low = min(point.error - point.reach[0] for point in several)
+        high = max(point.error + point.reach[1] for point in several)
+        margin = 0.08 * (high - low)
+        axes.set_ylim(max(low - margin, 0.0), min(high + margin, ERROR_MAX))
+    axes.set_ylabel(f"{asked}\n1 - F1, %")
+    name_points(axes, several)
+
+
+def name_points(axes: Axes, several: Sequence[Point]) -> None:
+    """Put the names in a column beside the panel, in the order of the errors."""
+    ordered = sorted(several, key=lambda point: point.error)
+    heights = np.linspace(0.02, 0.98, len(ordered))
+    for point, height in zip(ordered, heights, strict=True):
+        is_default = point.name == DEFAULT
+        axes.annotate(
+            f"{point.name} (default)" if is_default else point.name, (point.us, point.error),
+            fontsize=FONT_PT, color=COLOURS[point.kind],
+            fontweight="bold" if is_default else "normal", va="center",
+            xytext=(1.02, height), textcoords="axes fraction",
+            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": QUIET, "relpos": (0.0, 0.5)},
+        )  # fmt: skip

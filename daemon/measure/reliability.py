@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.measure.streams import Group, Life, Stream
+from graspd.daemon.measure.streams import Group, Life
 from graspd.daemon.process.text import markdown_table
 from graspd.daemon.trust.learner import SCALE
 
@@ -74,48 +74,38 @@ def slope(p_slip: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
     return factor
 
 
-def fitted_scales(several: Sequence[Stream], unscaled: Sequence[Life]) -> dict[Group, float]:
+def fitted_scales(unscaled: Sequence[Life]) -> dict[Group, float]:
     """Return the scale of each group of objects, fitted on the other groups of its split.
 
-    `unscaled` are the streams' lives with a scale of 1. A group without others has the learner's.
+    `unscaled` are lives with a scale of 1. A group without others has the learner's.
     """
     scales = {}
-    for group in dict.fromkeys(one.group for one in several):
-        others = [
-            index
-            for index, one in enumerate(several)
-            if one.group[0] == group[0] and one.group != group
-        ]
-        scales[group] = SCALE
-        if others:
-            lives = [unscaled[index] for index in others]
-            scales[group] = slope(*outcomes_of([several[index] for index in others], lives))
+    for group in dict.fromkeys(life.stream.group for life in unscaled):
+        split = [life for life in unscaled if life.stream.group[0] == group[0]]
+        others = [life for life in split if life.stream.group != group]
+        scales[group] = slope(*outcomes_of(others)) if others else SCALE
     return scales
 
 
-def outcomes_of(
-    several: Sequence[Stream], lives: Sequence[Life]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def outcomes_of(lives: Sequence[Life]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return `p_slip` of all judged grasps that rest on an outcome, and whether each slipped."""
-    judged = [~one.refused & (life.outcomes > 0) for one, life in zip(several, lives, strict=True)]
-    p_slip = [life.p_slip[rows] for life, rows in zip(lives, judged, strict=True)]
-    slipped = [one.slipped[rows] for one, rows in zip(several, judged, strict=True)]
-    return np.concatenate(p_slip), np.concatenate(slipped)
+    p_slip = np.concatenate([life.p_slip for life in lives])
+    slipped = np.concatenate([life.stream.slipped for life in lives])
+    refused = np.concatenate([life.stream.refused for life in lives])
+    rows = ~refused & (np.concatenate([life.outcomes for life in lives]) > 0)
+    return p_slip[rows], slipped[rows]
 
 
-def reliability(
-    several: Sequence[Stream], lives: Sequence[Life], scales: dict[Group, float]
-) -> Reliability:
+def reliability(lives: Sequence[Life], scales: dict[Group, float]) -> Reliability:
     """Return what `p_slip` of these lives is worth; they were lived with these scales."""
-    p_slip, slipped = outcomes_of(several, lives)
+    p_slip, slipped = outcomes_of(lives)
     parts = []
     for low, high in itertools.pairwise(EDGES):
         inside = (p_slip >= low) & (p_slip < high)
         if inside.any():
             said, actual = float(p_slip[inside].mean()), float(slipped[inside].mean())
             parts.append(Part(low, high, int(inside.sum()), said, actual))
-    each = [slope(*outcomes_of([one], [life])) for one, life in zip(several, lives, strict=True)]
-    spread = tuple(np.quantile(each, SPREAD).tolist())
+    spread = tuple(np.quantile([slope(*outcomes_of([life])) for life in lives], SPREAD).tolist())
     return Reliability(parts, slope(p_slip, slipped), spread, list(scales.values()), SCALE)
 
 

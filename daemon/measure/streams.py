@@ -60,6 +60,7 @@ class Stream:
 class Life:
     """Verdicts on a stream's grasps (N,), each after the outcomes of the grasps before it."""
 
+    stream: Stream
     p_slip: NDArray[np.float64]
     """NaN: refused."""
     stable: NDArray[np.bool_]
@@ -67,8 +68,6 @@ class Life:
     """Grasps whose lift under supervision was asked for."""
     outcomes: NDArray[np.int64]
     """Number of outcomes that each verdict rests on."""
-    within: bool
-    """True if slips among stable lifts never exceeded the bound."""
 
 
 def streams(
@@ -125,7 +124,7 @@ def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCAL
     trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
     trust.learner.scale = scale
     p_slip, stable = np.full(count, np.nan), np.zeros(count, np.bool_)
-    supervised, outcomes, within = np.zeros(count, np.bool_), np.zeros(count, np.int64), True
+    supervised, outcomes = np.zeros(count, np.bool_), np.zeros(count, np.int64)
     for index in np.flatnonzero(~stream.refused).tolist():
         grasp = GraspId(f"{stream.table} {stream.order}", index)
         margin, slipped = float(stream.margins[index]), bool(stream.slipped[index])
@@ -136,5 +135,4 @@ def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCAL
         trust.note(grasp, assessed, stable=bool(stable[index]))
         if every or stable[index] or assessed.supervised:
             trust.outcome(grasp, slipped=slipped)
-        within &= trust.risk.bound is None or trust.risk.slips <= trust.risk.bound + 1e-9
-    return Life(p_slip, stable, supervised, outcomes, within)
+    return Life(stream, p_slip, stable, supervised, outcomes)

@@ -160,7 +160,7 @@ def _put_on(card: Path, worth: Worth) -> None:
 def worth_of(several: Sequence[Stream], command: str) -> Worth:
     """Live all streams, with scales that were fitted on other objects, and measure them."""
     unscaled = [live(one, RiskLimits(), every=True, scale=1.0) for one in several]
-    scales = fitted_scales(several, unscaled)
+    scales = fitted_scales(unscaled)
 
     def lives(chosen: RiskLimits, *, every: bool) -> list[Life]:
         return [live(one, chosen, every=every, scale=scales[one.group]) for one in several]
@@ -174,14 +174,15 @@ def worth_of(several: Sequence[Stream], command: str) -> Worth:
     return Worth(
         command,
         len(several),
-        measured(several, learning, risks[ALLOWED]),
-        list(_risks(several, risks)),
+        measured(learning, risks[ALLOWED]),
         [
-            risk_figures(several, lived, ALLOWED, ALL_DAYS, count)
-            for count, lived in warm_ups.items()
+            risk_figures(of_day, target, day)
+            for target, of_target in risks.items()
+            for day, of_day in _by_day(of_target).items()
         ],
-        list(_days(several, learning)),
-        reliability(several, learning, scales),
+        [risk_figures(lived, ALLOWED, ALL_DAYS, count) for count, lived in warm_ups.items()],
+        [_day_f1(day, of_day) for day, of_day in _by_day(learning).items()],
+        reliability(learning, scales),
     )
 
 
@@ -190,8 +191,9 @@ def limits(share: float, warm_up: int = WARM_UP) -> RiskLimits:
     return RiskLimits(share, warm_up, EXPLORE)
 
 
-def measured(several: Sequence[Stream], learning: Sequence[Life], risk: Sequence[Life]) -> Curves:
+def measured(learning: Sequence[Life], risk: Sequence[Life]) -> Curves:
     """Return how often `stable` was said and slipped, over all streams together."""
+    several = [life.stream for life in learning]
     said = {
         PUBLISHED: [one.published < 0.0 for one in several],
         ALONE: [(one.margins < 0.0) & ~one.refused for one in several],
@@ -217,17 +219,14 @@ def _curve(
 
 
 def risk_figures(
-    several: Sequence[Stream],
-    lives: Sequence[Life],
-    target: float,
-    day: str,
-    warm_up: int = WARM_UP,
+    lives: Sequence[Life], target: float, day: str, warm_up: int = WARM_UP
 ) -> RiskFigures:
-    """Return what a target kept; every life must be of its stream."""
+    """Return what a target kept in these lives, which are all of one day or of `ALL_DAYS`."""
     kept, stable, slips, above = [], 0, 0, 0
-    for one, life in zip(several, lives, strict=True):
-        called, slipped = int(life.stable.sum()), int((life.stable & one.slipped).sum())
-        kept.append((called - slipped) / max(int((~one.slipped).sum()), 1))
+    for life in lives:
+        ended = life.stream.slipped
+        called, slipped = int(life.stable.sum()), int((life.stable & ended).sum())
+        kept.append((called - slipped) / max(int((~ended).sum()), 1))
         stable, slips = stable + called, slips + slipped
         above += slipped > target * called
     return RiskFigures(
@@ -242,29 +241,19 @@ def risk_figures(
     )
 
 
-def _risks(several: Sequence[Stream], lives: dict[float, list[Life]]) -> Iterator[RiskFigures]:
-    for target, of_target in lives.items():
-        for day, chosen in _by_day(several).items():
-            these = [of_target[index] for index in chosen]
-            yield risk_figures([several[index] for index in chosen], these, target, day)
+def _day_f1(day: str, learning: Sequence[Life]) -> DayF1:
+    several = [life.stream for life in learning]
+    judged = ~np.concatenate([one.refused for one in several])
+    slipped = np.concatenate([one.slipped for one in several])[judged]
+    alone = np.concatenate([one.margins for one in several])[judged] >= 0.0
+    after = np.concatenate([life.p_slip for life in learning])[judged] >= 0.5
+    f1 = (VerdictFigures.of(called, slipped).f1 for called in (alone, after))
+    return DayF1(day, len(learning), *f1)
 
 
-def _days(several: Sequence[Stream], learning: Sequence[Life]) -> Iterator[DayF1]:
-    for day, chosen in _by_day(several).items():
-        here = [(several[index], learning[index]) for index in chosen]
-        slipped = np.concatenate([one.slipped[~one.refused] for one, _ in here])
-        alone = np.concatenate([one.margins[~one.refused] >= 0.0 for one, _ in here])
-        after = np.concatenate([life.p_slip[~one.refused] >= 0.5 for one, life in here])
-        f1 = (VerdictFigures.of(called, slipped).f1 for called in (alone, after))
-        yield DayF1(day, len(chosen), *f1)
-
-
-def _by_day(several: Sequence[Stream]) -> dict[str, list[int]]:
-    """Return the places of each day's streams."""
-    days = sorted({one.protocol for one in several})
-    return {
-        day: [index for index, one in enumerate(several) if one.protocol == day] for day in days
-    }
+def _by_day(lives: Sequence[Life]) -> dict[str, list[Life]]:
+    days = sorted({life.stream.protocol for life in lives})
+    return {day: [life for life in lives if life.stream.protocol == day] for day in days}
 
 
 def lines(worth: Worth) -> Iterator[str]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,14 +17,16 @@ from graspd.drivers.recordings.csv_rows import (
     OBJECT,
     SLIPPED,
     TIME,
+    Row,
     columns_of,
     electrode_columns,
+    read_rows,
 )
 from graspd.extras import require
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
-    from graspd.drivers.base import Driver, Reading
+    from graspd.daemon.record.player import McapReplayDriver
 
 MCAP, PARQUET = ".mcap", ".parquet"
 
@@ -44,14 +45,13 @@ def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
         from graspd.daemon.record.export import collect
 
         return grasps_of(collect([path]), "unknown")
-    fingers = _fingers(path)
-    columns = columns_of(path, fingers)
+    fingers, columns = _fingers(path), columns_of(path, ())
     if columns.is_stream:
         raise RecordingError(path, "is a stream and no grasp table: read_recording reads it")
     if not columns.has_labels:
         raise RecordingError(path, f"has no column `{SLIPPED}`: the outcomes are not known")
-    rows = [each for each in _played(path, fingers) if isinstance(each, TactileReading)]
-    notes = [each.annotation for each in rows if each.annotation is not None]
+    rows = list(read_rows(path, fingers))
+    notes = [row.annotation for row in rows]
     labels = {
         OBJECT: [note.object_name for note in notes],
         SLIPPED: [bool(note.slipped) for note in notes],
@@ -66,18 +66,28 @@ def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
     Raises `RecordingError`.
     """
     path = Path(path)
+    driver: ReplayDriver | McapReplayDriver
     if path.suffix == MCAP:
         require("mcap", "read_recording of MCAP", "record")
-    fingers = _fingers(path)
+        from graspd.daemon.record.mcap import header_of
+        from graspd.daemon.record.player import McapReplayDriver
+
+        fingers = header_of(path).fingers
+        driver = McapReplayDriver([path], fingers)
+    else:
+        fingers = _fingers(path)
+        driver = ReplayDriver([path], fingers, speed=None)
     rows: list[TactileReading] = []
     joints: list[dict[str, float]] = []
     angles: dict[str, float] = {}
-    for reading in _played(path, fingers):
-        if isinstance(reading, JointReading):
-            angles |= zip(reading.names, reading.position_rad.tolist(), strict=True)
-        else:
-            rows.append(reading)
-            joints.append(dict(angles))
+    with driver:
+        while not driver.exhausted:
+            for reading in driver.read_ready():
+                if isinstance(reading, JointReading):
+                    angles |= zip(reading.names, reading.position_rad.tolist(), strict=True)
+                else:
+                    rows.append(reading)
+                    joints.append(dict(angles))
     times = pd.DataFrame({TIME: [reading.made_ns / 1e9 for reading in rows]})
     return pd.concat([times, _counts(rows, fingers), pd.DataFrame(joints)], axis=1)
 
@@ -93,37 +103,18 @@ def grasps_of(export: Export, object_name: str) -> pd.DataFrame:
     return pd.concat([pd.DataFrame(labels), _table(counts, export.fingers)], axis=1)
 
 
-def _played(path: Path, fingers: Sequence[str]) -> Iterator[Reading]:
-    """Yield all readings of a file, as fast as it can be read."""
-    driver: Driver
-    if path.suffix == MCAP:
-        from graspd.daemon.record.player import McapReplayDriver
-
-        driver = McapReplayDriver([path], fingers)
-    else:
-        driver = ReplayDriver([path], fingers, speed=None)
-    with closing(driver):
-        driver.open()
-        while not driver.exhausted:
-            yield from driver.read_ready()
-
-
 def _fingers(path: Path) -> tuple[str, ...]:
-    """Return the fingers that a file has."""
-    if path.suffix == MCAP:
-        from graspd.daemon.record.mcap import header_of
-
-        return header_of(path).fingers
+    """Return the fingers that a CSV file has."""
     fingers = columns_of(path, ()).fingers
     if not fingers:
         raise RecordingError(path, "has no columns of electrodes, such as ff_biotac_1")
     return fingers
 
 
-def _counts(rows: Sequence[TactileReading], fingers: Sequence[str]) -> pd.DataFrame:
+def _counts(rows: Sequence[TactileReading | Row], fingers: Sequence[str]) -> pd.DataFrame:
     """Return the counts of readings; NaN where an electrode is faulty."""
-    counts: NDArray[np.generic] = np.array([reading.counts for reading in rows])
-    faulty = np.array([reading.faults for reading in rows]) != 0
+    counts: NDArray[np.generic] = np.array([row.counts for row in rows])
+    faulty = np.array([row.faults for row in rows]) != 0
     return _table(np.where(faulty, np.nan, counts) if faulty.any() else counts, fingers)
 
 

@@ -9,8 +9,7 @@ from typing import Final, Self
 import foxglove
 import msgspec
 
-from graspd.daemon.record.flat import flat
-from graspd.daemon.record.topics import schemas
+from graspd.daemon.record.topics import flat, schemas
 from graspd.daemon.record.viewers import Viewer
 
 ADDRESS: Final = "127.0.0.1"

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from io import BytesIO
 from itertools import count
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple, Self
 
 import lz4.frame
+import msgspec
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError, UnsupportedCompressionError
@@ -19,12 +22,13 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 
-from graspd.daemon.record.files import RecordingFile
-from graspd.daemon.record.header import RecordingHeader
 from graspd.daemon.record.topics import schemas
-from graspd.drivers.base import RecordingError
+from graspd.drivers.base import FINGERS, RecordingError
 from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.models.session_statistics import SessionState
 
+MODE: Final = 0o640
+"""File mode of recordings; not readable for all users, as they show what a hand did."""
 METADATA: Final = "graspd"
 """Name of the metadata record at the start of each file of graspd."""
 RECORD_MAX_BYTES: Final = 64 << 20
@@ -39,6 +43,94 @@ _DAMAGE = (
     *(OverflowError, MemoryError),
 )
 """Exceptions of the library for a damaged file; huge lengths cause the last two."""
+
+_TEXTS: Final = ("boot_id", "model", "model_sha256", "judge", "trust")
+"""Fields written as text, or as base64 if they are bytes; all others are JSON."""
+_OLDER: Final = {"trust": "", "says_judged": "false"}
+"""Values of the fields that older recordings lack."""
+
+
+class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
+    """Description of the run, and its state, so that one file alone can be replayed."""
+
+    fingers: tuple[str, ...]
+    """Fingers in the order of a reading's rows."""
+    joints: bool
+    """True if the hand had joint angles."""
+    boot_id: str
+    scene: dict[str, dict[str, Any]]
+    """Sections `hand`, `model`, `gate`, `session`, `learn` and `risk`."""
+    model: str
+    model_sha256: str
+    file: int = 0
+    """Number of the file in the run; one is skipped after a failure of the disk."""
+    wall_minus_monotonic_ns: int = 0
+    """Wall time less the daemon's monotonic time, ns."""
+    judge: bytes = b""
+    """State of the judge, from `graspd.daemon.judge.memory.encode`; empty: not known."""
+    axis_ns: int = 0
+    """Difference `t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
+    session: SessionState | None = None
+    """Statistics of the session; None for a model without a session."""
+    trust: bytes = b""
+    """State of learning, from `graspd.daemon.trust.trust.encode`; empty without learning."""
+    says_judged: bool = True
+    """True if the file has `judged` messages."""
+
+    def texts(self) -> dict[str, str]:
+        """Return the fields as texts, for a metadata record of MCAP."""
+        return {
+            name: value if name in _TEXTS else msgspec.json.encode(value).decode()
+            for name, value in msgspec.to_builtins(self).items()
+        }
+
+    @classmethod
+    def of(cls, texts: Mapping[str, str]) -> Self:
+        """Return the header in `texts`. Raises `KeyError` or `ValueError`."""
+        texts = {**_OLDER, **texts}
+        fields: dict[str, Any] = {name: texts[name] for name in cls.__struct_fields__}
+        fields["session"] = fields["session"] or "null"  # older recordings have this
+        for name in fields.keys() - _TEXTS:
+            fields[name] = msgspec.json.decode(fields[name])
+        header = msgspec.convert(fields, cls)
+        if not header.fingers or not set(header.fingers) <= set(FINGERS):
+            raise ValueError(f"no fingers of a hand: {header.fingers}")
+        return header
+
+
+class RecordingFile:
+    """One file that is being written. Methods raise `OSError` if the disk fails."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file, which must not exist."""
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+        self._path = path
+        self._stream = os.fdopen(os.open(path, flags, MODE), "wb")
+
+    def append(self, content: bytes) -> None:
+        self._stream.write(content)
+
+    def flush(self) -> int:
+        """Write everything to the disk; return the size of the file, bytes."""
+        self._stream.flush()
+        os.fdatasync(self._stream.fileno())
+        return self._stream.tell()
+
+    def close(self) -> None:
+        try:
+            self.flush()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close after an error; buffered bytes may be lost."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    def remove(self) -> None:
+        self.abandon()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
 
 
 class McapWriter(RecordingFile):

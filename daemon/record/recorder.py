@@ -5,13 +5,16 @@ The loop appends to a bounded queue, and a thread writes. A slow disk costs entr
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import re
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
 import msgspec
@@ -19,11 +22,8 @@ from msgspec.structs import replace
 
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
-from graspd.daemon.record.files import RecordingFile, Retention
-from graspd.daemon.record.flat import flat
-from graspd.daemon.record.header import RecordingHeader
-from graspd.daemon.record.mcap import McapWriter
-from graspd.daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
+from graspd.daemon.record.mcap import McapWriter, RecordingFile, RecordingHeader
+from graspd.daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic, flat
 from graspd.daemon.record.viewers import Viewer
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.base import JointReading, Reading
@@ -46,6 +46,7 @@ FLUSH_AFTER: Final = 0.8
 """Share of the flush interval after which a flush is due; a round and the writing follow."""
 CLOSE_S: Final = 0.5
 """Longest wait of `close` for the thread, s."""
+_STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 MakeHeader = Callable[[], RecordingHeader]
 """Function that makes the header of a copied state; called in the thread."""
@@ -78,8 +79,9 @@ class Recorder(Companion):
 
     def __init__(
         self,
-        retention: Retention,
         options: Record,
+        hand: str,
+        boot_id: str,
         *,
         take_header: Callable[[], MakeHeader],
         tap: Tap | None = None,
@@ -91,7 +93,9 @@ class Recorder(Companion):
         `take_header`: copies the state for a file's header. It is called here and after a status,
         when no reading is being judged.
         """
-        self._retention = retention
+        self._options = options
+        self._hand = hand
+        self._boot_id = boot_id
         self._rotate_bytes = round(options.rotate_mb * 1e6)
         self._rotate_ns = round(options.rotate_minutes * 60e9)
         self._flush_ns = round(options.flush_ms * 1e6)
@@ -100,7 +104,7 @@ class Recorder(Companion):
         self._clock = clock
         self._wall_clock = wall_clock
         self._queue: deque[_Entry] = deque()
-        self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
+        self._names = {topic: f"{topic}.{hand}".encode() for topic in Topic}
         self._last_topic = b""
         self._viewer = Viewer(options.images_hz)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
@@ -134,7 +138,7 @@ class Recorder(Companion):
     def on_verdict(self, published: PublishedVerdict) -> None:
         judgement = published.judgement
         if judgement.moment.judged and judgement.judged_counts is not None:
-            making = partial(Judged.of, self._retention.boot_id, judgement)
+            making = partial(Judged.of, self._boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 
     def on_event(self, event: LoopEvent) -> None:
@@ -217,10 +221,13 @@ class Recorder(Companion):
     def _begin(self, now_ns: int, header: RecordingHeader) -> None:
         offset_ns = self._wall_clock() - now_ns
         header = replace(header, file=self._number, wall_minus_monotonic_ns=offset_ns)
-        path = self._retention.path(self._number, ".mcap")
+        # Names sort by time.
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        name = f"{self._hand}-{stamp}-{self._boot_id[:8]}-{self._number:04}"
+        path = self._options.folder / f"{name}.mcap"
         files: list[RecordingFile] = []
         try:
-            self._counted["removed"] += self._retention.make_room(self._rotate_bytes)
+            self._counted["removed"] += make_room(self._options, self._hand)
             files.append(McapWriter(path, header))
             if self._tap is not None:
                 files.append(RecordingFile(path.with_suffix(self._tap.ending)))
@@ -295,5 +302,37 @@ class Recorder(Companion):
         is_first = self._retry_due_ns is None
         self._retry_due_ns = self._clock() + RETRY_NS
         say = log.warning if is_first else log.debug
-        where = self._retention.directory
+        where = self._options.folder
         say("record: %s: %s; nothing is recorded", where, error.strerror or error)
+
+
+def make_room(options: Record, hand: str) -> int:
+    """Delete the hand's oldest recordings until another file fits; return their number.
+
+    A link log belongs to its recording. Raises `OSError`.
+    """
+    options.folder.mkdir(parents=True, exist_ok=True)
+    recordings = _recordings(options.folder, hand)
+    total_mb = options.rotate_mb + sum(size for _, size in recordings.values()) / 1e6
+    removed = 0
+    while recordings and (len(recordings) >= options.keep_files or total_mb > options.keep_mb):
+        paths, size = recordings.pop(min(recordings))
+        for path in paths:
+            path.unlink(missing_ok=True)
+        total_mb -= size / 1e6
+        removed += 1
+    return removed
+
+
+def _recordings(folder: Path, hand: str) -> dict[str, tuple[list[Path], int]]:
+    """Return paths and total size, bytes, of each recording, by the stamp in its name."""
+    pattern = re.compile(rf"{re.escape(hand)}-({_STAMP})\.(mcap|can\.log|serial)")
+    recordings: dict[str, tuple[list[Path], int]] = {}
+    for path in folder.iterdir():
+        match = pattern.fullmatch(path.name)
+        if match is None:
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            paths, size = recordings.get(match[1], ([], 0))
+            recordings[match[1]] = ([*paths, path], size + path.stat().st_size)
+    return recordings

@@ -1,4 +1,7 @@
-"""The topics of a recording, and the messages that are not published."""
+"""The topics of a recording, their schemas, and the messages that are not published.
+
+Viewers read neither null nor nested lists: recorded messages are without, and schemas are plain.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +9,29 @@ import json
 from collections.abc import Sequence
 from enum import StrEnum
 from functools import cache
+from itertools import chain
 from typing import Annotated, Any, Final, Literal, Self
 
 import msgspec
 import numpy as np
+from msgspec import inspect
 
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.publish import messages
 from graspd.daemon.publish.messages import WIRE_VERSION, Count, Tactile
-from graspd.daemon.record.flat import schema_of, table
 from graspd.daemon.record.viewers import Log, RawImage
 from graspd.daemon.trust.learner import LearnerState
 from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
 from graspd.drivers.hand import JOINTS
 from graspd.models.session_statistics import SessionState
 
+JsonSchema = dict[str, Any]
+TABLE: Final = (
+    f"Shape (fingers, {ELECTRODES}), row by row: finger f's electrode e is at "
+    f"{ELECTRODES} * f + e - 1, with f from 0 and e from 1."
+)
+UNKNOWN: Final = "unknown"
+"""State of a finger that is not known. A viewer draws the last state on where there is none."""
 _ANGLES = msgspec.Meta(
     extra_json_schema={"properties": {name: {"type": "number"} for name in sorted(JOINTS)}}
 )
@@ -179,3 +190,90 @@ def joint_reading(payload: bytes) -> JointReading:
     return JointReading(
         message.t_mono_ns, message.seq, message.names, np.array(position_rad, dtype=np.float64)
     )
+
+
+def flat(value: object) -> object:
+    """Return a message without null; each table becomes one list, row by row."""
+    if isinstance(value, dict):
+        return {name: _part(name, one) for name, one in value.items() if one is not None}
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        return list(chain.from_iterable(value))
+    return value
+
+
+def _part(name: str, value: object) -> object:
+    if name == "fingers" and isinstance(value, dict):  # of a verdict
+        return {finger: UNKNOWN if state is None else state for finger, state in value.items()}
+    return flat(value)
+
+
+def table(values: object) -> object:
+    """Return recorded counts as rows of 24, one per finger, as in older recordings."""
+    if not isinstance(values, list) or not values or isinstance(values[0], list):
+        return values
+    return [values[first : first + ELECTRODES] for first in range(0, len(values), ELECTRODES)]
+
+
+def schema_of(message: type[msgspec.Struct]) -> JsonSchema:
+    """Return the schema of a flat message. Raises `TypeError` for an unreadable field."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **_schema(inspect.type_info(message)),
+    }
+
+
+def _schema(kind: inspect.Type) -> JsonSchema:
+    match kind:
+        case inspect.Metadata():
+            return {**_schema(kind.type), **(kind.extra_json_schema or {})}
+        case inspect.UnionType(types=(inner, inspect.NoneType())):
+            return _schema(inner)
+        case inspect.StructType():
+            return _object(kind)
+        case inspect.DictType():
+            more = _schema(kind.value_type)
+            if isinstance(kind.value_type, inspect.UnionType) and "enum" in more:
+                more["enum"] = [*more["enum"], UNKNOWN]
+            named = dict.fromkeys(_values(kind.key_type), more)
+            return {"type": "object", "properties": named, "additionalProperties": more}
+        case inspect.ListType(item_type=inspect.ListType(item_type=count)):
+            return {"type": "array", "description": TABLE, "items": _schema(count)}
+        case inspect.ListType() | inspect.VarTupleType():
+            return {"type": "array", "items": _schema(kind.item_type)}
+        case inspect.EnumType() | inspect.LiteralType():
+            values = _values(kind)
+            plain = "integer" if isinstance(values[0], int) else "string"
+            return {"type": plain, "enum": values}
+        case inspect.BytesType():
+            return {"type": "string", "contentEncoding": "base64"}
+        case inspect.BoolType():
+            return {"type": "boolean"}
+        case inspect.IntType():
+            return {"type": "integer"}
+        case inspect.FloatType():
+            return {"type": "number"}
+        case inspect.StrType():
+            return {"type": "string"}
+    raise TypeError(f"no viewer can read {kind}")
+
+
+def _object(kind: inspect.StructType) -> JsonSchema:
+    required = [
+        field.encode_name
+        for field in kind.fields
+        if field.required and not isinstance(field.type, inspect.UnionType)
+    ]
+    return {
+        "title": kind.cls.__name__,
+        "description": (kind.cls.__doc__ or "").strip(),
+        "type": "object",
+        "properties": {field.encode_name: _schema(field.type) for field in kind.fields},
+        "required": required,
+    }
+
+
+def _values(kind: inspect.Type) -> list[Any]:
+    """Return the values of an enumeration or a literal, in order."""
+    if isinstance(kind, inspect.EnumType):
+        return [member.value for member in kind.cls]
+    return list(kind.values) if isinstance(kind, inspect.LiteralType) else []

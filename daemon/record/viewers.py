@@ -93,11 +93,17 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Viewer:
-    """Makes Foxglove's log lines and images from the messages of one hand."""
+    """Makes Foxglove's log lines and images from the messages of one hand.
+
+    Images are relative to the resting counts of each finger, which it learns.
+    """
 
     def __init__(self, images_hz: float) -> None:
         """Draw at most `images_hz` images a second; 0 draws none."""
-        self._painter = Painter(images_hz)
+        self._period_ns = round(1e9 / images_hz) if images_hz else None
+        self._due_ns = 0
+        self._gate: GateState | None = None
+        self._rest = RestCounts()
         self._verdict: tuple[int, Decision, list[Reason]] | None = None
         self._state: State | None = None
         self._health: dict[str, Reason] = {}
@@ -111,7 +117,7 @@ class Viewer:
             return
         try:
             message = msgspec.convert(content, MESSAGES[kind])
-            image = self._painter.paint(message, wall_ns)
+            image = self._image_if_due(message, wall_ns)
         except ValueError:
             return
         for level, name, text in self._changes(message):
@@ -137,6 +143,7 @@ class Viewer:
         return []
 
     def _of_verdict(self, message: Verdict) -> list[LogLine]:
+        self._gate = message.gate
         verdict = message.grasp, message.verdict, message.reasons
         if verdict == self._verdict:
             return []
@@ -160,20 +167,8 @@ class Viewer:
         self._state, self._health = message.state, message.health
         return lines
 
-
-class Painter:
-    """Draw readings relative to the resting counts of each finger, which it learns."""
-
-    def __init__(self, images_hz: float) -> None:
-        self._period_ns = round(1e9 / images_hz) if images_hz else None
-        self._due_ns = 0
-        self._gate: GateState | None = None
-        self._rest = RestCounts()
-
-    def paint(self, message: Message, wall_ns: int) -> RawImage | None:
+    def _image_if_due(self, message: Message, wall_ns: int) -> RawImage | None:
         """Return the image of a reading if one is due. Raises `ValueError`."""
-        if isinstance(message, Verdict):
-            self._gate = message.gate
         if not isinstance(message, Tactile) or self._period_ns is None:
             return None
         late_ns = wall_ns - self._due_ns

@@ -1,20 +1,31 @@
-"""Snapshots as tables for a terminal."""
+"""The terminal view: tables, drawn until `q`, Ctrl-C or SIGTERM; Ctrl-Z stops it."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import select
+import signal
+import sys
+import termios
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+import tty
+from collections.abc import Iterator, Sequence
+from types import FrameType
+from typing import Self
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import printable
 from graspd.daemon.watch.fingers import FingerImage, FingerMotion
 from graspd.daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
+from graspd.daemon.watch.view import TICK_S, HandFeed, snapshots
 
 STYLES = {
     Tone.STABLE: "bold #ffffff on #2da44e",
@@ -37,58 +48,148 @@ NAMES_MAX = 1000
 """Most characters shown of several received names: a hand's 120 electrodes have 840."""
 LABEL_COLUMNS = 12
 """Width of the longest label, `grasps seen` or `last message`, columns."""
+SIGNALS_MAX = 64
 
 Row = tuple[str, str]
 """Label and text."""
 
 
-@dataclass(frozen=True)
-class Screen:
-    """Size of the terminal, and what the user chose to see."""
-
-    width: int
-    """Width, columns."""
-    height: int | None = None
-    """Height, lines; None: no limit."""
-    chosen: int = 0
-    """Number of the hand that is shown if there is no room for all."""
-    page: int = 0
-    """Number of pages skipped with the space bar."""
+def can_draw() -> bool:
+    """Return True if standard output is a terminal with a movable cursor."""
+    console = Console()
+    return console.is_terminal and not console.is_dumb_terminal
 
 
-def draw(hands: Sequence[Snapshot], screen: Screen) -> RenderableType:
-    """Return tables of all hands, or of the chosen one where there is no room."""
+def show(hands: Sequence[HandFeed]) -> None:
+    """Draw on the terminal until told to stop."""
+    console = Console(highlight=False)
+    with StopSignal() as stop, Suspension() as suspension:
+        keyboard = Keyboard(stop)
+        while True:
+            with (
+                keyboard.unbuffered(),
+                Live(console=console, screen=True, auto_refresh=False) as live,
+            ):
+                for seen in snapshots(hands, lambda: keyboard.wait() or suspension.asked):
+                    chosen = keyboard.tabs % len(hands)
+                    picture = draw(seen, console.width, chosen, keyboard.spaces)
+                    live.update(picture, refresh=True)
+            if stop.received is not None or not suspension.asked:
+                return
+            now = time.strftime("%H:%M:%S")
+            console.print(f"graspd watch stopped at {now}: unknown until it goes on (fg)")
+            suspension.stop()
+
+
+class Suspension:
+    """Ctrl-Z: the last verdict must not stay on the screen while nothing is drawn."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> Self:
+        """Take over SIGTSTP, unless it is ignored."""
+        self._former = signal.getsignal(signal.SIGTSTP)
+        if self._former is not signal.SIG_IGN:
+            signal.signal(signal.SIGTSTP, self._ask)
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        signal.signal(signal.SIGTSTP, self._former)
+
+    def stop(self) -> None:
+        """Stop the process; return when it is continued."""
+        self.asked = False
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTSTP)
+        signal.signal(signal.SIGTSTP, self._ask)
+
+    def _ask(self, _number: int, _frame: FrameType | None) -> None:
+        self.asked = True
+
+
+class Keyboard:
+    """Typed keys: `q` ends, Tab shows the next hand, space what does not fit."""
+
+    def __init__(self, stop: StopSignal) -> None:
+        """Wait for `stop` too."""
+        self.tabs = 0
+        """How often Tab was typed."""
+        self.spaces = 0
+        """How often space was typed since then."""
+        self._stop = stop
+        self._waited = [stop.fileno()]
+        """Descriptors of signals and, while keys are read, of the keyboard."""
+
+    def wait(self) -> bool:
+        """Wait for a tick; return True after a signal that ends, or `q`."""
+        ready, _, _ = select.select(self._waited, [], [], TICK_S)
+        if self._stop.fileno() in ready:
+            os.read(self._stop.fileno(), SIGNALS_MAX)  # also of signals that do not end it
+        if self._stop.received is not None:
+            return True
+        for keyboard in ready:
+            if keyboard != self._stop.fileno():
+                typed = os.read(keyboard, 64)
+                if b"\t" in typed:
+                    self.tabs, self.spaces = self.tabs + typed.count(b"\t"), 0
+                self.spaces += typed.count(b" ")
+                return typed[:1] in {b"q", b"Q", b""}
+        return False
+
+    @contextlib.contextmanager
+    def unbuffered(self) -> Iterator[None]:
+        """Read keys at once and without echo, if there is a terminal."""
+        if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
+            yield
+            return
+        keyboard = sys.stdin.fileno()
+        former = termios.tcgetattr(keyboard)
+        self._waited.append(keyboard)
+        try:
+            tty.setcbreak(keyboard)
+            yield
+        finally:
+            self._waited.remove(keyboard)
+            termios.tcsetattr(keyboard, termios.TCSADRAIN, former)
+
+
+def draw(hands: Sequence[Snapshot], width: int, chosen: int, page: int) -> RenderableType:
+    """Return tables of all hands, or of hand number `chosen` if `width`, columns, is too small.
+
+    `page`: how many pages of the lines that do not fit are skipped.
+    """
     if len(hands) == 1:
-        return _hand(hands[0], screen, "q ends")
-    if screen.width // len(hands) >= HAND_COLUMNS:
+        return _hand(hands[0], page, "q ends")
+    if width // len(hands) >= HAND_COLUMNS:
         beside = Table.grid(expand=True, padding=(0, 2))
         for _ in hands:
             beside.add_column(ratio=1)
-        beside.add_row(*[_hand(hand, screen, "q ends") for hand in hands])
+        beside.add_row(*[_hand(hand, page, "q ends") for hand in hands])
         return beside
-    chosen = hands[screen.chosen]
-    others = [_verdict(hand, wraps=True) for hand in hands if hand is not chosen]
-    return _hand(chosen, screen, "q ends, tab shows the next hand", others)
+    shown = hands[chosen]
+    others = [_verdict(hand, wraps=True) for hand in hands if hand is not shown]
+    return _hand(shown, page, "q ends, tab shows the next hand", others)
 
 
 class Fitted:
     """A head that stays, and below it one page of the rest; the last line counts what is cut."""
 
     def __init__(
-        self, head: RenderableType, wrong: RenderableType, rest: RenderableType, screen: Screen
+        self, head: RenderableType, wrong: RenderableType, rest: RenderableType, page: int
     ) -> None:
         """`wrong` says what is wrong; its lines are counted apart."""
         self._parts = head, wrong, rest
-        self._screen = screen
+        self._page = page
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         free = options.update(height=None)
         head, wrong, rest = (console.render_lines(part, free, pad=False) for part in self._parts)
-        height, body = self._screen.height, wrong + rest
-        if height is not None and len(head) + len(body) > height:
+        height, body = console.height, wrong + rest
+        if len(head) + len(body) > height:
             room = max(height - len(head) - 1, 1)
             pages = math.ceil(len(body) / room)
-            first = min(self._screen.page % pages * room, len(body) - room)
+            first = min(self._page % pages * room, len(body) - room)
             hidden = [*range(first), *range(first + room, len(body))]
             troubles = sum(line < len(wrong) for line in hidden)
             body = body[first : first + room]
@@ -103,7 +204,7 @@ def _cut(lines: int, troubles: int) -> Text:
     return Text(f"{lines} more lines{wrong}: space shows them", style="reverse", no_wrap=True)
 
 
-def _hand(seen: Snapshot, screen: Screen, keys: str, others: Sequence[Text] = ()) -> RenderableType:
+def _hand(seen: Snapshot, page: int, keys: str, others: Sequence[Text] = ()) -> RenderableType:
     wrong, figures = _table(), _table()
     for label, text in [*_labelled("why", seen.why), *_health(seen)]:
         wrong.add_row(label, Text(text))
@@ -115,7 +216,7 @@ def _hand(seen: Snapshot, screen: Screen, keys: str, others: Sequence[Text] = ()
     clock = time.strftime("%H:%M:%S", time.localtime(seen.t))
     model = printable(seen.model or "no model yet", NAME_MAX)
     header = Text(f"graspd {clock} ({keys})  {seen.state or '-'}  {model}")
-    return Fitted(Group(*others, _verdict(seen), header), wrong, figures, screen)
+    return Fitted(Group(*others, _verdict(seen), header), wrong, figures, page)
 
 
 def _table() -> Table:

@@ -83,30 +83,24 @@ class History:
     """
 
     def __init__(self) -> None:
-        self._seconds: dict[int, tuple[str, int]] = {}
-        """By the second's number: what `seconds` returns of it. The newest is last."""
+        self.seconds: deque[tuple[str, int]] = deque(maxlen=SECONDS)
+        """Tones and highest probability of slip of each second, the oldest first.
+
+        Tones are letters of `TONE_CODE`, each once, the latest last; "" for a second without any.
+        The probability is in %; `NO_SHARE` if there was none.
+        """
+        self._newest = 0
+        """Number of the last second."""
 
     def add(self, now_ns: int, tone: Tone, p_slip: float | None) -> None:
         """Add what is shown at `now_ns`; a `p_slip` of None adds no probability."""
         second, code = now_ns // SECOND_NS, TONE_CODE[tone]
+        steps = min(second - self._newest, SECONDS) if self.seconds else 1
+        self.seconds.extend([("", NO_SHARE)] * steps)
+        self._newest = second
+        codes, highest = self.seconds.pop()
         share = NO_SHARE if p_slip is None else round(100 * p_slip)
-        codes, highest = self._seconds.get(second, ("", NO_SHARE))
-        self._seconds[second] = codes.replace(code, "") + code, max(share, highest)
-        while len(self._seconds) > SECONDS:
-            del self._seconds[next(iter(self._seconds))]
-
-    def seconds(self) -> list[tuple[str, int]]:
-        """Return the tones and the highest probability of slip of each second, the oldest first.
-
-        Tones are letters of `TONE_CODE`, each once, the latest last; "" for a second without any.
-        The probability is in %; `NO_SHARE` if there was none. At most `SECONDS` entries.
-        """
-        if not self._seconds:
-            return []
-        newest = max(self._seconds)
-        oldest = max(min(self._seconds), newest - SECONDS + 1)
-        not_seen = "", NO_SHARE
-        return [self._seconds.get(second, not_seen) for second in range(oldest, newest + 1)]
+        self.seconds.append((codes.replace(code, "") + code, max(share, highest)))
 
 
 class View:
@@ -217,7 +211,6 @@ class View:
             self._history.add(now_ns, tone, p_slip)
         if not silent:
             self._rate_marks.append((now_ns, self._received))
-        seconds = self._history.seconds()
         wall_t = self._wall()
         health = [] if status is None or silent else _health(status)
         return Snapshot(
@@ -248,8 +241,8 @@ class View:
             timing=figures.timing(last, status, self._rate_hz(), self._lost, self._unreadable),
             session=figures.session(verdict, status),
             drivers=figures.drivers(status),
-            history=[codes for codes, _ in seconds],
-            history_p=[share for _, share in seconds],
+            history=[codes for codes, _ in self._history.seconds],
+            history_p=[share for _, share in self._history.seconds],
         )
 
     def _verdict_now(self, now_ns: int) -> tuple[Tone, list[Line]]:

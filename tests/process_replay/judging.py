@@ -17,8 +17,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
 from graspd.daemon.publish.outbox import Outbox
-from graspd.daemon.record.files import Retention
-from graspd.daemon.record.header import RecordingHeader
+from graspd.daemon.record.mcap import RecordingHeader
 from graspd.daemon.record.recorder import Recorder
 from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.scene import Scene
@@ -104,8 +103,9 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
 
 def _recorder(folder: Path, clock: Clock, pipeline: Pipeline, header: RecordingHeader) -> Recorder:
     return Recorder(
-        Retention(folder, "right", BOOT_ID, keep_files=9, keep_bytes=10**9),
-        Record(images_hz=0.0),
+        Record(directory=folder, images_hz=0.0),
+        "right",
+        BOOT_ID,
         take_header=lambda: header_now(pipeline, header),
         clock=clock,
         wall_clock=clock,

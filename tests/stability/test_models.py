@@ -182,6 +182,3 @@ def test_inputs_and_probabilities_keep_their_bounds_over_the_12_bit_space(
     assert abs(said.p_slip - wanted) < P_SLIP_ERROR_MAX
     if abs(wanted - 0.5) > P_SLIP_ERROR_MAX:
         assert (said.p_slip >= 0.5) == (wanted >= 0.5)
-
-
-NOT_FINITE = st.sampled_from((np.nan, np.inf, -np.inf))

@@ -1,4 +1,4 @@
-"""`graspd report error-vs-time`: every model is in its figures, tables and picture."""
+"""`graspd report error-vs-time`: every model is in its figures, tables and error_vs_time."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from graspd.daemon.commands.report import add_arguments
-from graspd.daemon.measure import error_vs_time, picture
-from graspd.daemon.measure.candidates import errors, loop_image, model_step
-from graspd.daemon.measure.timing import measure
+from graspd.daemon.measure import error_vs_time
+from graspd.daemon.measure.candidates import errors, loop_image, measure, model_step
+from graspd.daemon.measure.error_vs_time import Point
 from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
@@ -96,7 +96,7 @@ def test_each_point_is_named_in_the_panels_that_it_is_in(
         protocols = set(row["error"]) & {"cv", "objects", "objects-whole", "session"}
         assert drawn.count(f"<!-- {label} -->") == len(protocols) == 3
     assert not any(f"<!-- {row['name']} -->" in drawn for row in found["rows"] if row not in whole)
-    assert all(f"<!-- {asked}" in drawn for _, asked in picture.PANELS)
+    assert all(f"<!-- {asked}" in drawn for _, asked in error_vs_time.PANELS)
 
 
 def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[str, Any]) -> None:
@@ -104,7 +104,7 @@ def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[s
         text = (folder / f"error-vs-time.{suffix}").read_text()
         assert "-quick" in text  # an XML comment has no "--"
         assert found["machine"]["processor"].split("(")[0] in text
-    drawn = picture.draw({**found, "quick": False}, ["figures of all models"])
+    drawn = error_vs_time.draw({**found, "quick": False}, ["figures of all models"])
     assert "-quick" not in drawn
     assert "<desc>\nfigures of all models\n </desc>" in drawn
     assert "Error against run time" in drawn
@@ -112,13 +112,13 @@ def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[s
 
 def test_no_name_covers_a_point_or_another_name() -> None:
     several = [
-        picture.Point(f"model-{number}", "model", 100.0 + number, 5.0 + number / 50, (1, 1), False)
+        Point(f"model-{number}", "model", 100.0 + number, 5.0 + number / 50, (1, 1), False)
         for number in range(12)
     ]
     figure = Figure(figsize=(9, 3), dpi=72)
     axes = figure.subplots()
     axes.set(xscale="log", xlim=(50, 500), ylim=(4, 7))
-    picture.name_points(axes, several)
+    error_vs_time.name_points(axes, several)
     figure.draw_without_rendering()
     boxes = [Text.get_window_extent(text) for text in axes.texts]  # without their lines
     assert len(boxes) == len(several)
@@ -130,8 +130,8 @@ def test_the_front_is_what_none_is_both_faster_and_more_exact_than() -> None:
     # By hand: c is slower and worse than b; the peer is no model of graspd's.
     given = [("a", "model", 9.0, 8.0), ("b", "model", 20.0, 5.0), ("c", "model", 30.0, 6.0)]
     given += [("d", "model", 40.0, 4.0), ("e", "peer", 8.0, 1.0)]
-    several = [picture.Point(*each, (0.0, 0.0), False) for each in given]
-    assert [point.name for point in picture.front(several)] == ["a", "b", "d"]
+    several = [Point(*each, (0.0, 0.0), False) for each in given]
+    assert [point.name for point in error_vs_time.front(several)] == ["a", "b", "d"]
 
 
 def test_an_interval_is_nadeaus_and_bengios() -> None:

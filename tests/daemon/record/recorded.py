@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -11,8 +12,9 @@ from typing import Any, cast
 import zmq
 
 from graspd.daemon.publish.messages import Status, Verdict
-from graspd.daemon.record.header import RecordingHeader
-from graspd.daemon.record.mcap import McapReader
+from graspd.daemon.record.mcap import McapReader, RecordingHeader
+from graspd.daemon.record.recorder import MakeHeader, Recorder
+from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.drivers.recordings.csv_rows import open_recording
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
@@ -61,8 +63,22 @@ class Lab:
 
     @property
     def files(self) -> list[Path]:
-        """The recordings, oldest first."""
-        return sorted((self.folder / "record").glob("*.mcap"))
+        return files(self.folder)
+
+
+def files(folder: Path) -> list[Path]:
+    """The recordings, oldest first."""
+    return sorted((folder / "record").glob("*.mcap"))
+
+
+def recorder(
+    folder: Path,
+    take_header: Callable[[], MakeHeader] = lambda: lambda: HEADER,
+    **options: Any,  # noqa: ANN401
+) -> Recorder:
+    """A recorder that flushes after 100 ms unless the options say otherwise."""
+    wanted = Record(**{"directory": folder / "record", "flush_ms": 100.0, **options})
+    return Recorder(wanted, "right", BOOT, take_header=take_header)
 
 
 def scene(folder: Path, record: str = "", more: str = "", gate: str = "") -> Path:

@@ -19,8 +19,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.publish.messages import OutcomeMessage, encode
 from graspd.daemon.record.export import collect
 from graspd.daemon.record.frames import read_grasps
-from graspd.daemon.record.header import RecordingHeader
-from graspd.daemon.record.mcap import McapWriter
+from graspd.daemon.record.mcap import McapWriter, RecordingHeader
 from graspd.daemon.record.topics import Judged
 from graspd.drivers.base import ElectrodeFault, RecordingError, TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_TABLE

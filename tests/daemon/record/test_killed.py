@@ -9,7 +9,7 @@ import pytest
 
 from tests.bench.live import Subscriber
 from tests.daemon.processes import TIMEOUT_S, start
-from tests.daemon.record.recorded import messages, scene
+from tests.daemon.record.recorded import files, messages, scene
 from tests.kit.messages import decode_verdict
 
 FLUSH_S = 1.0
@@ -34,7 +34,7 @@ def test_a_killed_daemon_loses_no_more_than_the_flush_interval(
                 daemon.kill()
                 wait_s = 0.2
         daemon.communicate(timeout=TIMEOUT_S)
-    (path,) = (tmp_path / "record").glob("*.mcap")
+    (path,) = files(tmp_path)
     recorded = [content["seq"] for kind, content in messages(path) if kind == "verdict"]
     assert recorded == list(range(len(recorded)))
     lost = [t for seq, t in published.items() if seq >= len(recorded)]

@@ -17,7 +17,7 @@ from graspd.drivers.recordings.can_log import CanLog
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.commands.test_hardware_commands import GROUP, SCENES, filled, twin
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
-from tests.daemon.record.recorded import compared, messages
+from tests.daemon.record.recorded import compared, files, messages
 from tests.ports import can_id
 
 FAULTS = ("--drop", "0.0005", "--bit-flip", "0.0005", "--seed", "5")
@@ -47,7 +47,7 @@ def record(kind: str, folder: Path) -> tuple[Path, Path]:
         daemon.terminate()
         _, said = daemon.communicate(timeout=TIMEOUT_S)
     assert daemon.returncode == 0, said
-    (recording,) = (folder / "record").glob("*.mcap")
+    (recording,) = files(folder)
     (log,) = set((folder / "record").iterdir()) - {recording}
     return recording, log
 

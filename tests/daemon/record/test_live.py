@@ -22,10 +22,10 @@ import zmq
 from graspd.daemon.record.topics import schemas
 from tests.conftest import ROOT
 from tests.daemon.processes import TIMEOUT_S, graspd, start
+from tests.kit.messages import GOLDEN
+from tests.ports import free_port
 
 pytest.importorskip("foxglove", reason="extra foxglove")
-
-GOLDEN = ROOT / "tests" / "daemon" / "publish" / "golden"
 
 
 class ViewerClient:
@@ -94,8 +94,7 @@ class Hand:
         self.socket = context.socket(zmq.XPUB)
         self.socket.linger = 0
         self.socket.bind(f"ipc://{folder}/hand")
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         self.arguments = ("--foxglove", "--connect", f"ipc://{folder}/hand", "--port", self.port)
 
     def wait_for_subscriber(self) -> None:

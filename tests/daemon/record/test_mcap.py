@@ -22,7 +22,6 @@ from mcap.writer import Writer
 from msgspec.structs import replace
 
 from graspd.daemon.publish.messages import Tactile, encode
-from graspd.daemon.record.header import RecordingHeader
 from graspd.daemon.record.mcap import (
     CHUNK_MAX_BYTES,
     METADATA,
@@ -30,6 +29,7 @@ from graspd.daemon.record.mcap import (
     McapReader,
     McapWriter,
     RecordedMessage,
+    RecordingHeader,
     header_of,
 )
 from graspd.daemon.record.player import McapReplayDriver

@@ -13,6 +13,7 @@ import jsonschema
 import jsonschema.validators
 import msgspec
 import pytest
+import zmq
 from mcap.reader import make_reader
 from msgspec.structs import replace
 
@@ -21,8 +22,16 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.models.training.data.datasets import read_table
-from tests.daemon.processes import graspd
-from tests.daemon.record.recorded import Lab, compared, messages, without_null, work
+from tests.daemon.processes import graspd, start, wait_for
+from tests.daemon.record.recorded import (
+    Lab,
+    compared,
+    files,
+    messages,
+    scene,
+    without_null,
+    work,
+)
 
 GRASPS = 4
 
@@ -186,11 +195,6 @@ def test_what_another_graspd_had_learned_is_left_out_with_a_warning(
 
 
 def test_questions_and_announcements_are_in_the_recording_and_repeated(tmp_path: Path) -> None:
-    import zmq
-
-    from tests.daemon.processes import start, wait_for
-    from tests.daemon.record.recorded import scene
-
     risk = "[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 0\noutstanding_max = 1\n"
     with (
         start("run", scene(tmp_path, more=risk, gate='mode = "request"\n')) as daemon,
@@ -210,7 +214,7 @@ def test_questions_and_announcements_are_in_the_recording_and_repeated(tmp_path:
                 break
         daemon.terminate()
         daemon.communicate(timeout=200)
-    (path,) = (tmp_path / "record").glob("*.mcap")
+    (path,) = files(tmp_path)
     before = of_readings(path)
     assert sum(verdict["judged"] for verdict in before) >= 2
     assert before[-1]["risk"]["announced"] == before[-1]["risk"]["awaited"] == 1

@@ -23,15 +23,12 @@ from graspd.daemon.judge.reasons import GateCause
 from graspd.daemon.publish.companion import LoopEvent, PublishedVerdict
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.outbox import Outbox
-from graspd.daemon.record.files import Retention
-from graspd.daemon.record.header import RecordingHeader
-from graspd.daemon.record.mcap import McapWriter, header_of
+from graspd.daemon.record.mcap import McapWriter, RecordingHeader, header_of
 from graspd.daemon.record.recorder import Recorder
-from graspd.daemon.scene.scene import Record
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from tests.daemon.fakes import NO_LIFT
-from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, files, messages, recorder
 from tests.kit.waiting import wait_until
 
 STATUS, VERDICT = b"status.right", b"verdict.right"
@@ -58,27 +55,17 @@ class Loop:
             recorder.on_status(NO_STATUS)
 
 
-def make(folder: Path, loop: Loop, **options: float) -> Recorder:
-    retention = Retention(folder / "record", "right", BOOT, 100, 10**9)
-    wanted = Record(**{"flush_ms": 100.0, **options})  # type: ignore[arg-type]
-    return Recorder(retention, wanted, take_header=loop.header)
-
-
-def files(folder: Path) -> list[Path]:
-    return sorted((folder / "record").glob("*.mcap"))
-
-
 def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_path: Path) -> None:
     loop = Loop()
     loop.sent = 7
-    recorder = make(tmp_path, loop, rotate_minutes=0.01)
-    while recorder.counters["record"]["files"] < 4:
+    writing = recorder(tmp_path, loop.header, rotate_minutes=0.01)
+    while writing.counters["record"]["files"] < 4:
         for _ in range(20):
-            loop.send(recorder, VERDICT)
-        loop.send(recorder, STATUS)
+            loop.send(writing, VERDICT)
+        loop.send(writing, STATUS)
         time.sleep(0.02)
-    loop.send(recorder, STATUS)
-    recorder.close()
+    loop.send(writing, STATUS)
+    writing.close()
     number = 7
     for path in files(tmp_path):
         assert header_of(path).axis_ns == number
@@ -87,19 +74,19 @@ def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_pat
         assert found[-1][0] == "status"
         number += len(found)
     assert number == loop.sent
-    assert recorder.counters["record"]["recorded"] == loop.sent - 7
+    assert writing.counters["record"]["recorded"] == loop.sent - 7
 
 
 def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
     loop = Loop()
-    recorder = make(tmp_path, loop, rotate_minutes=0.01)
+    writing = recorder(tmp_path, loop.header, rotate_minutes=0.01)
     for _ in range(90):
-        loop.send(recorder, VERDICT)
+        loop.send(writing, VERDICT)
         time.sleep(0.01)
-    assert recorder.counters["record"]["files"] == 1
-    loop.send(recorder, STATUS)
-    wait_until(lambda: recorder.counters["record"]["files"] == 2)
-    recorder.close()
+    assert writing.counters["record"]["files"] == 1
+    loop.send(writing, STATUS)
+    wait_until(lambda: writing.counters["record"]["files"] == 2)
+    writing.close()
     assert header_of(files(tmp_path)[1]).axis_ns == loop.sent
 
 
@@ -110,19 +97,19 @@ def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_th
     blocked = tmp_path / "record"
     blocked.write_text("a file where the folder should be")
     loop = Loop()
-    recorder = make(tmp_path, loop)
-    wait_until(lambda: recorder.counters["record"]["failures"] == 1)
+    writing = recorder(tmp_path, loop.header)
+    wait_until(lambda: writing.counters["record"]["failures"] == 1)
     blocked.unlink()
-    while not recorder.counters["record"]["writing"]:
-        loop.send(recorder, VERDICT)
-        loop.send(recorder, STATUS)
+    while not writing.counters["record"]["writing"]:
+        loop.send(writing, VERDICT)
+        loop.send(writing, STATUS)
         time.sleep(0.01)
-    loop.send(recorder, VERDICT)
-    recorder.close()
+    loop.send(writing, VERDICT)
+    writing.close()
     (path,) = files(tmp_path)
     known = header_of(path).axis_ns
     assert [content["number"] for _, content in messages(path)] == [*range(known, loop.sent)]
-    assert recorder.counters["record"]["lost"] == known > 0
+    assert writing.counters["record"]["lost"] == known > 0
 
 
 class Daemon:

@@ -17,20 +17,15 @@ import pytest
 
 from graspd.daemon import scene
 from graspd.daemon.record import recorder as recorder_module
-from graspd.daemon.record.files import Retention
 from graspd.daemon.record.mcap import McapReader, McapWriter
-from graspd.daemon.record.recorder import QUEUE_MAX, Recorder
+from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, make_room
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.csv_rows import open_recording
-from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages
+from tests.daemon.record.recorded import BOOT, NO_STATUS, files, messages, recorder
 from tests.kit.waiting import wait_until
 
 TOPIC = b"verdict.right"
-
-
-def retention(folder: Path, keep_files: int = 10, keep_bytes: int = 10**9) -> Retention:
-    return Retention(folder / "record", "right", BOOT, keep_files, keep_bytes)
 
 
 Make = Callable[..., Recorder]
@@ -40,15 +35,13 @@ Make = Callable[..., Recorder]
 def make(tmp_path: Path) -> Iterator[Make]:
     made: list[Recorder] = []
 
-    def new(where: Retention | None = None, **options: Any) -> Recorder:  # noqa: ANN401
-        wanted = Record(**{"flush_ms": 100.0, **options})
-        place = where or retention(tmp_path)
-        made.append(Recorder(place, wanted, take_header=lambda: lambda: HEADER))
+    def new(**options: Any) -> Recorder:  # noqa: ANN401
+        made.append(recorder(tmp_path, **options))
         return made[-1]
 
     yield new
-    for recorder in made:
-        recorder.close()
+    for each in made:
+        each.close()
 
 
 def payload(number: int, size: int = 0) -> bytes:
@@ -58,17 +51,16 @@ def payload(number: int, size: int = 0) -> bytes:
 
 
 def numbers(folder: Path) -> list[int]:
-    paths = sorted((folder / "record").glob("*.mcap"))
-    return [content["number"] for path in paths for _, content in messages(path)]
+    return [content["number"] for path in files(folder) for _, content in messages(path)]
 
 
 def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: Make) -> None:
-    recorder = make()
+    writing = make()
     for number in range(1000):
-        recorder.send(TOPIC, payload(number))
-    recorder.close()
+        writing.send(TOPIC, payload(number))
+    writing.close()
     assert numbers(tmp_path) == list(range(1000))
-    assert recorder.counters["record"] == {
+    assert writing.counters["record"] == {
         "recorded": 1000,
         "dropped": 0,
         "lost": 0,
@@ -82,11 +74,11 @@ def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: 
 def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
     tmp_path: Path, make: Make
 ) -> None:
-    recorder = make()
+    writing = make()
     before_ns = time.monotonic_ns()
-    recorder.send(TOPIC, payload(0))
+    writing.send(TOPIC, payload(0))
     after_ns = time.monotonic_ns()
-    recorder.close()
+    writing.close()
     (path,) = (tmp_path / "record").iterdir()
     with open_recording(path) as stream:
         recording = McapReader(path, stream)
@@ -101,13 +93,13 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
 def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
     tmp_path: Path, make: Make
 ) -> None:
-    recorder = make(rotate_mb=0.1)
+    writing = make(rotate_mb=0.1)
     for number in range(300):
-        recorder.send(TOPIC, payload(number, 4000))
+        writing.send(TOPIC, payload(number, 4000))
         if number % 30 == 29:
-            wait_until(lambda n=number: recorder.counters["record"]["recorded"] > n)  # type: ignore[misc]
-            recorder.on_status(NO_STATUS)
-    recorder.close()
+            wait_until(lambda n=number: writing.counters["record"]["recorded"] > n)  # type: ignore[misc]
+            writing.on_status(NO_STATUS)
+    writing.close()
     paths = sorted((tmp_path / "record").iterdir())
     assert 4 <= len(paths) <= 12  # 300 of 2 kB each, compressed from hex
     assert numbers(tmp_path) == list(range(300))
@@ -122,24 +114,24 @@ def old(folder: Path, hour: int, size: int, ending: str = "mcap") -> Path:
 
 def test_the_oldest_files_make_room_and_nothing_else_is_removed(tmp_path: Path) -> None:
     folder = tmp_path / "record"
-    files = [old(folder, hour, 10) for hour in range(5)]
+    paths = [old(folder, hour, 10) for hour in range(5)]
     beside = old(folder, 0, 10, "can.log")
     strangers = [folder / "right-notes.mcap", folder / "left-20200101T000000Z-00000000-0000.mcap"]
     for path in strangers:
         path.write_bytes(b"")
-    assert retention(tmp_path, keep_files=4).make_room(0) == 2
-    assert not files[0].exists()
+    assert make_room(Record(directory=folder, keep_files=4), "right") == 2
+    assert not paths[0].exists()
     assert not beside.exists()
-    assert not files[1].exists()
-    assert all(path.exists() for path in [*files[2:], *strangers])
+    assert not paths[1].exists()
+    assert all(path.exists() for path in [*paths[2:], *strangers])
 
 
 def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
     for hour in range(5):
-        old(tmp_path / "record", hour, 1000)
-    assert retention(tmp_path, keep_bytes=4500).make_room(1000) == 2
-    assert retention(tmp_path, keep_bytes=10).make_room(1000) == 3
-    assert retention(tmp_path, keep_bytes=10).make_room(1000) == 0
+        old(tmp_path, hour, 10**6)
+    for keep_mb, removed in ((4.5, 2), (1.0, 3), (1.0, 0)):
+        options = Record(directory=tmp_path, keep_mb=keep_mb, rotate_mb=1.0)
+        assert make_room(options, "right") == removed
 
 
 class StalledDisk:
@@ -163,13 +155,13 @@ def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
 ) -> None:
     disk = StalledDisk(monkeypatch)
     monkeypatch.setattr(recorder_module, "CLOSE_S", 100.0)
-    recorder = make()
+    writing = make()
     assert disk.asked.wait(100)
     for number in range(QUEUE_MAX + 500):
-        recorder.send(TOPIC, payload(number))
-    assert recorder.counters["record"]["dropped"] == 500
+        writing.send(TOPIC, payload(number))
+    assert writing.counters["record"]["dropped"] == 500
     disk.answers.set()
-    recorder.close()
+    writing.close()
     assert numbers(tmp_path) == list(range(QUEUE_MAX))
 
 
@@ -178,9 +170,9 @@ def test_the_end_does_not_wait_for_a_disk_that_never_answers(
 ) -> None:
     disk = StalledDisk(monkeypatch)
     monkeypatch.setattr(recorder_module, "CLOSE_S", 0.05)
-    recorder = make()
+    writing = make()
     assert disk.asked.wait(100)
-    recorder.close()
+    writing.close()
     assert "does not answer" in caplog.text
     disk.answers.set()
     wait_until(lambda: threading.active_count() == 1 or not _recording())
@@ -197,20 +189,20 @@ def test_a_disk_that_refuses_is_told_once_and_tried_again_every_minute(
     monkeypatch.setattr(recorder_module, "RETRY_NS", 300_000_000)
     blocked = tmp_path / "record"
     blocked.write_text("a file where the folder should be")
-    recorder = make()
-    while recorder.counters["record"]["failures"] < 3:
-        recorder.on_status(NO_STATUS)
+    writing = make()
+    while writing.counters["record"]["failures"] < 3:
+        writing.on_status(NO_STATUS)
         time.sleep(0.01)
-    recorder.send(TOPIC, payload(1))
-    wait_until(lambda: recorder.counters["record"]["lost"] == 1)
+    writing.send(TOPIC, payload(1))
+    wait_until(lambda: writing.counters["record"]["lost"] == 1)
     assert [r.levelname for r in caplog.records] == ["WARNING"]
-    assert recorder.counters["record"]["writing"] == 0
+    assert writing.counters["record"]["writing"] == 0
     blocked.unlink()
-    while not recorder.counters["record"]["writing"]:
-        recorder.on_status(NO_STATUS)
+    while not writing.counters["record"]["writing"]:
+        writing.on_status(NO_STATUS)
         time.sleep(0.01)
-    recorder.send(TOPIC, payload(2))
-    recorder.close()
+    writing.send(TOPIC, payload(2))
+    writing.close()
     assert numbers(tmp_path) == [2]
 
 
@@ -221,7 +213,7 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
 
     The test goes the rounds itself: with this interval the thread's first one comes after 6 s.
     """
-    recorder = make(flush_ms=60_000.0)
+    writing = make(flush_ms=60_000.0)
     real, written = McapWriter.write, list[int]()
 
     def write(file: McapWriter, topic: bytes, payload: bytes, at_ns: int) -> None:
@@ -232,14 +224,14 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
 
     monkeypatch.setattr(McapWriter, "write", write)
     for number in range(10):
-        recorder.send(TOPIC, payload(number))
-    recorder.go_round()
+        writing.send(TOPIC, payload(number))
+    writing.go_round()
     for number in range(20):
-        recorder.send(TOPIC, payload(number))
-    recorder.go_round()
-    recorder.send(TOPIC, payload(0))
-    recorder.close()
-    counted = recorder.counters["record"]
+        writing.send(TOPIC, payload(number))
+    writing.go_round()
+    writing.send(TOPIC, payload(0))
+    writing.close()
+    counted = writing.counters["record"]
     assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
 
 

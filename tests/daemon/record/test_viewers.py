@@ -16,20 +16,17 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.publish.messages import State
-from graspd.daemon.record.files import Retention
-from graspd.daemon.record.flat import flat, schema_of, table
 from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
-from graspd.daemon.record.recorder import Recorder
-from graspd.daemon.record.topics import Exchanged, Topic, schemas
+from graspd.daemon.record.topics import Exchanged, Topic, flat, schema_of, schemas, table
 from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
-from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.learner import LearnerState
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.models.layout import D1
 from graspd.models.session_statistics import SessionState
-from tests.daemon.record.recorded import BOOT, HEADER, messages
+from tests.daemon.record.recorded import HEADER, files, messages, recorder
 from tests.daemon.watch.watch_fakes import status, tactile, verdict
+from tests.kit.messages import GOLDEN
 
 PLAIN = ("boolean", "string", "number", "integer")
 TIME = {"sec": "integer", "nsec": "integer"}
@@ -233,12 +230,11 @@ def test_a_verdict_is_said_when_it_changes_and_not_again() -> None:
 
 def test_gate_outcome_state_and_health_are_said() -> None:
     viewer = Viewer(0.0)
-    golden = Path(__file__).parents[1] / "publish" / "golden"
-    gate = json.loads((golden / "gate.json").read_bytes())
+    gate = json.loads((GOLDEN / "gate.json").read_bytes())
     (line,) = said(viewer, "gate", gate)
     assert line[0] == INFO
     assert f"{gate['former']} to {gate['state']} ({gate['cause']})" in line[2]
-    outcome = json.loads((golden / "outcome.json").read_bytes())
+    outcome = json.loads((GOLDEN / "outcome.json").read_bytes())
     (line,) = said(viewer, "outcome", outcome)
     assert f"grasp {outcome['grasp']}: the lift ended in {outcome['outcome']}" in line[2]
     well, ill = json.loads(status(0, health={})), json.loads(status(1))
@@ -252,15 +248,8 @@ def test_gate_outcome_state_and_health_are_said() -> None:
     assert said(viewer, "status", silent)[0] == (WARNING, "state", "silent")
 
 
-def recorder(folder: Path) -> Recorder:
-    options = Record(flush_ms=100.0)
-    return Recorder(
-        Retention(folder, "right", BOOT, 9, 10**9), options, take_header=lambda: lambda: HEADER
-    )
-
-
 def recorded(folder: Path) -> list[tuple[str, dict[str, Any]]]:
-    (path,) = folder.glob("*.mcap")
+    (path,) = files(folder)
     return [(kind, content) for kind, content in messages(path) if kind != "image"]
 
 
@@ -328,7 +317,7 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
     writing = recorder(tmp_path)
     writing.exchanged(session, learned)
     writing.close()
-    (path,) = tmp_path.glob("*.mcap")
+    (path,) = files(tmp_path)
     told: list[RecordedEvent] = []
     driver = McapReplayDriver([path], ("ff",))
     driver.on_event = told.append

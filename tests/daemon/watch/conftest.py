@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.watch.browser import Browser
-from tests.daemon.watch.pages import Page
+from tests.daemon.watch.browser import Browser, Page
 from tests.daemon.watch.watch_fakes import Talker
 
 

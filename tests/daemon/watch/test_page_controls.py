@@ -9,8 +9,7 @@ import pytest
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.watch.snapshot import Snapshot
 from graspd.daemon.watch.view import View
-from tests.daemon.watch.browser import CHROMIUM, Browser, see, show, text
-from tests.daemon.watch.pages import Page, serving_hands
+from tests.daemon.watch.browser import CHROMIUM, Browser, Page, see, serving_hands, show, text
 from tests.daemon.watch.watch_fakes import Talker, whole_hand
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")

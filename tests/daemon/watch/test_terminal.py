@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import re
 import time
 
 import pytest
 from msgspec import structs
-from rich.console import Console
 
 from graspd.daemon.judge.reasons import ADVICE, Decision, FingerState, Reason
 from graspd.daemon.watch.fingers import FingerMotion
 from graspd.daemon.watch.snapshot import Snapshot, Tone
-from graspd.daemon.watch.terminal import STYLES, Screen, draw
+from graspd.daemon.watch.terminal import STYLES
 from tests.daemon.watch.watch_fakes import (
     ENDPOINT,
     MS,
@@ -60,13 +58,9 @@ def test_all_words_fit_a_terminal_of_sixty_columns(decision: Decision, width: in
 @pytest.mark.parametrize("tone", Tone)
 def test_only_the_verdict_has_the_colour_of_its_tone(tone: Tone) -> None:
     seen = structs.replace(a_full_hand(), tone=tone, headline="word")
-    file = io.StringIO()
-    Console(file=file, width=80, force_terminal=True, color_system="truecolor").print(
-        draw([seen], Screen(80))
-    )
-    background = "48;2;" in file.getvalue()
-    assert background == (tone is not Tone.LEANS)  # hollow
-    coloured = re.findall(r"\x1b\[[0-9;]*38;2;[0-9;]*m([^\x1b]*)", file.getvalue())
+    drawn = "\n".join(text_of(seen, 80, colours=True))
+    assert ("48;2;" in drawn) == (tone is not Tone.LEANS)  # hollow
+    coloured = re.findall(r"\x1b\[[0-9;]*38;2;[0-9;]*m([^\x1b]*)", drawn)
     assert coloured == [" WORD "]
     assert STYLES.keys() == set(Tone)
 
@@ -115,10 +109,8 @@ def test_the_figures_of_a_dead_daemon_have_their_time_and_are_dim(width: int) ->
     assert last in "\n".join(text_of(dead, width))
     assert last not in "\n".join(text_of(alive, width))
     for seen, dims in ((alive, False), (dead, True)):
-        file = io.StringIO()
-        console = Console(file=file, width=width, force_terminal=True, color_system="truecolor")
-        console.print(draw([seen], Screen(width)))
-        styles = re.search(r"(\x1b\[[0-9;]*m)readings 100 /s", file.getvalue())
+        drawn = "\n".join(text_of(seen, width, colours=True))
+        styles = re.search(r"(\x1b\[[0-9;]*m)readings 100 /s", drawn)
         assert bool(styles and styles[1] == "\x1b[2;3m") is dims  # dim and italic (ECMA-48)
 
 

@@ -1,17 +1,31 @@
-"""What an operator is told: a dead link, a silent daemon, a viewer held up, parts not well."""
+"""What an operator is told: dead links, silent daemons, parts not well, what a verdict rests on."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+from msgspec import structs
 
 from graspd.daemon.commands.watch import where_to_examine, where_to_look
 from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
 from graspd.daemon.publish.messages import State
 from graspd.daemon.watch.snapshot import Line, Tone
 from graspd.daemon.watch.view import View
-from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, text_of, verdict
+from tests.daemon.watch.watch_fakes import (
+    ENDPOINT,
+    MS,
+    NOTHING_TOLD,
+    RISK,
+    a_view,
+    after,
+    status,
+    text_of,
+    verdict,
+)
+
+NETWORK = "slip probability by the network alone 30 %"
 
 
 @pytest.mark.parametrize(
@@ -129,3 +143,45 @@ def test_where_to_look_is_a_command_of_this_daemon(
 def test_where_to_examine_names_the_scene(endpoint: str, scene: str | None, command: str) -> None:
     said = where_to_examine(endpoint, None if scene is None else Path(scene))
     assert said.startswith(command)
+
+
+@pytest.mark.parametrize(
+    ("change", "evidence"),
+    [
+        (
+            {},
+            NETWORK + ", rests on 57 lifts; of 41 `stable` ones 2 slipped, target 10 %",
+        ),
+        (
+            {"outcomes": 1, "risk": structs.replace(NOTHING_TOLD, target=0.05)},
+            NETWORK + ", rests on 1 lift; no `stable` one told yet, target 5 %",
+        ),
+        (
+            {"risk": structs.replace(RISK, target=None)},
+            NETWORK + ", rests on 57 lifts; of 41 `stable` ones 2 slipped",
+        ),
+        (
+            {"risk": NOTHING_TOLD, "outcomes": 0},
+            NETWORK + ", no outcome told yet",
+        ),
+        ({"risk": None, "outcomes": 0, "p_slip_model": None}, "no outcome told yet"),
+    ],
+)
+def test_a_verdict_says_what_it_rests_on(change: dict[str, Any], evidence: str) -> None:
+    seen = after((b"verdict.right", verdict(0, Decision.STABLE, **change))).snapshot(0)
+    assert seen.evidence == evidence
+
+
+@pytest.mark.parametrize(
+    ("after_ms", "grasp", "is_held"), [(900, 7, True), (1100, 7, False), (900, 8, False)]
+)
+def test_a_slip_that_is_held_for_its_second_says_so(
+    after_ms: int, grasp: int, is_held: bool
+) -> None:
+    seen = after((b"verdict.right", verdict(0, Decision.SLIP)))
+    assert [line.what for line in seen.snapshot(0).why] == ["do not lift"]
+    fallen = verdict(1, Decision.SLIP, p_slip=0.4, grasp=grasp)
+    seen.take(b"verdict.right", fallen, after_ms * MS)
+    held = [line.advice for line in seen.snapshot(after_ms * MS).why if line.what == "slip, held"]
+    assert bool(held) == is_held
+    assert all("a moment ago its probability was 50 % or more" in advice for advice in held)

@@ -17,7 +17,17 @@ from graspd.daemon.trust.risk import RiskReport
 from graspd.daemon.watch.figures import SUPERVISED
 from graspd.daemon.watch.snapshot import Line, Snapshot, Tone
 from graspd.daemon.watch.view import History
-from tests.daemon.watch.watch_fakes import BOOT, MS, RISK, a_view, after, status, text_of, verdict
+from tests.daemon.watch.watch_fakes import (
+    BOOT,
+    MS,
+    NOTHING_TOLD,
+    RISK,
+    a_view,
+    after,
+    status,
+    text_of,
+    verdict,
+)
 from tests.kit.messages import GOLDEN
 
 ODD: tuple[object, ...] = (
@@ -25,7 +35,6 @@ ODD: tuple[object, ...] = (
     *([], [[]], {}, {"": 0}, None, True),
 )
 """Values in places where others belong."""
-NOTHING_TOLD = structs.replace(RISK, lifts=0, slips=0)
 
 
 def risk(**other: Any) -> RiskReport:  # noqa: ANN401
@@ -335,7 +344,7 @@ def test_a_second_keeps_all_its_tones_and_a_missed_one_none(
     history = History()
     for at_ms, tone, p_slip in moments:
         history.add(at_ms * MS, tone, p_slip)
-    assert history.seconds() == seconds
+    assert list(history.seconds) == seconds
 
 
 def mutated(rng: random.Random, golden: dict[str, object]) -> bytes:

@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing, suppress
 import pytest
 
 from graspd.daemon.watch.web import ADDRESS, CONNECTIONS_MAX, Server, load_page
-from tests.daemon.watch.pages import serving
+from tests.daemon.watch.browser import serving
 from tests.kit.waiting import wait_until
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import threading
-from typing import Any, Self
+from typing import Any, Literal, Self
 
+from msgspec import structs
 from rich.console import Console
 
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
@@ -23,7 +24,7 @@ from graspd.daemon.publish.messages import (
 from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.risk import RiskReport
 from graspd.daemon.watch.snapshot import Snapshot
-from graspd.daemon.watch.terminal import Screen, draw
+from graspd.daemon.watch.terminal import draw
 from graspd.daemon.watch.view import View
 from tests.daemon.publish.doors import Publisher
 
@@ -38,6 +39,7 @@ RISK = RiskReport(
     awaited=1,
 )
 """Enough to show `stable` as a promise: the lifts are more than 1 / target, 4.9 % slipped."""
+NOTHING_TOLD = structs.replace(RISK, lifts=0, slips=0)
 BOOT = "0f0e0d0c0b0a09080706050403020100"
 MS = 1_000_000
 PERIOD_S = 0.02
@@ -157,15 +159,19 @@ def text_of(
     seen: Snapshot | list[Snapshot],
     width: int = 80,
     chosen: int = 0,
-    height: int | None = None,
+    height: int = 1000,
     page: int = 0,
+    *,
+    colours: bool = False,
 ) -> list[str]:
-    """The lines of a terminal without colours."""
+    """The lines of a terminal, without colours unless they are asked for."""
     hands = seen if isinstance(seen, list) else [seen]
     file = io.StringIO()
-    Console(file=file, width=width, color_system=None).print(
-        draw(hands, Screen(width, height, chosen, page))
+    system: Literal["truecolor"] | None = "truecolor" if colours else None
+    console = Console(
+        file=file, width=width, height=height, force_terminal=colours, color_system=system
     )
+    console.print(draw(hands, width, chosen, page))
     return file.getvalue().splitlines()
 
 
