@@ -148,7 +148,7 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"{", b"[]", b"\xff\xfe", b'{"version":2}', b"null", b"{}" * 1000, b"x" * (2 << 20)],
+    [b"", b"{", b"[]", b"\xff\xfe", b'{"version":1}', b'{"version":2}', b"null", b"x" * (2 << 20)],
 )
 def test_what_is_no_session_is_one_line_and_a_new_session(
     tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
