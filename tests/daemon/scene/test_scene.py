@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -183,6 +184,12 @@ def test_control_characters_are_shown_and_not_sent(tmp_path: Path) -> None:
         assert "\\x1b[2J\\n\\u202e" in str(error.value)
 
 
+RISKS: dict[str, list[float]] = {
+    "max_slip_when_stable": [0.0, -0.1, 0.0009, 0.51, math.nan],
+    "warm_up": [-1],
+    "explore": [-0.1, 1.1, math.nan],
+    "outstanding_max": [0],
+}
 FAULTS: dict[str, list[float | list[int]]] = {
     "wrong_counts": [4096, -4096, 99999],
     "fingers": [[]],
@@ -197,12 +204,15 @@ FAULTS: dict[str, list[float | list[int]]] = {
 }
 
 
-@pytest.mark.parametrize("key", FAULTS)
-def test_replay_faults_out_of_range_are_mistakes_of_the_scene(tmp_path: Path, key: str) -> None:
-    for value in FAULTS[key]:
-        path = write(tmp_path, GOOD + f"[tactile.faults]\n{key} = {value}")
-        with pytest.raises(SceneError, match=rf"tactile\.faults\.{key}"):
-            load(path)
+@pytest.mark.parametrize(("section", "ranges"), [("tactile.faults", FAULTS), ("risk", RISKS)])
+def test_numbers_out_of_range_are_mistakes_of_the_scene(
+    tmp_path: Path, section: str, ranges: dict[str, list[object]]
+) -> None:
+    for key, values in ranges.items():
+        for value in values:
+            path = write(tmp_path, GOOD + f"[{section}]\n{key} = {value}")
+            with pytest.raises(SceneError, match=rf"{section}\.{key}"):
+                load(path)
 
 
 @pytest.mark.parametrize(
