@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
-from graspd.daemon.assembly.tables import Tables
+from graspd.daemon.assembly.sources import Source, Tables
 from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
@@ -30,7 +30,6 @@ from graspd.models.electrodes import Electrodes
 if TYPE_CHECKING:
     import pandas as pd
 
-    from graspd.daemon.assembly.recordings import RecordedRun
     from graspd.daemon.judge.calibration import Calibration
     from graspd.daemon.publish.messages import Verdict
     from graspd.models.contract import Finger
@@ -176,7 +175,7 @@ def judge(
 
 
 def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
-    source: Tables | RecordedRun = Tables(paths, {})
+    source: Source = Tables(paths, {})
     if assembly.MCAP in {path.suffix for path in paths}:
         assembly.require_mcap("judging MCAP")
         from graspd.daemon.assembly.recordings import RecordedRun

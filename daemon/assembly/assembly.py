@@ -39,8 +39,6 @@ RECORDED_MAX_AGE_MS = 1000.0
 NO_SILENCE_NS = 3_600_000_000_000
 """Time without a reading, ns, that counts as silence: no pause of a recording does."""
 MCAP = ".mcap"
-LINK_LOGS = (".log", ".serial")
-"""File name endings of link logs: candump text and serial bytes."""
 
 Clock = Callable[[], int]
 """Clock that returns monotonic ns."""

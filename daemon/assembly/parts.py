@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.judge.pipeline import Pipeline
@@ -21,7 +21,9 @@ from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from graspd.daemon.record.link_log import Tap
+    from graspd.daemon.record.player import McapReplayDriver
     from graspd.daemon.session.file import SessionFile
+    from graspd.drivers.recordings.link_log_player import LinkLogDriver
 
 log = logging.getLogger("graspd")
 
@@ -43,6 +45,20 @@ class Parts:
         """Make the parts. Raises `SceneError`, `ModelError` or `RecordingError`."""
         pipeline = assembly.build_pipeline(scene, model, learns=scene.session.learn)
         return cls(scene, model, pipeline, assembly.build_drivers(scene))
+
+    @classmethod
+    def played(
+        cls,
+        scene: Scene,
+        model: TactileModel,
+        driver: McapReplayDriver | LinkLogDriver[Any],
+        boot_id: str | None = None,
+    ) -> Parts:
+        """Make the parts that judge each reading at the time when `driver` hands it over."""
+        pipeline = assembly.build_pipeline(
+            scene, model, lambda: driver.handed_over_ns, learns=scene.session.learn
+        )
+        return cls(scene, model, pipeline, [driver], boot_id)
 
 
 class Assembly:

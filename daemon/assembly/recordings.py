@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Parts
-from graspd.daemon.assembly.tables import changed
+from graspd.daemon.assembly.sources import Source
 from graspd.daemon.judge.memory import recall
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
@@ -18,7 +17,7 @@ from graspd.daemon.publish.messages import OutcomeMessage
 from graspd.daemon.record.mcap import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Exchanged, Topic
-from graspd.daemon.scene import Scene, SceneError, parse
+from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.daemon.trust.trust import FormatError, decode
 from graspd.models.runtime import TactileModel
@@ -33,7 +32,7 @@ NOTHING_KNOWN: Final = (
 )
 
 
-class RecordedRun:
+class RecordedRun(Source):
     """One or more recordings of one run of the daemon, in the order of time."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -47,14 +46,18 @@ class RecordedRun:
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
+        recorded = self.header.scene
+        sections = {name: dict(recorded[name]) for name in SECTIONS if name in recorded}
+        if sections.get("model", {}).pop("min_accuracy", None) is not None:
+            log.warning("%s: was judged with min_accuracy, which is not known here", paths[0])
+        sections["tactile"] = {
+            "driver": "replay",
+            "recordings": [path.absolute() for path in paths],
+        }
+        super().__init__(sections, paths[0])
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the recorded scene, changed by these sections. Raises `SceneError`."""
-        recorded = self.header.scene
-        sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
-        if sections.get("model", {}).pop("min_accuracy", None) is not None:
-            log.warning("%s: was judged with min_accuracy, which is not known here", self._paths[0])
-        was = sections.get("gate", {}).get("mode")
+        was = self._sections.get("gate", {}).get("mode")
         self._same_grasps = mode is None or (mode == "every") == (was == "every")
         if not self._same_grasps:
             log.warning(
@@ -62,14 +65,9 @@ class RecordedRun:
                 self._paths[0],
                 was,
             )
-        sections["tactile"] = {
-            "driver": "replay",
-            "recordings": [path.absolute() for path in self._paths],
-        }
-        return parse(changed(sections, publish, model, mode), self._paths[0])
+        return super().scene(publish, model, mode)
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Return driver and judge, in the recorded state; `speed` None: fast."""
         header = self.header
         same_model = model.sha256 == header.model_sha256
         if not same_model:
@@ -77,20 +75,17 @@ class RecordedRun:
         driver = McapReplayDriver(
             self._paths, replayed.hand.fingers, speed=speed, axis_ns=header.axis_ns
         )
-        pipeline = assembly.build_pipeline(
-            replayed, model, lambda: driver.handed_over_ns, learns=replayed.session.learn
-        )
+        parts = Parts.played(replayed, model, driver, header.boot_id)
         try:
-            recall(pipeline, header.judge, same_model=same_model)
+            recall(parts.pipeline, header.judge, same_model=same_model)
         except ValueError:
             if header.file > 0:
                 log.warning(NOTHING_KNOWN, self._paths[0])
-        driver.on_event = partial(self._repeat, pipeline)
-        pipeline.boot_id = header.boot_id
-        return Parts(replayed, model, pipeline, [driver], header.boot_id)
+        driver.on_event = partial(self._repeat, parts.pipeline)
+        parts.pipeline.boot_id = header.boot_id
+        return parts
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Restore the recorded session and learning. Raises `SceneError`."""
         header = self.header
         try:
             if pipeline.session is not None and header.session is not None:
@@ -105,7 +100,6 @@ class RecordedRun:
             raise SceneError(f"{self._paths[0]}: the session in it {error}") from error
 
     def tell(self, companion: Companion) -> None:
-        """Pass the recorded outcomes of this run to `companion`."""
         self._companion = companion
 
     def _repeat(self, pipeline: Pipeline, event: RecordedEvent) -> None:

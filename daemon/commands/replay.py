@@ -8,11 +8,11 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
-from graspd.daemon.assembly.tables import Tables
+from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
 from graspd.daemon.commands.arguments import positive, within
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
@@ -23,9 +23,14 @@ from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.run.day_table import PUBLISHED, DayTable
 from graspd.daemon.run.loop import Loop, LoopTiming
-from graspd.daemon.run.printer import Printer
 from graspd.daemon.run.replaying import Comparison, Controller, trained_on
-from graspd.daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSummary, trained_on_line
+from graspd.daemon.run.summary import (
+    WITHOUT_LEARNING,
+    WITHOUT_SESSION,
+    Printer,
+    RunSummary,
+    trained_on_line,
+)
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.session import file as session_file
@@ -37,13 +42,6 @@ from graspd.models import zoo
 from graspd.models.bts3 import FINGERS, TABLES
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
-
-if TYPE_CHECKING:
-    from graspd.daemon.assembly.link_logs import LinkLogs
-    from graspd.daemon.assembly.recordings import RecordedRun
-
-Source: TypeAlias = "Tables | LinkLogs | RecordedRun"
-"""Source of recorded readings. Recordings of graspd contain the scene that judged them."""
 
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
@@ -252,7 +250,7 @@ def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
 def _source(args: argparse.Namespace) -> Source:
     """Return what plays the recordings. Imports only what this kind of them needs."""
     endings = {path.suffix for path in args.recordings}
-    if endings.isdisjoint({assembly.MCAP, *assembly.LINK_LOGS}):
+    if endings.isdisjoint({assembly.MCAP, *LINK_LOGS}):
         return _tables(args)
     if args.outcomes or args.min_confidence is not None or _risk(args):
         raise SceneError(
@@ -262,8 +260,6 @@ def _source(args: argparse.Namespace) -> Source:
     if args.loop or args.strict:
         raise SceneError("what graspd has recorded is played as it is: no --loop or --strict")
     if assembly.MCAP not in endings:
-        from graspd.daemon.assembly.link_logs import LinkLogs
-
         return LinkLogs(args.recordings, args.scene)
     assembly.require_mcap("replaying MCAP")
     from graspd.daemon.assembly.recordings import RecordedRun

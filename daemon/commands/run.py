@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
             stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
             printer = None
             if args.print:
-                from graspd.daemon.run.printer import Printer
+                from graspd.daemon.run.summary import Printer
 
                 printer = Printer(as_json=False)
             Runner(args.scene, stop, printer=printer, manager=_manager(stack)).run()

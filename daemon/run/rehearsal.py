@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from random import Random
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.daemon.assembly import assembly
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.scene import Scene
 from graspd.drivers.base import TactileReading
 from graspd.models.contract import SeenCounts
 
@@ -43,11 +45,15 @@ def grasps(training: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
         yield (rest + touch * (typical - rest) + noise).astype(np.uint16)
 
 
-def rehearse(make: Callable[[Callable[[], int]], Pipeline], training: SeenCounts) -> Pipeline:
-    """Judge a synthetic grasp; return the pipeline used. `make`: makes it from a clock."""
+def rehearse(scene: Scene) -> Pipeline:
+    """Judge a synthetic grasp; return the pipeline used. Raises `ModelError`.
+
+    It has a model of its own, because judging changes the scaling of a model's inputs.
+    """
     now_ns = 0
-    pipeline = make(lambda: now_ns)
-    for seq, counts in enumerate(grasps(training, GRASP_EVERY)):
+    model = assembly.load_model(scene)
+    pipeline = assembly.build_pipeline(scene, model, lambda: now_ns)
+    for seq, counts in enumerate(grasps(model.contract.seen, GRASP_EVERY)):
         now_ns = (seq + 1) * PERIOD_NS
         faults = np.zeros(counts.shape, dtype=np.uint8)
         pipeline.judge(TactileReading(t_ns=now_ns, seq=seq, counts=counts, faults=faults))

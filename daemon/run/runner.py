@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -12,20 +13,21 @@ from typing import TYPE_CHECKING
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish.companion import Companion, PublishedVerdict
 from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets, plan
 from graspd.daemon.run.loop import Ended, Loop, LoopTiming
 from graspd.daemon.run.reload import Reload, losses, start_again
-from graspd.daemon.run.run_log import RunLog
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.drivers.base import DriverError
 from graspd.models.contract import ModelError
 
 if TYPE_CHECKING:
-    from graspd.daemon.run.printer import Printer
     from graspd.daemon.run.realtime import RealtimeMode
     from graspd.daemon.run.replaying import Controller
+    from graspd.daemon.run.summary import Printer
     from graspd.daemon.run.systemd import Systemd
 
 log = logging.getLogger("graspd")
@@ -39,22 +41,13 @@ def prepare(path: Path) -> Parts:
     loaded = scene.load(path)
     parts = Parts.of(loaded, assembly.load_model(loaded))
     if loaded.realtime is not None:
-        rehearse_grasp(parts)
+        from graspd.daemon.run.rehearsal import rehearse  # only where a scene wants realtime
+
+        try:
+            rehearse(loaded)
+        except ModelError as error:  # the file has changed; the model in memory is good
+            log.warning("no rehearsal: %s", error)
     return parts
-
-
-def rehearse_grasp(parts: Parts) -> None:
-    """Judge a synthetic grasp."""
-    from graspd.daemon.run.rehearsal import rehearse  # only where a scene wants realtime
-
-    # With its own model, because judging changes the scaling of a model's inputs.
-    try:
-        model = assembly.load_model(parts.scene)
-        rehearse(
-            lambda clock: assembly.build_pipeline(parts.scene, model, clock), model.contract.seen
-        )
-    except ModelError as error:  # the file has changed; the model in memory is good
-        log.warning("no rehearsal: %s", error)
 
 
 def enter_realtime(running: scene.Scene, stack: ExitStack) -> RealtimeMode | None:
@@ -73,6 +66,34 @@ def _controller(wanted: scene.Scene) -> Controller | None:
     from graspd.daemon.run.replaying import Controller  # only where a scene wants it
 
     return Controller(only_lifted=True)
+
+
+class RunLog(Companion):
+    """Log one line at the end of a run: how long it was, what was judged, why it ended."""
+
+    def __init__(self) -> None:
+        self._start_s = time.monotonic()
+        self._readings = 0
+        self._judgements: Counter[Decision] = Counter()
+
+    def on_verdict(self, published: PublishedVerdict) -> None:
+        """Count a verdict. With a gate only those that judge a grasp are judgements."""
+        verdict = published.verdict
+        self._readings += published.reading is not None
+        if verdict.gate is None or verdict.judged:
+            self._judgements[verdict.verdict] += 1
+
+    def write(self, cause: str) -> None:
+        """Log the line. `cause`: what ended the run."""
+        counts = ", ".join(f"{self._judgements[decision]} {decision}" for decision in Decision)
+        log.info(
+            "ended by %s after %.1f s: %d readings, %d judgements: %s",
+            cause,
+            time.monotonic() - self._start_s,
+            self._readings,
+            self._judgements.total(),
+            counts,
+        )
 
 
 class Runner:

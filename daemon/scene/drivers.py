@@ -42,6 +42,8 @@ def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
     return base / path
 
 
+Fingers = Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)]
+Electrode = Annotated[int, Field(ge=1, le=ELECTRODES), unit()]
 Probability = Annotated[float, Field(ge=0.0, le=1.0), unit()]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
 Address = Annotated[str, AfterValidator(_ip_address)]
@@ -81,15 +83,9 @@ class ReplayFaultsSection(Section):
     """Delay of all readings."""
     intermittent_probability: Probability = 0.0
     """Share of readings that are lost."""
-    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
+    fingers: Fingers | None = None
     """Fingers with these faults; without it all."""
-    electrodes: (
-        Annotated[
-            tuple[Annotated[int, Field(ge=1, le=ELECTRODES), unit()], ...],
-            Field(min_length=1, strict=False),
-        ]
-        | None
-    ) = None
+    electrodes: Annotated[tuple[Electrode, ...], Field(min_length=1, strict=False)] | None = None
     """Electrodes with these faults; without it all."""
     seed: Annotated[int, Field(ge=0), unit()] = 0
     """The same seed gives the same faults."""
@@ -125,9 +121,7 @@ class SpiTactile(Section):
     """Selects this driver."""
     port: Name
     """Path in `/dev/serial/by-id/`, or a pyserial URL."""
-    sensors: (
-        Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
-    ) = None
+    sensors: Annotated[Fingers, Field(max_length=5)] | None = None
     """Fingers in the order of the chip selects; without it `hand.fingers`."""
     baud: Annotated[int, Field(ge=115_200, le=12_000_000), unit("bit/s")] = 921_600
     """Line rate; ports of USB CDC ignore it."""
@@ -142,9 +136,7 @@ class CanTactile(Section):
     """Name of a python-can interface."""
     channel: Name = "can0"
     """Name of the bus at that interface."""
-    sensors: (
-        Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
-    ) = None
+    sensors: Annotated[Fingers, Field(max_length=3)] | None = None
     """Fingers in the order of the words of `syntouch`; without it `hand.fingers`."""
     format: Literal["syntouch", "sweep_fd"] = "syntouch"
     """SynTouch's format, or graspd's for CAN FD."""

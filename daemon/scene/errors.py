@@ -70,20 +70,17 @@ def _place(scene: Section, location: tuple[int | str, ...]) -> tuple[list[str], 
     The driver's name, which pydantic puts between the keys, is left out.
     """
     keys: list[str] = []
-    section: Section | None = scene
-    inside: Section | None = scene
-    choices: dict[str, Section] = {}
+    section: Section | None = None
+    inside = [scene]
     for part in map(str, location):
-        if part in choices:
-            inside = choices[part]
-            choices = {}
+        of_driver = [each for each in inside if part in _tags(each)]
+        if len(inside) > 1 and of_driver:
+            inside = of_driver
             continue
         keys.append(part)
-        section = inside
+        section = inside[0] if len(inside) == 1 else None
         field = section.model_fields.get(part) if section else None
-        sections = list(_sections(field.annotation)) if field else []
-        choices = {tag: each for each in sections for tag in _tags(each)}
-        inside = sections[0] if len(sections) == 1 else None
+        inside = list(_sections(field.annotation)) if field else []
     return keys, section
 
 

@@ -20,6 +20,7 @@ from graspd.daemon.process.text import printable
 from graspd.daemon.scene.drivers import (
     CanTactile,
     FilePath,
+    Fingers,
     Joints,
     Name,
     PalmJoints,
@@ -50,7 +51,7 @@ class Hand(Section):
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]{1,32}$")] = "right"
     """Name in the topics and in the default socket."""
-    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] = ("ff", "mf", "th")
+    fingers: Fingers = ("ff", "mf", "th")
     """Fingers with a sensor, in the order of the model."""
 
     @field_validator("fingers")
@@ -132,7 +133,7 @@ class GateSection(Section):
     """Largest age of a reading. An older one, or silence, gives `unknown`."""
     sweeps: Annotated[Literal[1, 3], unit("readings")] | None = None
     """Judge single readings, or the median of three. Without it 3, in mode `every` 1."""
-    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
+    fingers: Fingers | None = None
     """Fingers that must touch; without it all of `hand.fingers`."""
     contact_counts: Annotated[float, Field(ge=5, le=1000), unit("counts")] = ContactLimits.counts
     """A finger touches when three of its electrodes are this far below their baseline, and also

@@ -54,16 +54,11 @@ class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Resting count of each electrode, finger by finger; 0: not known."""
 
 
-class _Version1(KeptSession, frozen=True, tag_field="version", tag=1):
-    """File of an older graspd, which did not learn from outcomes."""
-
-
-class _Version2(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="version", tag=2
-):
-    """File of this version, with the SHA-256 of its text."""
+class _Sealed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="version", tag=2):
+    """A session file."""
 
     sha256: str
+    """SHA-256 of the text of `kept`."""
     kept: msgspec.Raw
 
 
@@ -204,7 +199,7 @@ def _beside_any(path: Path) -> str:
 
 def _write(path: Path, kept: KeptSession, former: Path | None) -> None:
     content = msgspec.json.encode(kept)
-    sealed = _Version2(hashlib.sha256(content).hexdigest(), msgspec.Raw(content))
+    sealed = _Sealed(hashlib.sha256(content).hexdigest(), msgspec.Raw(content))
     try:
         write_atomically(path, msgspec.json.encode(sealed) + b"\n", former=former)
     except OSError as error:
@@ -248,9 +243,7 @@ def read(path: Path) -> KeptSession | None:
     except OSError as error:
         raise SessionFileError(f"{path}: cannot read the session: {error.strerror}") from error
     try:
-        content = msgspec.json.decode(data, type=_Version1 | _Version2)
-        if isinstance(content, _Version1):
-            return content
+        content = msgspec.json.decode(data, type=_Sealed)
         if hashlib.sha256(content.kept).hexdigest() != content.sha256:
             raise SessionFileError(f"{path}: not a session: its checksum is wrong")
         return msgspec.json.decode(content.kept, type=KeptSession)

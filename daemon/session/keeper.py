@@ -25,8 +25,13 @@ from graspd.daemon.session.file import (
     others,
     restore_kept,
 )
-from graspd.daemon.session.rest import Rest, moved_fingers
-from graspd.daemon.session.sensors import UNTOLD, OnExchange, SensorWatch
+from graspd.daemon.session.sensors import (
+    UNTOLD,
+    OnExchange,
+    Rest,
+    SensorWatch,
+    moved_fingers,
+)
 from graspd.daemon.trust.trust import Trust, TrustState, decode
 from graspd.drivers.base import ELECTRODES, Driver
 from graspd.models.session_statistics import SessionState

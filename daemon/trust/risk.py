@@ -44,7 +44,7 @@ class Permission(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RiskLimits:
-    """Limits set by the user."""
+    """Limits set by the user, within the ranges of the scene."""
 
     max_slip_when_stable: float | None = None
     """Share of the `stable` lifts that may slip, 0.001..0.5; None: no rule, all is allowed."""
@@ -56,16 +56,6 @@ class RiskLimits:
     that the rule is too strict."""
     outstanding_max: int = 5
     """Announced lifts, from 1 on, whose outcome may be out at once."""
-
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for what is out of range."""
-        alpha = self.max_slip_when_stable
-        if alpha is not None and not 0.001 <= alpha <= 0.5:
-            raise ValueError("max_slip_when_stable must be 0.001..0.5")
-        if self.warm_up < 0 or not 0.0 <= self.explore <= 1.0:
-            raise ValueError("warm_up must not be negative, explore must be 0..1")
-        if self.outstanding_max < 1:
-            raise ValueError("outstanding_max must be at least 1")
 
 
 class RiskReport(msgspec.Struct, frozen=True, kw_only=True):

@@ -175,9 +175,9 @@ def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:
 
 def test_a_broken_session_file_is_one_line_in_a_replay(tmp_path: Path) -> None:
     path = tmp_path / "kept.json"
-    statistics = {"weight": 1.0, "grasps": 1, "mean": [1.0] * 10, "squares": [1.0] * 10}
-    kept = {"version": 1, "fingers": ["ff", "mf", "th"], "serials": {}, "saved_at": 0.0}
-    path.write_text(json.dumps(kept | {"statistics": statistics}))
+    with SessionFile(path) as file:
+        odd = SessionState(1.0, 1, (1.0,) * 10, (1.0,) * 10)
+        file.save(kept_now(odd, ("ff", "mf", "th"), {}))
     result = graspd("replay", "--session", path)
     assert result.returncode == 2
     assert result.stderr == "graspd: the kept session is of 10 values, not of 150\n"

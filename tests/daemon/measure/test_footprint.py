@@ -35,10 +35,10 @@ NEVER = {
     *("drivers.recordings.serial_log", "drivers.recordings.link_log_player"),
     *("daemon.measure.candidates", "daemon.measure.error_vs_time", "daemon.measure.stability"),
     *("daemon.measure.streams", "daemon.measure.worth", "daemon.measure.cost"),
-    *("daemon.run.printer", "daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
+    *("daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
     *("daemon.scene.errors", "daemon.commands.doctor", "daemon.watch", "daemon.judge.memory"),
     *("daemon.record", "daemon.assembly.recorder", "daemon.assembly.recordings"),
-    *("daemon.assembly.link_logs", "daemon.publish.keys"),
+    *("daemon.assembly.sources", "daemon.publish.keys"),
 )
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
 for a service, realtime, known keys or a model that is not of the zoo."""
@@ -220,7 +220,7 @@ def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training(
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     modules = tuple(json.loads(result.stderr))
-    unwanted = NEVER - {"graspd.daemon.run.printer", "graspd.daemon.run.summary"}
+    unwanted = NEVER - ours("daemon.assembly.sources", "daemon.run.summary")
     unwanted |= BUSES["spi"] | BUSES["can"] | BUSES["palm"] | HALL | ASK
     unwanted.add("graspd.daemon.session.keeper")
     assert below(unwanted, modules) == []

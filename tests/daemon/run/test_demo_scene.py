@@ -10,8 +10,8 @@ from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import PublishedVerdict
 from graspd.daemon.publish.messages import Verdict
-from graspd.daemon.run.printer import Printer
 from graspd.daemon.run.runner import Runner
+from graspd.daemon.run.summary import Printer
 from graspd.daemon.watch.figures import doubt
 from graspd.drivers.recordings.csv_player import SHOW_RECORDING
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ

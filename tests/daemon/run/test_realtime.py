@@ -22,7 +22,6 @@ from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.judge.reasons import GateState
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.run.rehearsal import rehearse
-from graspd.daemon.run.runner import rehearse_grasp
 from graspd.daemon.scene.scene import Realtime
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
@@ -158,11 +157,7 @@ def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None)
 
 def test_the_rehearsal_goes_through_a_whole_grasp() -> None:
     tactile = {"driver": "spi", "port": "/nowhere"}
-    wanted = scene.parse({"tactile": tactile}, Path("any.toml"))
-    model = assembly.load_model(wanted)
-    pipeline = rehearse(
-        lambda clock: assembly.build_pipeline(wanted, model, clock), model.contract.seen
-    )
+    pipeline = rehearse(scene.parse({"tactile": tactile}, Path("any.toml")))
     assert pipeline.hand is not None
     memory = pipeline.hand.gate.memory
     assert memory.grasp == 1
@@ -185,7 +180,7 @@ def test_the_rehearsal_leaves_the_judge_as_it_was(as_before: None, tmp_path: Pat
         parts = Parts.of(wanted, assembly.load_model(wanted))
         judged.append(p_slips(parts, rows[:40]))
         if rehearsed:
-            rehearse_grasp(parts)
+            rehearse(wanted)
         judged[-1] += p_slips(parts, rows[40:])
     assert judged[0] == judged[1]
 

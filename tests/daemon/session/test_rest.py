@@ -17,8 +17,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.session.file import SessionFile, load, others
 from graspd.daemon.session.keeper import SessionKeeper
-from graspd.daemon.session.rest import moved_fingers
-from graspd.daemon.session.sensors import LOOK_EVERY, SensorWatch
+from graspd.daemon.session.sensors import LOOK_EVERY, SensorWatch, moved_fingers
 from graspd.drivers.base import TactileReading
 from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint
 from graspd.drivers.twins.grasps.grasps import recorded_counts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import random
 from collections.abc import Callable, Iterator
@@ -11,7 +10,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from unittest import mock
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -206,22 +204,6 @@ def test_what_was_kept_before_takes_the_place_of_what_is_damaged(
         assert file.remove()
         assert not file.remove()
         assert file.load() is None
-
-
-def test_a_file_of_the_first_version_is_still_read(tmp_path: Path) -> None:
-    session = calibration()
-    observe(session, 30)
-    path = tmp_path / "right.json"
-    kept = {"version": 1, "fingers": FINGERS, "serials": {"ff": "A"}, "saved_at": 5.0}
-    statistics = msgspec.to_builtins(session.state())
-    path.write_bytes(msgspec.json.format(json.dumps(kept | {"statistics": statistics}).encode()))
-    found = load(path)
-    assert found is not None
-    assert (found.statistics, found.serials, found.trust) == (session.state(), {"ff": "A"}, None)
-    with SessionFile(path) as file:
-        file.load()
-        save(file, 1)
-    assert read(former_of(path)) == found
 
 
 def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_path: Path) -> None:

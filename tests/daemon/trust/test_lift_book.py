@@ -4,24 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from graspd.daemon.trust.lift_book import LIFTS_MAX, NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
+from graspd.daemon.trust.lift_book import LIFTS_MAX, NOT_ASSESSED, LiftBook, OutcomeStatus
+from tests.daemon.trust.grasps import named
 
-BOOT = "0" * 32
 CONTROLLER, DASHBOARD = b"controller", b"dashboard"
 
 
-def named(grasp: int) -> GraspId:
-    return GraspId(BOOT, grasp)
-
-
-def test_only_the_owner_reports_a_grasp_that_was_claimed() -> None:
-    lifts = LiftBook()
-    lifts.claim(named(1), CONTROLLER)
-    assert lifts.may_report(named(1), CONTROLLER)
-    assert not lifts.may_report(named(1), DASHBOARD)
-
-
-def test_a_grasp_stays_with_its_first_owner() -> None:
+def test_only_its_first_owner_reports_a_grasp_that_was_claimed() -> None:
     lifts = LiftBook()
     lifts.claim(named(1), CONTROLLER)
     lifts.claim(named(1), DASHBOARD)

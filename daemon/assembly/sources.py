@@ -1,0 +1,118 @@
+"""Build scene and judge of what is judged again: grasp tables and streams (CSV), link logs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graspd.daemon import scene
+from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.publish.companion import Companion
+from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.drivers import CanTactile, SpiTactile
+from graspd.daemon.scene.scene import Hand
+from graspd.models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from graspd.drivers.recordings.link_log_player import LinkLogDriver
+
+LINK_LOGS = {".log": "can", ".serial": "spi"}
+"""File name endings of link logs, candump text and serial bytes, and the driver of such a link."""
+LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session")
+"""Sections of a scene that change verdicts; a link log has no joints."""
+
+
+class Source:
+    """Recorded readings to judge again, and the sections of the scene that judges them."""
+
+    def __init__(self, sections: Mapping[str, dict[str, Any]], where: Path) -> None:
+        """`where`: the file of the sections, for messages."""
+        self._sections = sections
+        self._where = where
+
+    def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
+        """Return the scene with these sections; the model's thresholds stay. `mode`: of the gate.
+
+        Raises `SceneError`.
+        """
+        former = self._sections.get("model", {})
+        if model:
+            former = {key: value for key, value in former.items() if key not in ("name", "path")}
+        gate = self._sections.get("gate", {}) | ({} if mode is None else {"mode": mode})
+        changes = {"model": former | model, "gate": gate, "publish": publish}
+        return scene.parse({**self._sections, **changes}, self._where)
+
+    def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
+        """Make driver and judge; `speed` None: fast. Raises `SceneError` or `RecordingError`."""
+        raise NotImplementedError
+
+    def restore(self, pipeline: Pipeline) -> None:
+        """Restore the recorded session and learning, if there are any. Raises `SceneError`."""
+
+    def tell(self, companion: Companion) -> None:
+        """Pass the recorded outcomes to `companion`, if there are any."""
+
+
+class Tables(Source):
+    """Grasp tables and streams, which do not say how they were judged."""
+
+    def __init__(self, paths: Sequence[Path], sections: Mapping[str, dict[str, Any]]) -> None:
+        """`sections`: of the scene, where it differs from one that plays `paths` fast."""
+        recordings = [path.absolute() for path in paths]
+        tactile = {"driver": "replay", "pace": "fast", "recordings": recordings}
+        changes = {
+            "tactile": tactile | sections.get("tactile", {}),
+            "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS},
+        }
+        super().__init__({**sections, **changes}, Path("command line"))
+
+    def parts(self, replayed: Scene, model: TactileModel, _speed: float | None) -> Parts:
+        """Make the parts for the model's fingers; the scene has the speed."""
+        hand = Hand(fingers=model.contract.fingers)
+        return Parts.of(replayed.model_copy(update={"hand": hand}), model)
+
+
+class LinkLogs(Source):
+    """Link logs of one kind, in order of time."""
+
+    def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
+        """`path`: of the scene; None: defaults. Raises `SceneError` for two kinds of files."""
+        endings = {each.suffix for each in paths}
+        if len(endings) > 1:
+            raise SceneError(f"files of {' and '.join(sorted(endings))} are not one recording")
+        self._paths = tuple(paths)
+        driver = LINK_LOGS[paths[0].suffix]
+        if path is None:
+            port = {"port": "link log"} if driver == "spi" else {}
+            super().__init__({"tactile": {"driver": driver, **port}}, Path("command line"))
+            return
+        loaded = scene.load(path)
+        if loaded.tactile.driver != driver:
+            raise SceneError(f"{path}: tactile.driver must be {driver}")
+        written = loaded.model_dump(mode="json", exclude_unset=True)
+        super().__init__({key: written[key] for key in LINK_SECTIONS if key in written}, path)
+
+    def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
+        try:
+            driver = self._driver(replayed, speed)
+        except ValueError as error:
+            raise SceneError(f"[tactile] {error}") from error
+        return Parts.played(replayed, model, driver)
+
+    def _driver(self, replayed: Scene, speed: float | None) -> LinkLogDriver[Any]:
+        tactile, fingers = replayed.tactile, replayed.hand.fingers
+        if isinstance(tactile, SpiTactile):
+            from graspd.drivers.recordings.serial_log import SerialLog
+
+            return SerialLog(self._paths, fingers, tactile.sensors, speed=speed)
+        if not isinstance(tactile, CanTactile):
+            raise ValueError("link logs are of the drivers can and spi")
+        from graspd.drivers.recordings.can_log import CanLog
+
+        board = tactile.model_dump(
+            exclude={"driver", "interface", "channel", "bitrate", "data_bitrate"}
+        )
+        return CanLog(self._paths, fingers, speed=speed, **board)
