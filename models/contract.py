@@ -1,8 +1,7 @@
-"""The contract of a model: its description of itself, inside the ONNX file.
+"""The contract of a model: one JSON object under the metadata key `graspd` of its ONNX file.
 
-The contract is one JSON object under the metadata key `graspd` of the ONNX model. The daemon
-refuses a model without one, because a network that is fed with the wrong layout, filling or finger
-order still answers, but wrongly.
+The daemon refuses a model without one, because a network that is fed with the wrong layout, filling
+or finger order still answers, but wrongly.
 """
 
 from __future__ import annotations

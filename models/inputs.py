@@ -108,11 +108,7 @@ class CountsBuilder(InputBuilder):
 
 
 class SessionBuilder(InputBuilder):
-    """Features of a reading, standardised by the values of `use`, then clipped.
-
-    The error is the rounding to float32, 6e-8 of the largest magnitude, if no mean is over a
-    million times its spread.
-    """
+    """Features of a reading, standardised by the values of `use`, then clipped."""
 
     name = "session_features"
 

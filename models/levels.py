@@ -27,10 +27,7 @@ FULL_DEVIATIONS = 2.5
 SHARE = 0.02
 """Weight of a new reading in the rest, which at 100 Hz follows within half a second."""
 STRAY_COUNTS = 20.0
-"""Largest change, counts, that the rest learns from one reading: where a touch begins.
-
-A reading may already be a touch that the gate has not noticed yet.
-"""
+"""Largest change, counts, that the rest learns from a reading, which may already be a touch."""
 KNOWN_AFTER = 25
 """Number of readings whose mean is the first rest."""
 

@@ -24,8 +24,7 @@ from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
 from graspd.models.training.evaluating.days import SessionDay, by_object
 from graspd.models.training.fitting.trained import Trained, train
-from graspd.models.training.systems.registry import SYSTEMS
-from graspd.models.training.systems.system import with_recipes
+from graspd.models.training.systems.registry import SYSTEMS, with_recipes
 
 OWN, PUBLISHED = "small-session", "cnn1"
 """Systems that judge: graspd's default, and the published network on the plain image."""

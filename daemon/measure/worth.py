@@ -30,7 +30,6 @@ from graspd.daemon.process.text import complain, markdown_table, progress, write
 from graspd.daemon.trust.risk import RiskLimits
 from graspd.models.contract import ModelError
 from graspd.models.training.data.datasets import DatasetError, read_all
-from graspd.models.training.evaluating.day_figures import VerdictFigures
 from graspd.models.training.evaluating.files import to_json, write_whole
 from graspd.models.training.evaluating.style import (
     BLUE,
@@ -43,6 +42,7 @@ from graspd.models.training.evaluating.style import (
     style,
     to_svg,
 )
+from graspd.models.training.evaluating.summaries import VerdictFigures
 from graspd.models.zoo import read_card
 
 ALLOWED: Final = 0.05

@@ -118,18 +118,18 @@ _shtab_graspd_doctor_defaults_added=0
 _shtab_graspd_evaluate_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "*--protocol[may be repeated (default\: the first six, of own tables alone cv and objects). cv\: known objects\: stratified folds of palm_down \+ palm_side (the paper\'s)\; unknown\: the paper\'s 8 objects left out of palm_down \+ palm_side\; objects\: objects left out in groups, palm_down \+ palm_side \+ palm_45\; objects-whole\: objects left out in groups, palm_down \+ palm_side\; session\: palm_45 by palm_down \+ palm_side, its objects left out in groups\; days\: tables by others (A\: palm_45 by palm_down \+ palm_side\; B\: palm_down and palm_side by palm_45\; C\: each of these by the other and palm_45), their objects left out in groups\; cv-palm-down\: stratified folds of palm_down alone\; cv-palm-side\: stratified folds of palm_side alone]:protocol:(cv unknown objects objects-whole session days cv-palm-down cv-palm-side)"
-  "--data[folder with the published grasp tables]:DIR:_files"
-  "*--own[a grasp table of your own, as \`graspd export-grasps\` writes it. May be given several times. Beside the tables of --data, or, without --data, alone\: by cv and objects]:FILE:_files"
+  "--data[folder with the published grasp tables\: palm_down.csv, palm_side.csv and, for some models and protocols, palm_45.csv]:DIR:_files"
+  "*--own[a grasp table of your own, as \`graspd export-grasps\` writes it, that is one session\: 20 grasps or more, some that slipped and some that stayed. May be given several times. Beside the tables of --data, or, without --data, alone]:FILE:_files"
+  "--jobs[trainings at once on this machine (default\: 1)]:N:_files"
+  "--quiet[show no progress bar]"
   "--out[folder for results\; what is there already is not run again (default\: runs\/evaluate)]:DIR:_files"
   "--seeds[split seeds (default\: 3)]:N:_files"
-  "--jobs[processes on this machine (default\: 1)]:N:_files"
   "--dask[scheduler of a Dask cluster of two threads or more, tcp\:\/\/HOST\:PORT, to run on instead (extra\: cluster)\; it runs what it is sent\: only in a network that you trust]:ADDRESS:_files"
   "--quick[few grasps, folds and epochs\: does it run\?]"
   "--grid[try the grids of classical systems and name the best]"
   "--table[write the table of all results in --out beside the paper\'s\; needs --data]:FILE:_files"
   "--plots[draw them into this folder]:DIR:_files"
   "--json[print the summaries as JSON]"
-  "--quiet[show no progress bar]"
   "(*)::systems (default\: all)\: cnn0, cnn1, cnn2, cnn3, cnn3-3x3, cnn1-faithful, cnn1-augmented, cnn1-dropout, cnn1-plain, svm, mlp, rf, cnn0-d1-least-contact, cnn0-d2a-least-contact, cnn0-d2b-least-contact, cnn0-d3-least-contact, cnn0-horizontal, cnn0-vertical, svm-electrodes, blend-electrodes, cnn0-electrodes, small-electrodes, svm-session, hgb-session, cnn1-session, small-session, small-session-ff, small-session-mf, small-session-th, small-session-ff-mf, small-session-ff-th, small-session-mf-th:_files"
 )
 
@@ -323,16 +323,16 @@ _shtab_graspd_session_show_defaults_added=0
 
 _shtab_graspd_train_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "--data[folder with palm_down.csv, palm_side.csv and, for some models, palm_45.csv]:DIR:_files"
+  "--data[folder with the published grasp tables\: palm_down.csv, palm_side.csv and, for some models and protocols, palm_45.csv]:DIR:_files"
   "*--own[a grasp table of your own, as \`graspd export-grasps\` writes it, that is one session\: 20 grasps or more, some that slipped and some that stayed. May be given several times. Beside the tables of --data, or, without --data, alone]:FILE:_files"
+  "--jobs[trainings at once on this machine (default\: 1)]:N:_files"
+  "--quiet[show no progress bar]"
   "--name[name of the result (default\: MODEL, with --own and the names of these tables)]:NAME:_files"
   "--out[folder for the result (default\: runs\/NAME)]:DIR:_files"
   "--results[folder of finished trainings, which are not run again\; \`graspd evaluate\` shares it (default\: trainings in --out)]:DIR:_files"
   "--seed[default\: 0]:N:_files"
   "--folds[needs as many objects, and as many grasps that slipped and that stayed (default\: 10, or as many as these are enough for)]:N:_files"
   "--only[measure by this one protocol (cv\: known objects\; objects\: others, which cannot be measured of a single one) and leave the other studies out\: for a model that is compared and not used]:PROTOCOL:(cv objects objects-whole)"
-  "--jobs[trainings at once (default\: 1)]:N:_files"
-  "--quiet[show no progress bar]"
   ":one of cnn0, cnn1, cnn2, cnn3, cnn3-3x3, cnn1-faithful, cnn1-augmented, cnn1-dropout, cnn1-plain, svm, mlp, rf, cnn0-d1-least-contact, cnn0-d2a-least-contact, cnn0-d2b-least-contact, cnn0-d3-least-contact, cnn0-horizontal, cnn0-vertical, svm-electrodes, blend-electrodes, cnn0-electrodes, small-electrodes, svm-session, hgb-session, cnn1-session, small-session, small-session-ff, small-session-mf, small-session-th, small-session-ff-mf, small-session-ff-th, small-session-mf-th:(blend-electrodes cnn0 cnn0-d1-least-contact cnn0-d2a-least-contact cnn0-d2b-least-contact cnn0-d3-least-contact cnn0-electrodes cnn0-horizontal cnn0-vertical cnn1 cnn1-augmented cnn1-dropout cnn1-faithful cnn1-plain cnn1-session cnn2 cnn3 cnn3-3x3 hgb-session mlp rf small-electrodes small-session small-session-ff small-session-ff-mf small-session-ff-th small-session-mf small-session-mf-th small-session-th svm svm-electrodes svm-session)"
 )
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Numbers = NDArray[np.generic]
-"""Counts of any type: as read (uint16), or mapped to other sensors (float64)."""
+"""Counts as read (uint16), or mapped to other sensors (float64)."""
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 """Input of a model."""

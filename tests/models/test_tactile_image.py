@@ -14,12 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS
 from graspd.models.layout import D1, LAYOUTS, Layout
-from graspd.models.tactile_image import (
-    Fill,
-    Normalisation,
-    TactileImager,
-    fill_matrix,
-)
+from graspd.models.tactile_image import Fill, Normalisation, TactileImager, fill_matrix
 
 Image = list[list[float]]
 

@@ -17,14 +17,15 @@ from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from graspd.models.tactile_image import TactileImager
-from graspd.models.training.data.datasets import Grasps, read_whole
+from graspd.models.training.data.datasets import Grasps, read_all
 
 CARD: dict[str, Any] = json.loads((zoo.ZOO / "cnn1.json").read_text())
 
 
 @pytest.fixture(scope="module")
 def whole(bts3_dir: Path) -> Grasps:
-    return read_whole(bts3_dir)
+    grasps = read_all(bts3_dir)
+    return grasps.rows(grasps.rows_of(("palm_down", "palm_side")))
 
 
 @pytest.fixture(scope="module")

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from graspd.models.contract import Dataset
-from graspd.models.training.data.datasets import DatasetError, lab_table_names, unpublished
+from graspd.models.training.data.datasets import (
+    FEWEST_GRASPS,
+    DatasetError,
+    Grasps,
+    lab_table_names,
+    read_with_lab_tables,
+    unpublished,
+)
 from graspd.models.training.data.protocols import TooFewGraspsError
-
-EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class WrongInputError(Exception):
@@ -30,6 +34,35 @@ def whole(low: int, high: int) -> Callable[[str], int]:
     return parse
 
 
+def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of both commands."""
+    parser.add_argument(
+        "--data",
+        type=Path,
+        metavar="DIR",
+        help="folder with the published grasp tables: palm_down.csv, palm_side.csv and, for some "
+        "models and protocols, palm_45.csv",
+    )
+    parser.add_argument(
+        "--own",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a grasp table of your own, as `graspd export-grasps` writes it, that is one session: "
+        f"{FEWEST_GRASPS} grasps or more, some that slipped and some that stayed. May be given "
+        "several times. Beside the tables of --data, or, without --data, alone",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=whole(1, 1024),
+        default=1,
+        metavar="N",
+        help="trainings at once on this machine (default: 1)",
+    )
+    parser.add_argument("--quiet", action="store_true", help="show no progress bar")
+
+
 def exit_code(
     command: str, folder: Path, work: Callable[[], None], failure: type[Exception]
 ) -> int:
@@ -41,26 +74,33 @@ def exit_code(
         work()
     except KeyboardInterrupt:
         say(command, "interrupted; the same command goes on from here")
-        return EXIT_INTERRUPTED
+        return 130
     except OSError as error:
         say(command, f"{error.filename or folder}: {error.strerror or error}")
-        return EXIT_INPUT
+        return 2
     except (DatasetError, TooFewGraspsError, WrongInputError) as error:
         say(command, str(error))
-        return EXIT_INPUT
+        return 2
     except failure as error:
         say(command, str(error))
-        return EXIT_FAILED
-    return EXIT_OK
+        return 1
+    return 0
 
 
-def warn_of_unpublished(command: str, files: Sequence[Dataset]) -> None:
-    """Warn of tables with a published name that are not, byte for byte, the published ones."""
-    own = lab_table_names(files)
-    for name in unpublished(files):
+def read_grasps(command: str, args: argparse.Namespace) -> Grasps:
+    """Return the grasps of `--data` and `--own`. Raises `WrongInputError`, `DatasetError`.
+
+    Warns of tables with a published name that are not, byte for byte, the published ones.
+    """
+    if args.data is None and not args.own:
+        raise WrongInputError("needs --data DIR, --own FILE, or both")
+    grasps = read_with_lab_tables(args.data, args.own)
+    own = lab_table_names(grasps.files)
+    for name in unpublished(grasps.files):
         if name not in own:
             text = f"{name}.csv is not the published table; the figures are of this data only"
             say(command, f"warning: {text}")
+    return grasps
 
 
 def say(command: str, text: str) -> None:

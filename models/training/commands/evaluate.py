@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from graspd.models.training.commands.common import EXIT_INPUT, exit_code, say, whole
+from graspd.models.training.commands.common import add_shared_arguments, exit_code, whole
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS
 from graspd.models.training.systems.registry import SYSTEMS
 
@@ -13,10 +13,7 @@ from graspd.models.training.systems.registry import SYSTEMS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
     parser.add_argument(
-        "names",
-        nargs="*",
-        metavar="NAME",
-        help=f"systems (default: all): {', '.join(SYSTEMS)}",
+        "names", nargs="*", metavar="NAME", help=f"systems (default: all): {', '.join(SYSTEMS)}"
     )
     parser.add_argument(
         "--protocol",
@@ -25,18 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="may be repeated (default: the first six, of own tables alone cv and objects). "
         + "; ".join(f"{name}: {text}" for name, text in ABOUT.items()),
     )
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder with the published grasp tables"
-    )
-    parser.add_argument(
-        "--own",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="a grasp table of your own, as `graspd export-grasps` writes it. May be given several "
-        "times. Beside the tables of --data, or, without --data, alone: by cv and objects",
-    )
+    add_shared_arguments(parser)
     parser.add_argument(
         "--out",
         type=Path,
@@ -46,13 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--seeds", type=whole(1, 1000), metavar="N", help="split seeds (default: 3)"
-    )
-    parser.add_argument(
-        "--jobs",
-        type=whole(1, 1024),
-        default=1,
-        metavar="N",
-        help="processes on this machine (default: 1)",
     )
     parser.add_argument(
         "--dask",
@@ -75,16 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw them into this folder")
     parser.add_argument("--json", action="store_true", help="print the summaries as JSON")
-    parser.add_argument("--quiet", action="store_true", help="show no progress bar")
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate; what is finished is kept and not run again.
     Returns 0, 1 (the cluster failed), 2 (input or folder), 130 (Ctrl-C)."""
     from graspd.models.training.commands.evaluation import evaluate
-    from graspd.models.training.evaluating.run_jobs import ClusterError
+    from graspd.models.training.evaluating.jobs import ClusterError
 
-    if args.data is None and not args.own:
-        say("evaluate", "needs --data DIR, --own FILE, or both")
-        return EXIT_INPUT
     return exit_code("evaluate", args.out, lambda: evaluate(args), ClusterError)

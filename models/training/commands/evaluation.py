@@ -15,19 +15,13 @@ import numpy as np
 from sklearn.model_selection import ParameterGrid
 
 from graspd.extras import needs
-from graspd.models.training.commands.common import (
-    WrongInputError,
-    progress_bar,
-    say,
-    warn_of_unpublished,
-)
-from graspd.models.training.data.datasets import Grasps, read_with_lab_tables
+from graspd.models.training.commands.common import WrongInputError, progress_bar, read_grasps, say
+from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
 from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
 from graspd.models.training.evaluating.files import to_json, write_whole
-from graspd.models.training.evaluating.jobs import Job, JobResult, jobs_of
+from graspd.models.training.evaluating.jobs import Job, JobResult, jobs_of, run_jobs
 from graspd.models.training.evaluating.results_table import results_table
-from graspd.models.training.evaluating.run_jobs import run_jobs
 from graspd.models.training.evaluating.summaries import (
     SystemSummary,
     made_with,
@@ -36,8 +30,13 @@ from graspd.models.training.evaluating.summaries import (
     write_summary,
 )
 from graspd.models.training.making.plan import TrainingPlan, with_enough_folds
-from graspd.models.training.systems.registry import SYSTEMS
-from graspd.models.training.systems.system import BlendConfig, System, digest, with_recipes
+from graspd.models.training.systems.registry import (
+    SYSTEMS,
+    BlendConfig,
+    System,
+    digest,
+    with_recipes,
+)
 
 SEEDS = 3
 """Split seeds of an evaluation unless `--seeds` says otherwise."""
@@ -49,8 +48,7 @@ def evaluate(args: argparse.Namespace) -> None:
     """Evaluate what the command line asks for. Raises what `exit_code` knows."""
     systems = _systems(args.names, grid=args.grid)
     _check_extras(args)
-    grasps = read_with_lab_tables(args.data, args.own)
-    warn_of_unpublished("evaluate", grasps.files)
+    grasps = read_grasps("evaluate", args)
     if args.quick:
         systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
         chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]

@@ -7,24 +7,21 @@ import dataclasses
 import shlex
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from graspd.models import own, zoo
 from graspd.models.training.commands.common import (
-    EXIT_INPUT,
     WrongInputError,
+    add_shared_arguments,
     exit_code,
+    progress_bar,
+    read_grasps,
     say,
-    warn_of_unpublished,
     whole,
 )
-from graspd.models.training.data.datasets import (
-    FEWEST_GRASPS,
-    DatasetError,
-    Grasps,
-    read_with_lab_tables,
-)
+from graspd.models.training.data.datasets import DatasetError, Grasps
 from graspd.models.training.data.protocols import FOLDS, TooFewGraspsError
 from graspd.models.training.systems.registry import SYSTEMS
 
@@ -38,27 +35,9 @@ MAX_SEED = 2**32 - 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
     parser.add_argument(
-        "model",
-        choices=sorted(SYSTEMS),
-        metavar="MODEL",
-        help=f"one of {', '.join(SYSTEMS)}",
+        "model", choices=sorted(SYSTEMS), metavar="MODEL", help=f"one of {', '.join(SYSTEMS)}"
     )
-    parser.add_argument(
-        "--data",
-        type=Path,
-        metavar="DIR",
-        help="folder with palm_down.csv, palm_side.csv and, for some models, palm_45.csv",
-    )
-    parser.add_argument(
-        "--own",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="a grasp table of your own, as `graspd export-grasps` writes it, that is one session: "
-        f"{FEWEST_GRASPS} grasps or more, some that slipped and some that stayed. May be given "
-        "several times. Beside the tables of --data, or, without --data, alone",
-    )
+    add_shared_arguments(parser)
     parser.add_argument(
         "--name",
         type=_name,
@@ -93,41 +72,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "measured of a single one) and leave the other studies out: for a model that is compared "
         "and not used",
     )
-    parser.add_argument(
-        "--jobs", type=whole(1, 256), default=1, metavar="N", help="trainings at once (default: 1)"
-    )
-    parser.add_argument("--quiet", action="store_true", help="show no progress bar")
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, measure, export. Returns 0, 1 (export failed), 2 (data or folder), 130 (Ctrl-C)."""
-    if args.data is None and not args.own:
-        say("train", "needs --data DIR, --own FILE, or both")
-        return EXIT_INPUT
     from graspd.models.training.making.export import ExportError
 
     plan = _plan(args)
-    if args.own and plan.model in zoo.names():
-        say("train", f"graspd ships a model {plan.model!r}: choose another --name")
-        return EXIT_INPUT
     out: Path = args.out or Path("runs") / plan.model
     return exit_code("train", out, lambda: _train(args, plan, out), ExportError)
 
 
 def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
-    from graspd.models.training.commands.common import progress_bar
     from graspd.models.training.making.make_model import EXTRA_TRAININGS, make_model
     from graspd.models.training.making.plan import limits, preflight, with_enough_folds
 
     started_s = time.monotonic()
-    grasps = read_with_lab_tables(args.data, args.own)
+    if args.own and plan.model in zoo.names():
+        raise WrongInputError(f"graspd ships a model {plan.model!r}: choose another --name")
+    grasps = read_grasps("train", args)
     if args.data is not None:
         there = {file.name for file in grasps.files}
         for table in plan.system.tables:
             if table not in there:
                 path = args.data / f"{table}.csv"
                 raise DatasetError(path, f"is missing, {plan.system.name} needs it")
-        warn_of_unpublished("train", grasps.files)
     for sentence in limits(plan, grasps):
         say("train", f"warning: {sentence}")
     try:
@@ -135,7 +104,8 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
             plan, why = with_enough_folds(plan, grasps)
             if why:
                 say("train", f"takes {plan.folds} folds: {why}")
-        preflight(plan, grasps)
+        else:
+            preflight(plan, grasps)
         # Now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
         results = args.results or out / "trainings"
@@ -157,13 +127,13 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
 
 def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
     """Say with which options these grasps are enough, if there are such."""
-    from graspd.models.training.making.plan import enough_folds
+    from graspd.models.training.making.plan import with_enough_folds
 
     for only in (plan.only, "cv"):
-        other = dataclasses.replace(plan, only=only, folds=plan.folds + (only != plan.only))
-        if (folds := enough_folds(other, grasps)) is not None:
+        with suppress(TooFewGraspsError):
+            other, _ = with_enough_folds(dataclasses.replace(plan, only=only), grasps)
             words = "" if only is None else f" --only {only}"
-            say("train", f"these grasps are enough for --folds {folds}{words}")
+            say("train", f"these grasps are enough for --folds {other.folds}{words}")
             return
 
 

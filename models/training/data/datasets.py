@@ -33,8 +33,8 @@ FEWEST_GRASPS = 20
 ENOUGH_GRASPS = 200
 """Fewest grasps of lab tables without the published ones.
 
-The daemon refuses readings that are unlike the training. With 20 grasps of palm_45 in the training
-it refuses 98 % of the others; with 100 grasps 20 %, with 200 6 %, with 500 2.5 %.
+Trained on 20 grasps of palm_45, the daemon refuses 98 % of the others as unlike the training; on
+100 grasps 20 %, on 200 6 %, on 500 2.5 %.
 """
 COUNT_COLUMNS = tuple(
     f"{finger}_biotac_{electrode}" for finger in FINGERS for electrode in range(1, ELECTRODES + 1)
@@ -140,17 +140,12 @@ def read_table(path: Path) -> Grasps:
     )
 
 
-def read_whole(folder: Path) -> Grasps:
-    """The data of the paper, *Whole*: palm_down.csv, then palm_side.csv. Raises `DatasetError`."""
+def read_all(folder: Path) -> Grasps:
+    """Return palm_down, palm_side and, if the folder has it, palm_45. Raises `DatasetError`."""
     if not folder.is_dir():
         raise DatasetError(folder, "no such folder")
-    return concatenate([read_table(folder / f"{name}.csv") for name in WHOLE])
-
-
-def read_all(folder: Path) -> Grasps:
-    """*Whole*, then the later session if the folder has it. Raises `DatasetError`."""
-    whole, later = read_whole(folder), folder / f"{NEW_SESSION}.csv"
-    return concatenate([whole, read_table(later)]) if later.exists() else whole
+    paths = [folder / f"{name}.csv" for name in (*WHOLE, NEW_SESSION)]
+    return concatenate([read_table(path) for path in paths if path != paths[-1] or path.exists()])
 
 
 def read_with_lab_tables(folder: Path | None, lab: Sequence[Path]) -> Grasps:

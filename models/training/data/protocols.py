@@ -47,11 +47,7 @@ DAYS = (
 )
 """Streams of `days`: name, tables of the training, judged tables."""
 DAYS_FOLDS = 4
-"""Most folds of objects in `days`.
-
-With more, no table would have enough grasps of a fold's objects to measure a session of hundreds of
-grasps.
-"""
+"""Most folds of objects in `days`; with more, no session would have hundreds of grasps."""
 
 
 class TooFewGraspsError(ValueError):
@@ -66,10 +62,7 @@ class Split:
     train: Ints
     test: Ints
     calibration: Ints | None = None
-    """Grasps that may calibrate the session in `session`, without their labels.
-
-    They are of the test's session, but of other objects. In `days` each table starts a new session.
-    """
+    """Grasps of other objects that may calibrate the session in `session`, without labels."""
 
 
 def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:

@@ -10,10 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 THREADS = 1
-"""Threads of a training. The number is fixed, because sums over more threads round differently.
-
-It is one, because threads on busy cores wait for each other. Parallel trainings are faster.
-"""
+"""Threads of a training. Sums over more threads round differently, and cores are busy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +97,8 @@ class SecondConvolution:
 class NetworkConfig:
     """A convolutional network: convolution(s), one hidden dense layer, two classes.
 
-    It takes images, or features whose first 24 values per finger become a D1 image inside the
-    network while the rest joins the hidden layer's inputs.
+    It takes images, or features. The first 24 features of each finger become a D1 image inside the
+    network; the others are inputs of the hidden layer.
     """
 
     filters: int
@@ -125,11 +122,18 @@ CNN3 = NetworkConfig(filters=32, hidden=1024, pool=True, second=SecondConvolutio
 
 
 @dataclass(frozen=True, slots=True)
+class Augmentation:
+    """Flips and small rotations of tactile images (paper, section III-E): four times the images."""
+
+    rotation_deg: float = 10.0
+    """Each image is rotated by this angle, to the left or to the right at random."""
+
+
+@dataclass(frozen=True, slots=True)
 class DayShift:
     """Assumed difference of the features of two days after standardising.
 
-    The values are those that helped networks on new days. Twice as much helps networks of a single
-    training day more, but costs the others.
+    Twice as much helps networks of a single training day more, but costs the others.
     """
 
     gain: float = 0.3
@@ -157,8 +161,7 @@ class Recipe:
     warm_up: float = 0.3
     """Fraction of the training in which the learning rate rises."""
     weight_decay: float = 0.5
-    """Decoupled (times the learning rate in each step), on convolution and dense weights only;
-    stands for the paper's L2 term."""
+    """Decoupled, on convolution and dense weights only; stands for the paper's L2 term."""
     label_smoothing: float = 0.0
     """Part of each target that is shared evenly among both classes."""
     input_noise: float = 0.0

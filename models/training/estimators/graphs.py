@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -225,7 +224,11 @@ def from_torch(
     """Return the graph of a network of inputs (N, *shape)."""
     # Two inputs, because one would let the exporter take the batch for a constant.
     example = torch.zeros(2, *shape)
-    with _quiet("torch.onnx"):
+    # On the exporter's warnings and deprecations no user can act.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        warnings.simplefilter("ignore", DeprecationWarning)
         program = torch.onnx.export(
             network,
             (example,),
@@ -242,21 +245,6 @@ def from_torch(
     model: onnx.ModelProto = program.model_proto
     _strip(model)
     return model
-
-
-@contextmanager
-def _quiet(name: str) -> Iterator[None]:
-    """Hide the exporter's deprecations and warnings, on which no user can act."""
-    logger = logging.getLogger(name)
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", category=FutureWarning)
-            warnings.filterwarnings("ignore", category=DeprecationWarning)
-            yield
-    finally:
-        logger.setLevel(level)
 
 
 def _strip(model: onnx.ModelProto) -> None:

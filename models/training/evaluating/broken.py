@@ -13,16 +13,13 @@ from graspd.models.training.arrays import Bools, Numbers
 from graspd.models.training.data.datasets import COUNT_MAX, Grasps
 from graspd.models.training.data.protocols import fold_seed, folds_of
 from graspd.models.training.fitting.trained import Trained, train
-from graspd.models.training.systems.system import System
+from graspd.models.training.systems.registry import System
 
 FOLDS, JUDGED_FOLDS = 10, 3
 """Number of stratified folds, and of those judged; three show a difference of a few points."""
 NUMBERS = (1, 2, 4, 8, 12)
 LOOKED_FOR_MAX = 13
-"""Most broken electrodes that are searched in a reading; the daemon refuses a reading with 13.
-
-It repairs at most 12 (`BROKEN_MAX` of `graspd.daemon.judge.health`).
-"""
+"""Most broken electrodes that are searched: one more than the daemon repairs in a reading."""
 
 Breakage = Callable[[Numbers, np.random.Generator], Numbers]
 KINDS: dict[str, Breakage] = {
@@ -45,10 +42,7 @@ class Broken:
     known: float
     """F1 if all broken electrodes are known and repaired."""
     found: float
-    """F1 if electrodes are repaired whose values do not fit the others of the reading.
-
-    The daemon refuses a reading with more than a few of them.
-    """
+    """F1 if electrodes are repaired whose values do not fit the others of the reading."""
     detected: float
     """Fraction of the broken electrodes that were found by their values."""
 
@@ -140,7 +134,9 @@ class _Fold:
 def _break(folds: list[_Fold], number: int, reads: str, random: np.random.Generator) -> Broken:
     unnoticed, known, found, detected = [], [], [], []
     for fold in folds:
-        where = _places(fold.counts.shape, number, random)
+        # The places with the smallest of random numbers, `number` in each reading.
+        order = random.random((len(fold.counts), fold.counts[0].size)).argsort(axis=1)
+        where: Bools = (order < number).reshape(fold.counts.shape)
         counts = np.where(where, KINDS[reads](fold.counts, random), fold.counts)
         marked = fold.find(counts)
         unnoticed.append(fold.judge(counts))
@@ -150,10 +146,3 @@ def _break(folds: list[_Fold], number: int, reads: str, random: np.random.Genera
     return Broken(
         number, reads, *(float(np.mean(values)) for values in (unnoticed, known, found, detected))
     )
-
-
-def _places(shape: tuple[int, ...], number: int, random: np.random.Generator) -> Bools:
-    """Draw `number` places in each reading: True there, shape (N, fingers, 24)."""
-    order = random.random((shape[0], shape[1] * shape[2])).argsort(axis=1)
-    places: Bools = (order < number).reshape(shape)
-    return places

@@ -13,7 +13,7 @@ from graspd.models.training.data.datasets import COUNT_MAX, Grasps
 from graspd.models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED, Standards
 from graspd.models.training.fitting.standards import PRIOR_GRASPS as PRIOR
 from graspd.models.training.fitting.trained import Trained
-from graspd.models.training.systems.system import SessionFeatures
+from graspd.models.training.systems.registry import SessionFeatures
 
 CALIBRATED_FROM = 20
 """Grasps from which a session counts as calibrated; more gain at most two points."""

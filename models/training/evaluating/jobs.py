@@ -1,21 +1,29 @@
-"""Run one training, judge the held-out grasps, and store the result by a digest of its causes."""
+"""Run trainings that judge held-out grasps; store each result by a digest of its causes.
+
+Many run by joblib: in processes, or on a Dask cluster (extra `cluster`).
+"""
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import io
 import json
 import logging
+import signal
 import threading
 import time
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import joblib
 import numpy as np
+from joblib.externals.loky import get_reusable_executor
 from numpy.typing import DTypeLike
 
 from graspd.models.inputs import raw_features
@@ -26,20 +34,19 @@ from graspd.models.training.evaluating.days import judged_days
 from graspd.models.training.evaluating.files import write_whole
 from graspd.models.training.fitting.standards import NONE, TRAINING, later_session
 from graspd.models.training.fitting.trained import train
-from graspd.models.training.systems.system import SessionFeatures, System, digest
+from graspd.models.training.systems.registry import SessionFeatures, System, digest
 
 FORMAT = 1
 """Version of results; raise it if a job gives another result, or its file changes."""
 MAX_FILE_BYTES = 64 * 2**20
 """Largest result file, bytes; 4682 grasps in 8 variants take 0.4 MB."""
+CONNECT_TIMEOUT_S = 10
+WORKERS_TIMEOUT_S = 60
+"""Longest wait for a cluster's first worker, s."""
 _ONE_AT_A_TIME = threading.Lock()
 """Lock of torch's random state and number of threads, which the process shares."""
 
-_BY_VARIANT: dict[str, DTypeLike] = {
-    "margins": np.float64,
-    "ages": np.int64,
-    "refused": np.bool_,
-}
+_BY_VARIANT: dict[str, DTypeLike] = {"margins": np.float64, "ages": np.int64, "refused": np.bool_}
 """Types of the arrays that a result has for each variant."""
 
 _log = logging.getLogger(__name__)
@@ -47,6 +54,10 @@ _log = logging.getLogger(__name__)
 
 class BrokenResultError(Exception):
     """A stored result is damaged; run the job again."""
+
+
+class ClusterError(Exception):
+    """The cluster is gone, or lost a job too often. Finished jobs are kept; try again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,3 +209,101 @@ def load(folder: Path, job: Job, data: str) -> JobResult | None:
 def save(folder: Path, job: Job, data: str, result: JobResult) -> None:
     """Store a result for `load`. Raises `OSError`."""
     write_whole(folder / job.file_name(data), result.to_bytes())
+
+
+def run_jobs(
+    wanted: Sequence[Job],
+    grasps: Grasps,
+    folder: Path,
+    *,
+    processes: int = 1,
+    dask: str | None = None,
+) -> Iterator[tuple[Job, JobResult]]:
+    """Yield each job with its result: first the stored ones, then the others as they end.
+
+    Each result is stored in `folder` before it is yielded, so an interrupted run can continue.
+    `processes`: number of jobs at a time. `dask`: address of the scheduler of a Dask cluster, which
+    then runs the jobs. Its workers need graspd with the extras `train` and `cluster`, but no folder
+    and no data. A job whose worker is lost runs again.
+
+    Raises what `run` raises, `ClusterError`, and `OSError` if the folder cannot be used.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    data = grasps.digest()
+    missing = []
+    for job in wanted:
+        stored = load(folder, job, data)
+        if stored is None:
+            missing.append(job)
+        else:
+            yield job, stored
+    if not missing:
+        return
+    with _on_cluster(dask, grasps) if dask else _on_this_machine(processes) as parallel:
+        in_process = dask is None and processes > 1
+        outcomes = parallel(joblib.delayed(_run)(job, grasps, in_process) for job in missing)
+        with closing(outcomes):  # stops what still runs
+            for outcome in outcomes:
+                if not isinstance(outcome, tuple):  # what joblib makes of a cancelled task
+                    raise ClusterError(f"the cluster lost a job: {outcome!r}")
+                job, result = outcome
+                save(folder, job, data, result)
+                yield job, result
+
+
+def _run(job: Job, grasps: Grasps, in_process: bool) -> tuple[Job, JobResult]:
+    if in_process:
+        # A terminal sends Ctrl-C to the workers, too; it is the first process that ends them.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return job, run(job, grasps)
+
+
+@contextmanager
+def _on_this_machine(processes: int) -> Iterator[joblib.Parallel]:
+    try:
+        yield _parallel("loky", n_jobs=processes)
+    finally:
+        if processes > 1:
+            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+
+
+@contextmanager
+def _on_cluster(address: str, grasps: Grasps) -> Iterator[joblib.Parallel]:
+    from distributed import Client, KilledWorker
+
+    # What it has to say, with a traceback, also comes as an exception.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    try:
+        asyncio.run(_knock(address))
+        client = Client(  # type: ignore[no-untyped-call]
+            address, timeout=CONNECT_TIMEOUT_S, set_as_default=False
+        )
+    except (OSError, ValueError) as error:
+        raise ClusterError(f"no Dask scheduler at {address}: {_line(error)}") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
+            # Every worker gets the grasps once, not with each job.
+            yield _parallel("dask", client=client, scatter=[grasps], pure=False)
+        except KilledWorker as error:
+            raise ClusterError(f"a job lost one worker after the other: {_line(error)}") from error
+        except (TimeoutError, CancelledError) as error:
+            raise ClusterError(f"the cluster does not answer: {_line(error)}") from error
+
+
+async def _knock(address: str) -> None:
+    """Connect once: a client that finds no scheduler would leave its thread running."""
+    from distributed.comm.core import connect
+
+    comm = await connect(address, timeout=CONNECT_TIMEOUT_S)  # type: ignore[no-untyped-call]
+    comm.abort()
+
+
+def _parallel(backend: str, **options: object) -> joblib.Parallel:
+    with joblib.parallel_config(backend, **options):
+        # All at once, so that workers that join later get their share.
+        return joblib.Parallel(batch_size=1, pre_dispatch="all", return_as="generator_unordered")
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc_auc_score
 
+from graspd.models.contract import ConfidenceStep
 from graspd.models.training.arrays import Bools, Floats, Ints
 
 TEMPERATURE_RANGE = (0.05, 20.0)
@@ -53,21 +54,11 @@ class Fraction:
     high: float
 
 
-@dataclass(frozen=True, slots=True)
-class CurvePoint:
-    """Accuracy and coverage if grasps under `confidence` are not judged."""
-
-    confidence: float
-    accuracy: float
-    coverage: float
-
-
 def score(margins: Floats, slipped: Bools, probability: Floats) -> dict[str, float | None]:
     """Return figures of margins and slip probabilities against labels (N,), slip positive.
 
-    `auc`, the area under the ROC curve, is None for a single class. `ece` is the expected
-    calibration error of the verdict's probability, `brier` the mean squared error of the slip
-    probability, `log_loss` its mean negative log-likelihood, nats.
+    `auc` is None for a single class. `ece` is the expected calibration error of the verdict's
+    probability, `brier` the mean squared error of the slip probability.
     """
     verdict = margins > 0.0
     precision, recall, f1, _ = precision_recall_fscore_support(
@@ -160,11 +151,10 @@ def wilson(accuracy: float, grasps: int) -> Fraction:
 
 def coverage_curve(
     probability: Floats, slipped: Bools, steps: int = CURVE_STEPS
-) -> list[CurvePoint]:
+) -> list[ConfidenceStep]:
     """Return the accuracy of the most confident verdicts, ascending in coverage up to all.
 
-    Slip probabilities and labels have shape (N,), N > 0. Verdicts of equal confidence stay
-    together.
+    Verdicts of equal confidence stay together.
     """
     points = _points(probability, slipped)
     number = len(slipped)
@@ -179,7 +169,7 @@ def accuracy_at(probability: Floats, slipped: Bools, coverage: float) -> float:
     return float(accuracy[max(1, round(coverage * len(accuracy))) - 1])
 
 
-def reject_threshold(probability: Floats, slipped: Bools, wanted: float) -> CurvePoint | None:
+def reject_threshold(probability: Floats, slipped: Bools, wanted: float) -> ConfidenceStep | None:
     """Return the lowest confidence from which verdicts reach the accuracy `wanted`.
 
     None: no confidence reaches it with `FEWEST_JUDGED` verdicts.
@@ -212,12 +202,12 @@ def _ece(probability: Floats, slipped: Bools) -> float:
     return float(np.abs(gaps).sum() / len(probability))
 
 
-def _points(probability: Floats, slipped: Bools) -> list[CurvePoint]:
+def _points(probability: Floats, slipped: Bools) -> list[ConfidenceStep]:
     """Return a point for each confidence that occurs, ascending in coverage."""
     confidence, accuracy = _by_confidence(probability, slipped)
     ends = np.flatnonzero(np.append(confidence[1:] != confidence[:-1], True)).tolist()
     return [
-        CurvePoint(float(confidence[end]), float(accuracy[end]), (end + 1) / len(confidence))
+        ConfidenceStep(float(confidence[end]), float(accuracy[end]), (end + 1) / len(confidence))
         for end in ends
     ]
 

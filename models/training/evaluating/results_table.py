@@ -6,13 +6,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
-from graspd.models.training.evaluating.day_figures import GROUPS
 from graspd.models.training.evaluating.findings import FINDINGS, HOW_SURE
 from graspd.models.training.evaluating.metrics import Spread, paired_difference
-from graspd.models.training.evaluating.summaries import HEADLINE, SystemSummary
+from graspd.models.training.evaluating.summaries import GROUPS, HEADLINE, SystemSummary
 from graspd.models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
-from graspd.models.training.systems.registry import SYSTEMS
-from graspd.models.training.systems.system import PaperFigure, System
+from graspd.models.training.systems.registry import SYSTEMS, PaperFigure, System
 
 NOT_RUN = "-"
 REFERENCE = "cnn1"

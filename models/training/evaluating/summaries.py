@@ -14,29 +14,14 @@ import msgspec
 import numpy as np
 from sklearn.metrics import confusion_matrix, f1_score
 
-from graspd.models.contract import Dataset
+from graspd.models.contract import ConfidenceStep, Dataset
 from graspd.models.training.arrays import Bools, Floats
 from graspd.models.training.data.datasets import Grasps
-from graspd.models.training.data.protocols import PROTOCOLS, EvalProtocol
-from graspd.models.training.evaluating.day_figures import DayFigures, day_figures
+from graspd.models.training.data.protocols import DAYS, PROTOCOLS, EvalProtocol
+from graspd.models.training.evaluating import metrics
 from graspd.models.training.evaluating.files import to_json, write_whole
 from graspd.models.training.evaluating.jobs import Job, JobResult
-from graspd.models.training.evaluating.metrics import (
-    CurvePoint,
-    Fraction,
-    Spread,
-    accuracy_at,
-    coverage_curve,
-    cross_fitted_p_slip,
-    fit_temperature,
-    over_seeds,
-    p_slip,
-    reject_threshold,
-    reliability_bins,
-    score,
-    wilson,
-)
-from graspd.models.training.systems.system import digest
+from graspd.models.training.systems.registry import digest
 
 FORMAT = 1
 HEADLINE = "n50"
@@ -46,6 +31,14 @@ COVERAGES = (0.9, 0.8, 0.5)
 AGES = (0, 5, 10, 20, 50, 100, 300)
 """Limits of the groups of grasps by the age of a running session, grasps."""
 LIBRARIES = ("numpy", "scikit-learn", "torch")
+STREAMS = [f"{day} {table}" for day, _, judged in DAYS for table in judged]
+"""Names of the streams of `days`: `A`, `B` or `C`, and the table that is judged."""
+GROUPS = {
+    **{name: [name] for name in STREAMS},
+    "A and C": [name for name in STREAMS if not name.startswith("B")],
+    "all": STREAMS,
+}
+"""Streams that are counted together, by the name of the group."""
 
 _log = logging.getLogger(__name__)
 
@@ -54,7 +47,7 @@ _log = logging.getLogger(__name__)
 class ObjectFigures:
     """Figures of one object's grasps."""
 
-    share: Fraction
+    share: metrics.Fraction
     f1: float
     """Slip positive; 0 for an object that never slipped."""
 
@@ -65,15 +58,56 @@ class AgeFigures:
 
     grasps_before: int
     """Lowest age of the group, grasps; it ends below that of the next group."""
-    share: Fraction
+    share: metrics.Fraction
     temperature: float
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictFigures:
+    """Figures of verdicts as fractions; slip is positive."""
+
+    grasps: int
+    f1: float
+    slips_among_stable: float | None
+    """Share of slips among the grasps called stable; None: no such grasp."""
+    slips_called_stable: float | None
+    """Share of the slips that are called stable; None: no slip."""
+    stable_called_slip: float | None
+    """Share of the stable grasps that are called slip; None: no stable grasp."""
+
+    @classmethod
+    def of(cls, called_slip: Bools, slipped: Bools) -> VerdictFigures:
+        """Return the figures of verdicts and outcomes, shape (N,) each."""
+        missed, alarms = ~called_slip & slipped, called_slip & ~slipped
+        f1 = f1_score(slipped, called_slip, zero_division=0.0) if len(slipped) else 0.0
+        return cls(
+            len(slipped),
+            float(f1),
+            _share(missed, ~called_slip),
+            _share(missed, slipped),
+            _share(alarms, ~slipped),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class DayFigures:
+    """Figures of grasps of another day."""
+
+    every: VerdictFigures
+    """Figures of all grasps, also those that the daemon would refuse."""
+    judged: VerdictFigures
+    """Figures of the grasps that the daemon would judge."""
+    coverage: float
+    """Fraction of the grasps that would be judged."""
+    refused_slipped: float | None
+    """Fraction of slips among the refused grasps; None: no such grasp."""
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
     """Figures of one way of judging. Grasps of all seeds count alike."""
 
-    spreads: dict[str, Spread]
+    spreads: dict[str, metrics.Spread]
     """Mean and spread of each figure, by its name."""
     figures: dict[str, list[list[float | None]]]
     """Each figure in each fold (seeds, folds), by its name."""
@@ -82,12 +116,12 @@ class Variant:
     confusion: list[list[int]]
     """Grasps of all seeds: rows stable, slip as it was; columns as it was judged."""
     objects: dict[str, ObjectFigures]
-    palms: dict[str, Fraction]
+    palms: dict[str, metrics.Fraction]
     """Share of right verdicts by name of the table."""
-    curve: list[CurvePoint]
+    curve: list[ConfidenceStep]
     coverages: dict[str, float]
     """Accuracy of the most confident grasps, by their share."""
-    thresholds: dict[str, CurvePoint | None]
+    thresholds: dict[str, ConfidenceStep | None]
     """Lowest confidence that reaches an accuracy, by that accuracy."""
     bins: list[tuple[float, float, int]]
     """Mean slip probability, share that slipped, grasps."""
@@ -206,7 +240,10 @@ def _variant(name: str, seeds: Sequence[Sequence[JobResult]], grasps: Grasps) ->
     ends = np.cumsum([len(result.test) for result in results])[:-1]
     of_folds = iter(np.split(probability, ends))
     scores = [
-        [score(fold.margins[name], grasps.slipped[fold.test], next(of_folds)) for fold in folds]
+        [
+            metrics.score(fold.margins[name], grasps.slipped[fold.test], next(of_folds))
+            for fold in folds
+        ]
         for folds in seeds
     ]
     figures = {
@@ -215,35 +252,63 @@ def _variant(name: str, seeds: Sequence[Sequence[JobResult]], grasps: Grasps) ->
     slipped, verdict = grasps.slipped[rows], margins > 0.0
     objects, tables = np.array(grasps.objects)[rows], grasps.table_of[rows]
 
-    def share(inside: Bools) -> Fraction:
+    def share(inside: Bools) -> metrics.Fraction:
         # A grasp that was judged once per seed is one grasp to the interval.
         right = verdict[inside] == slipped[inside]
-        return wilson(float(right.mean()), max(1, len(right) // len(seeds)))
+        return metrics.wilson(float(right.mean()), max(1, len(right) // len(seeds)))
 
     def by_object(inside: Bools) -> ObjectFigures:
         f1 = f1_score(slipped[inside], verdict[inside], zero_division=0.0)
         return ObjectFigures(share(inside), float(f1))
 
     def by_age(group: int, inside: Bools) -> AgeFigures:
-        temperature = fit_temperature(margins[inside], slipped[inside])
+        temperature = metrics.fit_temperature(margins[inside], slipped[inside])
         return AgeFigures(AGES[group], share(inside), temperature)
 
     ages = [result.ages[name] for result in results if name in result.ages]
     groups = np.searchsorted(AGES, np.concatenate(ages), side="right") - 1 if ages else np.array([])
     return Variant(
-        spreads={metric: over_seeds(values) for metric, values in figures.items()},
+        spreads={metric: metrics.over_seeds(values) for metric, values in figures.items()},
         figures=figures,
-        temperature=fit_temperature(margins, slipped),
+        temperature=metrics.fit_temperature(margins, slipped),
         confusion=confusion_matrix(slipped, verdict, labels=(False, True)).tolist(),
         objects={name: by_object(objects == name) for name in np.unique(objects).tolist()},
         palms={grasps.files[table].name: share(tables == table) for table in np.unique(tables)},
-        curve=coverage_curve(probability, slipped),
-        coverages={f"{c:g}": accuracy_at(probability, slipped, c) for c in COVERAGES},
-        thresholds={f"{a:g}": reject_threshold(probability, slipped, a) for a in WANTED_ACCURACIES},
-        bins=reliability_bins(probability, slipped),
+        curve=metrics.coverage_curve(probability, slipped),
+        coverages={f"{c:g}": metrics.accuracy_at(probability, slipped, c) for c in COVERAGES},
+        thresholds={
+            f"{a:g}": metrics.reject_threshold(probability, slipped, a) for a in WANTED_ACCURACIES
+        },
+        bins=metrics.reliability_bins(probability, slipped),
         ages=[by_age(group, groups == group) for group in np.unique(groups)],
         days=day_figures(name, seeds, grasps) if results[0].refused else {},
     )
+
+
+def day_figures(
+    variant: str, folds: Sequence[Sequence[JobResult]], grasps: Grasps
+) -> dict[str, DayFigures]:
+    """Return the figures by group of streams. `folds`: results of `days` for each seed."""
+    results = [result for each in folds for result in each]
+    rows = np.concatenate([result.test for result in results])
+    slip = np.concatenate([result.margins[variant] for result in results]) > 0.0
+    refused = np.concatenate([result.refused[variant] for result in results])
+    slipped, tables = grasps.slipped[rows], [grasps.files[t].name for t in grasps.table_of[rows]]
+    # The splits of a seed are those of the first of `DAYS`, then of the next.
+    days = [DAYS[fold * len(DAYS) // len(each)][0] for each in folds for fold in range(len(each))]
+    day_of = np.repeat(days, [len(result.test) for result in results])
+    streams = [f"{day} {table}" for day, table in zip(day_of, tables, strict=True)]
+    made = {}
+    for group, names in GROUPS.items():
+        every = np.isin(streams, names)
+        judged = every & ~refused
+        made[group] = DayFigures(
+            VerdictFigures.of(slip[every], slipped[every]),
+            VerdictFigures.of(slip[judged], slipped[judged]),
+            float(1.0 - refused[every].mean()),
+            _share(every & slipped & refused, every & refused),
+        )
+    return made
 
 
 def _probability(name: str, folds: Sequence[JobResult], grasps: Grasps) -> Floats:
@@ -259,5 +324,9 @@ def _probability(name: str, folds: Sequence[JobResult], grasps: Grasps) -> Float
         objects = np.array(grasps.objects)[rows]
         groups = np.unique(objects, return_inverse=True)[1].astype(np.int64)
     if len(np.unique(groups)) == 1:
-        return p_slip(margins)
-    return cross_fitted_p_slip(margins, grasps.slipped[rows], groups)
+        return metrics.p_slip(margins)
+    return metrics.cross_fitted_p_slip(margins, grasps.slipped[rows], groups)
+
+
+def _share(some: Bools, of: Bools) -> float | None:
+    return float(some.sum() / of.sum()) if of.any() else None

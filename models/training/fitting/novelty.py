@@ -14,14 +14,13 @@ from graspd.models.training.data.datasets import COUNT_MAX
 MARGIN_COUNTS = 100
 """Margin around the training range, counts, within which a count still passes as seen.
 
-It is wide enough for held-out grasps of the same session, and narrow enough for drifted electrodes.
-It refuses 97 % of the later session palm_45, which the network judges wrongly.
+Held-out grasps of the same session pass. It refuses 97 % of the later session palm_45, which the
+network judges wrongly.
 """
 SESSION_MARGIN_COUNTS = 500
-"""Margin of a session model, counts, which takes counts mapped to the training's sensors.
+"""Margin of a session model, counts: the mapping follows drift, and is rough in a young session.
 
-It is wide because the mapping already follows drift, and is rough in a young session. It refuses
-6 % of palm_45.
+It refuses 6 % of palm_45.
 """
 DISTANCE_MAX = 2.5
 """Largest root-mean-square whitened deviation that still passes as seen.

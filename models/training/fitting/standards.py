@@ -77,8 +77,7 @@ def later_session(
     """Return standards of the rows `test` of features (all grasps, M), by variant.
 
     The second result has, for running variants, the grasps (N,) before each test grasp. The rows
-    `pool` calibrate `n5` ... and `all`. In a running session each grasp counts after its judgement.
-    Labels are not used.
+    `pool` calibrate `n5` ... and `all`.
     """
     random = np.random.default_rng(seed)
     standards = {NONE: training.prior, ALL: Standards.of(features[pool])}

@@ -5,43 +5,50 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from graspd.models.bts3 import CITATIONS, LICENCE, REPOSITORY
 from graspd.models.contract import (
     CLASSES,
     ConfidenceStep,
+    Dataset,
     Input,
     MeasuredError,
     ModelContract,
     SessionInput,
     Sharpness,
 )
-from graspd.models.training.data.datasets import Grasps
+from graspd.models.training.data.datasets import ENOUGH_GRASPS, Grasps, lab_table_names, unpublished
 from graspd.models.training.estimators.graphs import OPSET
 from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.broken import broken_study
 from graspd.models.training.evaluating.days import CALIBRATED_FROM
 from graspd.models.training.evaluating.files import to_json, write_whole
 from graspd.models.training.evaluating.metrics import FEWEST_JUDGED
-from graspd.models.training.evaluating.run_jobs import run_jobs
 from graspd.models.training.evaluating.summaries import SystemSummary, made_with, summarise
 from graspd.models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
 from graspd.models.training.fitting.standards import PRIOR_GRASPS, RUNNING
 from graspd.models.training.fitting.trained import Trained, train
-from graspd.models.training.making.card import data_sources, measured, weak_points
 from graspd.models.training.making.export import export
 from graspd.models.training.making.plan import TrainingPlan
-from graspd.models.training.systems.system import SessionFeatures, System, configuration
+from graspd.models.training.systems.registry import SessionFeatures, System, configuration
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 EXTRA_TRAININGS = 2
-"""Trainings beside the folds: one for repeatability, one for the model itself.
+"""Trainings beside the folds and the last three, of the study of broken electrodes."""
 
-The study of broken electrodes, three more, comes last.
-"""
+PUBLISHED_DATA = "The data is of one hand and 41 objects, lifted in one way."
+WEAK_POINTS = (
+    "A wrong electrode that keeps within what its neighbours allow is not noticed.",
+    "Readings are compared with the training's covariance: what varies like a grasp without being "
+    "one, such as hum on all electrodes, may be judged.",
+)
+
+OWN_LICENCE = "whatever the owner of the tables says"
+"""Licence of data without a published table."""
 
 
 def make_model(
@@ -56,7 +63,7 @@ def make_model(
     """
     wanted = plan.jobs(grasps)
     found = {}
-    for job, result in run_jobs(wanted, grasps, results, processes=plan.processes):
+    for job, result in jobs.run_jobs(wanted, grasps, results, processes=plan.processes):
         found[job] = result
         on_done()
     summaries = [
@@ -86,9 +93,9 @@ def make_model(
             "parity": parity,
         },
         "parameters": trained.fitted.parameters,
-        "data": data_sources(grasps.files),
+        "data": _data_sources(grasps.files),
         "system": configuration(system, "input", "estimator", "recipe", "augmentation", "tables"),
-        "protocols": {summary.protocol: measured(summary) for summary in summaries},
+        "protocols": {summary.protocol: _card_figures(summary) for summary in summaries},
         "temperature": temperature,
         "calibrated_by": calibrator.protocol,
         "broken": None if plan.only else broken_study(system, trained.grasps, plan.seed),
@@ -99,7 +106,7 @@ def make_model(
         ),
         "command": plan.command,
         "made_with": made_with(LIBRARIES) | {"machine": platform.machine()},
-        "weak_points": weak_points(summaries, trained.grasps),
+        "weak_points": _weak_points(summaries, trained.grasps),
         "worth": None,  # `graspd report worth --card` fills it in
     }
     write_whole(path.with_suffix(".json"), to_json(card))
@@ -132,9 +139,9 @@ def _confidence(summary: SystemSummary) -> tuple[ConfidenceStep, ...]:
     """Return the steps with enough grasps; few grasps do not show how often they are right."""
     judged = summary.folds * summary.test_grasps
     return tuple(
-        ConfidenceStep(point.confidence, point.accuracy, point.coverage)
-        for point in reversed(summary.main.curve)
-        if round(point.coverage * judged) >= FEWEST_JUDGED
+        step
+        for step in reversed(summary.main.curve)
+        if round(step.coverage * judged) >= FEWEST_JUDGED
     )
 
 
@@ -180,11 +187,105 @@ def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> dict[st
     `held_out_object`: of grasps of an object, by the other objects. `made_up`: of readings that no
     hand ever made, before any repair, by the way they were made up.
     """
-    grasps, margin = trained.grasps, trained.margin
+    grasps, seen = trained.grasps, contract.seen
     objects, counts = np.array(grasps.objects), trained.mapped(grasps.counts, grasps.table_of)
     # Two of other objects at least have a covariance.
     several = len(objects) - max(Counter(grasps.objects).values()) > 1
     return {
-        "held_out_object": held_out_never_seen(counts, objects, margin) if several else None,
-        "made_up": made_up_never_seen(counts, contract.seen, seed),
+        "held_out_object": held_out_never_seen(counts, objects, seen.margin) if several else None,
+        "made_up": made_up_never_seen(counts, seen, seed),
     }
+
+
+def _data_sources(files: Sequence[Dataset]) -> dict[str, object]:
+    """Return licence and sources of the tables used for training or judging.
+
+    Files under `not_published` differ from the published ones: the rest is not about them.
+    """
+    not_published = unpublished(files)
+    sources: dict[str, object]
+    if len(lab_table_names(files)) == len(files):
+        sources = {"licence": OWN_LICENCE, "repository": None, "cite": ()}
+    else:
+        sources = {"licence": LICENCE, "repository": REPOSITORY, "cite": CITATIONS}
+    return {**sources, "not_published": not_published}
+
+
+def _card_figures(summary: SystemSummary) -> dict[str, object]:
+    """Return the figures of a protocol that a user of the model needs, slip positive.
+
+    `calibrated_by`: F1 by variant of session calibration; empty where no session is left out.
+    """
+    main = summary.main
+    several = summary.variants if len(summary.variants) > 1 else {}
+    return {
+        "folds": summary.folds,
+        "train_grasps": summary.train_grasps,
+        "test_grasps": summary.test_grasps,
+        "spreads": main.spreads,
+        "temperature": main.temperature,
+        "confusion": main.confusion,
+        "palms": main.palms,
+        "objects": main.objects,
+        "accuracy_at_coverage": main.coverages,
+        "thresholds": main.thresholds,
+        "calibrated_by": {name: variant.spreads["f1"] for name, variant in several.items()},
+        "days": main.days,
+    }
+
+
+def _weak_points(summaries: Sequence[SystemSummary], grasps: Grasps) -> tuple[str, ...]:
+    """Return sentences on what the model cannot do, with figures; `grasps` are trained on."""
+    texts = []
+    for summary in summaries:
+        f1 = 100 * summary.main.spreads["f1"].mean
+        if summary.protocol.startswith("objects"):
+            worst = min(summary.main.objects.items(), key=lambda item: item[1].share.accuracy)
+            texts.append(
+                f"New objects do worse than known ones: F1 {f1:.1f} %; the worst is {worst[0]}, "
+                f"of which {100 * worst[1].share.accuracy:.0f} % are judged rightly."
+            )
+        elif summary.protocol == "days":
+            figures = summary.main.days["all"].every
+            among, missed = figures.slips_among_stable, figures.slips_called_stable
+            if among is not None and missed is not None:
+                texts.append(
+                    f"On days that it was not trained on, with new objects, {100 * among:.0f} % of "
+                    f"what it calls stable slips, and {100 * missed:.0f} % of the slips are called "
+                    "stable, as long as it is told no outcomes."
+                )
+        elif summary.protocol == "session" and len(summary.variants) > 1:
+            none = 100 * summary.variants["none"].spreads["f1"].mean
+            texts.append(
+                f"On another day it needs the session's grasps: F1 {none:.1f} % without any, "
+                f"{f1:.1f} % with fifty."
+            )
+        elif summary.protocol == "session":
+            auc = summary.main.spreads["auc"].mean
+            texts.append(
+                f"On another day (palm_45: same hand, other palm pose, drifted sensors) F1 is "
+                f"{f1:.1f} %: it still ranks (AUC {auc:.2f}), its zero has moved. What looks "
+                "unlike the training data is refused."
+            )
+    own = lab_table_names(grasps.files)
+    return (*texts, *(_own_data(grasps, own, summaries) if own else [PUBLISHED_DATA]), *WEAK_POINTS)
+
+
+def _own_data(
+    grasps: Grasps, own: Sequence[str], summaries: Sequence[SystemSummary]
+) -> Iterator[str]:
+    objects, tables = len(set(grasps.objects)), sum(file.rows > 0 for file in grasps.files)
+    yield (
+        f"The data is of {objects} {'object' if objects == 1 else 'objects'} in {tables} "
+        f"{'table' if tables == 1 else 'tables'}. Not published: {', '.join(own)}."
+    )
+    if any(summary.protocol == "session" for summary in summaries):
+        yield "The figures of another day are of the published tables alone."
+    else:
+        yield "What it is worth on another day than those of its data was not measured."
+    if len(grasps) < ENOUGH_GRASPS:
+        yield (
+            f"{len(grasps)} grasps, {int(grasps.slipped.sum())} of which slipped, are few: the "
+            "daemon takes many others for unlike the training, and calls them unknown; "
+            f"{ENOUGH_GRASPS} are enough."
+        )

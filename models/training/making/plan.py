@@ -18,7 +18,7 @@ from graspd.models.training.data.datasets import ENOUGH_GRASPS, Grasps, lab_tabl
 from graspd.models.training.data.protocols import EvalProtocol, TooFewGraspsError, splits
 from graspd.models.training.evaluating.broken import left_out
 from graspd.models.training.evaluating.jobs import Job, jobs_of
-from graspd.models.training.systems.system import SessionFeatures, System
+from graspd.models.training.systems.registry import SessionFeatures, System
 
 FEWEST_FOLDS = 2
 FEW_OBJECTS = 10
@@ -112,28 +112,19 @@ def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
                 )
 
 
-def enough_folds(plan: TrainingPlan, grasps: Grasps) -> int | None:
-    """Return the most folds below the plan's for which the grasps suffice; None: none."""
-    for folds in range(plan.folds - 1, FEWEST_FOLDS - 1, -1):
-        try:
-            preflight(dataclasses.replace(plan, folds=folds), grasps)
-        except TooFewGraspsError:
-            continue
-        return folds
-    return None
-
-
 def with_enough_folds(plan: TrainingPlan, grasps: Grasps) -> tuple[TrainingPlan, str]:
     """Return the plan with the most folds, up to its own, that these grasps are enough for, and
     why they are fewer: "" if they are not. Raises `TooFewGraspsError` if there are none."""
-    try:
-        preflight(plan, grasps)
-    except TooFewGraspsError as error:
-        folds = enough_folds(plan, grasps)
-        if folds is None:
-            raise
-        return dataclasses.replace(plan, folds=folds), str(error)
-    return plan, ""
+    why = ""
+    for folds in range(plan.folds, FEWEST_FOLDS - 1, -1):
+        fewer = dataclasses.replace(plan, folds=folds)
+        try:
+            preflight(fewer, grasps)
+        except TooFewGraspsError as error:
+            why = why or str(error)
+        else:
+            return fewer, why
+    raise TooFewGraspsError(why)
 
 
 def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:

@@ -1,21 +1,30 @@
-"""All systems that can be trained, by name: input, estimator, recipe."""
+"""All systems that can be trained, by name: each is one way from counts to log-odds of slip."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
+
+import msgspec
 
 from graspd.models.bts3 import FINGERS, NEW_SESSION, WHOLE
 from graspd.models.contract import CountsInput, Finger, ImageInput, VectorInput
 from graspd.models.layout import D1, D2A, D2B, D3
 from graspd.models.tactile_image import Composition, Fill, Normalisation
-from graspd.models.training.data.augmentation import Augmentation
+from graspd.models.training.data.protocols import EvalProtocol
 from graspd.models.training.estimators.configs import (
     CNN0,
     CNN1,
     CNN2,
     CNN3,
+    AnyRecipe,
+    Augmentation,
     BoostingConfig,
+    ClassicalConfig,
     ForestConfig,
     MlpConfig,
     NetworkConfig,
@@ -23,15 +32,115 @@ from graspd.models.training.estimators.configs import (
     Recipe,
     SecondConvolution,
     SessionRecipe,
+    SvmConfig,
 )
-from graspd.models.training.estimators.configs import SvmConfig as Svm
-from graspd.models.training.systems.system import (
-    BlendConfig,
-    Member,
-    PaperFigure,
-    SessionFeatures,
-    System,
-)
+
+CLIP = 3.0
+"""Limit of standardised session features; one beyond it comes from a sensor that moved."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFeatures:
+    """Input of a session model: features standardised by session, clipped to +-`clip`."""
+
+    clip: float = CLIP
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One of the estimators that a blend asks."""
+
+    estimator: NetworkConfig | ClassicalConfig
+    recipe: AnyRecipe | None = None
+    """Training recipe of a network; None for other estimators."""
+    copies: int = 1
+    """Number of trainings of the member, each with another seed."""
+    weight: float = 1.0
+    """Weight of all copies together."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlendConfig:
+    """Weighted mean of the members' margins, each first divided by its own spread."""
+
+    members: tuple[Member, ...]
+
+
+SystemInput = ImageInput | VectorInput | CountsInput | SessionFeatures
+Estimator = NetworkConfig | ClassicalConfig | BlendConfig
+
+
+@dataclass(frozen=True, slots=True)
+class PaperFigure:
+    """A figure of the paper, %, slip positive: mean and standard deviation."""
+
+    protocol: EvalProtocol
+    f1: tuple[float, float]
+    accuracy: tuple[float, float] | None = None
+    precision: tuple[float, float] | None = None
+    recall: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """One way from counts to a margin, complete except for data and seed."""
+
+    name: str
+    description: str
+    input: SystemInput
+    estimator: Estimator
+    recipe: AnyRecipe | None = None
+    """Training recipe of the network `estimator`; None for other estimators."""
+    augmentation: Augmentation | None = None
+    standardise: bool = False
+    """True: the model standardises each input value by its training mean and spread."""
+    fingers: tuple[Finger, ...] = FINGERS
+    tables: tuple[str, ...] = WHOLE
+    """Training tables of the kept model; protocols have their own."""
+    published: tuple[PaperFigure, ...] = ()
+
+
+def digest(system: System) -> str:
+    """Return the SHA-256 of how it is trained, without name, texts, fingers and tables."""
+    parts = configuration(system, "input", "estimator", "recipe", "augmentation", "standardise")
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def configuration(system: System, *fields: str) -> dict[str, Any]:
+    """Return these fields of a system, JSON-ready, and its fingers if they are not all three."""
+    names = fields if system.fingers == FINGERS else (*fields, "fingers")
+    return {name: _plain(getattr(system, name)) for name in names}
+
+
+def with_recipes(system: System, *, epochs: int) -> System:
+    """Return the system with this number of epochs in each of its recipes."""
+    estimator = system.estimator
+    if isinstance(estimator, BlendConfig):
+        members = [
+            replace(member, recipe=_with_epochs(member.recipe, epochs))
+            for member in estimator.members
+        ]
+        estimator = BlendConfig(tuple(members))
+    recipe = _with_epochs(system.recipe, epochs)
+    return replace(system, estimator=estimator, recipe=recipe)
+
+
+def _with_epochs(recipe: AnyRecipe | None, epochs: int) -> AnyRecipe | None:
+    return None if recipe is None else replace(recipe, epochs=epochs)
+
+
+def _plain(value: object) -> Any:  # noqa: ANN401 - JSON
+    """Return a value for JSON with class names, so that kinds with equal fields differ."""
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, msgspec.Struct):
+        names = value.__struct_fields__
+    elif dataclasses.is_dataclass(value):
+        names = tuple(field.name for field in dataclasses.fields(value))
+    else:
+        return value
+    return {"kind": type(value).__name__, **{name: _plain(getattr(value, name)) for name in names}}
 
 
 def image(
@@ -49,7 +158,7 @@ IMAGE = image()
 SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
-SHARP_SVM = Svm(c=5.0, gamma=0.02)
+SHARP_SVM = SvmConfig(c=5.0, gamma=0.02)
 SESSION_RECIPE = SessionRecipe()
 
 
@@ -125,7 +234,7 @@ _PAPER = (
         "svm",
         "Support vector machine on the 72 z-scored counts.",
         VECTOR,
-        Svm(c=3.0, gamma=0.1),
+        SvmConfig(c=3.0, gamma=0.1),
         published=(PaperFigure("cv", (88.0, 2.9)),),
     ),
     System("mlp", "Multi-layer perceptron on the 72 z-scored counts.", VECTOR, MlpConfig((300,))),
@@ -210,7 +319,7 @@ _SESSION = (
         "svm-session",
         "Support vector machine on session-calibrated features.",
         SESSION,
-        Svm(c=3.0, gamma=0.003),
+        SvmConfig(c=3.0, gamma=0.003),
     ),
     System(
         "hgb-session",

@@ -40,8 +40,7 @@ from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.data.protocols import object_folds
 from graspd.models.training.fitting.trained import Trained, train
-from graspd.models.training.systems.registry import SYSTEMS
-from graspd.models.training.systems.system import System, with_recipes
+from graspd.models.training.systems.registry import SYSTEMS, System, with_recipes
 
 GRASPS = 300
 LIMITS = limits(ALLOWED)

@@ -19,7 +19,7 @@ from graspd.models.training.commands import evaluate, evaluation
 from graspd.models.training.commands.evaluation import grid_of
 from graspd.models.training.data.datasets import read_all
 from graspd.models.training.estimators.configs import GRIDS, ForestConfig, SvmConfig
-from graspd.models.training.evaluating import jobs, run_jobs
+from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.jobs import Job
 from graspd.models.training.systems.registry import SYSTEMS
 from tests.models.training.samples import OBJECTS, table, write, write_sessions
@@ -181,7 +181,7 @@ def test_no_cluster_is_exit_code_1_and_says_so(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="no extra: cluster")
-    monkeypatch.setattr(run_jobs, "CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr(jobs, "CONNECT_TIMEOUT_S", 1)
     options = ["--data", str(data), "--out", str(tmp_path), "--dask", "tcp://127.0.0.1:9"]
     assert graspd_evaluate("svm", "--quick", *options) == 1
     last = capsys.readouterr().err.splitlines()[-1]

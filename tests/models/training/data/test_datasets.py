@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,18 @@ from graspd.models.bts3 import TABLES
 from graspd.models.training.data.datasets import (
     DatasetError,
     concatenate,
+    read_all,
     read_table,
-    read_whole,
+    read_with_lab_tables,
     unpublished,
 )
-from tests.models.training.samples import separable_counts, write_table
+from tests.models.training.samples import (
+    separable_counts,
+    table,
+    write,
+    write_sessions,
+    write_table,
+)
 
 # Grasps, stable, slip, SHA-256: as recorded when the data was taken in.
 REAL = {
@@ -59,12 +66,13 @@ def test_counts_stand_by_finger_and_electrode(bts3_dir: Path) -> None:
             assert grasps.slipped[index] == (row["slipped"] == "1")
 
 
-def test_whole_is_palm_down_then_palm_side(bts3_dir: Path) -> None:
-    whole = read_whole(bts3_dir)
-    assert (len(whole), int(whole.slipped.sum())) == (2549, 1279)
+def test_a_folder_is_palm_down_then_palm_side_then_palm_45(bts3_dir: Path) -> None:
+    grasps = read_all(bts3_dir)
+    whole = grasps.rows(grasps.rows_of(("palm_down", "palm_side")))
+    assert (len(grasps), len(whole), int(whole.slipped.sum())) == (4682, 2549, 1279)
     assert 5 <= int(whole.counts.min()) < int(whole.counts.max()) <= 3975
-    assert [file.name for file in whole.files] == ["palm_down", "palm_side"]
-    assert np.array_equal(whole.counts[:1276], read_table(bts3_dir / "palm_down.csv").counts)
+    assert [file.name for file in grasps.files] == list(REAL)
+    assert np.array_equal(grasps.counts[:1276], read_table(bts3_dir / "palm_down.csv").counts)
 
 
 def test_the_list_of_published_tables_agrees_with_the_record() -> None:
@@ -151,21 +159,21 @@ def test_bytes_that_are_not_text_are_refused(tmp_path: Path) -> None:
 
 def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="nowhere: no such folder"):
-        read_whole(tmp_path / "nowhere")
+        read_all(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match=r"palm_down\.csv: cannot read: No such file"):
-        read_whole(tmp_path)
+        read_all(tmp_path)
 
 
 def test_a_table_with_other_bytes_is_known_as_not_published(tmp_path: Path) -> None:
     for name in ("palm_down", "palm_side"):
         write_table(tmp_path / f"{name}.csv", *separable_counts(6))
-    assert unpublished(read_whole(tmp_path).files) == ["palm_down", "palm_side"]
+    assert unpublished(read_all(tmp_path).files) == ["palm_down", "palm_side"]
 
 
 def test_some_rows_keep_counts_labels_objects_and_tables_together(tmp_path: Path) -> None:
     for seed, name in enumerate(("palm_down", "palm_side")):
         write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))
-    whole = read_whole(tmp_path)
+    whole = read_all(tmp_path)
     some = whole.rows(np.array([1, 5, 7]))
     assert np.array_equal(some.counts, whole.counts[[1, 5, 7]])
     assert some.slipped.tolist() == [True, True, True]
@@ -188,3 +196,49 @@ def test_the_digest_of_grasps_is_of_counts_labels_objects_and_tables(tmp_path: P
         down.digest(),
     }
     assert len(digests) == 6
+
+
+def refusal(lab: Sequence[Path], folder: Path | None = None) -> str:
+    with pytest.raises(DatasetError) as caught:
+        read_with_lab_tables(folder, lab)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "problem"),
+    [
+        ("palm_45", range(80), "has the name of a published table: rename it, or use --data"),
+        ("la\nb", range(80), "has a name that cannot be printed"),
+        ("lab", range(19), "has 19 grasps, 20 are the fewest"),
+        ("lab", range(0, 80, 2), "has no grasp that slipped, a session needs both kinds"),
+        ("lab", range(1, 80, 2), "has no grasp that stayed, a session needs both kinds"),
+        ("lab", (*range(80), 7), "has counts twice: the same grasp counts once"),
+    ],
+)
+def test_a_lab_table_that_would_mislead_is_refused(
+    name: str, rows: Sequence[int], problem: str, tmp_path: Path
+) -> None:
+    counts, slipped = separable_counts(80)
+    path = tmp_path / f"{name}.csv"
+    write_table(path, counts[list(rows)], slipped[list(rows)])
+    assert refusal([path]) == f"{path}: {problem}"
+
+
+@pytest.mark.parametrize("beside", ["palm_45", "monday"])
+def test_a_grasp_that_is_in_two_tables_is_refused(beside: str, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    write_sessions(data, 40)
+    monday, both = tmp_path / "monday.csv", tmp_path / "both.csv"
+    write(monday, table("monday", 40, 3))
+    first = monday if beside == "monday" else data / "palm_45.csv"
+    both.write_bytes(first.read_bytes())
+    said = f"has counts that are in {beside}, too: the same grasp counts once"
+    assert refusal([monday, both], data) == f"{both}: {said}"
+
+
+def test_two_lab_tables_have_two_names(tmp_path: Path) -> None:
+    paths = [tmp_path / day / "lab.csv" for day in ("monday", "friday")]
+    for seed, path in enumerate(paths):
+        path.parent.mkdir()
+        write(path, table("lab", 40, seed))
+    assert refusal(paths) == f"{paths[1]}: has the same name as {paths[0]}: rename one"

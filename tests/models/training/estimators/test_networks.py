@@ -21,9 +21,9 @@ from graspd.models.training.estimators.networks import (
     build,
     for_inference,
     for_margin,
-    parameter_count,
+    logits,
+    reproducible,
 )
-from graspd.models.training.estimators.recipe import logits, reproducible
 
 TINY = NetworkConfig(filters=4, hidden=16)
 DEEP = NetworkConfig(
@@ -76,7 +76,7 @@ def test_a_network_has_the_parameters_of_its_layers(
     config: NetworkConfig, shape: tuple[int, ...], parameters: int
 ) -> None:
     network = build(config, shape).eval()
-    assert parameter_count(network) == parameters
+    assert sum(parameter.numel() for parameter in network.parameters()) == parameters
     assert network(torch.zeros(2, *shape)).shape == (2, 2)
 
 

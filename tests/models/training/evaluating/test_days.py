@@ -12,9 +12,9 @@ from graspd.models.contract import SessionInput, Sharpness
 from graspd.models.inputs import SessionBuilder
 from graspd.models.training.data.protocols import splits
 from graspd.models.training.evaluating import jobs
-from graspd.models.training.evaluating.day_figures import VerdictFigures, day_figures
 from graspd.models.training.evaluating.days import CALIBRATED_FROM, Day, SessionDay
 from graspd.models.training.evaluating.jobs import Job, JobResult
+from graspd.models.training.evaluating.summaries import VerdictFigures, day_figures
 from graspd.models.training.fitting.standards import PRIOR_GRASPS
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS

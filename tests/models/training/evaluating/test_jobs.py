@@ -21,7 +21,7 @@ from graspd.models.training.fitting.standards import (
     TrainingStandards,
     later_session,
 )
-from graspd.models.training.systems.system import SessionFeatures, System
+from graspd.models.training.systems.registry import SessionFeatures, System
 from tests.models.training.samples import sessions
 
 GRASPS = sessions(200)

@@ -23,8 +23,7 @@ from graspd.models.training.evaluating.summaries import (
     write_summary,
 )
 from graspd.models.training.fitting.standards import SESSION_VARIANTS
-from graspd.models.training.systems.registry import SYSTEMS
-from graspd.models.training.systems.system import digest
+from graspd.models.training.systems.registry import SYSTEMS, digest
 from tests.models.training.samples import sessions
 
 GRASPS = sessions(200)

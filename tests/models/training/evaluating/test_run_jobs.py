@@ -19,9 +19,8 @@ from graspd.models.contract import VectorInput
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.estimators.configs import ForestConfig
 from graspd.models.training.evaluating import jobs
-from graspd.models.training.evaluating.jobs import Job, JobResult
-from graspd.models.training.evaluating.run_jobs import ClusterError, run_jobs
-from graspd.models.training.systems.system import System
+from graspd.models.training.evaluating.jobs import ClusterError, Job, JobResult, run_jobs
+from graspd.models.training.systems.registry import System
 from tests.models.training.samples import sessions
 
 GRASPS = sessions(120)

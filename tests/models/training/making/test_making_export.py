@@ -38,11 +38,10 @@ from graspd.models.training.estimators.configs import (
     SecondConvolution,
     SvmConfig,
 )
-from graspd.models.training.fitting.fit import Fitted, FittedClassical, fit
 from graspd.models.training.fitting.standards import Standards
+from graspd.models.training.fitting.trained import Fitted, FittedClassical, fit
 from graspd.models.training.making.export import ExportError, export
-from graspd.models.training.systems.registry import SESSION
-from graspd.models.training.systems.system import BlendConfig, Estimator, Member, System
+from graspd.models.training.systems.registry import SESSION, BlendConfig, Estimator, Member, System
 from tests.models.training.samples import separable_counts
 
 COUNTS, SLIPPED = separable_counts(90)

@@ -10,7 +10,7 @@ from torch import nn
 
 from graspd.models.inputs import VectorBuilder
 from graspd.models.tactile_image import TactileImager
-from graspd.models.training.estimators import recipe as recipes
+from graspd.models.training.estimators import networks
 from graspd.models.training.estimators.configs import (
     DayShift,
     NetworkConfig,
@@ -18,9 +18,10 @@ from graspd.models.training.estimators.configs import (
     Recipe,
     SessionRecipe,
 )
-from graspd.models.training.estimators.networks import build
-from graspd.models.training.estimators.recipe import (
+from graspd.models.training.estimators.networks import (
+    build,
     logits,
+    on_another_day,
     optimization,
     reproducible,
     train_network,
@@ -49,7 +50,7 @@ def slipped() -> NDArray[np.bool_]:
 @pytest.fixture
 def dense(monkeypatch: pytest.MonkeyPatch) -> None:
     """Train a plain network, whose updates can be worked out: one hidden layer of 5 units."""
-    monkeypatch.setattr(recipes, "build", lambda *_: plain_network())
+    monkeypatch.setattr(networks, "build", lambda *_: plain_network())
 
 
 def plain_network(inputs: int = 72) -> nn.Sequential:
@@ -180,7 +181,7 @@ def test_an_epoch_sees_each_grasp_at_most_once(
             return inputs
 
     network = nn.Sequential(Recorder(), *plain_network())
-    monkeypatch.setattr(recipes, "build", lambda *_: network)
+    monkeypatch.setattr(networks, "build", lambda *_: network)
     train_network(TINY, vectors[:grasps], slipped[:grasps], recipe, seed=0)
     rows = {tuple(row) for row in torch.cat(batches).tolist()}
     assert len(rows) == sum(map(len, batches)) == seen
@@ -211,7 +212,7 @@ def test_input_noise_is_drawn_from_the_seed(
 def test_days_are_drawn_from_the_seed_and_change_what_is_learned(
     slipped: NDArray[np.bool_], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recipes, "build", lambda *_: plain_network(26))
+    monkeypatch.setattr(networks, "build", lambda *_: plain_network(26))
     features = np.random.default_rng(0).normal(size=(len(slipped), 26)).astype(np.float32)
     shifted = SessionRecipe(epochs=2)
     first = _weights(train_network(TINY, features, slipped, shifted, seed=1))
@@ -229,3 +230,42 @@ def test_weight_decay_spares_biases_and_norms() -> None:
         assert spared["weight_decay"] == 0.0
         # The published regularizer leaves the last layer alone.
         assert len(decayed["params"]) == (3 if isinstance(recipe, Recipe) else 2)
+
+
+def shifted(features: torch.Tensor, *shift: float) -> torch.Tensor:
+    """The features on another day, by these gain, finger gain and offset."""
+    torch.manual_seed(0)
+    return on_another_day(features, DayShift(*shift))
+
+
+def test_another_day_without_a_shift_is_the_same_day() -> None:
+    features = torch.randn(5, 78)
+    assert torch.equal(shifted(features, 0.0, 0.0, 0.0), features)
+
+
+def test_each_feature_of_each_grasp_has_a_gain_of_its_own() -> None:
+    exponents = shifted(torch.ones(4000, 52), 0.3, 0.0, 0.0).log()
+    assert exponents.std(dim=0).numpy() == pytest.approx(0.3, abs=0.02)
+    assert torch.corrcoef(exponents.T).fill_diagonal_(0.0).abs().max() < 0.1
+
+
+def test_a_finger_gain_is_one_for_its_24_electrodes_and_none_for_mean_and_spread() -> None:
+    features = shifted(torch.ones(4000, 52), 0.0, 0.3, 0.0)
+    ff, th, rest = features[:, :24], features[:, 24:48], features[:, 48:]
+    assert torch.equal(ff, ff[:, :1].expand(-1, 24))
+    assert torch.equal(th, th[:, :1].expand(-1, 24))
+    assert not torch.equal(ff[:, 0], th[:, 0])
+    assert ff[:, 0].log().std().item() == pytest.approx(0.3, abs=0.02)
+    assert torch.equal(rest, torch.ones(4000, 4))
+
+
+def test_an_offset_is_of_means_and_spreads_alone() -> None:
+    features = shifted(torch.zeros(4000, 26), 0.0, 0.0, 0.7)
+    assert torch.equal(features[:, :24], torch.zeros(4000, 24))
+    assert features[:, 24:].std(dim=0).numpy() == pytest.approx(0.7, abs=0.04)
+
+
+@pytest.mark.parametrize("shape", [(2, 72), (2, 3, 26), (2, 3, 12, 11)])
+def test_other_inputs_have_no_other_day(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="no session features"):
+        on_another_day(torch.zeros(shape), DayShift())
