@@ -14,59 +14,48 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import NoReturn
 
 from graspd.daemon import __version__
-from graspd.daemon.commands.arguments import Parser
+from graspd.daemon.commands.arguments import Parser, UsageError
 from graspd.daemon.process import logs
 from graspd.daemon.process.text import complain
 from graspd.extras import needs
 
 COMMANDS = {
-    "run": ("graspd.daemon.commands.run", "run the daemon on a scene"),
-    "replay": ("graspd.daemon.commands.replay", "judge recordings and print the verdicts"),
-    "watch": (
-        "graspd.daemon.commands.watch",
-        "see it live, in a terminal (extra: watch) or a browser",
-    ),
-    "scene": (
-        "graspd.daemon.commands.texts",
-        "print an example scene, or what each of its keys means",
-    ),
-    "check": ("graspd.daemon.commands.check", "say whether a scene is right and what it needs"),
-    "doctor": (
-        "graspd.daemon.commands.doctor",
-        "look at hardware, model and privileges for what is wrong",
-    ),
-    "twin": ("graspd.daemon.commands.twin", "stand in for a bridge, a CAN board or a palm"),
-    "data": ("graspd.daemon.commands.data", "get the real grasp recordings"),
-    "schema": ("graspd.daemon.commands.texts", "print the JSON Schema of the messages"),
-    "models": ("graspd.daemon.commands.models", "list the models and show their cards"),
-    "session": (
-        "graspd.daemon.commands.session",
-        "show, reset or seed what is known of the sensors",
-    ),
+    "run": (".run", "run the daemon on a scene"),
+    "replay": (".replay", "judge recordings and print the verdicts"),
+    "watch": (".watch", "see it live, in a terminal (extra: watch) or a browser"),
+    "scene": (".texts", "print an example scene, or what each of its keys means"),
+    "check": (".check", "say whether a scene is right and what it needs"),
+    "doctor": (".doctor", "look at hardware, model and privileges for what is wrong"),
+    "twin": (".twin", "stand in for a bridge, a CAN board or a palm"),
+    "data": (".data", "get the real grasp recordings"),
+    "schema": (".texts", "print the JSON Schema of the messages"),
+    "models": (".models", "list the models and show their cards"),
+    "session": (".session", "show, reset or seed what is known of the sensors"),
     "export-grasps": (
-        "graspd.daemon.commands.export_grasps",
+        ".export_grasps",
         "make a grasp table of what was recorded, for train (extra: record)",
     ),
-    "keys": (
-        "graspd.daemon.commands.keys",
-        "make and list the keys of those who may connect by TCP",
-    ),
+    "keys": (".keys", "make and list the keys of those who may connect by TCP"),
     "train": ("graspd.models.training.commands.train", "train and export a model (extra: train)"),
     "evaluate": (
         "graspd.models.training.commands.evaluate",
         "measure how good systems are (extra: train)",
     ),
     "report": (
-        "graspd.daemon.commands.report",
+        ".report",
         "measure error, time and exactness of the models (extras: train, report)",
     ),
-    "completion": ("graspd.daemon.commands.texts", "print what makes a shell complete commands"),
-    "manual": ("graspd.daemon.commands.texts", "print the manual page: graspd manual | man -l -"),
+    "completion": (".texts", "print what makes a shell complete commands"),
+    "manual": (".texts", "print the manual page: graspd manual | man -l -"),
 }
-"""Commands by name: a module with `add_arguments(parser)` and `run(args) -> int`, and help."""
+"""Commands by name: a module with `add_arguments(parser)` and `run(args) -> int`, and help.
+
+A name that begins with a dot is one of `graspd.daemon.commands`.
+"""
 EXTRAS = {
     "export-grasps": "record",
     "train": "train",
@@ -99,15 +88,34 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 
     def run() -> int:
         try:
-            code: int = importlib.import_module(COMMANDS[args.command][0]).run(args)
+            code: int = _module(args.command).run(args)
         except ModuleNotFoundError as error:
             if args.command not in EXTRAS:
                 raise
-            complain(needs(args.command, EXTRAS[args.command], error))
-            return WRONG
-        return code
+            problem = needs(args.command, EXTRAS[args.command], error)
+        except _input_errors() as error:
+            problem = str(error)
+        else:
+            return code
+        sys.stdout.flush()
+        complain(problem)
+        return WRONG
 
     return run
+
+
+def _input_errors() -> tuple[type[Exception], ...]:
+    """Return the errors that say which input is wrong. A command lets them pass.
+
+    They are imported only here, when a command has failed.
+    """
+    from graspd.daemon.publish.keys import KeysError
+    from graspd.daemon.scene import SceneError
+    from graspd.daemon.session.file import SessionFileError
+    from graspd.drivers.base import DriverError
+    from graspd.models.contract import ModelError
+
+    return UsageError, SceneError, ModelError, DriverError, SessionFileError, KeysError
 
 
 def whole_parser() -> Parser:
@@ -125,11 +133,15 @@ def _parser(is_wanted: Callable[[str], bool]) -> Parser:
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, help="what to do; each has its own --help"
     )
-    for name, (module, text) in COMMANDS.items():
+    for name, (_, text) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         if is_wanted(name):
-            importlib.import_module(module).add_arguments(command)
+            _module(name).add_arguments(command)
     return parser
+
+
+def _module(command: str) -> ModuleType:
+    return importlib.import_module(COMMANDS[command][0], "graspd.daemon.commands")
 
 
 class _Version(argparse.Action):

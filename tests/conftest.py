@@ -36,7 +36,7 @@ BEGUN_FIRST = (
     "bench/test_mutants.py",
     "stability/test_models.py",
     "daemon/measure/test_error_vs_time.py",
-    "daemon/doctor/test_healthy.py",
+    "daemon/doctor/test_link_faults.py",
     "daemon/judge/test_only_stable_if.py",
     "daemon/judge/test_grasps_to_the_lift.py",
     "daemon/commands/test_replay_command.py",

@@ -12,6 +12,10 @@ from typing import Any
 from graspd.daemon.process.text import did_you_mean
 
 
+class UsageError(Exception):
+    """The command line is wrong; the text says how."""
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that takes options and files in any order, and corrects a mistyped word."""
 
@@ -54,19 +58,14 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, said) from None
 
 
-def positive(text: str) -> float:
-    """A positive, finite number; for `argparse`."""
-    value = _number(text)
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
-
-
 def within(lowest: float, highest: float) -> Callable[[str], float]:
-    """Takes numbers from `lowest` to `highest`; for `argparse`."""
+    """Return a type for `argparse`: numbers from `lowest` to `highest`."""
 
     def parse(text: str) -> float:
-        value = _number(text)
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
         if not lowest <= value <= highest:
             raise argparse.ArgumentTypeError(
                 f"{text} is not a number from {lowest:g} to {highest:g}"
@@ -74,10 +73,3 @@ def within(lowest: float, highest: float) -> Callable[[str], float]:
         return value
 
     return parse
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

@@ -19,7 +19,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.commands.arguments import within
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
-from graspd.daemon.doctor.finding import Cause, Finding, Level, fine, roots, warning
+from graspd.daemon.doctor.finding import Cause, Finding, Level, fine, roots
 from graspd.daemon.doctor.link import counter_findings, device_findings, rate_finding
 from graspd.daemon.doctor.surroundings import (
     can_finding,
@@ -29,22 +29,13 @@ from graspd.daemon.doctor.surroundings import (
     shared_findings,
     socket_findings,
 )
-from graspd.daemon.process.text import (
-    Colour,
-    coloured,
-    complain,
-    printable,
-    write_json,
-    write_lines,
-)
-from graspd.drivers.base import Driver, DriverError, Fact, LinkError, TactileReading
+from graspd.daemon.process.text import Colour, coloured, printable, write_json, write_lines
+from graspd.drivers.base import Driver, Fact, LinkError, TactileReading
 
 LISTEN_S = 3.0
 LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0
-WAIT_S = 0.02
-"""Longest sleep between two looks at a driver, s."""
-SHORTEST_WAIT_S = 0.001
-"""Shortest one, s: a driver may be due again at once."""
+WAIT_S = 0.005
+"""Longest wait between two looks at the drivers, s: a recording has no descriptor to wait on."""
 BRIDGE_NAME = "graspd"
 BRIDGE_VENDOR = 0x2E8A
 """Raspberry Pi, which makes the Pico. Other ports are greeted only if their name is the bridge's:
@@ -82,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine; 0 if nothing is wrong, 1 if something is, 2 if the scene or its files are wrong."""
+    """Examine; 0 if nothing is wrong, 1 if something is. Raises `SceneError` or `DriverError`."""
     report: dict[str, Any] = {}
     logging.disable(logging.WARNING)  # what drivers warn of is among the findings
     try:
@@ -90,9 +81,6 @@ def run(args: argparse.Namespace) -> int:
             findings = _computer(report, args.listen)
         else:
             findings = _scene(scene.load(args.scene), report, args.listen)
-    except (scene.SceneError, DriverError) as error:
-        complain(error)
-        return 2
     finally:
         logging.disable(logging.NOTSET)
     if args.json:
@@ -172,7 +160,7 @@ def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
     if not findings:
         what = "no USB serial port and no CAN interface"
         advice = "plug the bridge or the CAN adapter in; no hardware: graspd twin"
-        findings.append(warning(what, Cause.PORT_MISSING, advice))
+        findings.append(Finding(Level.WARNING, what, Cause.PORT_MISSING, advice))
     return findings
 
 
@@ -231,7 +219,7 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         descriptors = [driver.fileno() for driver in drivers]
-        select.select([fd for fd in descriptors if fd is not None], [], [], _sleep_s(drivers))
+        select.select([fd for fd in descriptors if fd is not None], [], [], WAIT_S)
         for driver in drivers:
             for reading in driver.read_ready():
                 if isinstance(reading, TactileReading):
@@ -241,13 +229,6 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     if statistics.readings < 2:
         return listen_s
     return (last_s - first_s) * statistics.readings / (statistics.readings - 1)
-
-
-def _sleep_s(drivers: Sequence[Driver]) -> float:
-    """Return how long to wait, s: for bytes, or for the next reading of a recording."""
-    dues_ns = [due_ns for driver in drivers if (due_ns := driver.due_ns()) is not None]
-    wait_s = min(((due_ns - time.monotonic_ns()) / 1e9 for due_ns in dues_ns), default=WAIT_S)
-    return min(max(wait_s, SHORTEST_WAIT_S), WAIT_S)
 
 
 def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:

@@ -8,16 +8,16 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from graspd.daemon.commands.arguments import UsageError
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.process.text import complain, write_lines
 from graspd.daemon.publish.messages import OBJECT_PATTERN
-from graspd.drivers.base import RecordingError
 from graspd.extras import needs
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
 
-WRONG, FAILED = 2, 1
+FAILED = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,15 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the table; 0 if it has a grasp, 1 if it cannot be written or none has an outcome."""
     if args.out.exists() and not args.force:
-        complain(f"{args.out} is there already: --force replaces it")
-        return WRONG
+        raise UsageError(f"{args.out} is there already: --force replaces it")
     from graspd.daemon.record.export import collect, write
 
-    try:
-        export = collect(args.recordings)
-    except RecordingError as error:
-        complain(error)
-        return WRONG
+    export = collect(args.recordings)
     write_lines(_summary(export))
     if not export.grasps:
         complain("no judged grasp with an outcome: nothing is written")
@@ -74,8 +69,7 @@ def run(args: argparse.Namespace) -> int:
             content = table.getvalue().encode()
         write_atomically(args.out, content, mode=0o644)
     except ModuleNotFoundError as error:
-        complain(needs("--parquet", "pandas", error))
-        return WRONG
+        raise UsageError(needs("--parquet", "pandas", error)) from error
     except OSError as error:
         complain(f"{args.out}: {error.strerror or error}")
         return FAILED

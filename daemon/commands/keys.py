@@ -37,16 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make or list; 2 if keys cannot be made, or those that are there are wrong."""
+    """Make or list; 2 if keys that are there are wrong. Raises `KeysError`."""
     return _make(args) if args.action == "make" else _list(args)
 
 
 def _make(args: argparse.Namespace) -> int:
-    try:
-        public, secret = keys.make(args.dir, args.name)
-    except KeysError as error:
-        complain(error)
-        return WRONG
+    public, secret = keys.make(args.dir, args.name)
     write_lines(
         f"{printable(str(public))}: public; a client's goes into {CLIENTS}/ beside the daemon's",
         f"{printable(str(secret))}: secret; stays with its owner",

@@ -38,7 +38,7 @@ SHOWN = {
 LEFT_COLUMNS = 2
 """Columns of the list that begin at the left: name and fingers."""
 ADD, REMOVE = "add", "remove"
-WRONG, FAILED = 2, 1
+FAILED = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List, show, add or remove; 2 for a wrong model, 1 if a folder cannot be written."""
+    """List, show, add or remove; 1 if a folder cannot be written. Raises `ModelError`."""
     try:
         if args.what in (ADD, REMOVE):
             if args.which is None:
@@ -86,9 +86,6 @@ def run(args: argparse.Namespace) -> int:
         if args.which is not None:
             raise ModelError(f"only {ADD} and {REMOVE} take a second word: {args.which}")
         return _show(args)
-    except ModelError as error:
-        complain(error)
-        return WRONG
     except OSError as error:
         if error.filename is None and args.what not in (ADD, REMOVE):
             raise  # of standard output

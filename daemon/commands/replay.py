@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -13,7 +12,7 @@ from typing import Any
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
-from graspd.daemon.commands.arguments import positive, within
+from graspd.daemon.commands.arguments import UsageError, within
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.sleep import Sleep
@@ -34,8 +33,7 @@ from graspd.daemon.run.summary import (
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.session import file as session_file
-from graspd.daemon.session.file import SessionFileError
-from graspd.drivers.base import DriverError, RecordingError
+from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_DAY
 from graspd.drivers.recordings.csv_rows import SLIPPED, columns_of
 from graspd.models import zoo
@@ -52,6 +50,7 @@ RISK_OPTIONS = ("max_slip_when_stable", "warm_up", "explore")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    pace = within(0.001, 1e6)
     parser.add_argument(
         "recordings",
         nargs="*",
@@ -71,12 +70,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--speed",
-        type=positive,
+        type=pace,
         metavar="FACTOR",
         help="pace at this factor of real time (default: as fast as possible)",
     )
     parser.add_argument(
-        "--rate", type=positive, default=100.0, metavar="HZ", help="readings/s of a grasp table"
+        "--rate", type=pace, default=100.0, metavar="HZ", help="readings/s of a grasp table"
     )
     parser.add_argument("--loop", action="store_true", help="start again at the end, for ever")
     parser.add_argument(
@@ -153,35 +152,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 0 when the recordings were played to their end."""
+    if args.wait is not None and args.publish is None:
+        raise UsageError("--wait is for subscribers: it needs --publish")
+    if args.only_lifted and args.recordings and not args.outcomes:
+        raise UsageError("--only-lifted says which outcomes are told: it needs --outcomes")
+    if args.max_slip_when_stable and args.recordings and not args.outcomes:
+        raise UsageError("--max-slip-when-stable rests on outcomes: it needs --outcomes")
     try:
-        if args.wait is not None and args.publish is None:
-            raise SceneError("--wait is for subscribers: it needs --publish")
-        if args.only_lifted and args.recordings and not args.outcomes:
-            raise SceneError("--only-lifted says which outcomes are told: it needs --outcomes")
-        if args.max_slip_when_stable and args.recordings and not args.outcomes:
-            raise SceneError("--max-slip-when-stable rests on outcomes: it needs --outcomes")
         with StopSignal() as stop:
             return _replay(args, stop)
-    except (SceneError, ModelError, DriverError, SessionFileError) as error:
-        sys.stdout.flush()
-        complain(f"{error}{_where_from(error)}")
-        return 2
+    except RecordingError as error:
+        if error.path.exists() or error.path.stem not in {table.name for table in TABLES}:
+            raise
+        raise UsageError(f"{error}; `graspd data` gets it") from error
     except PublishError as error:
         complain(error)
         return 1
 
 
-def _where_from(error: Exception) -> str:
-    """Say how to get a published recording that is not there."""
-    if not isinstance(error, RecordingError) or error.path.exists():
-        return ""
-    published = error.path.name in {f"{table.name}.csv" for table in TABLES}
-    return "; `graspd data` gets it" if published else ""
-
-
 def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
-    is_demo = not args.recordings
-    if is_demo:
+    if not args.recordings:
         args.recordings, args.outcomes = [DEMO_DAY], True
         args.max_slip_when_stable = args.max_slip_when_stable or DEMO_RISK
     source = _source(args)
@@ -253,12 +243,12 @@ def _source(args: argparse.Namespace) -> Source:
     if endings.isdisjoint({assembly.MCAP, *LINK_LOGS}):
         return _tables(args)
     if args.outcomes or args.min_confidence is not None or _risk(args):
-        raise SceneError(
+        raise UsageError(
             "what graspd has recorded is judged under its own risk: no --outcomes, "
             "--max-slip-when-stable, --warm-up, --explore or --min-confidence"
         )
     if args.loop or args.strict:
-        raise SceneError("what graspd has recorded is played as it is: no --loop or --strict")
+        raise UsageError("what graspd has recorded is played as it is: no --loop or --strict")
     if assembly.MCAP not in endings:
         return LinkLogs(args.recordings, args.scene)
     assembly.require_mcap("replaying MCAP")
@@ -270,7 +260,7 @@ def _source(args: argparse.Namespace) -> Source:
 def _tables(args: argparse.Namespace) -> Tables:
     """Return tables that are judged as the command line says."""
     if args.scene is not None:
-        raise SceneError("--scene is for what came over a link")
+        raise UsageError("--scene is for what came over a link")
     tactile = {"rate_hz": args.rate, "loop": args.loop, "strict": args.strict}
     if args.speed is not None:
         tactile |= {"pace": "realtime", "speed": args.speed}
@@ -280,7 +270,7 @@ def _tables(args: argparse.Namespace) -> Tables:
     if args.max_slip_when_stable is not None:
         sections["risk"] = _risk(args)
     elif _risk(args):
-        raise SceneError("--warm-up and --explore need --max-slip-when-stable")
+        raise UsageError("--warm-up and --explore need --max-slip-when-stable")
     return Tables(args.recordings, sections)
 
 

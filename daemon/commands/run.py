@@ -16,9 +16,7 @@ from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import complain
 from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.run.runner import Runner
-from graspd.daemon.scene import SceneError
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
-from graspd.models.contract import ModelError
 
 if TYPE_CHECKING:
     from graspd.daemon.run.systemd import Systemd
@@ -39,16 +37,16 @@ def run(args: argparse.Namespace) -> int:
     _allow_descriptors()
     try:
         with ExitStack() as stack:
-            stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
+            on_terminal = sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
+            stop = stack.enter_context(StopSignal(reloads=not on_terminal))
             printer = None
             if args.print:
                 from graspd.daemon.run.summary import Printer
 
                 printer = Printer(as_json=False)
             Runner(args.scene, stop, printer=printer, manager=_manager(stack)).run()
-    except (SceneError, ModelError, RecordingError) as error:
-        complain(error)
-        return 2
+    except RecordingError:
+        raise
     except PublishError as error:
         complain(f"{error}{_held_by(error.taken)}")
         return 1
@@ -78,10 +76,6 @@ def _allow_descriptors() -> None:
     if soft != resource.RLIM_INFINITY and soft < limit:
         with contextlib.suppress(OSError):  # a service manager that forbids it has set its own
             resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
-
-
-def _on_terminal() -> bool:
-    return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 def _manager(stack: ExitStack) -> Systemd | None:

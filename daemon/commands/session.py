@@ -65,29 +65,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show, reset or seed the kept session; return 2 if an input is wrong."""
-    try:
-        wanted = scene.load(args.scene)
-        model = assembly.load_model(wanted)
-        learns = wanted.learn.enabled or wanted.risk is not None
-        if not (learns or isinstance(model.contract.input, SessionInput)):
-            raise ModelError(f"the model {model.contract.name} keeps no session")
-        if args.action != "show" and not _has_file(wanted):
-            raise SessionFileError(
-                f"{args.scene} keeps no session, and {wanted.session_path} may be that of a hand: "
-                "say `[session] keep = true`"
-            )
-        if args.action == "show":
-            _show(wanted, model, as_json=args.json)
-        elif args.action == "reset":
-            with SessionFile(wanted.session_path) as file:
-                result = "forgotten" if file.remove() else "no session was kept"
-            write_lines(f"{printable(str(wanted.session_path))}: {result}")
-        else:
-            _seed(wanted, model, args.recordings)
-    except (scene.SceneError, ModelError, DriverError, SessionFileError) as error:
-        complain(error)
-        return 2
+    """Show, reset or seed the kept session."""
+    wanted = scene.load(args.scene)
+    model = assembly.load_model(wanted)
+    learns = wanted.learn.enabled or wanted.risk is not None
+    if not (learns or isinstance(model.contract.input, SessionInput)):
+        raise ModelError(f"the model {model.contract.name} keeps no session")
+    if args.action != "show" and not _has_file(wanted):
+        raise SessionFileError(
+            f"{args.scene} keeps no session, and {wanted.session_path} may be that of a hand: "
+            "say `[session] keep = true`"
+        )
+    if args.action == "show":
+        _show(wanted, model, as_json=args.json)
+    elif args.action == "reset":
+        with SessionFile(wanted.session_path) as file:
+            result = "forgotten" if file.remove() else "no session was kept"
+        write_lines(f"{printable(str(wanted.session_path))}: {result}")
+    else:
+        _seed(wanted, model, args.recordings)
     return 0
 
 
@@ -108,7 +104,7 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
         former = _former(path)
         document = {
             "file": str(path),
-            "calibrated": bool(calibrated),
+            "calibrated": calibrated,
             "session": session,
             "former_saved_at": None if former is None else former.saved_at,
             "put_aside": [
@@ -121,13 +117,11 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
         write_lines(*_lines(path, kept, model, calibrated))
 
 
-def _is_calibrated(
-    wanted: scene.Scene, model: TactileModel, kept: KeptSession | None
-) -> bool | None:
-    """Return True if a daemon that starts now is calibrated; None: the model needs no session."""
+def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession | None) -> bool:
+    """Return True if a daemon that starts now is calibrated."""
     session = assembly.build_pipeline(wanted, model).session
     if session is None:
-        return None
+        return False
     try:
         if kept is not None:
             restore_kept(kept, wanted.hand.fingers, session)
@@ -148,7 +142,7 @@ def _former(path: Path) -> KeptSession | None:
 
 
 def _lines(
-    path: Path, kept: KeptSession | None, model: TactileModel, calibrated: bool | None
+    path: Path, kept: KeptSession | None, model: TactileModel, calibrated: bool
 ) -> Iterator[str]:
     if kept is None:
         yield f"{printable(str(path))}: no session is kept"

@@ -17,18 +17,15 @@ SHELLS = ("bash", "zsh", "fish")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `parser.prog`; only `scene` and `completion` have any."""
-    if parser.prog == "graspd scene":
-        _add_scene_arguments(parser)
-    elif parser.prog == "graspd completion":
+    if parser.prog == "graspd completion":
         parser.add_argument(
             "shell",
             choices=SHELLS,
             help='which shell: eval "$(graspd completion bash)", in zsh after compinit; '
             "graspd completion fish | source",
         )
-
-
-def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    if parser.prog != "graspd scene":
+        return
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "--example",

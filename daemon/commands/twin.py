@@ -9,7 +9,6 @@ import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
-from types import FrameType
 
 from graspd.daemon.process.signals import STOPPING
 from graspd.daemon.process.text import complain, write_json
@@ -158,11 +157,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until stopped or until the recording ends; prints the faults injected, as JSON."""
     stop = threading.Event()
-
-    def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    former = {number: signal.signal(number, ask_to_stop) for number in STOPPING}
+    former = {number: signal.signal(number, lambda *_: stop.set()) for number in STOPPING}
     try:
         injected = SERVE.get(args.kind, _serve_datagrams)(args, _faults(args), stop)
     except (DriverError, ValueError, OSError) as error:

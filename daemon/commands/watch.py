@@ -7,15 +7,13 @@ import contextlib
 import os
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import zmq
 
 from graspd.daemon import scene
+from graspd.daemon.commands.arguments import UsageError
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import complain
-from graspd.daemon.publish.keys import KeysError
-from graspd.daemon.scene import SceneError
 from graspd.daemon.watch.feed import Feed, load_keys
 from graspd.daemon.watch.view import TICK_S, HandFeed, View
 from graspd.extras import needs
@@ -29,26 +27,10 @@ NICENESS = 10
 """A daemon on the same processor comes first: drawing takes a tenth of one."""
 HANDS_MAX = 8
 """Most hands in one page or terminal."""
-FAILED, WRONG = 1, 2
+FAILED = 1
 
 SCENES, SOCKETS = Path("/etc/graspd"), Path("/run/graspd")
 """Folders of the service's scenes and sockets (deploy/systemd)."""
-
-
-class Target(NamedTuple):
-    """One daemon to watch."""
-
-    endpoint: str
-    hand: str | None
-    server_key: Path | None
-    look: str
-    """Place to look at if it is silent, for people."""
-    doctor: str
-    """Place to look at if it has no readings, for people."""
-
-
-class UsageError(Exception):
-    """The command line is wrong; the message says how."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,30 +72,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show until stopped; 2 for a wrong command line, 1 if the port cannot be had."""
+    """Show until stopped; 1 if the port cannot be had. Raises `UsageError`."""
     os.nice(NICENESS)
-    try:
-        with contextlib.ExitStack() as stack:
-            hands = []
-            for target in _targets(args):
-                keys = _keys(args, target.server_key)
-                feed = stack.enter_context(_feed(target.endpoint, keys))
-                view = View(target.endpoint, target.hand, target.look, target.doctor)
-                hands.append(HandFeed(feed, view))
-            if args.foxglove:
-                return _foxglove(hands, args.port or FOXGLOVE_PORT)
-            return _page(hands, args.port or PORT) if args.web else _terminal(hands)
-    except (SceneError, KeysError, UsageError) as error:
-        complain(error)
-    return WRONG
-
-
-def _feed(endpoint: str, keys: tuple[bytes, bytes, bytes] | None) -> Feed:
-    try:
-        return Feed(endpoint, keys)
-    except zmq.ZMQError as error:
-        problem = f"{endpoint}: cannot connect there: {error.strerror}"
-        raise UsageError(problem) from error
+    with contextlib.ExitStack() as stack:
+        hands = _hands(args, stack)
+        if args.foxglove:
+            return _foxglove(hands, args.port or FOXGLOVE_PORT)
+        return _page(hands, args.port or PORT) if args.web else _terminal(hands)
 
 
 def _port(text: str) -> int:
@@ -122,58 +87,62 @@ def _port(text: str) -> int:
     return int(text)
 
 
-def _targets(args: argparse.Namespace) -> list[Target]:
+def _hands(args: argparse.Namespace, stack: contextlib.ExitStack) -> list[HandFeed]:
+    """Connect to the daemons, until `stack` closes."""
     if args.connect and args.scenes:
         raise UsageError("--connect takes the place of scenes: give one or the other")
-    endpoints = args.connect or ([] if args.scenes else [ENDPOINT])
-    targets = [
-        Target(endpoint, None, args.server_key, where_to_look(endpoint), where_to_examine(endpoint))
-        for endpoint in endpoints
-    ]
+    number = len(args.connect or args.scenes)
+    if number > HANDS_MAX:
+        raise UsageError(f"{number} hands are more than the {HANDS_MAX} that can be watched")
+    if not args.scenes:
+        endpoints = args.connect or [ENDPOINT]
+        return [_hand(args, stack, endpoint, args.server_key) for endpoint in endpoints]
+    hands = []
     for path in args.scenes:
         wanted = scene.load(path)
         server = args.server_key
         if server is None and wanted.curve is not None:
             server = wanted.curve.secret_key.with_suffix(".key")
-        look, doctor = where_to_look(wanted.endpoint, path), where_to_examine(wanted.endpoint, path)
-        targets.append(Target(wanted.endpoint, wanted.hand.name, server, look, doctor))
-    if len(targets) > HANDS_MAX:
-        raise UsageError(f"{len(targets)} hands are more than the {HANDS_MAX} that can be watched")
-    return targets
+        hands.append(_hand(args, stack, wanted.endpoint, server, path, wanted.hand.name))
+    return hands
 
 
-def where_to_look(endpoint: str, scene_path: Path | None = None) -> str:
-    """Return the commands that show why the daemon of an endpoint is silent."""
-    socket = Path(endpoint.removeprefix("ipc://"))
-    if scene_path is not None and scene_path.absolute().parent == SCENES:
-        name = scene_path.stem
-    elif scene_path is not None:
-        return f"is it started? graspd run {scene_path}"
-    elif socket.parent == SOCKETS:
-        name = socket.stem
-    elif endpoint.startswith("tcp://"):
-        return "on the daemon's computer: systemctl status 'graspd@*'"
-    else:
-        return "is it started? graspd run SCENE"
-    return f"systemctl status graspd@{name}; journalctl -u graspd@{name}"
+def _hand(
+    args: argparse.Namespace,
+    stack: contextlib.ExitStack,
+    endpoint: str,
+    server_key: Path | None,
+    scene_path: Path | None = None,
+    name: str | None = None,
+) -> HandFeed:
+    """Connect to one daemon. Raises `UsageError` or `KeysError`."""
+    keys = None
+    if args.keys is not None:
+        if server_key is None:
+            raise UsageError("--keys needs --server-key: the daemon's .key file")
+        keys = load_keys(args.keys, server_key)
+    try:
+        feed = stack.enter_context(Feed(endpoint, keys))
+    except zmq.ZMQError as error:
+        raise UsageError(f"{endpoint}: cannot connect there: {error.strerror}") from error
+    return HandFeed(feed, View(endpoint, name, *where_to_look(endpoint, scene_path)))
 
 
-def where_to_examine(endpoint: str, scene_path: Path | None = None) -> str:
-    """Return the command that shows why the daemon of an endpoint has no readings."""
-    socket = Path(endpoint.removeprefix("ipc://"))
+def where_to_look(endpoint: str, scene_path: Path | None = None) -> tuple[str, str]:
+    """Return the commands that show why the daemon of an endpoint is silent or has no readings."""
+    socket, where = Path(endpoint.removeprefix("ipc://")), ""
     if scene_path is None and socket.parent == SOCKETS:
         scene_path = SCENES / f"{socket.stem}.toml"
-    is_far = scene_path is None and endpoint.startswith("tcp://")
-    where = "on the daemon's computer: " if is_far else ""
-    return f"{where}graspd doctor {scene_path or 'SCENE'}; the daemon's log says why"
-
-
-def _keys(args: argparse.Namespace, server_key: Path | None) -> tuple[bytes, bytes, bytes] | None:
-    if args.keys is None:
-        return None
-    if server_key is None:
-        raise UsageError("--keys needs --server-key: the daemon's .key file")
-    return load_keys(args.keys, server_key)
+    name = "SCENE" if scene_path is None else str(scene_path)
+    if scene_path is not None and scene_path.absolute().parent == SCENES:
+        service = f"graspd@{scene_path.stem}"
+        look = f"systemctl status {service}; journalctl -u {service}"
+    elif scene_path is None and endpoint.startswith("tcp://"):
+        where = "on the daemon's computer: "
+        look = f"{where}systemctl status 'graspd@*'"
+    else:
+        look = f"is it started? graspd run {name}"
+    return look, f"{where}graspd doctor {name}; the daemon's log says why"
 
 
 def _terminal(hands: list[HandFeed]) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
+from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, fine
 from graspd.drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 
 RAIL_COUNTS = 20
@@ -39,8 +39,7 @@ FROZEN = Trouble(
     Level.ERROR,
 )
 NEAR_RAIL = Trouble(
-    Cause.ELECTRODE_RAIL,
-    "alive, for it has noise: let go of what the hand holds, and look again",
+    Cause.ELECTRODE_RAIL, "alive, for it has noise: let go of what the hand holds, and look again"
 )
 RESTLESS = Trouble(
     Cause.ELECTRODE_RESTLESS,
@@ -120,7 +119,7 @@ class ElectrodeStatistics:
         if still.all():
             advice = "reset the board; does a relay or a recording repeat old data?"
             what = f"{name}: all counts are frozen"
-            return [error(what, Cause.REPEATED, advice)]
+            return [Finding(Level.ERROR, what, Cause.REPEATED, advice)]
         # A dead electrode is at a rail and has no noise: one of the two alone is no such sign.
         found = [_missing(name, missing, faults)] if missing.any() else []
         found += _named(name, rail & still, "stuck at a rail", DEAD)
@@ -142,30 +141,30 @@ class ElectrodeStatistics:
 def _absent(name: str, missing: Mask, faults: ElectrodeFault) -> Finding:
     if missing.any() and faults == ElectrodeFault.HELD:
         advice = "the board sends old values: reset it, and see whether its clock runs"
-        return error(f"{name}: old values repeat", Cause.REPEATED, advice)
+        return Finding(Level.ERROR, f"{name}: old values repeat", Cause.REPEATED, advice)
     why = _in_words(faults) if missing.any() else "each is at the end of its range, without noise"
     advice = "check the finger's plug, its chip select and its supply"
     what = f"{name}: no electrode can be read ({why})"
-    return error(what, Cause.SENSOR_ABSENT, advice)
+    return Finding(Level.ERROR, what, Cause.SENSOR_ABSENT, advice)
 
 
 def _missing(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
     advice = "does the board's sequence have it? if frames are lost, see there"
     what = f"{_names(name, which)} never or rarely sampled ({_in_words(faults)})"
     if faults & WORDS:
-        return error(what, Cause.SENSOR_WORDS, WORDS_ADVICE)
-    return error(what, Cause.ELECTRODE_UNREAD, advice)
+        return Finding(Level.ERROR, what, Cause.SENSOR_WORDS, WORDS_ADVICE)
+    return Finding(Level.ERROR, what, Cause.ELECTRODE_UNREAD, advice)
 
 
 def _unreliable(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
     what = f"{_names(name, which)} now and then faulty ({_in_words(faults)})"
     if faults & WORDS:
-        return warning(what, Cause.SENSOR_WORDS, WORDS_ADVICE)
+        return Finding(Level.WARNING, what, Cause.SENSOR_WORDS, WORDS_ADVICE)
     if faults & ElectrodeFault.HELD:
         advice = "the board repeats values now and then: see how long its sweep takes"
-        return warning(what, Cause.REPEATED, advice)
+        return Finding(Level.WARNING, what, Cause.REPEATED, advice)
     advice = "samples are lost on the way: see the load of the bus and of this computer"
-    return warning(what, Cause.ELECTRODE_UNREAD, advice)
+    return Finding(Level.WARNING, what, Cause.ELECTRODE_UNREAD, advice)
 
 
 def _named(finger: str, which: Mask, what: str, trouble: Trouble) -> list[Finding]:

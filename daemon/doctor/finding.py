@@ -120,16 +120,6 @@ def fine(what: str) -> Finding:
     return Finding(Level.OK, what)
 
 
-def error(what: str, cause: Cause, advice: str) -> Finding:
-    """Return a finding that keeps graspd from working."""
-    return Finding(Level.ERROR, what, cause, advice)
-
-
-def warning(what: str, cause: Cause, advice: str) -> Finding:
-    """Return a finding that graspd works with."""
-    return Finding(Level.WARNING, what, cause, advice)
-
-
 def roots(findings: Iterable[Finding]) -> list[Finding]:
     """Drop findings that another cause explains. A cause is as bad as what follows from it."""
     findings = list(findings)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, error, fine, warning
+from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, fine
 from graspd.drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
@@ -73,14 +73,15 @@ NOT_OURS = {
     ),
 }
 """Trouble of a link that receives data but gives no reading, by counters that are not 0."""
-LOSSES = ("link_losses",)
 FLAPS_MIN = 3
 """Fewest losses of a link while the doctor listens that are an error."""
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
 """Causes that a link shows between its losses; they are not reported beside the losses."""
 COUNTERS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
-    LOSSES: Trouble(Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"),
+    ("link_losses",): Trouble(
+        Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"
+    ),
     ("restarts",): Trouble(
         Cause.RESTARTED, f"the board was reset: {AGAIN}, its supply and reset line"
     ),
@@ -93,8 +94,7 @@ COUNTERS = {
         *("wrong_length_frames", "unknown_commands", "nonsense_packets", "bad_lengths"),
         "not_counts",
     ): Trouble(
-        Cause.DAMAGED,
-        f"damaged or foreign bytes: {AGAIN}, cable and hub, and who else sends there",
+        Cause.DAMAGED, f"damaged or foreign bytes: {AGAIN}, cable and hub, and who else sends there"
     ),
     ("kernel_drops", "untimed_frames", "host_tx_dropped"): Trouble(
         Cause.COMPUTER_BUSY,
@@ -113,8 +113,7 @@ COUNTERS = {
         "two send to one port, and one of them is listened to: name it with only_from",
     ),
     ("unexpected_channels",): Trouble(
-        Cause.SETTINGS,
-        "the board samples what the scene's sequence does not have: let them agree",
+        Cause.SETTINGS, "the board samples what the scene's sequence does not have: let them agree"
     ),
     (
         *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps", "interrupted_sweeps"),
@@ -226,7 +225,12 @@ def device_findings(
         if losses and link.fault in BETWEEN:
             what += f"; it was up and was lost {losses} {'time' if losses == 1 else 'times'}"
             trouble = TROUBLES[LinkCause.DISCONNECTED]
-        return [_of_link(what, trouble, counters)]
+        elif trouble.cause is Cause.SILENT:
+            for names, other in NOT_OURS.items():
+                if counted := _counted(names, counters):
+                    what, trouble = f"{what}, but {counted}", other
+                    break
+        return [Finding(Level.ERROR, what, trouble.cause, trouble.advice)]
     found = [] if link is None else [fine(f"{driver}: link up")]
     for key, fact in facts.items():
         what = f"{driver}: {key} {fact.text}"
@@ -240,7 +244,7 @@ def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
     for names, trouble in COUNTERS.items():
         if counted := _counted(names, counters):
             finding = trouble.finding(f"{driver}: {counted}")
-            if _is_too_much(trouble.cause, names, counters) or _flaps(trouble.cause, counters):
+            if _is_too_much(trouble.cause, names, counters):
                 finding = replace(finding, level=Level.ERROR)
             found.append(finding)
     return found
@@ -252,46 +256,33 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
     if not readings:
         advice = "is it powered, connected, and the one that the scene names?"
         what = f"{driver}: no reading in {seconds:.1f} s"
-        return error(what, Cause.SILENT, advice)
+        return Finding(Level.ERROR, what, Cause.SILENT, advice)
     if period_ns is None:
         return fine(f"{driver}: {rate_hz:.1f} readings/s")
     nominal_hz = 1e9 / period_ns
     what = f"{driver}: {rate_hz:.1f} readings/s of {nominal_hz:.1f}"
     if rate_hz < RATE_FRACTION * nominal_hz:
         advice = "none was lost on the way: the board is late, or this computer is busy (top)"
-        return warning(what, Cause.SLOW, advice)
+        return Finding(Level.WARNING, what, Cause.SLOW, advice)
     return fine(what)
 
 
-def _flaps(cause: Cause, counters: Mapping[str, int]) -> bool:
-    return cause is Cause.LINK_LOST and counters["link_losses"] >= FLAPS_MIN
-
-
 def _is_too_much(cause: Cause, names: Sequence[str], counters: Mapping[str, int]) -> bool:
-    """Return True if the share of damaged or lost frames may be one of `TOO_MUCH`."""
-    frames = next(filter(None, (counters.get(name, 0) for name in WHOLES)), 0)
-    pairs = [
-        (
-            sum(counters.get(name, 0) for name in names if name not in OF_VALUES | OF_READINGS),
-            frames,
-        ),
-        (counters.get("missed_readings", 0), counters.get("readings", 0)),
-    ]
+    """Return True for `FLAPS_MIN` losses of a link, and for a share of bad frames in `TOO_MUCH`."""
+    if cause is Cause.LINK_LOST:
+        return counters["link_losses"] >= FLAPS_MIN
     share = TOO_MUCH.get(cause)
-    return share is not None and any(
+    if share is None:
+        return False
+    frames = next(filter(None, (counters.get(name, 0) for name in WHOLES)), 0)
+    of_frames = [name for name in names if name not in OF_VALUES | OF_READINGS]
+    pairs = [(sum(counters.get(name, 0) for name in of_frames), frames)]
+    if "missed_readings" in names:
+        pairs.append((counters.get("missed_readings", 0), counters.get("readings", 0)))
+    return any(
         bad >= BAD_MIN and bad + 2.0 * math.sqrt(bad) >= share * (bad + sound)
-        for bad, sound in (pairs if "missed_readings" in names else pairs[:1])
+        for bad, sound in pairs
     )
-
-
-def _of_link(what: str, trouble: Trouble, counters: Mapping[str, int]) -> Finding:
-    """Judge a link that is not up, by its trouble and by its counters."""
-    if trouble.cause is Cause.SILENT and not counters.get("link_losses"):
-        for names, other in NOT_OURS.items():
-            if counted := _counted(names, counters):
-                what, trouble = f"{what}, but {counted}", other
-                break
-    return error(what, trouble.cause, trouble.advice)
 
 
 def _counted(names: Sequence[str], counters: Mapping[str, int]) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.doctor import computer
-from graspd.daemon.doctor.finding import Cause, Finding, error, fine, warning
+from graspd.daemon.doctor.finding import Cause, Finding, Level, fine
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
@@ -38,16 +38,16 @@ def model_finding(wanted: Scene) -> Finding:
         path = assembly.model_path(wanted)
     except ModelError as problem:
         advice = "graspd models lists those that there are"
-        return error(str(problem), Cause.MODEL_MISSING, advice)
+        return Finding(Level.ERROR, str(problem), Cause.MODEL_MISSING, advice)
     if not path.exists():
         advice = "[model] path is relative to the scene; graspd models lists those of the zoo"
-        return error(f"no model at {path}", Cause.MODEL_MISSING, advice)
+        return Finding(Level.ERROR, f"no model at {path}", Cause.MODEL_MISSING, advice)
     try:
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
     except ModelError as problem:
         advice = "choose a model that fits the hand: graspd models"
-        return error(str(problem), Cause.MODEL_MISFIT, advice)
+        return Finding(Level.ERROR, str(problem), Cause.MODEL_MISFIT, advice)
     return fine(f"model {model.contract.name} ({model.sha256[:12]}) fits the hand")
 
 
@@ -74,7 +74,7 @@ def shared_findings(section: Section) -> list[Finding]:
     match section:
         case SpiTactile(port=port) | CanTactile(channel=port) if computer.file_holders(port):
             what = f"{section.driver}: {port} is open in another program, which may take its bytes"
-            return [warning(what, Cause.PORT_HELD, "end it")]
+            return [Finding(Level.WARNING, what, Cause.PORT_HELD, "end it")]
     return []
 
 
@@ -84,9 +84,9 @@ def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = N
         return fine(str(interface))
     line = ip_link(interface.name, tactile)
     if interface.is_down:
-        return warning(str(interface), Cause.INTERFACE_DOWN, line)
+        return Finding(Level.WARNING, str(interface), Cause.INTERFACE_DOWN, line)
     advice = f"is its bit rate the board's? sudo ip link set {interface.name} down; {line}"
-    return warning(str(interface), Cause.BUS_ERRORS, advice)
+    return Finding(Level.WARNING, str(interface), Cause.BUS_ERRORS, advice)
 
 
 def ip_link(name: str, tactile: CanTactile | None) -> str:
@@ -121,7 +121,7 @@ def realtime_findings(wanted: Scene) -> list[Finding]:
         return []
     with RealtimeMode(wanted.realtime) as mode:
         lacking = mode.lacking.items()
-    warnings = [warning(what, Cause.REALTIME, advice) for what, advice in lacking]
+    warnings = [Finding(Level.WARNING, what, Cause.REALTIME, advice) for what, advice in lacking]
     return warnings or [fine("realtime as the scene wants it may be had")]
 
 
@@ -170,19 +170,19 @@ def _of_socket(name: str, path: Path) -> Iterator[Finding]:
     if not folder.is_dir():
         what = f"{name}: there is no folder {folder}"
         advice = f"the service makes it; without: sudo install -d -o $USER {folder}"
-        yield warning(what, Cause.SOCKET_FOLDER, advice)
+        yield Finding(Level.WARNING, what, Cause.SOCKET_FOLDER, advice)
         return
     holders = computer.file_holders(f"{path}.lock")
     if holders:
         what = f"{name}: {path} is in use: {'; '.join(map(str, holders))}"
-        yield warning(what, Cause.SOCKET_HELD, HELD_BY_GRASPD)
+        yield Finding(Level.WARNING, what, Cause.SOCKET_HELD, HELD_BY_GRASPD)
     elif path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
         advice = f"name another one, or move it away: mv {path} {path}.old"
-        yield error(f"{name}: {path} is no socket", Cause.SOCKET_HELD, advice)
+        yield Finding(Level.ERROR, f"{name}: {path} is no socket", Cause.SOCKET_HELD, advice)
     elif not os.access(folder, os.W_OK | os.X_OK):
         what = f"{name}: you may not make {path}"
         advice = f"as its owner: sudo -u {folder.owner()} graspd"
-        yield warning(what, Cause.SOCKET_DENIED, advice)
+        yield Finding(Level.WARNING, what, Cause.SOCKET_DENIED, advice)
 
 
 def _of_port(name: str, address: str) -> Iterator[Finding]:
@@ -197,10 +197,10 @@ def _of_port(name: str, address: str) -> Iterator[Finding]:
             what = f"{name}: tcp://{address}: {problem.strerror}"
             if problem.errno != errno.EADDRINUSE:
                 advice = "ip -brief address has those of this computer: name one of them"
-                yield error(what, Cause.ADDRESS, advice)
+                yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
                 return
             advice = f"sudo ss -tlpn 'sport = {port}' names who has it"
-            finding = warning(what, Cause.SOCKET_HELD, advice)
+            finding = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
             yield _held(finding, computer.port_holders("tcp", int(port)))
 
 
@@ -211,9 +211,9 @@ def _of_group(name: str, group: str | None) -> Iterator[Finding]:
         number = grp.getgrnam(group).gr_gid
     except KeyError:
         what, advice = f"{name}: there is no group {group}", f"sudo groupadd --system {group}"
-        yield error(what, Cause.SOCKET_GROUP, advice)
+        yield Finding(Level.ERROR, what, Cause.SOCKET_GROUP, advice)
         return
     if os.geteuid() != 0 and number not in {os.getegid(), *os.getgroups()}:
         what = f"{name}: you are not in the group {group} and cannot give the socket to it"
         advice = f"sudo usermod -aG {group} $USER, then log in again"
-        yield warning(what, Cause.SOCKET_GROUP, advice)
+        yield Finding(Level.WARNING, what, Cause.SOCKET_GROUP, advice)

@@ -142,8 +142,7 @@ class Door:
 
     def __init__(
         self,
-        publish: Listener,
-        ask: Listener | None = None,
+        listeners: Sequence[Listener],
         high_water_mark: int = 1000,
         admission: Admission | None = None,
         *,
@@ -151,7 +150,7 @@ class Door:
     ) -> None:
         """Raises `PublishError` if an endpoint cannot be had.
 
-        `publish`, `ask`: endpoints of subscribers and of questions; None: no questions.
+        `listeners`: endpoint of subscribers; a second one takes questions.
         `high_water_mark`: most messages that wait for one subscriber. `admission`: keys of
         `tcp://`. `awaits_subscriber`: True makes `wait_for_subscriber` possible.
         """
@@ -172,9 +171,9 @@ class Door:
             self._monitor = self._subscribers.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED)
         try:
             self._authenticate()
-            self._serve_subscribers(publish)
-            if ask is not None:
-                self._serve_questions(ask)
+            self._serve_subscribers(listeners[0])
+            for listener in listeners[1:]:
+                self._serve_questions(listener)
         except BaseException:
             self._stop_authenticator()
             self._context.destroy()

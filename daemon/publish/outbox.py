@@ -8,7 +8,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import onnxruntime
 
@@ -113,14 +113,6 @@ class Output(Protocol):
 
     def wanted(self, topic: bytes) -> bool:
         """Return True if a message of this topic is to be sent now."""
-
-
-class _Head(TypedDict):
-    """Fields that begin each message."""
-
-    boot_id: str
-    seq: int
-    t: float
 
 
 class Outbox:
@@ -246,10 +238,11 @@ class Outbox:
         for output in wanting:
             output.send(topic, payload)
 
-    def _head(self, kind: str) -> _Head:
+    def _head(self, kind: str) -> dict[str, Any]:
+        """Return the fields that begin each message."""
         seq = self._sent[kind]
         self._sent[kind] += 1
-        return _Head(boot_id=self.boot_id, seq=seq, t=self._wall_clock())
+        return {"boot_id": self.boot_id, "seq": seq, "t": self._wall_clock()}
 
     def _send(self, kind: str, payload: bytes) -> None:
         for output in self._outputs:

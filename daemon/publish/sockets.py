@@ -54,8 +54,8 @@ class Sockets(Companion):
         self._door: Door | None = None
         """None after `close`, and while an endpoint cannot be had again."""
         self.questions: Questions | None = None
-        self._publish: Listener | None = None
-        self._ask: Listener | None = None
+        self._listeners: list[Listener] = []
+        """Endpoint of the messages, then that of the questions, if peers may ask."""
         self._filenos: list[int] = []
         try:
             self._listen(wanted)
@@ -67,19 +67,17 @@ class Sockets(Companion):
     def _listen(self, wanted: Scene) -> None:
         publish = wanted.publish
         mode = None if publish.file_mode is None else int(publish.file_mode, 8)
-        self._publish = Listener(wanted.endpoint, mode, publish.group)
+        self._listeners.append(Listener(wanted.endpoint, mode, publish.group))
         if wanted.ask_endpoint is not None:
-            self._ask = Listener(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
+            ask = Listener(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
+            self._listeners.append(ask)
             from graspd.daemon.publish.questions import Questions  # only where peers may ask
 
             self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6))
 
     def _open(self) -> None:
-        if self._publish is None:
-            return
         self._door = Door(
-            self._publish,
-            self._ask,
+            self._listeners,
             self._high_water_mark,
             self._admission,
             awaits_subscriber=self._awaits_subscriber,
@@ -194,10 +192,8 @@ class Sockets(Companion):
         if self._door is not None and not self._door.close():
             log.warning("%s: peers keep libzmq from closing", self.endpoint)
         self._door = None
-        for listener in (self._publish, self._ask):
-            if listener is not None:
-                listener.close()
-        self._publish = self._ask = None
+        for listener in self._listeners:
+            listener.close()
 
     def __enter__(self) -> Self:
         return self

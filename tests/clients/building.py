@@ -1,10 +1,14 @@
-"""Compiling the C++ client, as its Makefile does; what was compiled is kept by its content."""
+"""Compiling the C++ client, as its Makefile does, and driving it by the orders of probe.cpp.
+
+What was compiled is kept by its content.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
@@ -113,3 +117,33 @@ def compiled_probe() -> Path:
         "-o",
     ]
     return kept(lambda folder: [*words, folder / "probe"], "probe")
+
+
+class Probe:
+    """A running probe."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def tell(self, *words: object) -> None:
+        """Give it an order, which it reads after the next `flush`."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(" ".join(map(str, words)) + "\n")
+
+    def ask(self, *words: object) -> str:
+        """Give it an order; return the first line of its answer."""
+        self.tell(*words)
+        self.flush()
+        return self.line()
+
+    def flush(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.flush()
+
+    def line(self) -> str:
+        """Return the next line that it writes."""
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().rstrip("\n")
+
+    def send_signal(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)

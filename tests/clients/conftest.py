@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.clients.building import compiled, compiled_probe
-from tests.clients.probe import Probe, probing
+from tests.clients.building import Probe, compiled, compiled_probe
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +25,10 @@ def binary() -> Path:
 
 @pytest.fixture
 def probe(binary: Path) -> Iterator[Probe]:
-    """The running probe."""
-    with probing(binary) as made:
-        yield made
+    """The running probe; the test fails if its sanitizers find something."""
+    with subprocess.Popen(
+        [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield Probe(process)
+        process.communicate(timeout=200)
+        assert process.returncode == 0, "the sanitizers found something"

@@ -19,6 +19,8 @@ from tests.kit.waiting import wait_until
 
 SILENCE_S = 0.1
 """`silence_ms` of a daemon at 100 Hz with the default age limit."""
+STALL_S = 2.0
+"""How long a busy computer may hold up a process."""
 
 
 def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_path: Path) -> None:
@@ -79,10 +81,7 @@ def test_soon_or_sure_is_for_who_lifts_to_choose(tmp_path: Path) -> None:
 
 def test_a_supervised_grasp_is_never_early(tmp_path: Path) -> None:
     sections = "[gate]\nearly = true\n[risk]\nmax_slip_when_stable = 0.1\nwarm_up = 50\n"
-    with (
-        Daemon(tmp_path, sections, whole_grasps=True) as daemon,
-        Client(daemon.endpoint) as graspd,
-    ):
+    with Daemon(tmp_path, sections, whole_grasps=True) as daemon, Client(daemon.endpoint) as graspd:
         said = [graspd.wait_for_grasp(30.0, supervised=True) for _ in range(2)]
         said += [graspd.may_i_lift(30.0, supervised=True).verdict]
     for verdict in said:
@@ -138,12 +137,45 @@ def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -
     assert (bool(answer), answer.verdict.reasons) == (False, ("silent",))
 
 
+def test_a_daemon_that_was_killed_is_unknown_until_it_is_heard_again(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Client(daemon.endpoint, max_age_ms=1e6) as graspd:
+        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
+        former = graspd.verdict().boot_id
+        daemon.kill()
+        killed_s = time.monotonic()
+        wait_until(lambda: graspd.verdict().reasons == ("silent",))
+        assert time.monotonic() - killed_s < SILENCE_S + STALL_S
+        assert (graspd.verdict().decision, graspd.verdict().boot_id) == ("unknown", former)
+        daemon.start()
+        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
+        assert graspd.verdict().boot_id != former  # nothing of before has come back
+
+
+def test_a_told_grasp_is_offered_no_more(tmp_path: Path) -> None:
+    sections = "[risk]\nmax_slip_when_stable = 0.1\nwarm_up = 50\n"
+    with (
+        Daemon(tmp_path, sections, whole_grasps=True) as daemon,
+        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as lifts,
+        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as asks_too,
+    ):
+
+        def is_refused() -> bool:
+            answer = lifts.may_i_lift(1.0, supervised=True)
+            if not answer:
+                return False
+            grasp = answer.verdict
+            assert lifts.tell(grasp, Outcome.SLIPPED, wait_s=10.0)
+            for client in (lifts, asks_too):
+                again = client.may_i_lift(0.05, supervised=True)
+                assert not again or again.verdict.grasp != grasp.grasp
+            return again.verdict.grasp == grasp.grasp and "outcome-told" in again.verdict.reasons
+
+        wait_until(is_refused)
+
+
 def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    with (
-        Daemon(tmp_path, endpoint=endpoint),
-        Client(endpoint, same_computer=False) as graspd,
-    ):
+    with Daemon(tmp_path, endpoint=endpoint), Client(endpoint, same_computer=False) as graspd:
         wait_until(lambda: bool(graspd.may_i_lift(1.0)))
         assert graspd.counts.lost == 0
 

@@ -14,16 +14,9 @@ from typing import Any
 import pytest
 import zmq
 
-from deploy.clients.python.graspd_client import (
-    Client,
-    Decision,
-    Outcome,
-    OutcomeAnswer,
-    Verdict,
-)
-from tests.clients.building import asked, cpp_lifts
+from deploy.clients.python.graspd_client import Client, Decision, Outcome, OutcomeAnswer, Verdict
+from tests.clients.building import Probe, asked, cpp_lifts
 from tests.clients.messages import TEACHES, TOPIC, verdict
-from tests.clients.probe import Probe
 from tests.threads import at_work
 
 PERIOD_MS = 5
@@ -102,10 +95,7 @@ def test_only_an_answer_that_fits_allows_a_lift(
 ) -> None:
     deadline_s = 100.0 if expected != "unknown" else DEADLINE_S
     places = [f"ipc://{tmp_path}/out", str(deadline_s), f"ipc://{tmp_path}/ask"]
-    with (
-        false_daemon(tmp_path, answer),
-        Client(places[0], ask_endpoint=places[2]) as graspd,
-    ):
+    with false_daemon(tmp_path, answer), Client(places[0], ask_endpoint=places[2]) as graspd:
         said = graspd.may_i_lift(deadline_s)
         result = asked(lift_gate, *places)
     assert (bool(said), said.verdict.decision) == (expected == "stable", expected)
@@ -338,6 +328,18 @@ def test_an_outcome_needs_a_grasp_somebody_to_tell_and_an_open_client(tmp_path: 
     assert asking.tell(LIFTED_ON, Outcome.SLIPPED).why == "closed"
     with Client(f"ipc://{tmp_path}/out") as graspd, pytest.raises(ValueError, match="ask_endpoint"):
         graspd.tell(LIFTED_ON, Outcome.SLIPPED)
+
+
+def test_a_told_grasp_is_offered_no_more_in_either_language(probe: Probe, tmp_path: Path) -> None:
+    places = [f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask"]
+    with false_daemon(tmp_path, told()), Client(places[0], ask_endpoint=places[1]) as graspd:
+        assert graspd.tell(graspd.may_i_lift(30.0).verdict, Outcome.SLIPPED, wait_s=30.0)
+        again = graspd.may_i_lift(DEADLINE_S, supervised=True)
+        assert (bool(again), again.verdict.reasons) == (False, ("outcome-told",))
+        probe.tell("client", *places)
+        assert probe.ask("lift").startswith("1 1 ")
+        assert probe.ask("slipped") == "told"
+        assert probe.ask("watch", DEADLINE_S).startswith("0 ")
 
 
 def test_in_cpp_a_lift_that_was_never_told_is_counted_and_warned_of(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
-from tests.clients.messages import ADDED, MS, Event, events, frames, supervised, verdict
+from tests.clients.messages import ADDED, MS, TEACHES, Event, events, frames, supervised, verdict
 from tests.clients.oracle import has_been_still, is_stable, is_to_be_watched, newest, told
 
 START_NS = 1000 * MS
@@ -111,13 +111,18 @@ def client(world: World, ask: bool = False, same: bool | None = None) -> Iterato
             yield made
 
 
-def stream(*outcomes: str, grasp: int = 1) -> list[tuple[int, list[bytes]]]:
-    """One message every 10 ms, from now on."""
-    times = [START_NS + number * 10 * MS for number in range(len(outcomes))]
-    return [
-        (at_ns, frames(verdict(seq, at_ns - MS, outcome, grasp=grasp)))
-        for seq, (at_ns, outcome) in enumerate(zip(times, outcomes, strict=True))
-    ]
+def coming(*messages: tuple[str, Mapping[str, Any]]) -> list[tuple[int, list[bytes]]]:
+    """One message every 10 ms from now on, each by its verdict and what else differs."""
+    sent = []
+    for seq, (outcome, more) in enumerate(messages):
+        at_ns = START_NS + seq * 10 * MS
+        read_ns = at_ns - round(more.get("age_ms", 1.0) * MS)
+        sent.append((at_ns, frames(verdict(seq, read_ns, outcome, **more))))
+    return sent
+
+
+def stream(*outcomes: str) -> list[tuple[int, list[bytes]]]:
+    return coming(*((outcome, {}) for outcome in outcomes))
 
 
 def payload(seq: int, outcome: str = "stable", *, boot_id: str = "a", grasp: int = 1) -> bytes:
@@ -195,15 +200,9 @@ def test_an_unknown_answer_is_asked_for_again() -> None:
     assert len(world.asking.said) == 2
 
 
-def watched(outcome: str = "unknown", number: int = 20) -> list[tuple[int, list[bytes]]]:
+def watched(outcome: str = "unknown") -> list[tuple[int, list[bytes]]]:
     """A stream of the warm-up."""
-    made = []
-    for seq in range(number):
-        at_ns = START_NS + seq * 10 * MS
-        known = verdict(seq, at_ns - MS, outcome, **WATCHED)
-        message = supervised(seq, at_ns - MS) if outcome == "unknown" else known
-        made.append((at_ns, frames(message)))
-    return made
+    return coming(*[(outcome, TEACHES if outcome == "unknown" else WATCHED)] * 20)
 
 
 @pytest.mark.parametrize("outcome", ["unknown", "slip", "stable"])
@@ -228,12 +227,9 @@ def test_only_true_asks_for_supervised_lifts(not_true: object) -> None:
 
 def grasps(number: int) -> World:
     """So many grasps, each stable for 10 ms."""
-    times = [START_NS + seq * 10 * MS for seq in range(number)]
-    coming = [
-        (at_ns, frames(verdict(seq, at_ns - MS, grasp=seq + 1))) for seq, at_ns in enumerate(times)
-    ]
-    answers = [(0, sent[1]) for _, sent in coming for _ in range(2)]
-    return World(coming, answers, [(MS, TAKEN)] * number)
+    sent = coming(*(("stable", {"grasp": grasp}) for grasp in range(1, number + 1)))
+    answers = [(0, message[1]) for _, message in sent for _ in range(2)]
+    return World(sent, answers, [(MS, TAKEN)] * number)
 
 
 def test_a_lift_that_was_allowed_and_never_told_is_counted_and_warned_of_at_times(

@@ -25,12 +25,7 @@ def block(language: str, first: str) -> list[str]:
 
 def run(*words: str | Path, **variables: str) -> str:
     done = subprocess.run(
-        words,
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-        env=os.environ | variables,
+        words, capture_output=True, text=True, timeout=200, check=False, env=os.environ | variables
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from deploy.clients.python.graspd_client import Client, Newest
+from tests.clients.building import Probe
 from tests.clients.messages import ADDED, MS, TOPIC, verdict
 from tests.clients.oracle import MAX_AGE_NS
-from tests.clients.probe import Probe
 from tests.clients.test_cpp_rules import START_NS, as_hex, said
 
 CASES: list[dict[str, Any]] = json.loads(

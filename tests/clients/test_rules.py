@@ -23,16 +23,7 @@ from deploy.clients.python.graspd_client import (
     Verdict,
     is_same_computer,
 )
-from tests.clients.messages import (
-    ADDED,
-    MS,
-    TOPIC,
-    Event,
-    events,
-    frames,
-    supervised,
-    verdict,
-)
+from tests.clients.messages import ADDED, MS, TOPIC, Event, events, frames, supervised, verdict
 from tests.clients.oracle import MAX_AGE_NS, Former, is_stable, is_to_be_watched
 
 START_NS = 1000 * MS

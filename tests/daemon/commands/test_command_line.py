@@ -17,6 +17,7 @@ from tests.conftest import ROOT
 from tests.daemon.commands.shell_files import parsers
 from tests.daemon.processes import GRASPD, graspd
 from tests.kit import inside
+from tests.kit.scenes import written
 
 EXTRAS = (
     "torch", "sklearn", "scipy", "joblib", "threadpoolctl", "onnx", "onnxscript", "skl2onnx",
@@ -79,8 +80,7 @@ def test_a_scene_that_plays_mcap_without_its_reader_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcap", None)
-    scene = tmp_path / "scene.toml"
-    scene.write_text('[tactile]\ndriver = "replay"\nrecordings = ["run.mcap"]\n')
+    scene = written(tmp_path, '[tactile]\ndriver = "replay"\nrecordings = ["run.mcap"]\n')
     done = inside.graspd(command, scene)
     assert done.returncode == 2
     assert done.stderr.startswith("graspd: replaying MCAP needs the package 'mcap': run ")

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
@@ -21,19 +22,15 @@ from tests.daemon import processes
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
 from tests.kit.inside import graspd
 from tests.kit.messages import decode_verdict
+from tests.kit.scenes import demo_scene, written
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 
 
 def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
-    endpoint = f"ipc://{tmp_path}/graspd"
-    scene.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "{endpoint}"\n'
-    )
+    scene = demo_scene(tmp_path, "loop = true")
     with start("run", scene) as process:
-        command = [sys.executable, "-c", SUBSCRIBER, endpoint, "20"]
+        command = [sys.executable, "-c", SUBSCRIBER, f"ipc://{tmp_path}/v", "20"]
         received = subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=TIMEOUT_S)
@@ -47,20 +44,28 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
     ("arguments", "says"),
     [
         (["replay", "--model", "absent.onnx"], "absent.onnx: cannot read the model"),
-        (["replay", "--speed", "nan"], "nan is not a positive number"),
+        (["replay", "--speed", "nan"], "nan is not a number from 0.001 to 1e+06"),
         (["replay", "--publish", "tcp://1.2.3.4:5"], "not a loopback address"),
         (["replay", "--publish", "ipc://*"], "needs a path that subscribers can know"),
         (["replay", "--publish", "tcp://127.0.0.1:*"], "needs a port"),
         (["replay", "--publish", ""], "must start with ipc://"),
         (["replay", "--model", ""], "model.name: string should have at least 1"),
         (["replay", "--wait", "3601"], "3601 is not a number from 0 to 3600"),
-        (["replay", "--speed", "abc"], "argument --speed: abc is not a positive number"),
+        (["replay", "--speed", "abc"], "argument --speed: abc is not a number from"),
         (["replay", "--max-slip-when-stable", "0.6"], "not a number from 0.001 to 0.5"),
         (["replay", "--max-slip-when-stable", "0.1", "--warm-up", "-1"], "risk.warm_up"),
         (["replay", str(DEMO_TABLE), "--max-slip-when-stable", "0.1"], "it needs --outcomes"),
         (["replay", "--min-confidence", "1"], "not a number from"),
         (["replay", str(DEMO_TABLE), str(DEMO_RECORDING)], "both grasp tables and streams"),
         (["doctor", "--listen", "inf"], "inf is not a number from 0.1 to 3600"),
+        (["doctor", "absent.toml"], "absent.toml: cannot read the scene"),
+        (["twin"], "required"),
+        (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
+        (["twin", "spi", "--dead", "th"], "'th' is no electrode"),
+        (["twin", "palm", "--to", "nowhere"], "nowhere"),
+        (["twin", "palm", "--one-byte-at-a-time"], "cannot show the fault one-byte-at-a-time"),
+        (["twin", "joints", "--unplugged", "mf"], "cannot show the fault unplugged-fingers"),
+        (["twin", "spi", "--recording", "absent.csv"], "absent.csv"),
     ],
 )
 def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) -> None:
@@ -68,6 +73,17 @@ def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) ->
     assert result.returncode == 2
     assert says in result.stderr
     assert "Traceback" not in result.stderr
+
+
+CAN, PALM = '[tactile]\ndriver = "can"\n', '[tactile]\ndriver = "palm"\n'
+
+
+def checked(folder: Path, text: str) -> dict[str, Any]:
+    """What `graspd check` tells programs of a scene that is right."""
+    result = graspd("check", written(folder, text), "--json")
+    assert result.returncode == 0, result.stderr
+    document: dict[str, Any] = json.loads(result.stdout)
+    return document
 
 
 @pytest.mark.parametrize(
@@ -82,10 +98,7 @@ def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) ->
 def test_check_says_what_is_written_without_a_recording(
     tmp_path: Path, sections: str, says: str
 ) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(f'[tactile]\ndriver = "can"\n{sections}\n')
-    result = graspd("check", scene, "--json")
-    assert json.loads(result.stdout)["left_out"]["record"] == says, result.stderr
+    assert checked(tmp_path, f"{CAN}{sections}\n")["left_out"]["record"] == says
 
 
 EARLY = "judged early after 100 ms, again after 240 ms"
@@ -98,9 +111,7 @@ EARLY = "judged early after 100 ms, again after 240 ms"
 def test_check_says_what_is_known_of_motion_and_when(
     tmp_path: Path, gate: str, judged: str, share: str
 ) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(f'[tactile]\ndriver = "can"\n[gate]\n{gate}\n')
-    said = json.loads(graspd("check", scene, "--json").stdout)["in"]["still"]
+    said = checked(tmp_path, f"{CAN}[gate]\n{gate}\n")["in"]["still"]
     assert said.endswith(f"said to move {share} of the time; {judged}")
     found = re.match(
         r"after 100 ms fast motion is excluded, (\d+) counts/s and more, after 240 ms slow slides,"
@@ -114,7 +125,6 @@ def test_check_says_what_is_known_of_motion_and_when(
 
 
 def test_run_names_the_process_that_has_the_port(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
         socket.create_server(("127.0.0.1", 0)) as tcp,
@@ -125,24 +135,16 @@ def test_run_names_the_process_that_has_the_port(tmp_path: Path) -> None:
             (f"udp://127.0.0.1:{udp.getsockname()[1]}", endpoint),
             ("udp://127.0.0.1:0", f"tcp://127.0.0.1:{tcp.getsockname()[1]}"),
         ):
-            scene.write_text(
-                f'[tactile]\ndriver = "palm"\nsource = "{source}"\n'
-                f'[publish]\nendpoint = "{publish}"\n[session]\nkeep = false\n'
-            )
+            text = f'[publish]\nendpoint = "{publish}"\n[session]\nkeep = false\n'
+            scene = written(tmp_path, f'{PALM}source = "{source}"\n{text}')
             result = processes.graspd("run", scene)
             assert result.returncode == 1, result.stderr
             assert f"Address already in use: PID {os.getpid()}, " in result.stderr
 
 
 def test_check_does_not_look_for_devices(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text('[tactile]\ndriver = "can"\ninterface = "nothing-of-this-name"\n')
-    assert graspd("check", scene).returncode == 0
-    scene.write_text('[tactile]\ndriver = "spi"\nport = "nothing://of-this-name"\n')
-    assert graspd("check", scene).returncode == 0
-
-
-PALM = '[tactile]\ndriver = "palm"\n'
+    for tactile in ('"can"\ninterface = "no-such-interface"', '"spi"\nport = "nothing://there"'):
+        assert checked(tmp_path, f"[tactile]\ndriver = {tactile}\n")
 
 
 @pytest.mark.parametrize(
@@ -159,15 +161,11 @@ PALM = '[tactile]\ndriver = "palm"\n'
 def test_check_warns_of_udp_that_anybody_can_send_to(
     tmp_path: Path, source: str, only_from: str, warned: bool
 ) -> None:
-    scene = tmp_path / "scene.toml"
     heard = f'source = "{source}"\n' + (f'only_from = "{only_from}"\n' if only_from else "")
     stream = f'[joints]\ndriver = "stream"\n{heard.replace(":98", ":99")}'
-    scene.write_text(f"{PALM}{heard}{stream}")
-    result = graspd("check", scene, "--json")
-    assert result.returncode == 0
-    told = json.loads(result.stdout)["warnings"]
+    told = checked(tmp_path, f"{PALM}{heard}{stream}")["warnings"]
     assert [warning[: warning.index(" ")] for warning in told] == ["[tactile]", "[joints]"] * warned
-    assert result.stderr.count("name its sender with only_from") == len(told)
+    assert all("name its sender with only_from" in warning for warning in told)
 
 
 @pytest.mark.parametrize(
@@ -184,33 +182,29 @@ def test_check_says_that_a_port_is_not_there_yet(
     tmp_path: Path, tactile: str, absent: str | None
 ) -> None:
     (tmp_path / "there").touch()
-    scene = tmp_path / "scene.toml"
-    scene.write_text("[tactile]\n" + tactile.format(folder=tmp_path))
-    result = graspd("check", scene, "--json")
-    assert result.returncode == 0
+    told = checked(tmp_path, "[tactile]\n" + tactile.format(folder=tmp_path))["warnings"]
     said = "" if absent is None else f"{absent.format(folder=tmp_path)} is not there yet; "
-    assert [warning.startswith(said) for warning in json.loads(result.stdout)["warnings"]] == (
-        [True] * (absent is not None)
-    )
+    assert [warning.startswith(said) for warning in told] == [True] * (absent is not None)
 
 
 WRONG_PARTS = {
-    '[tactile]\ndriver = "can"\nbitrate = 500000\n': "[tactile] bit rates of socketcan are set by",
+    CAN + "bitrate = 500000\n": "[tactile] bit rates of socketcan are set by",
     PALM + 'source = "udp://127.0.0.1:9870"\n[joints]\ndriver = "palm"\n'
     'calibration = "absent.toml"\n': "absent.toml: cannot be read: No such file or directory",
 }
 
 
 @pytest.mark.parametrize("command", ["check", "run", "doctor"])
-@pytest.mark.parametrize("text", WRONG_PARTS, ids=["bit rate", "calibration"])
-def test_what_a_driver_cannot_use_is_one_line(tmp_path: Path, command: str, text: str) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(f'{text}[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n')
-    result = graspd(command, scene)
+@pytest.mark.parametrize(("text", "says"), WRONG_PARTS.items(), ids=["bit rate", "calibration"])
+def test_what_a_driver_cannot_use_is_one_line(
+    tmp_path: Path, command: str, text: str, says: str
+) -> None:
+    text = f'{text}[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+    result = graspd(command, written(tmp_path, text))
     assert result.returncode == 2, result
     (line,) = result.stderr.splitlines()
     assert line.startswith("graspd: ")
-    assert WRONG_PARTS[text] in line
+    assert says in line
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
 
 

@@ -19,6 +19,7 @@ from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from tests.bench.live import Subscriber
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict
+from tests.kit.scenes import written
 from tests.ports import can_id, free_port, multicast_group
 
 WANTED = 150
@@ -45,13 +46,12 @@ def filled(text: str, folder: Path) -> str:
 
 
 def scene_for(kind: str, folder: Path) -> Path:
-    scene = folder / "scene.toml"
-    scene.write_text(
+    return written(
+        folder,
         f"[tactile]\n{filled(SCENES[kind], folder)}\n"
         f'[model]\nname = "cnn1"\n[publish]\nendpoint = "ipc://{folder}/graspd"\n'
-        "tactile_hz = 10000\n"
+        "tactile_hz = 10000\n",
     )
-    return scene
 
 
 def twin(kind: str, folder: Path, *more: str) -> subprocess.Popen[str]:
@@ -168,23 +168,3 @@ def test_the_doctor_without_a_scene_looks_at_the_computer() -> None:
     result = graspd("doctor", "--listen", 0.3, "--json")
     assert result.returncode in (0, 1)
     assert json.loads(result.stdout)["findings"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["twin"], "required"),
-        (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
-        (["twin", "spi", "--dead", "th"], "'th' is no electrode"),
-        (["twin", "palm", "--to", "nowhere"], "nowhere"),
-        (["twin", "palm", "--one-byte-at-a-time"], "cannot show the fault one-byte-at-a-time"),
-        (["twin", "joints", "--unplugged", "mf"], "cannot show the fault unplugged-fingers"),
-        (["twin", "spi", "--recording", "absent.csv"], "absent.csv"),
-        (["doctor", "absent.toml"], "absent.toml: cannot read the scene"),
-    ],
-)
-def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) -> None:
-    result = graspd(*arguments)
-    assert result.returncode == 2, result
-    assert says in result.stderr
-    assert "Traceback" not in result.stderr

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from graspd import drivers
 from graspd.daemon.assembly import assembly
-from graspd.daemon.commands import models
 from graspd.daemon.scene import Scene, parse
 from graspd.models import own, zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import read
 from tests.kit.inside import graspd
+from tests.kit.scenes import demo_scene
 
 
 @pytest.fixture
@@ -36,10 +35,21 @@ def trained(tmp_path: Path) -> Path:
     return Path(shutil.copy(zoo.find("mlp"), folder / "mine.onnx"))
 
 
-def command(*words: object) -> int:
-    parser = argparse.ArgumentParser()
-    models.add_arguments(parser)
-    return models.run(parser.parse_args([str(word) for word in words]))
+command = partial(graspd, "models")
+
+
+def done(*words: object) -> str:
+    """What a command that succeeds prints."""
+    result = command(*words)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def refused(says: str, *words: object) -> None:
+    result = command(*words)
+    assert result.returncode == 2
+    assert says in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", zoo.names())
@@ -61,31 +71,23 @@ def scene_with(name: str, fingers: tuple[str, ...] = ("ff", "mf", "th")) -> Scen
     return parse({"tactile": replay, "hand": hand, "model": model}, Path("scene.toml"))
 
 
-def test_an_added_model_is_found_by_its_name_until_it_is_removed(
-    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("add", trained, "--name", "mine", "--user") == 0
+def test_an_added_model_is_found_by_its_name_until_it_is_removed(home: Path, trained: Path) -> None:
+    told = done("add", trained, "--name", "mine", "--user")
     kept = home / ".local" / "share" / "graspd" / "models" / "mine.onnx"
-    told = capsys.readouterr().out
     assert told == f'{kept}: added; in a scene, below [model]: name = "mine"\n'
     assert kept.read_bytes() == trained.read_bytes()
     assert sorted(path.name for path in kept.parent.iterdir()) == ["mine.json", "mine.onnx"]
     assert kept.stat().st_mode & 0o777 == 0o644
     assert assembly.model_path(scene_with("mine")) == kept
     assert assembly.load_model(scene_with("mine")).sha256 == read(trained).sha256
-    assert command() == 0
-    listing = capsys.readouterr().out
+    listing = done()
     assert "mine (own)  " in listing
     assert f"mine: {zoo.card('mlp')['what']} ({kept})" in listing
-    assert command("add", trained, "--name", "a" * 40, "--user") == 0
-    capsys.readouterr()
-    assert command() == 0
-    assert f"{'a' * 40} (own)  ff mf th  " in capsys.readouterr().out  # columns do not touch
-    assert command("remove", "a" * 40, "--user") == 0
-    capsys.readouterr()
-    assert command("mine", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == zoo.card("mlp")
-    assert command("remove", "mine", "--user") == 0
+    done("add", trained, "--name", "a" * 40, "--user")
+    assert f"{'a' * 40} (own)  ff mf th  " in done()  # columns do not touch
+    done("remove", "a" * 40, "--user")
+    assert json.loads(done("mine", "--json")) == zoo.card("mlp")
+    done("remove", "mine", "--user")
     assert not list(kept.parent.iterdir())
     with pytest.raises(ModelError, match=f"no model 'mine' .*{kept.parent}"):
         assembly.model_path(scene_with("mine"))
@@ -94,41 +96,35 @@ def test_an_added_model_is_found_by_its_name_until_it_is_removed(
 def test_check_names_an_added_model_as_the_scene_does(
     home: Path, trained: Path, tmp_path: Path
 ) -> None:
-    assert command("add", trained, "--name", "mine", "--user") == 0
-    recording = Path(drivers.__file__).parent / "recordings" / "demo" / "synthetic_show.csv"
-    tactile = f'[tactile]\ndriver = "replay"\nrecordings = ["{recording}"]\n'
+    done("add", trained, "--name", "mine", "--user")
     for name, said in (("mine", "mine, trained as mlp ("), ("mlp", "mlp (")):
-        (tmp_path / "right.toml").write_text(f'{tactile}[model]\nname = "{name}"\n')
-        result = graspd("check", tmp_path / "right.toml", "--json")
+        scene = demo_scene(tmp_path, sections=f'[model]\nname = "{name}"')
+        result = graspd("check", scene, "--json")
         assert result.returncode == 0, result.stderr
         assert json.loads(result.stdout)["in"]["model"].startswith(said)
 
 
 def test_a_model_without_a_card_is_shown_and_kept_by_its_contract(
-    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+    home: Path, trained: Path
 ) -> None:
     trained.with_suffix(".json").unlink()
-    assert command(trained) == 0
-    shown = capsys.readouterr().out
+    shown = done(trained)
     assert shown.startswith("mlp: no card came with it\n")
     assert f"F1 {100 * zoo.card('mlp')['contract']['measured'][0]['f1_mean']:.1f} +- " in shown
-    assert command("add", trained, "--name", "mine", "--user") == 0
-    assert command("mine") == 0
-    assert "mlp: no card came with it\n" in capsys.readouterr().out
-    assert command() == 0
+    done("add", trained, "--name", "mine", "--user")
+    assert "mlp: no card came with it\n" in done("mine")
+    done()
 
 
-def test_the_users_model_comes_before_the_systems(
-    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("add", trained, "--name", "mine", "--system") == 0
+def test_the_users_model_comes_before_the_systems(home: Path, trained: Path) -> None:
+    done("add", trained, "--name", "mine", "--system")
     assert own.find("mine") == own.SYSTEM_FOLDER / "mine.onnx"
     assert own.SYSTEM_FOLDER.stat().st_mode & 0o777 == 0o755
-    assert command("add", trained, "--name", "mine", "--user") == 0
+    done("add", trained, "--name", "mine", "--user")
     assert own.find("mine").is_relative_to(home)
-    assert command("add", trained, "--name", "mine", "--system", "--force") == 0
-    assert "has this name too, and comes first for you" in capsys.readouterr().err
-    assert command("remove", "mine", "--user") == 0
+    again = command("add", trained, "--name", "mine", "--system", "--force")
+    assert (again.returncode, "this name too, and comes first for you" in again.stderr) == (0, True)
+    done("remove", "mine", "--user")
     assert own.find("mine") == own.SYSTEM_FOLDER / "mine.onnx"
 
 
@@ -154,43 +150,32 @@ def test_nothing_shadows_a_model_that_ships_with_graspd(home: Path, trained: Pat
     ],
 )
 def test_a_name_that_cannot_be_is_refused(
-    words: list[str],
-    says: str,
-    home: Path,
-    trained: Path,
-    capsys: pytest.CaptureFixture[str],
+    words: list[str], says: str, home: Path, trained: Path
 ) -> None:
-    assert command("add", trained, "--user", *words) == 2
-    assert says in capsys.readouterr().err
+    refused(says, "add", trained, "--user", *words)
     assert not home.exists()
 
 
-def test_what_the_daemon_would_refuse_is_not_added(
-    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_the_daemon_would_refuse_is_not_added(home: Path, trained: Path) -> None:
+    add = ("add", trained, "--name", "mine", "--user")
     whole = trained.read_bytes()
     trained.write_bytes(whole[:-100])
-    assert command("add", trained, "--name", "mine", "--user") == 2
-    assert "not a usable ONNX model" in capsys.readouterr().err
+    refused("not a usable ONNX model", *add)
     shutil.copy(zoo.find("svm"), trained)
-    assert command("add", trained, "--name", "mine", "--user") == 2
-    assert "mine.json: is the card of another file than mine.onnx" in capsys.readouterr().err
+    refused("mine.json: is the card of another file than mine.onnx", *add)
     trained.write_bytes(whole)
     card = json.loads(trained.with_suffix(".json").read_text())
     trained.with_suffix(".json").write_text(json.dumps({**card, "weak_points": 3}))
-    assert command("add", trained, "--name", "mine", "--user") == 2
-    assert "a card is wrong: Expected `array`" in capsys.readouterr().err
+    refused("a card is wrong: Expected `array`", *add)
     assert not home.exists()
 
 
-def test_a_model_is_replaced_only_when_that_is_said(
-    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("add", trained, "--name", "mine", "--user") == 0
-    assert command("add", zoo.find("svm"), "--name", "mine", "--user") == 2
-    assert "mine.onnx is there already: --force replaces it" in capsys.readouterr().err
+def test_a_model_is_replaced_only_when_that_is_said(home: Path, trained: Path) -> None:
+    done("add", trained, "--name", "mine", "--user")
+    add = ("add", zoo.find("svm"), "--name", "mine", "--user")
+    refused("mine.onnx is there already: --force replaces it", *add)
     assert own.find("mine").read_bytes() == trained.read_bytes()
-    assert command("add", zoo.find("svm"), "--name", "mine", "--user", "--force") == 0
+    done(*add, "--force")
     assert own.find("mine").read_bytes() == zoo.find("svm").read_bytes()
     assert own.card(own.find("mine")) == zoo.card("svm")
     assert home.exists()
@@ -208,11 +193,6 @@ def test_a_model_is_replaced_only_when_that_is_said(
         (["add", "absent.onnx"], "absent.onnx: cannot read the model"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(
-    words: list[str], says: str, home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(*words) == 2
-    said = capsys.readouterr().err
-    assert says in said
-    assert said.count("\n") == 1
+def test_what_cannot_be_done_is_one_line(words: list[str], says: str, home: Path) -> None:
+    refused(says, *words)
     assert not home.exists()

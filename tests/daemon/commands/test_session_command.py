@@ -13,26 +13,13 @@ import pytest
 from graspd.daemon.session.file import SessionFile, kept_now
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.models.session_statistics import SessionState
-from tests.daemon.processes import graspd
-
-SCENE = """
-[tactile]
-driver = "replay"
-recordings = ["{recording}"]
-
-[model]
-name = "{model}"
-
-[session]
-file = "right.session.json"
-"""
+from tests.kit.inside import graspd
+from tests.kit.scenes import demo_scene, session_scene, written
 
 
 @pytest.fixture
-def scene(tmp_path: Path, bts3_dir: Path) -> Path:
-    path = tmp_path / "scene.toml"
-    path.write_text(SCENE.format(recording=bts3_dir / "palm_45.csv", model="cnn1-session"))
-    return path
+def scene(tmp_path: Path) -> Path:
+    return session_scene(tmp_path, "cnn1-session")
 
 
 def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Path) -> None:
@@ -48,15 +35,8 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
     assert document["calibrated"] is True
     assert document["session"]["statistics"]["grasps"] == grasps
     assert f"{grasps} grasps, calibrated (from 20 on)" in graspd("session", "show", scene).stdout
-    replayed = graspd(
-        "replay",
-        recording,
-        "--model",
-        "cnn1-session",
-        "--session",
-        scene.parent / "right.session.json",
-        "--json",
-    )
+    kept = ("--session", scene.parent / "right.json")
+    replayed = graspd("replay", recording, "--model", "cnn1-session", *kept, "--json")
     assert replayed.returncode == 0, replayed.stderr
     first = json.loads(replayed.stdout.splitlines()[0])
     assert first["session_calibrated"] is True
@@ -69,12 +49,8 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
 def test_check_says_that_the_file_of_a_session_that_is_not_kept_is_not_read(
     keep: bool | None, tmp_path: Path
 ) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n[session]\nfile = "kept.json"\n'
-        + ("" if keep is None else f"keep = {str(keep).lower()}\n")
-    )
+    said = "" if keep is None else f"keep = {str(keep).lower()}\n"
+    path = demo_scene(tmp_path, sections=f'[session]\nfile = "kept.json"\n{said}')
     checked = graspd("check", path)
     assert checked.returncode == 0, checked.stderr
     assert ("not kept and its file not read" in checked.stdout) is (keep is not True)
@@ -82,35 +58,24 @@ def test_check_says_that_the_file_of_a_session_that_is_not_kept_is_not_read(
 
 
 def test_a_run_on_grasps_of_the_training_says_so(tmp_path: Path, bts3_dir: Path) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{bts3_dir}/palm_side.csv"]\n'
-        f'[model]\nname = "mlp"\n[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
-    )
-    result = graspd("run", path, "--print")
+    played = f'driver = "replay"\npace = "fast"\nrecordings = ["{bts3_dir}/palm_side.csv"]\n'
+    text = f'[tactile]\n{played}[model]\nname = "mlp"\n[publish]\nendpoint = "ipc://{tmp_path}/v"\n'
+    result = graspd("run", written(tmp_path, text), "--print")
     assert result.returncode == 0, result.stderr
     assert "the model was trained on palm_side.csv" in result.stdout
 
 
 @pytest.mark.parametrize("section", ["", '[session]\nkeep = false\nfile = "kept.json"\n'])
 def test_a_scene_that_keeps_no_session_touches_none(section: str, tmp_path: Path) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n{section}')
-    for refused in (
-        graspd("session", "seed", path, DEMO_TABLE),
-        graspd("session", "reset", path),
-    ):
+    path = demo_scene(tmp_path, sections=section)
+    for refused in (graspd("session", "seed", path, DEMO_TABLE), graspd("session", "reset", path)):
         assert refused.returncode == 2
         assert f"{path} keeps no session" in refused.stderr
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3_dir: Path) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        '[tactile]\ndriver = "spi"\nport = "/nowhere"\n[model]\nname = "small-session"\n'
-        '[session]\nfile = "right.session.json"\n'
-    )
+    path = session_scene(tmp_path)
     seeded = graspd("session", "seed", path, bts3_dir / "palm_45.csv")
     assert seeded.returncode == 0, seeded.stderr
     assert re.search(r": \d+ grasps of 2133 readings", seeded.stdout)
@@ -126,13 +91,9 @@ def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3
 
 
 def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        '[tactile]\ndriver = "spi"\nport = "/nowhere"\n[model]\nname = "small-session"\n'
-        '[session]\nfile = "right.session.json"\n'
-    )
+    path = session_scene(tmp_path)
     fingers = ("ff", "mf", "th")
-    with SessionFile(tmp_path / "right.session.json") as file:
+    with SessionFile(tmp_path / "right.json") as file:
         file.save(kept_now(None, fingers, {"ff": "BTSP-1"}))
         file.put_aside(kept_now(None, fingers, {"ff": "BTSP-2", "th": "BTSP-3"}))
     shown = graspd("session", "show", path)
@@ -143,14 +104,11 @@ def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
 
 def test_a_session_that_the_daemon_cannot_use_is_not_shown_as_calibrated(tmp_path: Path) -> None:
     """One that is of other fingers, and one whose electrodes all rest where no grasp is."""
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        '[tactile]\ndriver = "spi"\nport = "/nowhere"\n[session]\nfile = "right.session.json"\n'
-    )
+    path = session_scene(tmp_path)
     shown = []
     for fingers in (("ff", "mf", "rf"), ("ff", "mf", "th")):
         odd = SessionState(30.0, 30, (4000.0,) * 150, (1e4,) * 150)
-        with SessionFile(tmp_path / "right.session.json") as file:
+        with SessionFile(tmp_path / "right.json") as file:
             file.save(kept_now(odd, fingers, {}))
         program = graspd("session", "show", path, "--json")
         shown.append((json.loads(program.stdout)["calibrated"], program.stderr))
@@ -216,10 +174,8 @@ def test_a_young_session_is_hardly_ever_sure_and_then_right(bts3_dir: Path) -> N
     assert all(sure)
 
 
-def test_a_model_that_learns_nothing_says_so(tmp_path: Path, bts3_dir: Path) -> None:
-    path = tmp_path / "scene.toml"
-    scene = SCENE.format(recording=bts3_dir / "palm_45.csv", model="cnn1")
-    path.write_text(scene + "[learn]\nenabled = false\n")
+def test_a_model_that_learns_nothing_says_so(tmp_path: Path) -> None:
+    path = session_scene(tmp_path, "cnn1", "[learn]\nenabled = false\n")
     result = graspd("session", "show", path)
     assert result.returncode == 2
     assert result.stderr == "graspd: the model cnn1 keeps no session\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -16,22 +15,13 @@ from graspd.daemon.session.file import SessionFile, former_of, kept_now, load
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.trust import Trust, TrustState, decode
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from graspd.drivers.recordings.csv_rows import SLIPPED, read_rows
+from graspd.drivers.recordings.csv_rows import read_rows
 from tests.daemon.record.test_export import Writer
 from tests.kit.inside import graspd
+from tests.kit.scenes import session_scene, unlabelled_demo
 
 FINGERS = ("ff", "mf", "th")
 ROWS = list(read_rows(DEMO_TABLE, FINGERS))
-
-
-def scene_at(folder: Path, model: str = "small-session", more: str = "") -> Path:
-    folder.mkdir(exist_ok=True)
-    path = folder / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "spi"\nport = "/nowhere"\n[model]\nname = "{model}"\n'
-        f'[session]\nfile = "right.json"\n{more}'
-    )
-    return path
 
 
 def seed(path: Path, recording: Path) -> TrustState | None:
@@ -59,7 +49,7 @@ def live_trust(path: Path) -> Trust:
 
 
 def test_a_table_teaches_and_ends_the_warm_up_and_counts_no_lift(tmp_path: Path) -> None:
-    path = scene_at(tmp_path, more="[risk]\nmax_slip_when_stable = 0.1\n")
+    path = session_scene(tmp_path, sections="[risk]\nmax_slip_when_stable = 0.1\n")
     learned = seed(path, DEMO_TABLE)
     assert learned is not None
     known = sum(row.annotation.slipped is not None for row in ROWS)
@@ -89,38 +79,26 @@ def test_a_table_teaches_and_ends_the_warm_up_and_counts_no_lift(tmp_path: Path)
 
 
 def test_a_recording_teaches_as_the_table_of_its_grasps_does(tmp_path: Path) -> None:
-    table = scene_at(tmp_path / "table")
+    table = session_scene(tmp_path / "table")
     recording = tmp_path / "monday.mcap"
     writer = Writer(recording)
     for number, row in enumerate(ROWS, 1):
         writer.judged(number, row.counts)
         writer.outcome(number, "slip" if row.annotation.slipped else "stable")
     writer.close()
-    recorded = scene_at(tmp_path / "recorded")
+    recorded = session_scene(tmp_path / "recorded")
     assert seed(recorded, recording) == seed(table, DEMO_TABLE)
 
 
-def without_labels(folder: Path) -> Path:
-    """The table as of somebody who has not noted how the lifts ended."""
-    path = folder / "unlabelled.csv"
-    with DEMO_TABLE.open() as labelled, path.open("w") as out:
-        rows = csv.DictReader(labelled)
-        names = [name for name in rows.fieldnames or () if name != SLIPPED]
-        writer = csv.DictWriter(out, names, extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
-
-
 def test_a_table_without_labels_seeds_the_session_alone(tmp_path: Path) -> None:
-    learned = seed(scene_at(tmp_path), without_labels(tmp_path))
+    learned = seed(session_scene(tmp_path), unlabelled_demo(tmp_path))
     assert learned is not None
     assert (learned.learner.outcomes, learned.risk.proven) == (0, 0)
 
 
 def test_a_model_without_session_learns_from_outcomes_or_refuses(tmp_path: Path) -> None:
-    path = scene_at(tmp_path, model="mlp")
-    refused = graspd("session", "seed", path, without_labels(tmp_path))
+    path = session_scene(tmp_path, model="mlp")
+    refused = graspd("session", "seed", path, unlabelled_demo(tmp_path))
     assert refused.returncode == 2
     assert "none is a grasp whose outcome is known" in refused.stderr
     learned = seed(path, DEMO_TABLE)
@@ -132,15 +110,15 @@ def test_a_model_without_session_learns_from_outcomes_or_refuses(tmp_path: Path)
 
 
 def test_seeding_where_nothing_learns_keeps_what_was_learned(tmp_path: Path) -> None:
-    learned = seed(scene_at(tmp_path), DEMO_TABLE)
+    learned = seed(session_scene(tmp_path), DEMO_TABLE)
     assert learned is not None
     assert learned.learner.outcomes > 0
-    off = scene_at(tmp_path, more="[learn]\nenabled = false\n")
-    assert seed(off, without_labels(tmp_path)) == learned
+    off = session_scene(tmp_path, sections="[learn]\nenabled = false\n")
+    assert seed(off, unlabelled_demo(tmp_path)) == learned
 
 
 def test_a_run_that_prints_ends_with_what_outcomes_have_taught(tmp_path: Path) -> None:
-    path = scene_at(tmp_path, "mlp", "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n")
+    path = session_scene(tmp_path, "mlp", "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n")
     played = f'driver = "replay"\npace = "fast"\nrecordings = ["{DEMO_TABLE}"]'
     text = path.read_text().replace('driver = "spi"\nport = "/nowhere"', played)
     path.write_text(f'{text}[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n')
@@ -156,7 +134,7 @@ def test_a_run_that_prints_ends_with_what_outcomes_have_taught(tmp_path: Path) -
 
 
 def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
-    path, kept = scene_at(tmp_path), tmp_path / "right.json"
+    path, kept = session_scene(tmp_path), tmp_path / "right.json"
     seed(path, DEMO_TABLE)
     with SessionFile(kept) as file:
         first = file.load()
@@ -178,7 +156,7 @@ def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damaged", [("right.json",), ("right.json", "right.json.former")])
 def test_what_is_damaged_is_said(tmp_path: Path, damaged: tuple[str, ...]) -> None:
-    path, kept = scene_at(tmp_path, model="mlp"), tmp_path / "right.json"
+    path, kept = session_scene(tmp_path, model="mlp"), tmp_path / "right.json"
     with SessionFile(kept) as file:
         file.save(kept_now(None, FINGERS, {}))
         file.save(kept_now(None, FINGERS, {"ff": "A"}))

@@ -27,8 +27,7 @@ Faults = NDArray[np.uint8]
 
 
 def statistics(
-    spoil: Callable[[Counts, Faults, int], None],
-    readings: int = 100,
+    spoil: Callable[[Counts, Faults, int], None], readings: int = 100
 ) -> ElectrodeStatistics:
     """Statistics over untouched sensors with 3.5 counts of noise, spoilt by the test."""
     random = np.random.default_rng(0)
@@ -102,9 +101,7 @@ def restless(counts: Counts, _faults: object, number: int) -> None:
     ],
 )
 def test_a_fault_is_found_and_named(
-    spoil: Callable[[Counts, Faults, int], None],
-    level: Level,
-    says: str,
+    spoil: Callable[[Counts, Faults, int], None], level: Level, says: str
 ) -> None:
     (finding,) = statistics(spoil).findings()
     assert finding.level is level

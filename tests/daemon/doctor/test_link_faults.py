@@ -1,4 +1,4 @@
-"""Each fault of a link is told by its cause, and nothing else is accused."""
+"""Each fault of a link is told by its cause; nothing else is accused, and no healthy link."""
 
 from __future__ import annotations
 
@@ -34,6 +34,9 @@ from tests.drivers.can.can_standin import ScriptedBus, SocketBus, stand_in
 from tests.drivers.can.test_can_socket import DownSocket, over_socket
 
 LOOK_S = 3
+HOUR_S, EVERY_S = 3600, 20
+HAND_HZ = 10.0
+"""Moments of the hand in a second of its own: the link plays them faster, a look in less time."""
 
 LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
     "damaged bytes": (
@@ -171,3 +174,20 @@ def test_an_address_and_a_port_that_cannot_be_had_are_told(
             (finding,) = look(tmp_path, capsys, text + MODEL + published(tmp_path))
             assert finding["cause"] == cause
             assert (f"PID {pid}, " in finding["what"]) == (cause == "port-held")
+
+
+@pytest.mark.parametrize("kind", LINKS)
+def test_nothing_is_wrong_with_a_healthy_twin_for_an_hour(kind: str, tmp_path: Path) -> None:
+    sweeps, hand = int(LOOK_S * HAND_HZ), Hand(HAND_HZ)
+    sweep_hz = 1000 / 14 if kind == "palm" else 100.0
+    look_s = sweeps / sweep_hz
+    with LINKS[kind](hand, tmp_path, LinkFaults()) as (driver, step):
+        listen(driver, step, STEPS_PER_S[kind], ElectrodeStatistics(FINGERS))
+        for look in range(HOUR_S // EVERY_S):
+            statistics = ElectrodeStatistics(FINGERS)
+            listen(driver, step, round(look_s * STEPS_PER_S[kind]), statistics)
+            told = faults_told(driver, statistics, look_s)
+            assert told == [], f"after {look * EVERY_S} s"
+            if kind != "joints":
+                assert statistics.readings >= sweeps - 1
+                hand.skip(int(EVERY_S * HAND_HZ) - statistics.readings)

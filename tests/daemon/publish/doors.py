@@ -31,7 +31,7 @@ class Publisher:
         self._listener = Listener(endpoint)
         try:
             self.door = Door(
-                self._listener, high_water_mark=high_water_mark, awaits_subscriber=awaits
+                [self._listener], high_water_mark=high_water_mark, awaits_subscriber=awaits
             )
         except BaseException:
             self._listener.close()

@@ -16,12 +16,11 @@ from zmq.auth.thread import ThreadAuthenticator
 from graspd.daemon.publish import door as doors
 from graspd.daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
 from graspd.daemon.publish.listener import PublishError
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.publish.doors import QUIET_S, Asked, KeyedDoor
 from tests.kit.inside import graspd
 from tests.kit.messages import GOLDEN_STATUS
+from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S, wait_until
-from tests.ports import free_port
 
 
 @pytest.fixture
@@ -234,12 +233,8 @@ def test_a_folder_that_others_may_write_is_refused_before_anything_starts(
 ) -> None:
     make(tmp_path / "keys", "daemon")
     make(tmp_path / "keys" / "clients", "laptop")
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "tcp://127.0.0.1:{free_port()}"\n'
-        '[curve]\nsecret_key = "keys/daemon.key_secret"\nclients = "keys/clients"\n'
-    )
+    curve = '[curve]\nsecret_key = "keys/daemon.key_secret"\nclients = "keys/clients"\n'
+    scene = demo_scene(tmp_path, sections=curve)
     (tmp_path / "keys").chmod(0o777)
     done = graspd(command, scene)
     assert done.returncode == 2

@@ -40,13 +40,7 @@ def test_outcomes_are_published_as_the_schema_says() -> None:
     payloads = [payload for _, payload in output.sent]
     assert [decode_outcome(payload) for payload in payloads] == [
         OutcomeMessage(
-            boot_id=BOOT,
-            seq=seq,
-            t=5.0,
-            t_mono_ns=NOW_NS,
-            grasp=3,
-            outcome=outcome,
-            object="mug",
+            boot_id=BOOT, seq=seq, t=5.0, t_mono_ns=NOW_NS, grasp=3, outcome=outcome, object="mug"
         )
         for seq, outcome in enumerate(BOTH)
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -36,13 +36,6 @@ def questions(sent: list[Frames]) -> Questions:
         return True
 
     return Questions(send, PATIENCE_NS)
-
-
-@pytest.fixture
-def peers() -> Iterator[Peers]:
-    made = Peers()
-    yield made
-    made.close()
 
 
 def test_the_daemons_clock_is_told_at_once_and_judges_nothing(

@@ -7,7 +7,6 @@ import os
 import random
 import select
 import stat
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +29,6 @@ from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S, wait_until
 
 HOSTILE_MESSAGES = 2_000
-
-
-@pytest.fixture
-def peers() -> Iterator[Peers]:
-    peers = Peers()
-    yield peers
-    peers.close()
 
 
 def wanted(

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from graspd.daemon.commands.watch import where_to_examine, where_to_look
+from graspd.daemon.commands.watch import where_to_look
 from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
 from graspd.daemon.publish.messages import State
 from graspd.daemon.watch.snapshot import Line, Tone
@@ -125,7 +125,7 @@ def test_health_names_all_parts_of_a_reason_at_once() -> None:
 def test_where_to_look_is_a_command_of_this_daemon(
     endpoint: str, scene: str | None, look: str
 ) -> None:
-    said = where_to_look(endpoint, None if scene is None else Path(scene))
+    said, _ = where_to_look(endpoint, None if scene is None else Path(scene))
     assert said.startswith(look)
     if "graspd@" in look:
         assert "graspd@*" in said or f"journalctl -u {look.split()[2].rstrip(';')}" in said
@@ -141,7 +141,7 @@ def test_where_to_look_is_a_command_of_this_daemon(
     ],
 )
 def test_where_to_examine_names_the_scene(endpoint: str, scene: str | None, command: str) -> None:
-    said = where_to_examine(endpoint, None if scene is None else Path(scene))
+    _, said = where_to_look(endpoint, None if scene is None else Path(scene))
     assert said.startswith(command)
 
 
