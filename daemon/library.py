@@ -50,7 +50,7 @@ class GraspModel:
         """Order of the fingers in the counts."""
         self._contract = contract
         self._electrodes = Electrodes(contract.seen)
-        self._plausibility = Plausibility(self.fingers, contract.seen, self._electrodes)
+        self._plausibility = Plausibility(self.fingers, self._electrodes)
         self._network = Network(model, Limits.slip_threshold)
 
     def predict_proba(

@@ -59,8 +59,29 @@ class Deviations(NamedTuple):
         return float(self.counts.dot(self.residuals)) / (len(self.counts) - repaired)
 
 
+class Examination(NamedTuple):
+    """Result of examining a reading; arrays have shape (fingers, 24)."""
+
+    values: NDArray[np.float64]
+    """Its counts, with `implausible` electrodes repaired unless there are too many."""
+    implausible: NDArray[np.bool_]
+    """True for electrodes that were known to be broken, or do not fit the others."""
+    seen: bool
+    """True if it is like the training: a network may judge it."""
+    learned: bool
+    """True if a session may learn from it."""
+
+
 class Electrodes:
-    """Find and repair broken electrodes of readings that look like the training's."""
+    """Compare readings with the training: repair broken electrodes, refuse what is unlike it.
+
+    For readings that are far from all training data a network's answer is noise. There are two
+    tests, and each finds readings that the other misses. Each electrode must lie in its range of
+    training counts, with a margin; this finds drifted or broken electrodes. All electrodes together
+    must fit the training covariance; this finds values that are possible alone but not together.
+    Session models, whose counts are mapped to the training's sensors, use only the second test:
+    ranges would refuse good grasps of another day.
+    """
 
     def __init__(self, seen: SeenCounts) -> None:
         self._centre = np.array(seen.centre).ravel()
@@ -74,6 +95,37 @@ class Electrodes:
         """Training mean of each electrode, counts, shape (fingers, 24)."""
         self.spread = np.sqrt(np.diag(np.linalg.inv(self._precision))).reshape(self.centre.shape)
         """Training standard deviation of each electrode, counts, shape (fingers, 24)."""
+        self._low = np.array(seen.low, dtype=np.float64) - seen.margin
+        self._high = np.array(seen.high, dtype=np.float64) + seen.margin
+        self._whitening = whitening
+        self._square_min, self._square_max = seen.distance_min**2, seen.distance_max**2
+
+    def examine(
+        self, values: NDArray[np.float64], broken: NDArray[np.bool_], *, in_session: bool
+    ) -> Examination:
+        """Examine counts, shape (fingers, 24), in which electrodes known as `broken` are repaired.
+
+        `in_session`: True if they were mapped to the training's sensors by a session.
+        """
+        known = int(np.count_nonzero(broken))
+        at_most = known + CONTRADICTING_MAX + 1
+        deviations = self.compare(values)
+        implausible = self.implausible(deviations, broken, at_most)
+        number = int(np.count_nonzero(implausible))
+        if number >= at_most:
+            # The reading as a whole is like nothing in the training.
+            return Examination(values, implausible, seen=False, learned=False)
+        if number > known:
+            values = self.repaired(values, implausible)
+            deviations = self.compare(values)
+        if not in_session:
+            seen = not self.never_seen(values[np.newaxis], number)[0]
+            return Examination(values, implausible, seen, learned=True)
+        if self.moved_finger(deviations):
+            return Examination(values, implausible, seen=False, learned=False)
+        square = deviations.mean_square(number)
+        seen = self.is_near(square, number - known)
+        return Examination(values, implausible, seen, self.is_learned(square))
 
     def compare(self, values: NDArray[np.float64]) -> Deviations:
         """Compare counts, shape (fingers, 24), with what the training makes likely."""
@@ -126,6 +178,33 @@ class Electrodes:
         flat[out] = self._centre[out] - np.linalg.solve(precision[:, out], precision @ deviations)
         return flat.reshape(values.shape)
 
+    def never_seen(self, counts: NDArray[np.generic], repaired: int = 0) -> NDArray[np.bool_]:
+        """Return True for each reading of `counts` that is unlike the training, shape (N,).
+
+        `counts`: shape (N, fingers, 24). `repaired`: number of repaired electrodes in each, which
+        are left out of the mean distance.
+        """
+        values = counts.astype(np.float64)
+        outside = ((values < self._low) | (values > self._high)).any(axis=(1, 2))
+        deviations = (values.reshape(len(values), -1) - self._centre) @ self._whitening
+        squares = np.einsum("ne,ne->n", deviations, deviations) / (len(self._centre) - repaired)
+        # Not `square > limit`: a value that is not finite must count as never seen.
+        within = (squares <= self._square_max) & (squares >= self._square_min)
+        never: NDArray[np.bool_] = outside | ~within
+        return never
+
+    def is_near(self, square: float, contradicted: int = 0) -> bool:
+        """Return True if a reading of this `square` fits the covariance.
+
+        `contradicted`: number of its repaired electrodes that contradicted the others.
+        """
+        share = CONTRADICTED_DISTANCES if contradicted else 1.0
+        return self._square_min <= square <= share**2 * self._square_max
+
+    def is_learned(self, square: float) -> bool:
+        """Return True if a session may learn from a mapped reading of this `square`."""
+        return square <= LEARNED_DISTANCES**2 * self._square_max
+
 
 class _Others:
     """Precision and residuals of the remaining electrodes after some were left out.
@@ -159,53 +238,3 @@ class _Others:
         self._diagonal[electrode] = np.inf  # so that it is never the worst again
         self._columns[count] = column
         self.forgotten.append(electrode)
-
-
-class NoveltyCheck:
-    """Find readings that are far from all training data; for them a network's answer is noise.
-
-    There are two tests, and each finds readings that the other misses. Each electrode must lie in
-    its range of training counts, with a margin; this finds drifted or broken electrodes. All
-    electrodes together must fit the training covariance; this finds values that are possible alone
-    but not together. Session models, whose counts are mapped to the training's sensors, use only
-    the second test: ranges would refuse good grasps of another day.
-    """
-
-    def __init__(self, seen: SeenCounts) -> None:
-        self._low = np.array(seen.low, dtype=np.float64) - seen.margin
-        self._high = np.array(seen.high, dtype=np.float64) + seen.margin
-        self._centre = np.array(seen.centre).ravel()
-        self._whitening = seen.whitening_matrix()
-        self._electrodes = len(self._centre)
-        self._square_min, self._square_max = seen.distance_min**2, seen.distance_max**2
-
-    def never_seen(self, counts: NDArray[np.generic], repaired: int = 0) -> NDArray[np.bool_]:
-        """Return True for each reading of `counts` that is unlike the training, shape (N,).
-
-        `counts`: shape (N, fingers, 24). `repaired`: number of repaired electrodes in each, which
-        are left out of the mean distance.
-        """
-        values = counts.astype(np.float64)
-        outside = ((values < self._low) | (values > self._high)).any(axis=(1, 2))
-        squares = self._squares(values, repaired)
-        # Not `square > limit`: a value that is not finite must count as never seen.
-        within = (squares <= self._square_max) & (squares >= self._square_min)
-        never: NDArray[np.bool_] = outside | ~within
-        return never
-
-    def is_near(self, square: float, contradicted: int = 0) -> bool:
-        """Return True if a reading of this `square` fits the covariance.
-
-        `contradicted`: number of its repaired electrodes that contradicted the others.
-        """
-        share = CONTRADICTED_DISTANCES if contradicted else 1.0
-        return self._square_min <= square <= share**2 * self._square_max
-
-    def is_learned(self, square: float) -> bool:
-        """Return True if a session may learn from a mapped reading of this `square`."""
-        return square <= LEARNED_DISTANCES**2 * self._square_max
-
-    def _squares(self, values: NDArray[np.float64], repaired: int) -> NDArray[np.float64]:
-        deviations = (values.reshape(len(values), -1) - self._centre) @ self._whitening
-        squares: NDArray[np.float64] = np.einsum("ne,ne->n", deviations, deviations)
-        return squares / (self._electrodes - repaired)

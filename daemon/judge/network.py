@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.health import too_many
+from graspd.daemon.judge.health import any_of, too_many
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import COUNT_MAX, ELECTRODES
-from graspd.models.contract import Finger, ModelError, SeenCounts
-from graspd.models.electrodes import CONTRADICTING_MAX, Electrodes, NoveltyCheck
+from graspd.models.contract import Finger, ModelError
+from graspd.models.electrodes import Electrodes
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
 from graspd.models.runtime import TactileModel
 
@@ -66,10 +66,9 @@ NO_OPINION = Opinion(None, ())
 class Plausibility:
     """Repairs counts where electrodes contradict the others; refuses those unlike the training."""
 
-    def __init__(self, fingers: Sequence[Finger], seen: SeenCounts, electrodes: Electrodes) -> None:
-        """`seen`: the model's description of its training counts. `electrodes`: made from it."""
+    def __init__(self, fingers: Sequence[Finger], electrodes: Electrodes) -> None:
+        """`electrodes`: made from the model's description of its training counts."""
         self._fingers = tuple(fingers)
-        self._novelty = NoveltyCheck(seen)
         self._electrodes = electrodes
 
     def examine(
@@ -92,46 +91,24 @@ class Plausibility:
         if broken is None:
             broken = np.zeros(counts.shape, dtype=np.bool_)
         grasp: NDArray[np.generic] = counts
-        known = int(np.count_nonzero(broken))
-        if known:
-            grasp, values = self._repair(counts, values, broken, session)
-        deviations = self._electrodes.compare(values)
-        at_most = known + CONTRADICTING_MAX + 1
-        implausible = self._electrodes.implausible(deviations, broken, at_most)
-        number = int(np.count_nonzero(implausible))
-        repaired = grasp
-        # With more than that, the reading as a whole is like nothing in the training.
-        seen = learned = number < at_most and not too_many(implausible)
-        if seen:
-            if number > known:
-                repaired, values = self._repair(counts, values, implausible, session)
-                deviations = self._electrodes.compare(values)
-            if session is None:
-                seen = not self._novelty.never_seen(values[np.newaxis], number)[0]
-            elif self._electrodes.moved_finger(deviations):
-                seen = learned = False
-            else:
-                square = deviations.mean_square(number)
-                learned = self._novelty.is_learned(square)
-                seen = self._novelty.is_near(square, number - known) and not session.odd
+        if any_of(broken):
+            values = self._electrodes.repaired(values, broken)
+            grasp = _as_read(counts, values, broken, session)
+        found = self._electrodes.examine(values, broken, in_session=session is not None)
+        seen, learned = found.seen, found.learned
+        if too_many(found.implausible):
+            seen = learned = False
+        if session is not None and session.odd:
+            seen = False
         if not seen:
             # A young session learns from all, for that is how drift begins; later on a sensor that
             # fails would slowly become its own standard.
             learned |= session is None or not session.calibrated
             return Examined((Reason.NEVER_SEEN,), counts, (), grasp if learned else None)
-        return Examined((), repaired, self._names(implausible) if number else (), grasp)
-
-    def _repair(
-        self,
-        counts: NDArray[np.uint16],
-        values: NDArray[np.float64],
-        broken: NDArray[np.bool_],
-        session: Calibration | None,
-    ) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
-        """Return counts, and their values with the training's sensors, with `broken` repaired."""
-        values = self._electrodes.repaired(values, broken)
-        expected = values if session is None else session.from_training(values)
-        return np.where(broken, np.clip(expected, 0.0, COUNT_MAX), counts), values
+        if not any_of(found.implausible):
+            return Examined((), counts, (), counts)
+        repaired = _as_read(counts, found.values, found.implausible, session)
+        return Examined((), repaired, self._names(found.implausible), grasp)
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         places = np.argwhere(which).tolist()
@@ -180,6 +157,17 @@ class Network:
 def electrode_name(finger: Finger, place: int) -> str:
     """Return the name of an electrode, counted from 1: `ff_7` for finger `ff` and place 6."""
     return f"{finger}_{place + 1}"
+
+
+def _as_read(
+    counts: NDArray[np.uint16],
+    values: NDArray[np.float64],
+    broken: NDArray[np.bool_],
+    session: Calibration | None,
+) -> NDArray[np.generic]:
+    """Return counts with `broken` electrodes as today's sensors would read their `values`."""
+    expected = values if session is None else session.from_training(values)
+    return np.where(broken, np.clip(expected, 0.0, COUNT_MAX), counts)
 
 
 def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_] | None) -> bool:

@@ -120,7 +120,7 @@ class Pipeline:
         self._needs_session = needs_session
         self._fingers = contract.fingers
         self._health = Health(len(fingers))
-        self._plausibility = Plausibility(fingers, contract.seen, electrodes)
+        self._plausibility = Plausibility(fingers, electrodes)
         self._network = Network(model, limits.slip_threshold)
         self.trust = trust
         """Learning and risk; None: without learning and without a risk."""

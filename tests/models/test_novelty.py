@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graspd.models.contract import ModelContract, ModelError, SeenCounts, SessionInput, Sharpness
-from graspd.models.electrodes import Electrodes, NoveltyCheck
+from graspd.models.electrodes import Electrodes
 from tests.daemon.fakes import contract
 
 
@@ -32,14 +32,14 @@ def session(**changes: object) -> dict[str, object]:
 def test_a_count_beyond_the_margin_was_never_seen(count: int, refused: bool) -> None:
     counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
     counts[1, 1, 11] = count
-    assert NoveltyCheck(seen()).never_seen(counts).tolist() == [False, refused]
+    assert Electrodes(seen()).never_seen(counts).tolist() == [False, refused]
 
 
 @pytest.mark.parametrize(("off", "refused"), [(200, False), (201, True), (-201, True)])
 def test_the_distance_is_the_root_mean_square_deviation(off: int, refused: bool) -> None:
     # All 72 electrodes `off` counts from the centre, one spread being 100 counts: distance 2.
     counts = np.full((1, 3, 24), 2000 + off, dtype=np.uint16)
-    check = NoveltyCheck(seen(spread=1 / 100, distance_max=2.0))
+    check = Electrodes(seen(spread=1 / 100, distance_max=2.0))
     assert check.never_seen(counts).tolist() == [refused]
 
 
@@ -50,7 +50,7 @@ def test_the_triangle_is_read_row_by_row() -> None:
     counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
     counts[0, 0, 5] += 100
     counts[1, 0, 2] += 100
-    assert NoveltyCheck(crossed).never_seen(counts).tolist() == [True, False]
+    assert Electrodes(crossed).never_seen(counts).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_a_contract_that_contradicts_itself_is_refused(
 def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
     distance: float, near: bool, near_though_contradicted: bool, learned: bool
 ) -> None:
-    check = NoveltyCheck(seen(spread=1 / 100))
+    check = Electrodes(seen(spread=1 / 100))
     values = np.full((3, 24), 2000.0 + 100.0 * distance)
     deviations = Electrodes(seen(spread=1 / 100)).compare(values)
     assert check.is_near(deviations.mean_square()) is near
@@ -105,7 +105,7 @@ def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
 
 
 def test_a_reading_that_is_not_finite_is_neither_near_nor_learned() -> None:
-    check, values = NoveltyCheck(seen(spread=1 / 100)), np.full((3, 24), 2000.0)
+    check, values = Electrodes(seen(spread=1 / 100)), np.full((3, 24), 2000.0)
     values[0, 0] = np.nan
     square = Electrodes(seen(spread=1 / 100)).compare(values).mean_square()
     assert not check.is_near(square)

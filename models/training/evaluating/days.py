@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.models.electrodes import CONTRADICTING_MAX, Electrodes, NoveltyCheck
+from graspd.models.electrodes import Electrodes
 from graspd.models.inputs import builder, raw_features
 from graspd.models.session_statistics import SessionStatistics, is_odd
 from graspd.models.training.arrays import Bools, Floats, Ints, Numbers
@@ -65,8 +65,7 @@ class Day:
     """The daemon's `Plausibility`, for readings with no fault."""
 
     def __init__(self, trained: Trained) -> None:
-        seen = trained.seen()
-        self.electrodes, self._novelty = Electrodes(seen), NoveltyCheck(seen)
+        self.electrodes = Electrodes(trained.seen())
         self._sound = np.zeros(self.electrodes.centre.shape, np.bool_)
 
     def look(self, counts: Numbers, session: Standards | None = None) -> tuple[Numbers, bool, bool]:
@@ -77,22 +76,11 @@ class Day:
         now = session or Standards(self.electrodes.centre, self.electrodes.spread)
         scale = self.electrodes.spread / now.spread
         values = self.electrodes.centre + (counts.astype(np.float64) - now.mean) * scale
-        deviations = self.electrodes.compare(values)
-        found = self.electrodes.implausible(deviations, self._sound, CONTRADICTING_MAX + 1)
-        number = int(found.sum())
-        if number > CONTRADICTING_MAX:
-            return counts, False, False
-        if number:
-            values = self.electrodes.repaired(values, found)
-            deviations = self.electrodes.compare(values)
-            expected = now.mean + (values - self.electrodes.centre) / scale
-            counts = np.where(found, np.clip(expected, 0.0, COUNT_MAX), counts)
-        if session is None:
-            return counts, not self._novelty.never_seen(values[np.newaxis], number).any(), True
-        if self.electrodes.moved_finger(deviations):
-            return counts, False, False
-        square = deviations.mean_square(number)
-        return counts, self._novelty.is_near(square, number), self._novelty.is_learned(square)
+        found = self.electrodes.examine(values, self._sound, in_session=session is not None)
+        if found.values is not values:
+            expected = now.mean + (found.values - self.electrodes.centre) / scale
+            counts = np.where(found.implausible, np.clip(expected, 0.0, COUNT_MAX), counts)
+        return counts, found.seen, found.learned
 
 
 class SessionDay:

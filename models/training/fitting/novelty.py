@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from graspd.models.contract import SeenCounts
-from graspd.models.electrodes import NoveltyCheck
+from graspd.models.electrodes import Electrodes
 from graspd.models.training.arrays import Numbers
 from graspd.models.training.data.datasets import COUNT_MAX
 
@@ -72,9 +72,7 @@ def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN
     never = np.empty(len(counts), dtype=np.bool_)
     for group in np.unique(group_of):
         inside = group_of == group
-        never[inside] = NoveltyCheck(seen_counts(counts[~inside], margin)).never_seen(
-            counts[inside]
-        )
+        never[inside] = Electrodes(seen_counts(counts[~inside], margin)).never_seen(counts[inside])
     return float(never.mean())
 
 
@@ -94,7 +92,7 @@ def made_up_never_seen(counts: Numbers, seen: SeenCounts, seed: int) -> dict[str
         "each electrode from another grasp": lambda: random.permuted(counts, axis=0),
         "middle of the ranges, with noise": lambda: (low + high) / 2 + random.normal(0, 3.5, shape),
     }
-    check = NoveltyCheck(seen)
+    check = Electrodes(seen)
     return {
         name: float(check.never_seen(make().astype(np.uint16)).mean())
         for name, make in makers.items()

@@ -124,7 +124,7 @@ def test_a_finger_that_reads_about_the_same_everywhere_is_flat(
     counts[finger, :broken] = 0
     mask[finger, :broken] = True
     seen = seen_box(3)
-    found = Plausibility(FINGERS, seen, Electrodes(seen)).examine(counts, mask)
+    found = Plausibility(FINGERS, Electrodes(seen)).examine(counts, mask)
     assert (Reason.FLAT in found.reasons) == flat
 
 

@@ -26,7 +26,7 @@ BROKEN = ((0, 14), (1, 20))
 @pytest.fixture(scope="module")
 def plausibility() -> Plausibility:
     contract = TactileModel(zoo.find("cnn1")).contract
-    return Plausibility(contract.fingers, contract.seen, Electrodes(contract.seen))
+    return Plausibility(contract.fingers, Electrodes(contract.seen))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def seen_by_sessions() -> SeenCounts:
 @pytest.fixture(scope="module")
 def of_sessions() -> Plausibility:
     seen = seen_by_sessions()
-    return Plausibility(("ff", "mf", "th"), seen, Electrodes(seen))
+    return Plausibility(("ff", "mf", "th"), Electrodes(seen))
 
 
 def same_sensors(centre: NDArray[np.float64], **known: bool) -> Calibration:

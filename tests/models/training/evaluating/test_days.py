@@ -61,7 +61,7 @@ def test_a_session_is_judged_as_the_daemon_judges_it(
     )
     electrodes = Day(trained).electrodes
     session = SessionCalibration(wanted, electrodes.centre, electrodes.spread)
-    daemon = Plausibility(("ff", "mf", "th"), trained.seen(), electrodes)
+    daemon = Plausibility(("ff", "mf", "th"), electrodes)
     builder, expected = SessionBuilder(3, CLIP), np.empty(78, np.float32)
     refused_by_daemon = []
     for reading in stream:
@@ -82,7 +82,7 @@ def test_a_session_is_judged_as_the_daemon_judges_it(
 def test_without_a_session_it_is_looked_at_as_the_daemon_does(stream: NDArray[np.uint16]) -> None:
     trained = train(SYSTEMS["svm"], GRASPS.rows(GRASPS.rows_of(("palm_down", "palm_45"))), 0)
     day = Day(trained)
-    daemon = Plausibility(("ff", "mf", "th"), trained.seen(), day.electrodes)
+    daemon = Plausibility(("ff", "mf", "th"), day.electrodes)
     looks = [day.look(reading) for reading in stream]
     for reading, (counts, seen, _) in zip(stream, looks, strict=True):
         examined = daemon.examine(reading, NOTHING)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.models.electrodes import NoveltyCheck
+from graspd.models.electrodes import Electrodes
 from graspd.models.training.fitting.novelty import (
     held_out_never_seen,
     made_up_never_seen,
@@ -38,7 +38,7 @@ def test_seen_counts_are_range_mean_and_inverse_covariance() -> None:
 
 def test_values_that_are_possible_alone_but_not_together_were_never_seen() -> None:
     counts = random_counts(500)
-    check = NoveltyCheck(seen_counts(counts))
+    check = Electrodes(seen_counts(counts))
     assert check.never_seen(counts).mean() < 0.02
     torn = counts[:1].copy()
     torn[0, 0, ::2], torn[0, 0, 1::2] = counts.min() + 50, counts.max() - 50
@@ -51,7 +51,7 @@ def test_a_held_out_fold_is_not_judged_by_its_own_range() -> None:
     group_of = np.arange(100) // 50
     # Both odd readings are in the first group, so nothing in the second looks like them.
     assert held_out_never_seen(counts, group_of) >= 0.02
-    assert NoveltyCheck(seen_counts(counts)).never_seen(counts)[:2].tolist() == [False, False]
+    assert Electrodes(seen_counts(counts)).never_seen(counts)[:2].tolist() == [False, False]
 
 
 def test_made_up_readings_are_refused() -> None:
