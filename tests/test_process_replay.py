@@ -8,7 +8,7 @@ import pytest
 
 from tests.process_replay import commands, messages, verdicts
 from tests.process_replay.__main__ import KINDS, SHOWN_MAX
-from tests.process_replay.alike import lines_apart
+from tests.process_replay.commands import lines_apart
 from tests.process_replay.verdicts import P_SLIP_TOLERANCE, entries_apart, is_near, reference
 
 ALL = [(kind, name) for kind in KINDS for name in KINDS[kind].NAMES]

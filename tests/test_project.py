@@ -117,10 +117,9 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
     assert lost == []
 
 
-def test_files_that_contributors_are_sent_to_are_there() -> None:
-    named = found(
-        ".github/CONTRIBUTING.md", r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`"
-    )
+@pytest.mark.parametrize("page", [".github/CONTRIBUTING.md", "deploy/ARCHITECTURE.md"])
+def test_files_that_contributors_are_sent_to_are_there(page: str) -> None:
+    named = found(page, r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`")
     assert len(named) > 10
     assert [name for name in named if not (ROOT / name).exists()] == []
 

@@ -17,16 +17,6 @@ README = (ROOT / "README.md").read_text()
 ENDPOINT = "ipc:///tmp/graspd-demo.ipc"
 
 
-def test_files_that_say_where_to_start_are_there() -> None:
-    architecture = (ROOT / "deploy" / "ARCHITECTURE.md").read_text()
-    extend = architecture.partition("## Where to start")[2]
-    rows = [row.split("|") for row in extend.splitlines() if row.startswith("| ")][1:]
-    assert len(rows) > 10
-    paths = [re.findall(r"`((?:daemon|drivers|models|tests)/[^`]*)`", row[2]) for row in rows]
-    missing = [path for row in paths for path in row if not (ROOT / path).exists()]
-    assert missing == []
-
-
 def block(language: str) -> str:
     """The one code block of the README in this language."""
     (code,) = re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)

@@ -123,14 +123,19 @@ class Subscriber:
     """Hears a daemon."""
 
     def __init__(
-        self, endpoint: str, *, topics: Sequence[str] = ("verdict.",), keys: Path | None = None
+        self,
+        endpoint: str,
+        *,
+        topics: Sequence[str] = ("verdict.",),
+        keys: Path | None = None,
+        client: str = "friend",
     ) -> None:
-        """`keys`: folder of a daemon's key and of its client `friend`'s; None: without keys."""
+        """`keys`: folder of a daemon's key and of the `client`'s; None: without keys."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.rcvhwm = 0  # what is lost must be lost elsewhere
         if keys is not None:
-            own = load_pair(keys / "clients" / "friend.key_secret")
+            own = load_pair(keys / "clients" / f"{client}.key_secret")
             self._socket.curve_publickey, self._socket.curve_secretkey = own
             self._socket.curve_serverkey = load_pair(keys / "daemon.key_secret")[0]
         for topic in topics:

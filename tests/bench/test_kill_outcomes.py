@@ -24,9 +24,9 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.session.file import SessionFile, kept_now, load
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.trust import Trust, TrustState, decode
-from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
+from tests.daemon.fakes import sound
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict
 
@@ -61,8 +61,7 @@ class Reference:
         pipeline = assembly.build_pipeline(self._scene, self._model, learns=False)
         assert pipeline.session is not None
         pipeline.session.restore(self._statistics)
-        faults = np.zeros(counts.shape, dtype=np.uint8)
-        pipeline.judge(TactileReading(time.monotonic_ns(), 0, counts, faults))
+        pipeline.judge(sound(counts, time.monotonic_ns()))
         assessment = pipeline.memory.assessment
         if assessment is not None:
             self.trust.lifts.note(grasp, assessment.features, stable=stable)
@@ -112,7 +111,7 @@ class Bench:
         """Statistics that stay what they are: a grasp is then the same whenever it is judged."""
         pipeline = assembly.build_pipeline(self._scene, assembly.load_model(self._scene))
         for row in read_rows(DEMO_TABLE, self._scene.hand.fingers):
-            pipeline.judge(TactileReading(time.monotonic_ns(), 0, row.counts, row.faults))
+            pipeline.judge(sound(row.counts, time.monotonic_ns()))
         assert pipeline.session is not None
         with SessionFile(self._scene.session_path) as file:
             file.save(kept_now(pipeline.session.state(), self._scene.hand.fingers, {}))

@@ -8,15 +8,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
-from graspd.daemon.judge.reasons import Decision
-from graspd.daemon.publish.messages import Verdict, encode
+from graspd.daemon.judge.reasons import Reason
+from graspd.daemon.publish.messages import encode
 from tests.bench.live import TALLIED, Usage
 from tests.bench.soak import Plan, soak
 from tests.bench.soak_judge import Found, Heard, Row, judge
 from tests.daemon.processes import before_others
+from tests.kit.messages import GOLDEN_VERDICT
 
 SPEED = {"late verdicts", "worst, last byte to subscriber", "time to stop"}
 """Of the machine as much as of the daemon: no test is about them."""
@@ -151,23 +153,16 @@ def test_what_is_wrong_breaks_its_limit_and_no_other(name: str) -> None:
 
 def verdict(seq: int, t_ns: int, age_ms: float = 0.0, *, boot: str = "one") -> bytes:
     """The payload of one; an old one says that nothing came."""
+    reasons = [Reason.STALE if age_ms > 100.0 else Reason.NO_CONTACT]
     return encode(
-        Verdict(
+        msgspec.structs.replace(
+            GOLDEN_VERDICT,
             boot_id=boot,
             seq=seq,
-            t=0.0,
             t_mono_ns=t_ns,
-            grasp=0,
-            verdict=Decision.UNKNOWN,
-            verdict_code=0,
-            p_slip=None,
-            valid=False,
-            reasons=["stale" if age_ms > 100.0 else "no-contact"],  # type: ignore[list-item]
+            reasons=reasons,
             age_ms=age_ms,
             latency_us=0.0,
-            silence_ms=100.0,
-            model="",
-            model_sha="",
         )
     )
 

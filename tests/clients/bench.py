@@ -27,12 +27,11 @@ class Daemon:
         whole_grasps: bool = False,
         recording: Path | None = None,
         endpoint: str | None = None,
-        publish: str = "",
     ) -> None:
         """Judges each row of the demo table; with `whole_grasps`, one from touch to lift; or
         what the `recording` has.
 
-        `more` is what else there is in the scene, from `[tactile]` on, `publish` in `[publish]`.
+        `more` is what else there is in the scene, from `[tactile]` on.
         """
         self.endpoint = endpoint or f"ipc://{folder}/graspd"
         self.ask_endpoint = f"ipc://{folder}/ask"
@@ -41,7 +40,7 @@ class Daemon:
         if recording is None:
             recording = _one_grasp(folder / "grasp.csv") if whole_grasps else DEMO_TABLE
         self._scene.write_text(
-            f'[publish]\nendpoint = "{self.endpoint}"\n{publish}\n'
+            f'[publish]\nendpoint = "{self.endpoint}"\n'
             f'[ask]\nendpoint = "{self.ask_endpoint}"\n'
             f'[tactile]\ndriver = "replay"\nrecordings = ["{recording}"]\nloop = true\n{more}'
         )

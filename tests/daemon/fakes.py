@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
@@ -110,8 +111,13 @@ def pipeline(
 
 def reading(t_ns: int, seed: int = 0, seq: int = 0) -> TactileReading:
     """A sound reading: counts within what the fake model has seen."""
-    counts = np.random.default_rng(seed).integers(LOW, HIGH, (3, 24), dtype=np.uint16)
-    return TactileReading(t_ns, seq, counts, np.zeros((3, 24), dtype=np.uint8))
+    return sound(np.random.default_rng(seed).integers(LOW, HIGH, (3, 24)), t_ns, seq)
+
+
+def sound(counts: NDArray[np.generic], t_ns: int = 0, seq: int = 0) -> TactileReading:
+    """A reading of these counts, shape (fingers, 24), of which no electrode is flagged."""
+    faults = np.zeros(counts.shape, dtype=np.uint8)
+    return TactileReading(t_ns, seq, counts.astype(np.uint16), faults)
 
 
 class FakeDriver:

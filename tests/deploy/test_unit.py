@@ -134,12 +134,6 @@ def test_the_bus_has_the_rate_of_the_protocol() -> None:
     assert (network["BitRate"], network["RestartSec"]) == (["1M"], ["100ms"])
 
 
-@pytest.mark.parametrize("shell", ["dash", "bash"])
-def test_shells_understand_the_installer(shell: str) -> None:
-    done = run(tool(shell, shell), "-n", INSTALLER)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 def test_shellcheck_finds_nothing_in_the_installer() -> None:
     done = run(tool("shellcheck", "shellcheck"), INSTALLER)
     assert (done.returncode, done.stdout) == (0, "")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import re
 import shlex
@@ -20,7 +21,6 @@ from typing import Final
 
 from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
 from tests.kit.inside import graspd
-from tests.process_replay.alike import lines_apart
 from tests.process_replay.judging import Case, run
 from tests.process_replay.streams import CHECKOUT, demo
 
@@ -129,6 +129,10 @@ _MASKS: Final = (
 )
 
 
+NUMBER: Final = re.compile(r"(?<=[\[:, ])-?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)(?=[\],} \n]|$)")
+"""A number with a point or exponent. Others are counted and must be equal."""
+
+
 def execute(arguments: Sequence[str], folder: Path) -> CompletedProcess[str]:
     """Run a command in this process and folder."""
     with contextlib.chdir(folder), _environment(folder):
@@ -208,3 +212,25 @@ def _text(line: str, done: CompletedProcess[str], folder: Path) -> str:
 def differences(before: str, now: str) -> list[str]:
     """Return where two texts differ, line by line."""
     return lines_apart(before.splitlines(), now.splitlines(), TOLERANCE)
+
+
+def lines_apart(before: Sequence[str], now: Sequence[str], tolerance: float) -> list[str]:
+    """Return where lines differ. Numbers with a point may differ by `tolerance`."""
+    found = [
+        f"line {number}: {was}\n  became: {is_now}"
+        for number, (was, is_now) in enumerate(zip(before, now, strict=False), start=1)
+        if was != is_now and not _alike(was, is_now, tolerance)
+    ]
+    if len(before) != len(now):
+        found.append(f"{len(before)} lines became {len(now)}")
+    return found
+
+
+def _alike(was: str, is_now: str, tolerance: float) -> bool:
+    if NUMBER.sub("*", was) != NUMBER.sub("*", is_now):
+        return False
+    pairs = zip(NUMBER.findall(was), NUMBER.findall(is_now), strict=True)
+    return all(
+        math.isclose(float(left), float(right), rel_tol=tolerance, abs_tol=tolerance)
+        for left, right in pairs
+    )

@@ -11,7 +11,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from tests.process_replay.alike import NUMBER, lines_apart
+from tests.process_replay.commands import NUMBER, lines_apart
 from tests.process_replay.judging import Message
 from tests.process_replay.verdicts import FOLDER, played
 

@@ -11,16 +11,16 @@ import contextlib
 import signal
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
 from tests.system import steps_faults, steps_install, steps_verdicts
 from tests.system.image import CACHE, ImageError, image
-from tests.system.lab import Bridge, Lab, Outcome
+from tests.system.lab import Bridge, Lab, Outcome, StepError
 from tests.system.machine import Machine, MachineError
 from tests.system.payload import make_payload
-from tests.system.table import Table
 
 Step = Callable[[Lab], Outcome]
 
@@ -53,6 +53,51 @@ full disk ends must hold some: `serial_verdicts` waits for them. What takes its 
 begun by one step and awaited by a later one: `recording_again`, `hung`."""
 NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_install.start))
 """Without these there is no use in going on."""
+
+
+class Table:
+    """Lines of what was done, how long it took, how long a recovery took, and what was seen."""
+
+    def __init__(self) -> None:
+        self.failed: list[str] = []
+        self._began_s = time.monotonic()
+        _write("", "step", "took, s", "recovery, s", "seen")
+
+    @contextlib.contextmanager
+    def timed(self, name: str) -> Iterator[list[str]]:
+        """Time what is done within; what is put into the list is what was seen."""
+        began_s = time.monotonic()
+        seen: list[str] = []
+        yield seen
+        _write("ok", name, f"{time.monotonic() - began_s:.1f}", "", " ".join(seen))
+
+    def run(self, step: Step, lab: Lab) -> bool:
+        """Do a step; whether all was as it must be."""
+        name = step.__name__.replace("_", " ")
+        began_s = time.monotonic()
+        mark, recovery = "ok", ""
+        try:
+            outcome = step(lab)
+        except (StepError, MachineError) as error:
+            mark, what = "FAILED", str(error)
+            self.failed.append(name)
+        else:
+            what = outcome.what
+            if outcome.recovery_s is not None:
+                recovery = f"{outcome.recovery_s:.1f}"
+        _write(mark, name, f"{time.monotonic() - began_s:.1f}", recovery, what)
+        return mark == "ok"
+
+    def end(self) -> None:
+        """The last line."""
+        took_s = time.monotonic() - self._began_s
+        verdict = f"failed: {', '.join(self.failed)}" if self.failed else "all is well"
+        sys.stdout.write(f"{verdict}, in {took_s:.0f} s, under software emulation\n")
+
+
+def _write(mark: str, step: str, took: str, recovery: str, seen: str) -> None:
+    sys.stdout.write(f"{mark:7}{step:17}{took:>8}{recovery:>13}  {seen}\n")
+    sys.stdout.flush()
 
 
 def main(arguments: list[str] | None = None) -> int:

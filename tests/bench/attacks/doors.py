@@ -88,31 +88,29 @@ class Hand:
 
 
 @contextlib.contextmanager
-def hand(folder: Path, *, curve: bool = False) -> Iterator[Hand]:
-    """A daemon at rest: on Unix sockets, or with keys on TCP."""
-    publish, ask = f"ipc://{folder}/v", f"ipc://{folder}/ask"
-    keys = ""
+def hand(folder: Path, *, curve: bool = False, publish: str = "") -> Iterator[Hand]:
+    """A daemon at rest: on Unix sockets, or with keys on TCP; `publish` as of `running`."""
+    endpoint, ask = f"ipc://{folder}/v", f"ipc://{folder}/ask"
+    section, keys = "", None
     if curve:
         make(folder, "daemon")
         make(folder / "clients", "friend")
-        keys = '[curve]\nsecret_key = "daemon.key_secret"\nclients = "clients"\n'
-        publish, ask = (f"tcp://127.0.0.1:{port}" for port in (free_port(), free_port()))
+        section, keys = '[curve]\nsecret_key = "daemon.key_secret"\nclients = "clients"\n', folder
+        endpoint, ask = (f"tcp://127.0.0.1:{port}" for port in (free_port(), free_port()))
     sections = (
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[gate]\nmode = "every"\nrequest_ms = {PATIENCE_MS}.0\n[model]\nname = "cnn1"\n'
-        f'[ask]\nendpoint = "{ask}"\n{keys}'
+        f'[ask]\nendpoint = "{ask}"\n{section}'
     )
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    with running(folder, sections, endpoint=publish, keys=folder if keys else None) as (
-        process,
-        friend,
-    ):
+    started = running(folder, sections, endpoint=endpoint, keys=keys, publish=publish)
+    with started as (process, friend):
         if friend.take(PATIENCE_S) is None:
             raise TimeoutError("the daemon says nothing")
         for _ in range(100):
             friend.take(1.0)
-        yield Hand(process, publish, ask, friend, memory_mib(process.pid))
+        yield Hand(process, endpoint, ask, friend, memory_mib(process.pid))
 
 
 def connect(endpoint: str) -> socket.socket:

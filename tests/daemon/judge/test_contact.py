@@ -22,6 +22,9 @@ DRIFT = 0.7
 PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: eight all of it, the others a fifth."""
 ALL = np.ones((3, 24), dtype=np.bool_)
+SLOPES = np.random.default_rng(5).normal(0.0, 0.2, (3, 24))
+"""Counts/s by which the electrodes of a finger drift apart: 0.13 to 0.22 (standard deviation, over
+the real recording of untouched sensors)."""
 
 Counts = NDArray[np.uint16]
 
@@ -260,3 +263,56 @@ def test_fewer_than_twelve_usable_electrodes_never_touch(usable_electrodes: int)
     never_more.play(still(1.5), usable)
     assert never_more.contact.memory.tared.tolist() == [enough, True, True]
     assert never_more.play(touched(0.5, 500.0), usable)[:, FF].any() == enough
+
+
+def held(seconds: int, drift: float, depth: float = 300.0) -> NDArray[np.float64]:
+    """Mean counts, shape (sweeps, 3, 24), of a hold while the sensors drift, in counts/s."""
+    t_s = np.arange(0, seconds, 0.01)[:, None, None]
+    return at_rest() - depth * PRESSED + (drift + SLOPES) * t_s
+
+
+def opened(seconds: float, after_s: int, drift: float) -> NDArray[np.float64]:
+    """Mean counts of an open hand after a hold of `after_s` seconds."""
+    t_s = after_s + np.arange(0, seconds, 0.01)[:, None, None]
+    return at_rest() + (drift + SLOPES) * t_s
+
+
+@pytest.mark.parametrize("drift", [0.7, 0.0, -0.7])
+@pytest.mark.parametrize("seconds", [30, 300])
+def test_a_hand_that_opens_after_a_long_hold_touches_nothing(seconds: int, drift: float) -> None:
+    hand = Hand()
+    hand.play(still(1.5))
+    assert hand.play(noisy(held(seconds, drift)))[10:].all()
+    open_hand = hand.play(noisy(opened(4.0, seconds, drift), 1))
+    assert not open_hand[10:].any()
+    assert hand.contact.memory.tared.all()
+    assert hand.play(noisy(held(2, 0.0) + (drift + SLOPES) * seconds, 2))[10:].all()
+
+
+def test_a_hand_that_regrasps_at_once_after_a_short_hold_is_felt() -> None:
+    hand = Hand()
+    hand.play(still(1.5))
+    hand.play(noisy(held(20, 0.7)))
+    hand.play(noisy(opened(0.3, 20, 0.7), 1))
+    assert hand.play(noisy(held(2, 0.0) + 0.7 * 20, 2))[10:].all()
+
+
+@pytest.mark.parametrize("relaxed", [0.5, 0.2])
+def test_a_grip_that_relaxes_and_tightens_without_opening_is_felt(relaxed: float) -> None:
+    hand = Hand()
+    hand.play(still(1.5))
+    hand.play(noisy(held(5, 0.0)))
+    hand.play(noisy(held(2, 0.0, 300.0 * relaxed), 1))
+    assert hand.play(noisy(held(2, 0.0), 2))[10:].all()
+
+
+@pytest.mark.parametrize("higher", [15.0, 30.0])
+def test_a_hand_that_was_closed_at_the_start_is_tared_when_it_opens(higher: float) -> None:
+    hand = Hand()
+    bulge = np.where(np.arange(24) % 8 == 1, higher, 0.0)
+    closed = at_rest() - 300.0 * PRESSED + bulge * (1.0 + 300.0 / 60.0)
+    hand.play(noisy(np.broadcast_to(closed, (200, 3, 24))))
+    hand.play(still(4.0, 1))
+    assert hand.contact.memory.tared.all()
+    assert not hand.contact.memory.touching.any()
+    assert hand.play(noisy(held(2, 0.0), 2))[10:].all()

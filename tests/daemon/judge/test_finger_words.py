@@ -12,11 +12,12 @@ from graspd.daemon.judge.hand import FingerMemory, HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import FingerState, GateState, Reason
-from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.base import ElectrodeFault
 from graspd.models import zoo
 from graspd.models.contract import Finger
 from graspd.models.runtime import TactileModel
-from tests.daemon.judge.test_gate import ALL, FINGERS, LIMITS, MS, Scenario, readings
+from tests.daemon.fakes import FINGERS, MS, sound
+from tests.daemon.judge.test_gate import ALL, LIMITS, Scenario, readings
 
 FREE, TOUCH, SLIDE = FingerState
 UNKNOWN = dict.fromkeys(FINGERS)
@@ -144,9 +145,7 @@ def test_an_old_reading_tells_nothing(late_ms: int, is_known: bool) -> None:
 
 def test_where_each_reading_is_a_grasp_no_finger_has_a_word() -> None:
     judge = Pipeline(TactileModel(zoo.find("cnn1")), FINGERS, Limits(), lambda: 0)
-    counts = np.full(ALL.shape, 2000, dtype=np.uint16)
-    reading = TactileReading(0, 0, counts, np.zeros(ALL.shape, dtype=np.uint8))
-    assert judge.judge(reading).moment.fingers is None
+    assert judge.judge(sound(np.full(ALL.shape, 2000))).moment.fingers is None
 
 
 def test_faults_of_one_finger_leave_no_touch_in_any() -> None:
@@ -155,9 +154,8 @@ def test_faults_of_one_finger_leave_no_touch_in_any() -> None:
     judge = Pipeline(model, FINGERS, Limits(), lambda: now_ns, hand=LIMITS, learns=False)
     for t_s, reading in readings(FIRM):
         now_ns = reading.t_ns
-        faults = reading.faults.copy()
-        faults[2] = ElectrodeFault.MISSING if t_s > 1.2 else 0
-        judgement = judge.judge(TactileReading(reading.t_ns, reading.seq, reading.counts, faults))
+        reading.faults[2] = ElectrodeFault.MISSING if t_s > 1.2 else 0
+        judgement = judge.judge(reading)
         if t_s > 1.2:
             assert judgement.moment.fingers == UNKNOWN
     assert Reason.SENSOR_MISSING in judgement.reasons

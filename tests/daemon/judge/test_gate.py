@@ -14,11 +14,9 @@ from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import GateChange, GateState, Reason
 from graspd.drivers.base import JointReading, TactileReading
-from graspd.models.contract import Finger
+from tests.daemon.fakes import FINGERS, sound
 
-MS = 1_000_000
 START_NS = 10**12
-FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 SHAPE = (3, 24)
 ALL = np.ones(SHAPE, dtype=np.bool_)
 NOISE = 3.5
@@ -113,8 +111,7 @@ def readings(scenario: Scenario) -> list[tuple[float, TactileReading]]:
         counts += random.normal(0.0, NOISE, SHAPE)
         scenario.spoil(t_s, counts)
         t_ns = START_NS + round(scenario.retime(t_s) * 1e9)
-        rounded = np.clip(np.rint(counts), 1, 4094).astype(np.uint16)
-        made.append((t_s, TactileReading(t_ns, place, rounded, np.zeros(SHAPE, dtype=np.uint8))))
+        made.append((t_s, sound(np.clip(np.rint(counts), 1, 4094), t_ns)))
     return made
 
 

@@ -16,13 +16,12 @@ from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from graspd.daemon.judge.stillness import Motion
 from graspd.models.contract import Finger
+from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.test_gate import (
     ALL,
-    FINGERS,
     GATE,
     GRASPED,
     LIMITS,
-    MS,
     SHAPE,
     START_NS,
     UP,

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.decision import HandLimits, JointLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
-from graspd.drivers.base import JointReading, TactileReading
+from graspd.drivers.base import JointReading
 from graspd.drivers.twins.grasps.grasp_script import Timetable
 from graspd.drivers.twins.grasps.whole_grasps import WholeGrasps, rest_above
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
-from tests.daemon.fakes import Clock
+from tests.daemon.fakes import Clock, sound
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
 
 GRASPS = 40
@@ -55,10 +55,6 @@ class Study:
     """Longest time, s, for which a verdict still stood when the hand had begun to open."""
 
 
-def tactile(t_ns: int, counts: NDArray[np.uint16]) -> TactileReading:
-    return TactileReading(t_ns, 0, counts, np.zeros(counts.shape, dtype=np.uint8))
-
-
 @pytest.fixture(scope="module", params=[True, False], ids=["71.43 Hz held", "100 Hz fresh"])
 def found(bts3_dir: Path, untouched: NDArray[np.uint16], request: pytest.FixtureRequest) -> Study:
     """Grasps as a palm's recording has them, or as an SPI bridge reads them, and what is judged."""
@@ -78,14 +74,14 @@ def found(bts3_dir: Path, untouched: NDArray[np.uint16], request: pytest.Fixture
         fingers = model.contract.fingers
         return Pipeline(model, fingers, Limits(), clock, hand=hand, learns=False)
 
-    rows = [judge(None).judge(tactile(0, point.counts)) for point in points]
+    rows = [judge(None).judge(sound(point.counts)) for point in points]
     grasps = [Seen(*each) for each in zip(stream.timetables(), rows, strict=True)]
     study, pipeline = Study(grasps), judge(HandLimits(joints=JointLimits()))
     for moment in stream:
         clock.now_ns = round(moment.t_s * 1e9)
         joints = JointReading(clock(), 0, moment.joint_names, moment.position_rad)
         pipeline.observe_joints(joints)
-        judgement = pipeline.judge(tactile(clock(), moment.counts))
+        judgement = pipeline.judge(sound(moment.counts, clock()))
         truth = grasps[max(moment.grasp - 1, 0)].truth  # grasp 0: the rest before the first
         if judgement.decision is not Decision.UNKNOWN:
             is_held = truth.closed_s <= moment.t_s < truth.open_s

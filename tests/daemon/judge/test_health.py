@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.health import Checked, Health, too_many
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
+from tests.daemon.fakes import sound
 
 FINGERS = 3
 # What wears an electrode out, by the words of `graspd.daemon.judge.health`.
@@ -95,12 +96,10 @@ def test_every_electrode_is_broken_when_the_definition_says_so(seed: int) -> Non
 
 def test_a_first_reading_of_low_counts_is_no_jump_from_anywhere() -> None:
     health = Health(FINGERS)
-    counts = np.full((FINGERS, 24), 5, dtype=np.uint16)
-    counts[1, 4] = 3000
-    flags = np.zeros(counts.shape, dtype=np.uint8)
+    counts = np.full((FINGERS, 24), 5)
     for place in range(3):  # two jumps more would be enough
         counts[1, 4] = 3000 - 500 * place
-        health.check(TactileReading(place, place, counts.copy(), flags))
+        health.check(sound(counts))
     assert Reason.ELECTRODE_JUMPS not in health.electrodes().values()
 
 
@@ -110,11 +109,10 @@ def watched(steps: NDArray[np.int64]) -> tuple[Health, list[dict[tuple[int, int]
     The electrodes of the other fingers go up and down by one.
     """
     health, found = Health(FINGERS), []
-    flags = np.zeros((FINGERS, 24), dtype=np.uint8)
     for place in range(len(steps) + 1):
         counts = np.full((FINGERS, 24), 2000 + place % 2)
         counts[1] = 2000 + steps[:place].sum(axis=0)
-        health.check(TactileReading(place, place, counts.astype(np.uint16), flags))
+        health.check(sound(counts))
         found.append(health.electrodes())
     return health, found
 
@@ -195,12 +193,17 @@ def test_twelve_broken_electrodes_of_a_hand_and_eight_of_a_finger_can_be_repaire
     ("count", "railed"), [(0, True), (1, False), (4094, False), (4095, True), (65535, True)]
 )
 def test_rails_are_broken_and_their_neighbours_are_not(count: int, railed: bool) -> None:
-    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
+    counts = np.full((FINGERS, 24), 2000)
     counts[2, 7] = count
     health = Health(FINGERS)
-    broken = broken_of(health.check(TactileReading(0, 0, counts, np.zeros((3, 24), np.uint8))))
+    broken = broken_of(health.check(sound(counts)))
     assert broken.sum() == broken[2, 7] == railed
     assert health.electrodes() == ({(2, 7): Reason.SATURATED} if railed else {})
+
+
+def flat(count: int) -> TactileReading:
+    """A reading whose electrodes all read the same."""
+    return sound(np.full((FINGERS, 24), count))
 
 
 @pytest.mark.parametrize("flagged", [False, True])
@@ -209,53 +212,49 @@ def test_one_finger_that_repeats_itself_is_enough(finger: int, flagged: bool) ->
     """All others change in every electrode; what is flagged was not read and hides nothing."""
     health, reasons = Health(FINGERS), []
     for place in range(2):
-        counts = np.full((FINGERS, 24), 2000 + place, dtype=np.uint16)
-        flags = np.zeros((FINGERS, 24), dtype=np.uint8)
-        counts[finger] = 1500
+        reading = flat(2000 + place)
+        reading.counts[finger] = 1500
         if flagged:
-            counts[finger, 3] += place
-            flags[finger, 3] = 1
-        reasons.append(health.check(TactileReading(place, place, counts, flags)).reasons)
+            reading.counts[finger, 3] += place
+            reading.faults[finger, 3] = 1
+        reasons.append(health.check(reading).reasons)
     assert reasons == [(), (Reason.FROZEN,)]
 
 
 @pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF])
 def test_a_sweep_that_comes_again_was_seen_in_a_reading_that_could_not_be_used(flag: int) -> None:
     health, reasons = Health(FINGERS), []
-    for place, (sweep, bits) in enumerate([(0, flag), (1, 0), (2, 0), (0, 0)]):
-        counts = np.full((FINGERS, 24), 2000 + sweep, dtype=np.uint16)
-        flags = np.zeros((FINGERS, 24), dtype=np.uint8)
-        flags[0, 0] = bits
-        reasons.append(health.check(TactileReading(place, place, counts, flags)).reasons)
+    for count, bits in [(2000, flag), (2001, 0), (2002, 0), (2000, 0)]:
+        reading = flat(count)
+        reading.faults[0, 0] = bits
+        reasons.append(health.check(reading).reasons)
     assert reasons[1:] == [(), (), (Reason.FROZEN,)]
 
 
 def test_electrodes_of_all_fingers_that_repeat_themselves_are_no_held_finger() -> None:
     """Ten of each finger, as a palm at 71.43 Hz read at 100 Hz: 2 of 7, and quiet ones."""
-    health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
+    health = Health(FINGERS)
     for place in range(5):
-        counts = np.full((FINGERS, 24), 2000 + place, dtype=np.uint16)
-        counts[:, :10] = 2000
-        assert health.check(TactileReading(place, place, counts, flags)).reasons == ()
+        reading = flat(2000 + place)
+        reading.counts[:, :10] = 2000
+        assert health.check(reading).reasons == ()
 
 
 def test_of_two_faults_of_an_electrode_the_first_is_named() -> None:
-    health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
-    flags[0, 5] = ElectrodeFault.PARITY | ElectrodeFault.NOT_A_COUNT
-    flags[1, 6] = ElectrodeFault.ERROR_WORD
-    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
-    found = health.check(TactileReading(0, 0, counts, flags))
+    health, reading = Health(FINGERS), flat(2000)
+    reading.faults[0, 5] = ElectrodeFault.PARITY | ElectrodeFault.NOT_A_COUNT
+    reading.faults[1, 6] = ElectrodeFault.ERROR_WORD
+    found = health.check(reading)
     assert (found.reasons, int(broken_of(found).sum())) == ((), 2)
     assert health.electrodes() == {(0, 5): Reason.NOT_A_COUNT, (1, 6): Reason.ERROR_WORD}
 
 
 @pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF, 64])
 def test_a_fault_that_is_not_of_one_electrode_speaks_against_the_reading(flag: int) -> None:
-    flags = np.zeros((FINGERS, 24), dtype=np.uint8)
-    flags[2, 23] = flag
-    flags[0, 1] = ElectrodeFault.PARITY
-    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
+    reading = flat(2000)
+    reading.faults[2, 23] = flag
+    reading.faults[0, 1] = ElectrodeFault.PARITY
     named = {16: Reason.HELD, 32: Reason.CUT_OFF}.get(int(flag))
-    found = Health(FINGERS).check(TactileReading(0, 0, counts, flags))
+    found = Health(FINGERS).check(reading)
     assert found.reasons == ((Reason.PARITY, named) if named else (Reason.PARITY,))
     assert np.argwhere(broken_of(found)).tolist() == [[0, 1], [2, 23]]

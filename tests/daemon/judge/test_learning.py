@@ -12,10 +12,10 @@ from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
-from graspd.drivers.base import TactileReading
 from graspd.drivers.twins.grasps import synthetic
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
+from tests.daemon.fakes import sound
 
 Learnt = list[NDArray[np.generic]]
 
@@ -27,10 +27,7 @@ def grasps(number: int) -> NDArray[np.uint16]:
 
 
 def judge(pipeline: Pipeline, rows: NDArray[np.uint16]) -> list[Judgement]:
-    return [
-        pipeline.judge(TactileReading(0, seq, row, np.zeros(row.shape, dtype=np.uint8)))
-        for seq, row in enumerate(rows)
-    ]
+    return [pipeline.judge(sound(row)) for row in rows]
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
 from graspd.drivers.twins.palm import PalmTwin
-from tests.daemon.fakes import FINGERS, MS, Clock
+from tests.daemon.fakes import FINGERS, MS, Clock, sound
 from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
 from tests.drivers.one_sweep import tactile
@@ -163,11 +163,11 @@ def test_what_recurs_is_what_the_definition_says(flagged: float, seed: int) -> N
     health, definition = Health(len(FINGERS)), Definition()
     number_of_frozen = 0
     random = np.random.default_rng(seed)
-    for number, (counts, sound) in enumerate(zip(*sweeps_of(random, 500, flagged), strict=True)):
-        faults = np.where(sound, 0, ElectrodeFault.PARITY).astype(np.uint8)
+    for number, (counts, read) in enumerate(zip(*sweeps_of(random, 500, flagged), strict=True)):
+        faults = np.where(read, 0, ElectrodeFault.PARITY).astype(np.uint8)
         checked = health.check(TactileReading(number, number, counts, faults))
         is_frozen = Reason.FROZEN in checked.reasons
-        assert is_frozen == definition.recurs(counts, sound), f"seed {seed}, sweep {number}"
+        assert is_frozen == definition.recurs(counts, read), f"seed {seed}, sweep {number}"
         number_of_frozen += is_frozen
     assert 20 < number_of_frozen < 480
 
@@ -175,12 +175,11 @@ def test_what_recurs_is_what_the_definition_says(flagged: float, seed: int) -> N
 @pytest.mark.parametrize(("equal", "is_frozen"), [(19, False), (20, True), (23, True)])
 def test_a_sweep_of_twenty_equal_electrodes_comes_again(equal: int, is_frozen: bool) -> None:
     health, random = Health(3), np.random.default_rng(4)
-    faults = np.zeros((3, 24), dtype=np.uint8)
-    sweeps = random.integers(500, 3500, (9, 3, 24)).astype(np.uint16)
+    sweeps = random.integers(500, 3500, (9, 3, 24))
     sweeps[8, 1] = sweeps[2, 1]
     sweeps[8, 1, equal:] += 1
-    for number, counts in enumerate(sweeps):
-        checked = health.check(TactileReading(number, number, counts, faults))
+    for counts in sweeps:
+        checked = health.check(sound(counts))
     assert (Reason.FROZEN in checked.reasons) == is_frozen
 
 
@@ -188,32 +187,29 @@ def test_a_sweep_of_twenty_equal_electrodes_comes_again(equal: int, is_frozen: b
 def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
     """Its count means nothing, whoever flags it."""
     health, random = Health(3), np.random.default_rng(1)
-    old = random.integers(500, 3500, (9, 3, 24)).astype(np.uint16)
+    old = random.integers(500, 3500, (9, 3, 24))
     said = []
     for number in range(60):
-        counts, faults = old[number % 9].copy(), np.zeros((3, 24), dtype=np.uint8)
+        reading = sound(old[number % 9])
         where = {
             "always the same": [4],
             "another each time": random.choice(24, 3, replace=False).tolist(),
             "at first": [number % 24] if number < 9 else [],
             "later": [number % 24] if number >= 9 else [],
         }[faulty]
-        faults[:, where] = ElectrodeFault.PARITY
-        counts[:, where] = random.integers(0, 4096, (3, len(where)))
-        said.append(health.check(TactileReading(number, number, counts, faults)).reasons)
+        reading.faults[:, where] = ElectrodeFault.PARITY
+        reading.counts[:, where] = random.integers(0, 4096, (3, len(where)))
+        said.append(health.check(reading).reasons)
     assert all(Reason.FROZEN not in reasons for reasons in said[:9])
     assert all(Reason.FROZEN in reasons for reasons in said[9:])
 
 
 def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
     health, random = Health(3), np.random.default_rng(3)
-    faults = np.zeros((3, 24), dtype=np.uint8)
-    faults[1] = ElectrodeFault.MISSING
-    for number in range(300):
-        counts = random.integers(500, 3500, (3, 24)).astype(np.uint16)
-        counts[1] = 0
-        reasons = health.check(TactileReading(number, number, counts, faults)).reasons
-        assert Reason.FROZEN not in reasons
+    for _ in range(300):
+        reading = sound(random.integers(500, 3500, (3, 24)))
+        reading.counts[1], reading.faults[1] = 0, ElectrodeFault.MISSING
+        assert Reason.FROZEN not in health.check(reading).reasons
 
 
 @pytest.mark.parametrize("table", ["palm_45", "palm_down", "palm_side"])
@@ -227,7 +223,7 @@ def test_no_real_sweep_of_untouched_sensors_comes_again(untouched: NDArray[np.ui
 
 def again(sweeps: Iterable[NDArray[np.uint16]]) -> int:
     """Return the number of sweeps in which a finger comes again, of more than 900."""
-    health, faults = Health(3), np.zeros((3, 24), dtype=np.uint8)
-    readings = [TactileReading(place, place, counts, faults) for place, counts in enumerate(sweeps)]
-    assert len(readings) > 900
-    return sum(Reason.FROZEN in health.check(reading).reasons for reading in readings)
+    health = Health(3)
+    found = [Reason.FROZEN in health.check(sound(counts)).reasons for counts in sweeps]
+    assert len(found) > 900
+    return sum(found)

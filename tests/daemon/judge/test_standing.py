@@ -19,13 +19,13 @@ from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.risk import RiskLimits
 from graspd.daemon.trust.trust import Trust
-from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.bench.attacks.standing import drifting
-from tests.daemon.fakes import MS, Clock
+from tests.daemon.fakes import MS, Clock, sound
 from tests.daemon.judge.test_only_stable_if import HELD, Feel, Flaw, Hand, limits, tared
 
 PERIOD_NS = 14 * MS
@@ -72,7 +72,7 @@ def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool
     model, clock = TactileModel(zoo.find("cnn1")), Clock()
     hand = limits(on_request=on_request, early=early)
     judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=hand)
-    direct, faults = Direct(model), np.zeros((3, 24), dtype=np.uint8)
+    direct = Direct(model)
     told: list[Judgement] = []
     asked, ages = False, []
     for number, counts in zip(range(SWEEPS), never_twice(drifting()), strict=False):
@@ -81,7 +81,7 @@ def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool
         asked = asked or number % 25 == 0
         if number % 25 == 0:
             judge.ask()
-        told.append(judge.judge(TactileReading(clock(), number, counts, faults)))
+        told.append(judge.judge(sound(counts, clock())))
         if told[-1].p_slip is not None and not told[-1].opinion.repaired:
             age = direct.said[::-1].index(told[-1].p_slip)  # to the bit
             assert age * PERIOD_NS <= 100 * MS
@@ -192,12 +192,12 @@ def test_a_grasp_is_judged_without_what_it_taught_the_session_until_it_is_over(
     monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts, slip: taken.append(counts))
     model, clock = TactileModel(zoo.find("small-session")), Clock()
     judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=limits())
-    faults, held, judged = np.zeros((3, 24), dtype=np.uint8), 0, []
+    held, judged = 0, []
     grasp = synthetic_grasps(1, seed=1)
     (timetable,) = grasp.timetables()
-    for number, moment in enumerate(grasp):
+    for moment in grasp:
         clock.now_ns += 10 * MS
-        said = judge.judge(TactileReading(clock(), number, moment.counts, faults))
+        said = judge.judge(sound(moment.counts, clock()))
         judge.learn()
         held += timetable.closed_s <= moment.t_s < timetable.lift_s
         judged += [said.judged_counts] if said.moment.judged else []

@@ -57,9 +57,8 @@ def test_every_published_day_rests_otherwise_and_no_half_of_one_does(
         assert moved_fingers(rest_above(one), rest_above(other)) == [0]
 
 
-def test_untouched_sensors_rest_as_they_did(bts3_dir: Path) -> None:
-    sweeps = np.stack(list(recorded_counts(bts3_dir.parent / "untouched" / "untouched.csv")))
-    first, last = (np.median(part, axis=0) for part in (sweeps[:100], sweeps[-100:]))
+def test_untouched_sensors_rest_as_they_did(untouched: NDArray[np.uint16]) -> None:
+    first, last = (np.median(part, axis=0) for part in (untouched[:100], untouched[-100:]))
     assert moved_fingers(first, last) == []
     assert moved_fingers(first, np.roll(last, 1, axis=0)) != []
 

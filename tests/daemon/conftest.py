@@ -1,19 +1,20 @@
-"""Recordings that several tests of the judge use."""
+"""The recording of an untouched hand."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from graspd.drivers.twins.grasps.grasps import recorded_counts
-from tests.conftest import data_dir
 
 
 @pytest.fixture(scope="session")
-def untouched() -> NDArray[np.uint16]:
+def untouched(bts3_dir: Path) -> NDArray[np.uint16]:
     """9.8 s of three untouched sensors at 100 Hz, held values of 71.43 Hz: shape (977, 3, 24)."""
-    folder = data_dir()
-    if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
+    path = bts3_dir.parent / "untouched" / "untouched.csv"
+    if not path.is_file():
         pytest.skip("the real recording of an untouched hand is not there")
-    return np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
+    return np.array(list(recorded_counts(path)))
