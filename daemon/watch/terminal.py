@@ -23,8 +23,14 @@ from rich.text import Text
 
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import printable
-from graspd.daemon.watch.fingers import FingerImage, FingerMotion
-from graspd.daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
+from graspd.daemon.watch.snapshot import (
+    FingerImage,
+    FingerMotion,
+    JudgedGrasp,
+    Line,
+    Snapshot,
+    Tone,
+)
 from graspd.daemon.watch.view import TICK_S, HandFeed, snapshots
 
 STYLES = {
