@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -67,12 +66,6 @@ class Writer:
             grasp_boot_id=judged_by,
         )
         self._file.write(b"outcome.right", encode(message), self._now_ns)
-
-    def outcome_without_the_field(self, grasp: int, outcome: Ending) -> None:
-        """As it was recorded before objects were told."""
-        content = {"v": 1, "boot_id": self._boot_id, "seq": 0, "t": 0.0, "t_mono_ns": self._now_ns}
-        payload = json.dumps(content | {"grasp": grasp, "outcome": outcome}).encode()
-        self._file.write(b"outcome.right", payload, self._now_ns)
 
     def close(self) -> None:
         self._file.close()
@@ -168,7 +161,7 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
     writer.outcome(1, "slip", "mug")
     writer.outcome(2, "stable", "ball")
     writer.outcome(3, "stable")
-    writer.outcome_without_the_field(4, "slip")
+    writer.outcome(4, "slip")
     writer.outcome(5, "slip", "mug")
     writer.outcome(5, "stable", "box")  # the later counts, with its object ...
     writer.outcome(6, "slip", "mug")
