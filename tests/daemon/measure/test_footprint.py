@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from graspd.daemon.measure.cost import CostError, Footprint, measure
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
 from tests.kit.inside import graspd
+from tests.kit.scenes import demo_scene
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
@@ -126,10 +126,6 @@ def written(tmp_path: Path, text: str) -> Path:
     return scene
 
 
-def replay_of_table(extra: str = "") -> str:
-    return f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n{extra}'
-
-
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
 def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measured) -> None:
     cost = measured(scene)
@@ -159,11 +155,10 @@ def test_the_parts_add_up_to_the_start(measured: Measured) -> None:
 
 
 def test_the_running_daemon_has_what_was_measured(tmp_path: Path, measured: Measured) -> None:
-    endpoint = f"ipc://{tmp_path}/graspd"
-    scene = written(tmp_path, replay_of_table(f'loop = true\n[publish]\nendpoint = "{endpoint}"\n'))
+    scene = demo_scene(tmp_path, "loop = true")
     found = measured(scene)
     with start("run", scene) as process:
-        command = [sys.executable, "-c", SUBSCRIBER, endpoint, "40"]
+        command = [sys.executable, "-c", SUBSCRIBER, f"ipc://{tmp_path}/v", "40"]
         subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
         status = Path(f"/proc/{process.pid}/status").read_text().splitlines()
         descriptors = len(os.listdir(f"/proc/{process.pid}/fd"))
@@ -180,7 +175,7 @@ def test_the_running_daemon_has_what_was_measured(tmp_path: Path, measured: Meas
 def test_a_table_whose_readings_are_grasps_has_no_gate_and_no_joints(
     tmp_path: Path, measured: Measured
 ) -> None:
-    found = measured(written(tmp_path, replay_of_table()))
+    found = measured(demo_scene(tmp_path))
     assert below(GATE | JOINTS | HALL | KEPT | ASK, found["modules"]) == []
     assert found["timed"]["judged"]["number"] == found["timed"]["reading"]["number"]
 
@@ -242,7 +237,7 @@ def test_a_scene_that_cannot_be_measured_says_why(tmp_path: Path) -> None:
 
 
 def test_check_prints_what_each_part_costs_only_when_asked(tmp_path: Path) -> None:
-    scene = written(tmp_path, replay_of_table())
+    scene = demo_scene(tmp_path)
     plain = graspd("check", scene)
     assert plain.returncode == 0
     assert "MiB" not in plain.stdout
@@ -259,7 +254,7 @@ def test_check_prints_what_each_part_costs_only_when_asked(tmp_path: Path) -> No
 
 
 def test_check_of_several_scenes_makes_one_table(tmp_path: Path) -> None:
-    demo, table = DEPLOY / "scenes" / "demo.toml", written(tmp_path, replay_of_table())
+    demo, table = DEPLOY / "scenes" / "demo.toml", demo_scene(tmp_path)
     costs = graspd("check", "--cost", demo, table)
     assert costs.returncode == 0
     head, rule, *rows = costs.stdout.splitlines()

@@ -26,6 +26,7 @@ from graspd.models.training.data.datasets import read_table
 from tests.daemon.record import recorded
 from tests.daemon.record.recorded import BOOT
 from tests.kit.inside import graspd
+from tests.kit.scenes import demo_scene
 
 Ending = Literal["stable", "slip"]
 HEADER = replace(recorded.HEADER, fingers=("ff", "mf", "th"), wall_minus_monotonic_ns=10**18)
@@ -96,11 +97,7 @@ def test_a_row_is_what_was_judged(tmp_path: Path) -> None:
 def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_are_broken(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n[model]\nname = "cnn1"\n'
-    )
-    wanted = scene.load(path)
+    wanted = scene.load(demo_scene(tmp_path, sections='[model]\nname = "cnn1"'))
     pipeline = assembly.build_pipeline(wanted, assembly.load_model(wanted), lambda: 10**12)
     counts, sound = read_table(DEMO_TABLE).counts[0], np.zeros((3, 24), dtype=np.uint8)
     broken = sound.copy()
