@@ -10,7 +10,6 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
-import msgspec
 import numpy as np
 
 from graspd.daemon import scene
@@ -106,7 +105,7 @@ def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footpri
         finally:
             progress("")
         costs.append((path, footprint))
-        document["cost"] = msgspec.to_builtins(footprint)
+        document["cost"] = footprint
         cost_lines = cost.lines(footprint)
     for warning in document["warnings"]:
         complain(f"{path}: {warning}")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-
-import msgspec
+from typing import Any
 
 from graspd.daemon.process.text import markdown_table, printable
 
@@ -19,41 +19,8 @@ MESSAGE_MAX = 320
 """Longest error that is shown, characters."""
 KIB_PER_MIB = 1024
 
-
-class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Cost that one part of a scene adds to the process."""
-
-    name: str
-    modules: int
-    rss_kib: int
-    """Resident memory, KiB."""
-    threads: int
-    descriptors: int
-    wall_ms: float
-    cpu_ms: float
-
-
-class Quantiles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """CPU time of one thing done `number` times, us."""
-
-    number: int
-    p50_us: float
-    p99_us: float
-
-
-class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Cost of one scene. Drivers of hardware are made, but not opened."""
-
-    parts: tuple[Part, ...]
-    """Parts in the order of the start; shared cost counts with the first of them."""
-    start: Part
-    """From the start of the process to the first reading judged and reported."""
-    peak_kib: int
-    """Largest resident memory, KiB."""
-    modules: tuple[str, ...]
-    """Names of all that are imported."""
-    timed: dict[str, Quantiles]
-    """CPU time of a `reading`, of one that is `judged` by the network, and of its `report`."""
+Footprint = dict[str, Any]
+"""Cost of one scene, as `graspd.daemon.measure.footprint` writes it."""
 
 
 class CostError(Exception):
@@ -80,23 +47,23 @@ def measure(scene: Path) -> Footprint:
     if result.returncode != 0:
         why = result.stderr.strip().removeprefix("graspd: ")[-MESSAGE_MAX:]
         raise CostError(f"{scene}: cannot be measured: {why or result.returncode}")
-    return msgspec.json.decode(result.stdout, type=Footprint)
+    return dict(json.loads(result.stdout))
 
 
 def lines(cost: Footprint) -> Iterator[str]:
     """Yield the cost of one scene, part by part, for people."""
     heads = ("modules", "MiB", "threads", "descr.", "wall ms", "CPU ms")
     yield f"  {'cost':16}" + "".join(f"{head:>9}" for head in heads)
-    for part in (*cost.parts, cost.start):
+    for part in (*cost["parts"], cost["start"]):
         yield (
-            f"  {part.name:16}{part.modules:9}{part.rss_kib / KIB_PER_MIB:9.1f}{part.threads:9}"
-            f"{part.descriptors:9}{part.wall_ms:9.1f}{part.cpu_ms:9.1f}"
+            f"  {part['name']:16}{part['modules']:9}{part['rss_kib'] / KIB_PER_MIB:9.1f}"
+            f"{part['threads']:9}{part['descriptors']:9}{part['wall_ms']:9.1f}{part['cpu_ms']:9.1f}"
         )
-    yield f"  at most {cost.peak_kib / KIB_PER_MIB:.1f} MiB"
-    for name, times in cost.timed.items():
+    yield f"  at most {cost['peak_kib'] / KIB_PER_MIB:.1f} MiB"
+    for name, times in cost["timed"].items():
         yield (
-            f"  {name}: p50 {times.p50_us:.0f} us, p99 {times.p99_us:.0f} us of CPU time "
-            f"({times.number})"
+            f"  {name}: p50 {times['p50_us']:.0f} us, p99 {times['p99_us']:.0f} us of CPU time "
+            f"({times['number']})"
         )
 
 
@@ -119,15 +86,16 @@ def markdown(costs: Sequence[tuple[Path, Footprint]]) -> Iterator[str]:
 
 
 def _cells(name: str, cost: Footprint) -> Sequence[str]:
-    start, reading, judged = cost.start, cost.timed.get("reading"), cost.timed.get("judged")
-    over_kib = start.rss_kib - cost.parts[0].rss_kib
+    start, timed = cost["start"], cost["timed"]
+    reading, judged = timed.get("reading"), timed.get("judged")
+    over_kib = start["rss_kib"] - cost["parts"][0]["rss_kib"]
     return (
         name,
-        str(start.modules),
-        f"{start.rss_kib / KIB_PER_MIB:.1f} ({over_kib / KIB_PER_MIB:.1f})",
-        str(start.threads),
-        str(start.descriptors),
-        f"{start.wall_ms:.0f} ({start.cpu_ms:.0f})",
-        "-" if reading is None else f"{reading.p50_us:.0f} / {reading.p99_us:.0f}",
-        "-" if judged is None else f"{judged.p50_us:.0f}",
+        str(start["modules"]),
+        f"{start['rss_kib'] / KIB_PER_MIB:.1f} ({over_kib / KIB_PER_MIB:.1f})",
+        str(start["threads"]),
+        str(start["descriptors"]),
+        f"{start['wall_ms']:.0f} ({start['cpu_ms']:.0f})",
+        "-" if reading is None else f"{reading['p50_us']:.0f} / {reading['p99_us']:.0f}",
+        "-" if judged is None else f"{judged['p50_us']:.0f}",
     )

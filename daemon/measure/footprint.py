@@ -39,7 +39,11 @@ WRONG = 2
 
 
 class Meter:
-    """Notes what each part adds to this process."""
+    """Notes what each part adds to this process.
+
+    A part has `modules`, resident memory (`rss_kib`), `threads`, `descriptors`, and time on the
+    wall and of the CPU (`wall_ms`, `cpu_ms`).
+    """
 
     def __init__(self, started_ns: int) -> None:
         """Begin with the interpreter, started at monotonic `started_ns`."""
@@ -60,8 +64,16 @@ class Meter:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure and write a `cost.Footprint` to stdout; 2 if the scene or its files are wrong.
-    `arguments`: the scene, a folder for sockets, and the monotonic ns of the start."""
+    """Measure and write the cost to stdout, as JSON; 2 if the scene or its files are wrong.
+
+    `arguments`: the scene, a folder for sockets, and the monotonic ns of the start. The JSON has
+
+    - `parts`, see `Meter`, in the order of the start; shared cost counts with the first of them.
+    - `start`: their sum, from the start of the process to the first reading judged and reported
+    - `peak_kib`: largest resident memory
+    - `modules`: names of all that are imported
+    - `timed`: CPU time of a `reading`, of one that is `judged` by the network, and of its `report`
+    """
     path, folder, started_ns = arguments
     meter = Meter(int(started_ns))
     import gc

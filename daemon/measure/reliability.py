@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize
 
 from graspd.daemon.measure.streams import Group, Life
 from graspd.daemon.process.text import markdown_table
@@ -19,8 +20,6 @@ from graspd.daemon.trust.learner import SCALE
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
 """Ends of the parts in which `p_slip` is compared with what slipped."""
-STEPS: Final = 50
-"""Steps of Newton's method; 10 suffice."""
 SLOPE_MAX: Final = 20.0
 CONFIDENT: Final = 1e-12
 """A probability nearer to 0 or 1 is taken for this one."""
@@ -63,15 +62,16 @@ def slope(p_slip: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
     """
     p = np.clip(p_slip, CONFIDENT, 1.0 - CONFIDENT)
     log_odds = np.log(p / (1.0 - p))
-    factor = 1.0
-    for _ in range(STEPS):
-        said = 1.0 / (1.0 + np.exp(-factor * log_odds))
-        curvature = float((said * (1.0 - said) * log_odds**2).sum())
-        if curvature == 0.0:
-            break
-        factor += float(((slipped - said) * log_odds).sum()) / curvature
-        factor = min(max(factor, 0.0), SLOPE_MAX)
-    return factor
+    for_outcome = np.where(slipped, log_odds, -log_odds)
+    if not for_outcome.any():
+        return 1.0
+    best = optimize.minimize_scalar(
+        lambda factor: np.logaddexp(0.0, -factor * for_outcome).sum(),
+        bounds=(0.0, SLOPE_MAX),
+        method="bounded",
+        options={"xatol": 1e-9},
+    )
+    return float(best.x)
 
 
 def fitted_scales(unscaled: Sequence[Life]) -> dict[Group, float]:

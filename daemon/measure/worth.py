@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -144,17 +142,12 @@ def run(args: argparse.Namespace) -> int:
         write_whole(args.out / "worth.md", f"{text}\n".encode())
         write_whole(args.out / "worth.svg", draw(worth.curves, quick=args.quick).encode())
         if args.card is not None:
-            _put_on(args.card, worth)
+            write_whole(args.card, to_json({**read_card(args.card), "worth": worth}))
     except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2
     write_lines(text)
     return 0
-
-
-def _put_on(card: Path, worth: Worth) -> None:
-    content: dict[str, Any] = read_card(card) | {"worth": json.loads(to_json(worth))}
-    write_whole(card, to_json(content))
 
 
 def worth_of(several: Sequence[Stream], command: str) -> Worth:

@@ -49,19 +49,19 @@ class Export:
     """Files that were cut off or are damaged."""
     judged: dict[GraspId, Judged] = field(default_factory=dict)
     """Last judged counts of each grasp."""
+    told: set[GraspId] = field(default_factory=set)
+    """Grasps with an outcome."""
 
-    def take(self, message: RecordedMessage) -> GraspId | None:
-        """Add a message; return the grasp if it is an outcome.
-
-        Raises `ValueError` or `OverflowError` for a malformed one.
-        """
+    def take(self, message: RecordedMessage) -> None:
+        """Add a message. Raises `ValueError` or `OverflowError` for a malformed one."""
         if message.kind == Topic.JUDGED:
             judgement = decode_judged(message.payload)
             self.judged[GraspId(judgement.boot_id, judgement.grasp)] = judgement
         if message.kind != Topic.OUTCOME:
-            return None
+            return
         outcome = decode_outcome(message.payload)
         grasp = GraspId(outcome.grasp_boot_id or outcome.boot_id, outcome.grasp)
+        self.told.add(grasp)
         judged = self.judged.get(grasp)
         if judged is None:
             self.unjoined += 1
@@ -71,7 +71,6 @@ class Export:
             shape = len(self.fingers), ELECTRODES
             counts = np.array(judged.counts, dtype=np.uint16).reshape(shape)
             self.grasps[grasp] = Grasp(counts, outcome.outcome == "slip", outcome.object)
-        return grasp
 
     def leave_out_repeats(self) -> None:
         """Keep the first of all grasps with the same counts, and count the others."""
@@ -88,7 +87,6 @@ def collect(paths: Sequence[Path]) -> Export:
     Raises `RecordingError` for a file that is damaged, of other fingers, or without judged counts.
     """
     export = Export()
-    told: set[GraspId | None] = set()
     for path in paths:
         with open_recording(path) as stream:
             recording = McapReader(path, stream)
@@ -100,11 +98,11 @@ def collect(paths: Sequence[Path]) -> Export:
             export.fingers = header.fingers
             for message in recording:
                 try:
-                    told.add(export.take(message))
+                    export.take(message)
                 except (ValueError, OverflowError) as error:
                     raise RecordingError(path, f"{message.kind} message: {error}") from error
             export.cut_off += recording.cut_off
-    export.without_outcome = len(export.judged.keys() - told)
+    export.without_outcome = len(export.judged.keys() - export.told)
     export.leave_out_repeats()
     return export
 

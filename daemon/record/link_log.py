@@ -23,12 +23,7 @@ class Tap:
     Until `connect` it keeps the newest `EARLY_MAX` entries; older ones are dropped.
     """
 
-    def __init__(
-        self,
-        ending: str,
-        encode: Callable[..., bytes],
-        clock: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
+    def __init__(self, ending: str, encode: Callable[..., bytes]) -> None:
         """`ending`: end of the log's file name. `encode`: returns the bytes of an entry.
 
         Arguments of `encode`: the entry's monotonic time, ns; what to add to get the wall clock's
@@ -36,7 +31,6 @@ class Tap:
         """
         self.ending = ending
         self.encode = encode
-        self._clock = clock
         self._early: deque[tuple[tuple[object, ...], int]] = deque(maxlen=EARLY_MAX)
         self._sink: Sink | None = None
 
@@ -48,10 +42,11 @@ class Tap:
 
     def take(self, *entry: object) -> None:
         """Add CAN frames, or an event and the bytes of a serial line."""
+        at_ns = time.monotonic_ns()
         if self._sink is None:
-            self._early.append((entry, self._clock()))
+            self._early.append((entry, at_ns))
         else:
-            self._sink(entry, self._clock())
+            self._sink(entry, at_ns)
 
 
 def tap_of(driver: Driver, section: Tactile) -> Tap | None:

@@ -126,46 +126,43 @@ class Viewer:
         if image is not None:
             yield "image", msgspec.json.encode(image)
 
-    def _changes(self, message: Message) -> list[LogLine]:
-        """Return a log line for each change in a message."""
+    def _changes(self, message: Message) -> Iterator[LogLine]:
+        """Yield a log line for each change in a message."""
         match message:
             case GateMessage():
                 text = f"{message.former} to {message.state} ({message.cause})"
-                return [(INFO, "gate", f"grasp {message.grasp}: {text}")]
+                yield INFO, "gate", f"grasp {message.grasp}: {text}"
             case Verdict():
-                return self._of_verdict(message)
+                yield from self._of_verdict(message)
             case OutcomeMessage():
                 lifted = "" if message.object is None else f", {message.object}"
                 text = f"the lift ended in {message.outcome}{lifted}"
-                return [(INFO, "outcome", f"grasp {message.grasp}: {text}")]
+                yield INFO, "outcome", f"grasp {message.grasp}: {text}"
             case Status():
-                return self._of_status(message)
-        return []
+                yield from self._of_status(message)
 
-    def _of_verdict(self, message: Verdict) -> list[LogLine]:
+    def _of_verdict(self, message: Verdict) -> Iterator[LogLine]:
         self._gate = message.gate
         verdict = message.grasp, message.verdict, message.reasons
         if verdict == self._verdict:
-            return []
+            return
         self._verdict = verdict
         why = "; ".join(f"{reason}: {ADVICE[reason]}" for reason in to_act_on(message.reasons))
         if message.p_slip is not None:
             why = f"slips with a probability of {message.p_slip:.1%}"
         level = WARNING if message.verdict is Decision.SLIP else INFO
-        return [(level, "verdict", f"grasp {message.grasp}: {message.verdict} ({why})")]
+        yield level, "verdict", f"grasp {message.grasp}: {message.verdict} ({why})"
 
-    def _of_status(self, message: Status) -> list[LogLine]:
-        lines = []
+    def _of_status(self, message: Status) -> Iterator[LogLine]:
         if message.state is not self._state:
             level = WARNING if message.state is State.SILENT else INFO
-            lines.append((level, "state", str(message.state)))
+            yield level, "state", str(message.state)
         for part, reason in message.health.items():
             if self._health.get(part) is not reason:
-                lines.append((WARNING, "health", f"{part}: {reason}: {ADVICE[reason]}"))
-        well = self._health.keys() - message.health.keys()
-        lines += [(INFO, "health", f"{part}: well again") for part in well]
+                yield WARNING, "health", f"{part}: {reason}: {ADVICE[reason]}"
+        for part in self._health.keys() - message.health.keys():
+            yield INFO, "health", f"{part}: well again"
         self._state, self._health = message.state, message.health
-        return lines
 
     def _image_if_due(self, message: Message, wall_ns: int) -> RawImage | None:
         """Return the image of a reading if one is due. Raises `ValueError`."""

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import msgspec
 
-from graspd.daemon.watch.fingers import FingerImage
+from graspd.daemon.judge.reasons import FingerState
 
 
 class Tone(StrEnum):
@@ -31,6 +31,35 @@ class Line(msgspec.Struct, frozen=True):
 
     what: str
     advice: str
+
+
+class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
+    """Motion of a finger, in units of its own noise."""
+
+    now: float | None
+    """Motion now; None: not known."""
+    limit: float
+    """Largest motion that counts as still."""
+
+
+class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
+    """Picture of one finger."""
+
+    name: str
+    touches: bool | None
+    """True if it touches; None: not known."""
+    from_rest: bool
+    """True if levels are relative to the resting counts, False: to the finger's median."""
+    levels: list[int]
+    """Level of each pixel, 12 rows of 11; see `levels_of`."""
+    deepest: int
+    """Largest fall of an electrode, counts."""
+    marked: list[int]
+    """Pixels of electrodes that are faulty or repaired."""
+    motion: FingerMotion | None
+    """Motion; None: the daemon has no gate."""
+    state: FingerState | None = None
+    """State; None: not known."""
 
 
 class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,8 +90,6 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     last_t: float | None
     """Time at which the last verdict arrived, as `t`; None: no verdict yet."""
     tone: Tone
-    verdict: str
-    """`stable`, `slip` or `unknown`."""
     headline: str
     """Largest word on the screen: the verdict, "leans to stable", or that none has come yet."""
     evidence: str

@@ -23,8 +23,14 @@ from rich.text import Text
 
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import printable
-from graspd.daemon.watch.fingers import FingerImage, FingerMotion
-from graspd.daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
+from graspd.daemon.watch.snapshot import (
+    FingerImage,
+    FingerMotion,
+    JudgedGrasp,
+    Line,
+    Snapshot,
+    Tone,
+)
 from graspd.daemon.watch.view import TICK_S, HandFeed, snapshots
 
 STYLES = {
@@ -238,15 +244,14 @@ def _verdict(seen: Snapshot, *, wraps: bool = False) -> Text:
     )
 
 
-def _verdict_rows(seen: Snapshot) -> list[Row]:
+def _verdict_rows(seen: Snapshot) -> Iterator[Row]:
+    if seen.evidence:
+        yield "evidence", seen.evidence
     touches = "not known" if seen.contact is None else " ".join(seen.contact) or "nothing"
     number = "-" if seen.grasp is None else seen.grasp
-    grasp = f"{number}, gate {seen.gate or '-'}, touches {touches}, still {seen.still}"
-    return [
-        *([("evidence", seen.evidence)] if seen.evidence else []),
-        ("grasp", grasp),
-        *[(finger.name, _finger(finger)) for finger in seen.fingers],
-    ]
+    yield "grasp", f"{number}, gate {seen.gate or '-'}, touches {touches}, still {seen.still}"
+    for finger in seen.fingers:
+        yield finger.name, _finger(finger)
 
 
 def _health(seen: Snapshot) -> list[Row]:
@@ -279,26 +284,21 @@ def _motion(motion: FingerMotion) -> str:
     return f"{bar} moves {motion.now:.3g} of {motion.limit:.3g}"
 
 
-def _figures(seen: Snapshot) -> list[Row]:
-    rows = []
+def _figures(seen: Snapshot) -> Iterator[Row]:
     if seen.tone is Tone.SILENT and seen.last_t is not None:
         then = time.strftime("%H:%M:%S", time.localtime(seen.last_t))
         ago_s = seen.t - seen.last_t
-        rows = [("last message", f"{then}, {ago_s:.0f} s ago; figures of then")]
-    counts = [f"{count} {decision}" for decision, count in seen.counts.items()]
-    grasps = [_past(grasp) for grasp in seen.grasps]
+        yield "last message", f"{then}, {ago_s:.0f} s ago; figures of then"
+    yield "grasps seen", ", ".join(f"{count} {what}" for what, count in seen.counts.items())
+    yield "last grasps", "; ".join(map(_past, seen.grasps)) or "-"
+    yield "learning", _flow(seen.learning)
+    for line in seen.session:
+        yield line.what, printable(line.advice, NAME_MAX)
+    yield "timing", _flow(seen.timing)
     angles = sorted(seen.joints.items())
     joints = [f"{printable(name, 5)} {math.degrees(rad):.1f}°" for name, rad in angles]
-    return [
-        *rows,
-        ("grasps seen", ", ".join(counts)),
-        ("last grasps", "; ".join(grasps) or "-"),
-        ("learning", _flow(seen.learning)),
-        *[(line.what, printable(line.advice, NAME_MAX)) for line in seen.session],
-        ("timing", _flow(seen.timing)),
-        ("joints", ", ".join(joints) or "none"),
-        ("endpoint", f"{printable(seen.endpoint, 2 * NAME_MAX)} {seen.link}"),
-    ]
+    yield "joints", ", ".join(joints) or "none"
+    yield "endpoint", f"{printable(seen.endpoint, 2 * NAME_MAX)} {seen.link}"
 
 
 def _past(grasp: JudgedGrasp) -> str:

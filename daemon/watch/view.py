@@ -31,8 +31,7 @@ from graspd.daemon.publish.messages import (
 from graspd.daemon.watch import figures
 from graspd.daemon.watch.feed import CONNECTED, Feed
 from graspd.daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
-from graspd.daemon.watch.fingers import Fingers
-from graspd.daemon.watch.grasps import OPEN, GraspLog
+from graspd.daemon.watch.hand import OPEN, Fingers, GraspLog
 from graspd.daemon.watch.snapshot import Line, Snapshot, Tone
 
 TICK_S = 0.02
@@ -220,7 +219,6 @@ class View:
             t=wall_t,
             last_t=None if last is None else wall_t - (now_ns - self._verdict_ns) / 1e9,
             tone=tone,
-            verdict=word,
             headline=NO_VERDICT if last is None else LEANS if tone is Tone.LEANS else word,
             evidence="" if verdict is None else rests_on(verdict),
             p_slip=p_slip,

@@ -21,9 +21,14 @@ from graspd.models.electrodes import Electrodes
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
 from graspd.models.runtime import TactileModel
 from graspd.models.session_statistics import HORIZON_GRASPS, SessionState
-from tests.stability.exact import Exact, exact_input, exact_softening, exact_standard
+from tests.stability.exact import (
+    Exact,
+    Reference,
+    exact_input,
+    exact_softening,
+    exact_standard,
+)
 from tests.stability.readings import Counts, Raw
-from tests.stability.reference import Reference
 
 INPUT_RELATIVE_MAX = 1e-5
 """Largest error of a reading's input over the largest magnitude in that input."""

@@ -27,7 +27,7 @@ from tests.stability.comparison import (
     Comparison,
     comparison,
 )
-from tests.stability.exact import exact_input
+from tests.stability.exact import Reference, exact_input
 from tests.stability.readings import (
     LIKELY,
     NEVER_JUDGED,
@@ -37,7 +37,6 @@ from tests.stability.readings import (
     Raw,
     likely_grasps,
 )
-from tests.stability.reference import Reference
 
 Note = Callable[..., None]
 STREAM_STEP = 20

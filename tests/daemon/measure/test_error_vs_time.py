@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import io
 import itertools
 import json
 from pathlib import Path
@@ -19,7 +16,6 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from graspd.daemon.commands.report import add_arguments
 from graspd.daemon.measure import error_vs_time
 from graspd.daemon.measure.candidates import errors, loop_image, measure, model_step
 from graspd.daemon.measure.error_vs_time import Point
@@ -28,6 +24,7 @@ from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from graspd.models.tactile_image import TactileImager
 from tests.daemon.fakes import FakeModel, contract
+from tests.kit.inside import graspd
 from tests.models.training.samples import sessions
 
 WHOLE_S = 300.0
@@ -51,19 +48,10 @@ def fonts() -> None:
 @pytest.fixture(scope="module")
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report")
-    code, said = run("--data", str(bts3_dir), "--out", str(out), "--quick")
-    assert code == 0
-    assert said == (out / "error-vs-time.md").read_text()
+    made = graspd("report", "error-vs-time", "--data", bts3_dir, "--out", out, "--quick")
+    assert made.returncode == 0
+    assert made.stdout == (out / "error-vs-time.md").read_text()
     return out
-
-
-def run(*arguments: str) -> tuple[int, str]:
-    """Exit code and standard output of the report."""
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    with contextlib.redirect_stdout(io.StringIO()) as output:
-        code = error_vs_time.run(parser.parse_args(["error-vs-time", *arguments]))
-    return code, output.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +161,7 @@ def test_a_model_of_fingers_that_were_never_recorded_is_refused() -> None:
         model_step(cast(TactileModel, model), sessions(20))
 
 
-def test_a_folder_without_tables_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("--data", str(tmp_path)) == (2, "")
-    assert len(capsys.readouterr().err.splitlines()) == 1
+def test_a_folder_without_tables_is_one_line(tmp_path: Path) -> None:
+    refused = graspd("report", "error-vs-time", "--data", tmp_path)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert len(refused.stderr.splitlines()) == 1

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from graspd.daemon.measure.cost import CostError, Footprint, measure
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
 from tests.kit.inside import graspd
+from tests.kit.scenes import demo_scene
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
@@ -126,44 +126,39 @@ def written(tmp_path: Path, text: str) -> Path:
     return scene
 
 
-def replay_of_table(extra: str = "") -> str:
-    return f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n{extra}'
-
-
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
 def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measured) -> None:
     cost = measured(scene)
-    assert below(NEVER | FORBIDDEN[scene.stem], cost.modules) == []
-    assert BUSES[DRIVER.get(scene.stem, scene.stem)] <= set(cost.modules)
-    commands = [name for name in cost.modules if name.startswith("graspd.daemon.commands.")]
+    assert below(NEVER | FORBIDDEN[scene.stem], cost["modules"]) == []
+    assert BUSES[DRIVER.get(scene.stem, scene.stem)] <= set(cost["modules"])
+    commands = [name for name in cost["modules"] if name.startswith("graspd.daemon.commands.")]
     assert commands == ["graspd.daemon.commands.run"]
-    assert cost.start.rss_kib < MEMORY_MIB[scene.stem] * 1024
-    assert cost.start.cpu_ms < START_CPU_S[scene.stem] * 1e3
-    assert cost.start.threads == 1 + ZMQ_THREADS
-    assert cost.start.descriptors == STANDARD + SIGNALS + SOCKET + FILE
-    socket = next(part for part in cost.parts if part.name == "sockets")
-    assert (socket.threads, socket.descriptors) == (ZMQ_THREADS, SOCKET)
+    assert cost["start"]["rss_kib"] < MEMORY_MIB[scene.stem] * 1024
+    assert cost["start"]["cpu_ms"] < START_CPU_S[scene.stem] * 1e3
+    assert cost["start"]["threads"] == 1 + ZMQ_THREADS
+    assert cost["start"]["descriptors"] == STANDARD + SIGNALS + SOCKET + FILE
+    socket = next(part for part in cost["parts"] if part["name"] == "sockets")
+    assert (socket["threads"], socket["descriptors"]) == (ZMQ_THREADS, SOCKET)
     # Three seconds with some grasps, each judged as it settles and then twenty times a second.
-    reading, judged = cost.timed["reading"], cost.timed["judged"]
-    assert reading.number == 300
-    assert 5 <= judged.number <= 4 + 60
-    assert 0.0 < reading.p50_us <= reading.p99_us
+    reading, judged = cost["timed"]["reading"], cost["timed"]["judged"]
+    assert reading["number"] == 300
+    assert 5 <= judged["number"] <= 4 + 60
+    assert 0.0 < reading["p50_us"] <= reading["p99_us"]
 
 
 def test_the_parts_add_up_to_the_start(measured: Measured) -> None:
     cost = measured(DEPLOY / "scenes" / "palm.toml")
     for key in ("modules", "rss_kib", "threads", "descriptors", "wall_ms"):
-        parts = sum(getattr(part, key) for part in cost.parts)
-        assert parts == pytest.approx(getattr(cost.start, key))
-    assert cost.peak_kib >= cost.start.rss_kib
+        parts = sum(part[key] for part in cost["parts"])
+        assert parts == pytest.approx(cost["start"][key])
+    assert cost["peak_kib"] >= cost["start"]["rss_kib"]
 
 
 def test_the_running_daemon_has_what_was_measured(tmp_path: Path, measured: Measured) -> None:
-    endpoint = f"ipc://{tmp_path}/graspd"
-    scene = written(tmp_path, replay_of_table(f'loop = true\n[publish]\nendpoint = "{endpoint}"\n'))
+    scene = demo_scene(tmp_path, "loop = true")
     found = measured(scene)
     with start("run", scene) as process:
-        command = [sys.executable, "-c", SUBSCRIBER, endpoint, "40"]
+        command = [sys.executable, "-c", SUBSCRIBER, f"ipc://{tmp_path}/v", "40"]
         subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
         status = Path(f"/proc/{process.pid}/status").read_text().splitlines()
         descriptors = len(os.listdir(f"/proc/{process.pid}/fd"))
@@ -171,27 +166,27 @@ def test_the_running_daemon_has_what_was_measured(tmp_path: Path, measured: Meas
         process.communicate(timeout=TIMEOUT_S)
     words = [line.split() for line in status]
     running = {word[0].rstrip(":"): word[1] for word in words if len(word) > 1}
-    assert int(running["Threads"]) == found.start.threads
-    assert int(running["VmRSS"]) == pytest.approx(found.start.rss_kib, rel=0.05)
+    assert int(running["Threads"]) == found["start"]["threads"]
+    assert int(running["VmRSS"]) == pytest.approx(found["start"]["rss_kib"], rel=0.05)
     # A subscriber has one connection; whether it has gone by now is a matter of time.
-    assert descriptors - found.start.descriptors in {0, 1}
+    assert descriptors - found["start"]["descriptors"] in {0, 1}
 
 
 def test_a_table_whose_readings_are_grasps_has_no_gate_and_no_joints(
     tmp_path: Path, measured: Measured
 ) -> None:
-    found = measured(written(tmp_path, replay_of_table()))
-    assert below(GATE | JOINTS | HALL | KEPT | ASK, found.modules) == []
-    assert found.timed["judged"].number == found.timed["reading"].number
+    found = measured(demo_scene(tmp_path))
+    assert below(GATE | JOINTS | HALL | KEPT | ASK, found["modules"]) == []
+    assert found["timed"]["judged"]["number"] == found["timed"]["reading"]["number"]
 
 
 def test_a_model_without_a_session_brings_no_statistics(tmp_path: Path, measured: Measured) -> None:
     text = '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9870"\n'
     text += "[learn]\nenabled = false\n"  # else what outcomes teach is kept
     found = measured(written(tmp_path, f'{text}[model]\nname = "mlp"\n'))
-    assert below(STATISTICS | KEPT, found.modules) == []
-    assert set(found.modules) >= GATE
-    assert "session file" not in {part.name for part in found.parts}
+    assert below(STATISTICS | KEPT, found["modules"]) == []
+    assert set(found["modules"]) >= GATE
+    assert "session file" not in {part["name"] for part in found["parts"]}
 
 
 def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
@@ -203,14 +198,13 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
         f'[joints]\ndriver = "palm"\ncalibration = "{calibration}"\n[gate]\nmode = "request"\n'
     )
     found = measured(written(tmp_path, text))
-    parts = {part.name: part for part in found.parts}
-    assert HALL | ASK | {"graspd.daemon.judge.joint_motion"} <= set(found.modules)
-    assert (
-        below({"graspd.drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
-    )
-    assert parts["sockets"].threads == ZMQ_THREADS + 1
-    assert parts["sockets"].descriptors == SOCKET + ASK_SOCKET
-    assert found.timed["judged"].number > 0
+    parts = {part["name"]: part for part in found["parts"]}
+    assert HALL | ASK | {"graspd.daemon.judge.joint_motion"} <= set(found["modules"])
+    others = {"graspd.drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}
+    assert below(others, found["modules"]) == []
+    assert parts["sockets"]["threads"] == ZMQ_THREADS + 1
+    assert parts["sockets"]["descriptors"] == SOCKET + ASK_SOCKET
+    assert found["timed"]["judged"]["number"] > 0
 
 
 def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training() -> None:
@@ -243,7 +237,7 @@ def test_a_scene_that_cannot_be_measured_says_why(tmp_path: Path) -> None:
 
 
 def test_check_prints_what_each_part_costs_only_when_asked(tmp_path: Path) -> None:
-    scene = written(tmp_path, replay_of_table())
+    scene = demo_scene(tmp_path)
     plain = graspd("check", scene)
     assert plain.returncode == 0
     assert "MiB" not in plain.stdout
@@ -260,7 +254,7 @@ def test_check_prints_what_each_part_costs_only_when_asked(tmp_path: Path) -> No
 
 
 def test_check_of_several_scenes_makes_one_table(tmp_path: Path) -> None:
-    demo, table = DEPLOY / "scenes" / "demo.toml", written(tmp_path, replay_of_table())
+    demo, table = DEPLOY / "scenes" / "demo.toml", demo_scene(tmp_path)
     costs = graspd("check", "--cost", demo, table)
     assert costs.returncode == 0
     head, rule, *rows = costs.stdout.splitlines()

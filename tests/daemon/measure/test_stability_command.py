@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import io
 import json
 import sys
 from pathlib import Path
@@ -14,8 +11,8 @@ import pytest
 pytest.importorskip("onnx", reason="the report needs onnx, of the extra `train`")
 pytest.importorskip("torch", reason="the report needs torch, of the extra `train`")
 
-from graspd.daemon.commands.report import add_arguments
 from graspd.daemon.measure import stability
+from tests.kit.inside import graspd
 from tests.stability.rows import NUMBERS, row_of, text
 
 CASE = {
@@ -25,19 +22,11 @@ CASE = {
 }
 
 
-def run(*arguments: str) -> tuple[int, str]:
-    """Exit code and standard output of the report."""
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    with contextlib.redirect_stdout(io.StringIO()) as output:
-        code = stability.run(parser.parse_args(["stability", *arguments]))
-    return code, output.getvalue()
-
-
 @pytest.mark.timeout(240)
 def test_the_cases_of_a_model_become_two_tables() -> None:
-    code, said = run("small-session-mf", "--quick")
-    assert code == 0
+    made = graspd("report", "stability", "small-session-mf", "--quick")
+    assert made.returncode == 0
+    said = made.stdout
     assert "\n0 of 4" in said
     assert "break a bound, 3e+03 outcomes" in said
     for case in ("all 0", "demo table", "random 12-bit counts", "next to the threshold"):
@@ -62,16 +51,17 @@ def test_a_broken_bound_and_a_case_that_ends_early_are_said() -> None:
 
 
 def test_what_is_missing_is_said_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run("no-such-model")[0] == 2
-    assert run("mlp", "--data", str(tmp_path))[0] == 2
+    def refused(*arguments: object) -> str:
+        result = graspd("report", "stability", *arguments)
+        assert (result.returncode, result.stdout) == (2, "")
+        (line,) = result.stderr.splitlines()
+        return line
+
+    assert "no-such-model" in refused("no-such-model")
+    assert "palm_down.csv" in refused("mlp", "--data", tmp_path)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    assert run("mlp")[0] == 2
+    assert "needs the package 'onnx'" in refused("mlp")
     monkeypatch.setattr(stability, "CHECKOUT", tmp_path)
-    assert run("mlp")[0] == 2
-    model, table, package, tests = capsys.readouterr().err.splitlines()
-    assert "no-such-model" in model
-    assert "palm_down.csv" in table
-    assert "needs the package 'onnx'" in package
-    assert "run it in a checkout" in tests
+    assert "run it in a checkout" in refused("mlp")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import shutil
@@ -17,7 +16,6 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
-from graspd.daemon.commands.report import add_arguments
 from graspd.daemon.measure import streams as module
 from graspd.daemon.measure import worth
 from graspd.daemon.measure.reliability import fitted_scales, outcomes_of, slope
@@ -41,6 +39,7 @@ from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.data.protocols import object_folds
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS, System, with_recipes
+from tests.kit.inside import graspd
 
 GRASPS = 300
 LIMITS = limits(ALLOWED)
@@ -211,15 +210,9 @@ def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("worth")
     card = out / "card.json"
     shutil.copy(zoo.find("small-session").with_suffix(".json"), card)
-    arguments = ("--data", str(bts3_dir), "--out", str(out), "--card", str(card), "--quick")
-    assert worth.run(options(*arguments)) == 0
+    words = ("report", "worth", "--data", bts3_dir, "--out", out, "--card", card, "--quick")
+    assert graspd(*words).returncode == 0
     return out
-
-
-def options(*arguments: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    return parser.parse_args(["worth", *arguments])
 
 
 def test_from_tables_to_picture(folder: Path) -> None:

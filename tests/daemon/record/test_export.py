@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +26,7 @@ from graspd.models.training.data.datasets import read_table
 from tests.daemon.record import recorded
 from tests.daemon.record.recorded import BOOT
 from tests.kit.inside import graspd
+from tests.kit.scenes import demo_scene
 
 Ending = Literal["stable", "slip"]
 HEADER = replace(recorded.HEADER, fingers=("ff", "mf", "th"), wall_minus_monotonic_ns=10**18)
@@ -68,12 +68,6 @@ class Writer:
         )
         self._file.write(b"outcome.right", encode(message), self._now_ns)
 
-    def outcome_without_the_field(self, grasp: int, outcome: Ending) -> None:
-        """As it was recorded before objects were told."""
-        content = {"v": 1, "boot_id": self._boot_id, "seq": 0, "t": 0.0, "t_mono_ns": self._now_ns}
-        payload = json.dumps(content | {"grasp": grasp, "outcome": outcome}).encode()
-        self._file.write(b"outcome.right", payload, self._now_ns)
-
     def close(self) -> None:
         self._file.close()
 
@@ -103,11 +97,7 @@ def test_a_row_is_what_was_judged(tmp_path: Path) -> None:
 def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_are_broken(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n[model]\nname = "cnn1"\n'
-    )
-    wanted = scene.load(path)
+    wanted = scene.load(demo_scene(tmp_path, sections='[model]\nname = "cnn1"'))
     pipeline = assembly.build_pipeline(wanted, assembly.load_model(wanted), lambda: 10**12)
     counts, sound = read_table(DEMO_TABLE).counts[0], np.zeros((3, 24), dtype=np.uint8)
     broken = sound.copy()
@@ -168,7 +158,7 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
     writer.outcome(1, "slip", "mug")
     writer.outcome(2, "stable", "ball")
     writer.outcome(3, "stable")
-    writer.outcome_without_the_field(4, "slip")
+    writer.outcome(4, "slip")
     writer.outcome(5, "slip", "mug")
     writer.outcome(5, "stable", "box")  # the later counts, with its object ...
     writer.outcome(6, "slip", "mug")

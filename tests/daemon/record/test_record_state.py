@@ -90,15 +90,20 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
     assert header_of(files(tmp_path)[1]).axis_ns == loop.sent
 
 
-def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_then(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_disk_that_refuses_is_told_once_and_recorded_on_when_it_takes_files_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO)
     monkeypatch.setattr("graspd.daemon.record.recorder.RETRY_NS", 100_000_000)
     blocked = tmp_path / "record"
     blocked.write_text("a file where the folder should be")
     loop = Loop()
     writing = recorder(tmp_path, loop.header)
-    wait_until(lambda: writing.counters["record"]["failures"] == 1)
+    while writing.counters["record"]["failures"] < 3:
+        loop.send(writing, STATUS)
+        time.sleep(0.01)
+    assert [each.levelname for each in caplog.records] == ["WARNING"]
+    assert writing.counters["record"]["writing"] == 0
     blocked.unlink()
     while not writing.counters["record"]["writing"]:
         loop.send(writing, VERDICT)

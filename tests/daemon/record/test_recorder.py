@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import logging
 import os
 import threading
 import time
@@ -180,30 +179,6 @@ def test_the_end_does_not_wait_for_a_disk_that_never_answers(
 
 def _recording() -> bool:
     return any(thread.name == "recorder" for thread in threading.enumerate())
-
-
-def test_a_disk_that_refuses_is_told_once_and_tried_again_every_minute(
-    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
-    monkeypatch.setattr(recorder_module, "RETRY_NS", 300_000_000)
-    blocked = tmp_path / "record"
-    blocked.write_text("a file where the folder should be")
-    writing = make()
-    while writing.counters["record"]["failures"] < 3:
-        writing.on_status(NO_STATUS)
-        time.sleep(0.01)
-    writing.send(TOPIC, payload(1))
-    wait_until(lambda: writing.counters["record"]["lost"] == 1)
-    assert [r.levelname for r in caplog.records] == ["WARNING"]
-    assert writing.counters["record"]["writing"] == 0
-    blocked.unlink()
-    while not writing.counters["record"]["writing"]:
-        writing.on_status(NO_STATUS)
-        time.sleep(0.01)
-    writing.send(TOPIC, payload(2))
-    writing.close()
-    assert numbers(tmp_path) == [2]
 
 
 def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(

@@ -66,8 +66,8 @@ def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoi
         view = View(endpoint)
         for topic, payload in feed.take():
             view.take(topic, payload, feed.empty_ns)
-        assert view.snapshot(clock.now_ns).verdict == "unknown"
-        assert view.snapshot(looked_ns).verdict == "stable"
+        assert view.snapshot(clock.now_ns).headline == "unknown"
+        assert view.snapshot(looked_ns).headline == "stable"
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.reasons import Decision, GateState
-from graspd.daemon.watch.fingers import FingerImage
+from graspd.daemon.watch.snapshot import FingerImage
 from graspd.daemon.watch.view import View
 from graspd.models.layout import D1
 from graspd.models.levels import RestCounts

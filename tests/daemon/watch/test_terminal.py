@@ -9,8 +9,7 @@ import pytest
 from msgspec import structs
 
 from graspd.daemon.judge.reasons import ADVICE, Decision, FingerState, Reason
-from graspd.daemon.watch.fingers import FingerMotion
-from graspd.daemon.watch.snapshot import Snapshot, Tone
+from graspd.daemon.watch.snapshot import FingerMotion, Snapshot, Tone
 from graspd.daemon.watch.terminal import STYLES
 from tests.daemon.watch.watch_fakes import (
     ENDPOINT,
@@ -43,9 +42,9 @@ def test_all_words_fit_a_terminal_of_sixty_columns(decision: Decision, width: in
         "touches ff mf rf lf th, still 131 ms, may slide",
         "th ########--|---------- moves 1.2 of 1.5",
         "FFJ3 28.6°",  # 0.5 rad
-        "small-session 0123456789ab",
-        "latency p50, p99 250 us, 500 us; longest latency 750 us",
-        "session 12 grasps, not yet calibrated",
+        "cnn1 0123456789ab",
+        "latency p50, p99 250 us, 500 us; longest latency 500 us",
+        "session 57 grasps, calibrated",
         f"endpoint {ENDPOINT} connecting",
         f"health ff_7 electrode-dead: {ADVICE[Reason.ELECTRODE_DEAD]}",
         *(line.advice for line in seen.why),

@@ -83,7 +83,7 @@ def test_a_viewer_that_stood_still_says_so_itself() -> None:
     seen = view.snapshot(5100 * MS)
     stood = "this viewer itself stood still for 5000 ms"
     assert seen.why[0] == Line("held up", f"{stood} and connects again")
-    assert (seen.verdict, seen.history) == ("unknown", ["s"])
+    assert (seen.headline, seen.history) == ("unknown", ["s"])
     seen = view.snapshot(6100 * MS)
     assert seen.why[0] == Line("silent", f"no message since; {stood}")
     assert seen.history == ["s", "", "", "", "", "", "."]

@@ -229,7 +229,7 @@ def test_several_hands_are_one_page_of_one_process(tmp_path: Path, port: int) ->
                         break
             page.send_signal(signal.SIGTERM)
             assert page.wait(PATIENCE_S) == 0  # with a page open
-        assert (first["tone"], first["verdict"]) == ("silent", "unknown")
+        assert (first["tone"], first["headline"]) == ("silent", "no verdict yet")
         assert (second["hand"], second["endpoint"]) == ("right", f"ipc://{tmp_path}/right")
         assert page.stderr is not None
         assert page.stderr.read() == ""

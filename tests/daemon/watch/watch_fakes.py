@@ -11,22 +11,13 @@ from msgspec import structs
 from rich.console import Console
 
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.publish.messages import (
-    DECISION_CODE,
-    LearnerHealth,
-    Lifts,
-    State,
-    Status,
-    Tactile,
-    Verdict,
-    encode,
-)
-from graspd.daemon.trust.lift_book import OutcomeStatus
+from graspd.daemon.publish.messages import DECISION_CODE, encode
 from graspd.daemon.trust.risk import RiskReport
 from graspd.daemon.watch.snapshot import Snapshot
 from graspd.daemon.watch.terminal import draw
 from graspd.daemon.watch.view import View
 from tests.daemon.publish.doors import Publisher
+from tests.kit.messages import GOLDEN, GOLDEN_STATUS, GOLDEN_VERDICT, decode_tactile
 
 RISK = RiskReport(
     target=0.1,
@@ -40,7 +31,8 @@ RISK = RiskReport(
 )
 """Enough to show `stable` as a promise: the lifts are more than 1 / target, 4.9 % slipped."""
 NOTHING_TOLD = structs.replace(RISK, lifts=0, slips=0)
-BOOT = "0f0e0d0c0b0a09080706050403020100"
+BOOT = GOLDEN_VERDICT.boot_id
+GOLDEN_TACTILE = decode_tactile((GOLDEN / "tactile.json").read_bytes())
 MS = 1_000_000
 PERIOD_S = 0.02
 ENDPOINT = "ipc:///tmp/any"
@@ -49,30 +41,24 @@ RESTING = [3000] * 24
 
 def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> bytes:  # noqa: ANN401
     p_slip = {Decision.STABLE: 0.25, Decision.SLIP: 0.75, Decision.UNKNOWN: None}[decision]
-    content: dict[str, Any] = {
-        "boot_id": BOOT,
-        "seq": seq,
-        "t": 1790000000.0,
-        "t_mono_ns": 123456789012345,
-        "grasp": 7,
-        "verdict": decision,
-        "verdict_code": DECISION_CODE[decision],
-        "p_slip": p_slip,
-        "valid": p_slip is not None,
-        "reasons": [] if p_slip is not None else [Reason.NO_CONTACT],
-        "age_ms": 0.5,
-        "latency_us": 250.0,
-        "judged": p_slip is not None,
-        "gate": GateState.IDLE if p_slip is None else GateState.JUDGED,
-        "contact": [] if p_slip is None else ["ff", "th"],
-        "silence_ms": 100.0,
-        "model": "small-session",
-        "model_sha": "0123456789ab",
-        "p_slip_model": None if p_slip is None else 0.3,
-        "outcomes": 57,
-        "risk": RISK,
-    }
-    return encode(Verdict(**{**content, **other}))
+    judged = p_slip is not None
+    said = structs.replace(
+        GOLDEN_VERDICT,
+        seq=seq,
+        grasp=7,
+        verdict=decision,
+        verdict_code=DECISION_CODE[decision],
+        p_slip=p_slip,
+        valid=judged,
+        reasons=[] if judged else [Reason.NO_CONTACT],
+        judged=judged,
+        gate=GateState.JUDGED if judged else GateState.IDLE,
+        contact=["ff", "th"] if judged else [],
+        p_slip_model=0.3 if judged else None,
+        outcomes=57,
+        risk=RISK,
+    )
+    return encode(structs.replace(said, **other))
 
 
 def tactile(seq: int, *counts: list[int], faulty: tuple[int, ...] = ()) -> bytes:
@@ -80,42 +66,13 @@ def tactile(seq: int, *counts: list[int], faulty: tuple[int, ...] = ()) -> bytes
     faults = [[0] * 24 for _ in counts]
     for electrode in faulty:
         faults[0][electrode] = 1
-    return encode(
-        Tactile(
-            boot_id=BOOT,
-            seq=seq,
-            t=1790000000.0,
-            t_mono_ns=123456789012345,
-            fingers=["ff", "th"],
-            counts=list(counts),
-            faults=faults,
-            joints={"FFJ3": 0.5},
-        )
-    )
+    reading = structs.replace(GOLDEN_TACTILE, seq=seq, counts=list(counts), faults=faults)
+    return encode(structs.replace(reading, joints={"FFJ3": 0.5}))
 
 
 def status(seq: int, **other: Any) -> bytes:  # noqa: ANN401
-    content: dict[str, Any] = {
-        "boot_id": BOOT,
-        "seq": seq,
-        "t": 1790000000.0,
-        "t_mono_ns": 123456789012345,
-        "state": State.RUNNING,
-        "readings_hz": 100.0,
-        "verdicts": {Decision.STABLE: 3},
-        "reasons": {},
-        "drivers": {"replay": {"readings": 3}},
-        "session_grasps": 12,
-        "session_calibrated": False,
-        "gate": GateState.IDLE,
-        "tared": ["ff", "th"],
-        "health": {"ff_7": Reason.ELECTRODE_DEAD},
-        "latency_us": {"p50": 250.0, "p99": 500.0, "max": 750.0},
-        "model": "small-session",
-        "model_sha": "0123456789ab",
-        "versions": {"graspd": "0.1.0"},
-    }
-    return encode(Status(**{**content, **other}))
+    health = {"ff_7": Reason.ELECTRODE_DEAD}
+    return encode(structs.replace(GOLDEN_STATUS, **{"seq": seq, "health": health, **other}))
 
 
 def a_view(hand: str | None = None) -> View:
@@ -130,8 +87,6 @@ def after(*messages: tuple[bytes, bytes], at_ns: int = 0) -> View:
 
 
 FIVE = ["ff", "mf", "rf", "lf", "th"]
-LIFTS = Lifts(reported=41, outstanding=1, unreported=3)
-LEARNER = LearnerHealth(enabled=True, outcomes=5, told={OutcomeStatus.TAKEN: 5}, uncertainty=0.4)
 
 
 def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snapshot:
@@ -148,7 +103,7 @@ def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snaps
         motion=dict.fromkeys(FIVE, 1.2),
         motion_limits=dict.fromkeys(FIVE, 1.5),
     )
-    view.take(f"status.{hand}".encode(), status(seq, lifts=LIFTS, learner=LEARNER), 0)
+    view.take(f"status.{hand}".encode(), status(seq), 0)
     message = json.dumps(json.loads(tactile(0)) | reading).encode()
     view.take(f"tactile.{hand}".encode(), message, 0)
     view.take(f"verdict.{hand}".encode(), said, 0)

@@ -1,20 +1,91 @@
-"""The grasps of a hand: verdicts, ends of lifts, and counts."""
+"""Tactile images and grasps of a hand, from its messages so far."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
+
+import numpy as np
 
 from graspd.daemon.judge.reasons import Decision, GateState
-from graspd.daemon.publish.messages import OutcomeMessage, Verdict
+from graspd.daemon.publish.messages import OutcomeMessage, Tactile, Verdict
 from graspd.daemon.watch.figures import lift
-from graspd.daemon.watch.snapshot import JudgedGrasp
+from graspd.daemon.watch.snapshot import FingerImage, FingerMotion, JudgedGrasp
+from graspd.models.contract import Finger
+from graspd.models.layout import ELECTRODES
+from graspd.models.levels import PIXELS, RestCounts, fall_of, levels_of
 
+OLD_NS = 1_000_000_000
+"""Largest age of a reading whose image is shown, ns."""
 GRASPS_MAX = 8
 OPEN = {GateState.IDLE, GateState.RELEASED}
 """States of the gate without a grasp."""
 
 Key = tuple[str, int]
 """`boot_id` and number of a grasp."""
+
+
+class Fingers:
+    """Learns the resting counts from readings, and draws the newest reading."""
+
+    def __init__(self) -> None:
+        self._tactile: Tactile | None = None
+        self._tactile_ns = 0
+        self._rest = RestCounts()
+
+    def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
+        """Take in a reading; return False, and ignore it, if its shapes are wrong.
+
+        `resting`: fingers that rest in it, to learn from.
+        """
+        lengths = {len(tactile.fingers), len(tactile.counts), len(tactile.faults)}
+        rows = [*tactile.counts, *tactile.faults]
+        if len(lengths) != 1 or any(len(row) != ELECTRODES for row in rows):
+            return False
+        self._tactile, self._tactile_ns = tactile, now_ns
+        for index, finger in enumerate(tactile.fingers):
+            if finger in resting:
+                counts = np.array(tactile.counts[index])
+                sound = np.array(tactile.faults[index]) == 0
+                self._rest.learn(finger, counts, sound)
+        return True
+
+    def images(self, verdict: Verdict, now_ns: int) -> list[FingerImage]:
+        """Return the image of each finger in the newest reading; none if it is too old."""
+        tactile = self._tactile
+        if tactile is None or now_ns - self._tactile_ns > OLD_NS:
+            return []
+        return [self._image(tactile, index, verdict) for index in range(len(tactile.fingers))]
+
+    def _image(self, tactile: Tactile, index: int, verdict: Verdict) -> FingerImage:
+        name = tactile.fingers[index]
+        counts = np.array(tactile.counts[index], dtype=np.float64)
+        sound = np.array(tactile.faults[index]) == 0
+        electrodes = range(1, ELECTRODES + 1)
+        repaired = [f"{name}_{number}" in verdict.repaired for number in electrodes]
+        rest = self._rest.of(name)
+        fall = fall_of(counts, sound, rest)
+        return FingerImage(
+            name=name,
+            touches=None if verdict.contact is None else name in verdict.contact,
+            from_rest=rest is not None,
+            levels=levels_of(fall, from_rest=rest is not None).tolist(),
+            deepest=round(float(fall.max())),
+            marked=sorted(PIXELS[electrode] for electrode in np.flatnonzero(~sound | repaired)),
+            motion=_motion(verdict, name),
+            state=(verdict.fingers or {}).get(name),
+        )
+
+    @property
+    def joints(self) -> dict[str, float]:
+        return {} if self._tactile is None else self._tactile.joints
+
+
+def _motion(verdict: Verdict, finger: Finger) -> FingerMotion | None:
+    if verdict.motion is None:
+        return None
+    limit = (verdict.motion_limits or {}).get(finger, 0.0)
+    return FingerMotion(now=verdict.motion.get(finger) if limit > 0.0 else None, limit=limit)
 
 
 class GraspLog:
