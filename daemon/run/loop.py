@@ -162,8 +162,10 @@ class Loop:
         for before_wait in self._before_wait:
             before_wait(self)
         self._wait(selector)
-        if not self._take_readings():
-            self._check_silence()
+        if not self._take_readings() and not self._tactile.exhausted:
+            now_ns = self._clock()
+            if now_ns >= self._silence_due_ns:
+                self._report_silence(now_ns)
         if self._clock() >= self._status_due_ns:
             self._send_status()
         for after_round in self._after_round:
@@ -274,11 +276,6 @@ class Loop:
         self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
         return True
 
-    def _check_silence(self) -> None:
-        now_ns = self._clock()
-        if now_ns >= self._silence_due_ns and not self._tactile.exhausted:
-            self._report_silence(now_ns)
-
     def _report_silence(self, now_ns: int, *, is_answer: bool = False) -> None:
         self._state = State.SILENT
         judgement = self._pipeline.silence(self._last_t_ns)
@@ -343,7 +340,9 @@ class Loop:
 
     def outcome(self, report: Report, answer: Answer) -> None:
         """Learn, publish and save the outcome of a judged grasp's lift; then call `answer`."""
-        lifts, grasp = self._pipeline.lifts, self._judged_as(report.grasp)
+        lifts, grasp = self._pipeline.lifts, report.grasp
+        if grasp.boot_id == self._outbox.boot_id:  # the book of a replay has the recorded ids
+            grasp = GraspId(self._pipeline.boot_id, grasp.grasp)
         if not lifts.may_report(grasp, report.peer):
             answer(NOT_YOURS)
             return
@@ -365,12 +364,6 @@ class Loop:
         if problem is None:
             self._pipeline.lifts.keep(grasp)
         answer(problem)
-
-    def _judged_as(self, grasp: GraspId) -> GraspId:
-        """Return the id of a grasp in the book; a replay uses the recorded ids."""
-        if grasp.boot_id != self._outbox.boot_id:
-            return grasp
-        return GraspId(self._pipeline.boot_id, grasp.grasp)
 
 
 def _count_tactile(readings: Sequence[Reading]) -> int:
