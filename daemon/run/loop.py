@@ -127,7 +127,6 @@ class Loop:
         self._shedder = LoadShedder(now_ns, live=self._tactile.live, sleep=timing.rest)
         self._last_t_ns = now_ns
         self._silence_due_ns = now_ns + self._silence_ns
-        self._status_due_ns = now_ns + STATUS_PERIOD_NS
         self._status_at_ns = now_ns
         self._readings_since_status = 0
 
@@ -166,7 +165,7 @@ class Loop:
             now_ns = self._clock()
             if now_ns >= self._silence_due_ns:
                 self._report_silence(now_ns)
-        if self._clock() >= self._status_due_ns:
+        if self._clock() - self._status_at_ns >= STATUS_PERIOD_NS:
             self._send_status()
         for after_round in self._after_round:
             after_round()
@@ -200,7 +199,7 @@ class Loop:
         self._watched = watched
 
     def _next_due_ns(self) -> int:
-        due_ns = min(self._silence_due_ns, self._status_due_ns)
+        due_ns = min(self._silence_due_ns, self._status_at_ns + STATUS_PERIOD_NS)
         for timer in self._due_ns:
             timer_ns = timer()
             if timer_ns is not None and timer_ns < due_ns:
@@ -328,7 +327,6 @@ class Loop:
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns
-        self._status_due_ns = now_ns + STATUS_PERIOD_NS
         for on_status in self._on_status:
             on_status(status)
 
