@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
@@ -263,23 +263,19 @@ def _tactile(scene: Scene) -> Driver:
 
 
 def _palm(scene: Scene, options: PalmTactile) -> Driver:
-    joints, fingers = scene.joints, scene.hand.fingers
-    calibration = joints.calibration if isinstance(joints, PalmJoints) else None
-    heed = options.heed_finger_bits
+    joints = scene.joints
+    common: dict[str, Any] = {
+        "fingers": scene.hand.fingers,
+        "calibration": joints.calibration if isinstance(joints, PalmJoints) else None,
+        "heed_finger_bits": options.heed_finger_bits,
+    }
     if options.source.startswith("udp://"):
         from graspd.drivers.palm.driver import PalmDriver
 
-        return PalmDriver(
-            options.source,
-            fingers,
-            calibration=calibration,
-            only_from=options.only_from,
-            heed_finger_bits=heed,
-        )
+        return PalmDriver(options.source, only_from=options.only_from, **common)
     from graspd.drivers.recordings.palm_file import PalmFile
 
-    path = Path(options.source)
-    return PalmFile(path, fingers, calibration=calibration, heed_finger_bits=heed)
+    return PalmFile(Path(options.source), **common)
 
 
 def _replay(scene: Scene, options: ReplayTactile) -> Driver:

@@ -82,7 +82,6 @@ class RecordedRun(Source):
             if header.file > 0:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         driver.on_event = partial(self._repeat, parts.pipeline)
-        parts.pipeline.boot_id = header.boot_id
         return parts
 
     def restore(self, pipeline: Pipeline) -> None:

@@ -34,7 +34,6 @@ class DayTable(Companion):
         self._warnings = warnings
         self._part = Tally(), Tally()
         self._whole = Tally(), Tally()
-        self._grasps = 0
         methods = f"the published method ({PUBLISHED})", f"graspd ({model})"
         heads = "".join(f"{method:>{len(COLUMNS)}}" for method in methods)
         self._write(
@@ -58,13 +57,13 @@ class DayTable(Companion):
         for tallies in (self._part, self._whole):
             tallies[0].add(said, (), note.slipped)
             tallies[1].add(verdict.verdict, verdict.reasons, note.slipped)
-        self._grasps += 1
-        if self._grasps % GRASPS == 0:
+        if self._part[0].labelled == GRASPS:
             self._end_part(None if verdict.risk is None else verdict.risk.target)
 
     def _end_part(self, allowed: float | None) -> None:
-        first = self._grasps - self._part[0].labelled + 1
-        self._line(f"{first}-{self._grasps}", self._part, allowed)
+        last = self._whole[0].labelled
+        first = last - self._part[0].labelled + 1
+        self._line(f"{first}-{last}", self._part, allowed)
         self._part = Tally(), Tally()
 
     def summary(self, trust: Trust | None) -> None:
@@ -92,7 +91,7 @@ class DayTable(Companion):
             "the risk of a lift on `stable`",
             f"good lifts kept    {_kept(graspd)}, published {_kept(published)}: "
             "`stable` of those that hold",
-            f"unknown            {graspd.decisions[Decision.UNKNOWN]} of {self._grasps} grasps, "
+            f"unknown            {graspd.decisions[Decision.UNKNOWN]} of {graspd.labelled} grasps, "
             f"published {published.decisions[Decision.UNKNOWN]}: no answer, so grasp again",
         ]
 

@@ -127,7 +127,6 @@ class Loop:
         self._shedder = LoadShedder(now_ns, live=self._tactile.live, sleep=timing.rest)
         self._last_t_ns = now_ns
         self._silence_due_ns = now_ns + self._silence_ns
-        self._status_due_ns = now_ns + STATUS_PERIOD_NS
         self._status_at_ns = now_ns
         self._readings_since_status = 0
 
@@ -162,9 +161,11 @@ class Loop:
         for before_wait in self._before_wait:
             before_wait(self)
         self._wait(selector)
-        if not self._take_readings():
-            self._check_silence()
-        if self._clock() >= self._status_due_ns:
+        if not self._take_readings() and not self._tactile.exhausted:
+            now_ns = self._clock()
+            if now_ns >= self._silence_due_ns:
+                self._report_silence(now_ns)
+        if self._clock() - self._status_at_ns >= STATUS_PERIOD_NS:
             self._send_status()
         for after_round in self._after_round:
             after_round()
@@ -198,7 +199,7 @@ class Loop:
         self._watched = watched
 
     def _next_due_ns(self) -> int:
-        due_ns = min(self._silence_due_ns, self._status_due_ns)
+        due_ns = min(self._silence_due_ns, self._status_at_ns + STATUS_PERIOD_NS)
         for timer in self._due_ns:
             timer_ns = timer()
             if timer_ns is not None and timer_ns < due_ns:
@@ -274,11 +275,6 @@ class Loop:
         self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
         return True
 
-    def _check_silence(self) -> None:
-        now_ns = self._clock()
-        if now_ns >= self._silence_due_ns and not self._tactile.exhausted:
-            self._report_silence(now_ns)
-
     def _report_silence(self, now_ns: int, *, is_answer: bool = False) -> None:
         self._state = State.SILENT
         judgement = self._pipeline.silence(self._last_t_ns)
@@ -331,7 +327,6 @@ class Loop:
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns
-        self._status_due_ns = now_ns + STATUS_PERIOD_NS
         for on_status in self._on_status:
             on_status(status)
 
@@ -343,7 +338,9 @@ class Loop:
 
     def outcome(self, report: Report, answer: Answer) -> None:
         """Learn, publish and save the outcome of a judged grasp's lift; then call `answer`."""
-        lifts, grasp = self._pipeline.lifts, self._judged_as(report.grasp)
+        lifts, grasp = self._pipeline.lifts, report.grasp
+        if grasp.boot_id == self._outbox.boot_id:  # the book of a replay has the recorded ids
+            grasp = GraspId(self._pipeline.boot_id, grasp.grasp)
         if not lifts.may_report(grasp, report.peer):
             answer(NOT_YOURS)
             return
@@ -365,12 +362,6 @@ class Loop:
         if problem is None:
             self._pipeline.lifts.keep(grasp)
         answer(problem)
-
-    def _judged_as(self, grasp: GraspId) -> GraspId:
-        """Return the id of a grasp in the book; a replay uses the recorded ids."""
-        if grasp.boot_id != self._outbox.boot_id:
-            return grasp
-        return GraspId(self._pipeline.boot_id, grasp.grasp)
 
 
 def _count_tactile(readings: Sequence[Reading]) -> int:

@@ -113,7 +113,8 @@ class Runner:
         self._printer = printer
         self._manager = manager
         self._sockets: Sockets | None = None
-        self._reload = Reload(stop, partial(prepare, path), self._say_reloading)
+        began = (lambda: None) if manager is None else manager.reloading
+        self._reload = Reload(stop, partial(prepare, path), began)
         self._running = False
         self._former: Parts | None = None
         """Parts of the scene before a reload, until the new scene runs."""
@@ -245,10 +246,6 @@ class Runner:
             for loss in losses(self._latest.pipeline, kept=self._keeps_session):
                 log.warning("%s", loss)
         self._latest, self._keeps_session = parts, keeps_session
-
-    def _say_reloading(self) -> None:
-        if self._manager is not None:
-            self._manager.reloading()
 
     def _taken(self) -> Parts | None:
         """Return the prepared scene; None, with an error in the log, if it is wrong."""

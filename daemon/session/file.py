@@ -162,12 +162,7 @@ def kept_now(
     trust: TrustState | None = None,
     rest: tuple[float, ...] | None = None,
 ) -> KeptSession:
-    """Return the content of a session file, with the time of the call as its `saved_at`.
-
-    `statistics`: those of the sensors' counts; None: the model needs none. `serials`: serial number
-    of each finger's sensor. `trust`: learner and risk; None: neither. `rest`: count at which each
-    electrode rests; None: not known.
-    """
+    """Return the content of a session file that is saved now; `KeptSession` has the meanings."""
     learned = None if trust is None else encode(trust)
     return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned, rest)
 

@@ -113,8 +113,6 @@ class LiftBook:
         """Number of lifts that were announced."""
         self.awaited = 0
         """Number of announced lifts whose outcome is out."""
-        self.abandoned = 0
-        """Number of announced lifts that left the book before an outcome came."""
 
     def __contains__(self, grasp: object) -> bool:
         """True if the grasp was judged and is in the book."""
@@ -131,11 +129,11 @@ class LiftBook:
         return lift is not None and lift.stable
 
     def note(self, grasp: GraspId, features: bytes, *, stable: bool) -> bool:
-        """Enter how a grasp was judged, and by which features (float64); True if that was new.
+        """Enter how a grasp was judged, and by which features (float64).
 
         The first verdict counts, or the first that called the grasp `stable`: a controller lifts on
         that one. A grasp that was not assessed is entered again once it is. Nothing changes after
-        the outcome is known.
+        the outcome is known. Return True if an announced lift left the book untold.
         """
         lift = self._lifts.get(grasp)
         if lift is not None:
@@ -146,10 +144,14 @@ class LiftBook:
             stable = stable or lift.stable
         announced = lift is not None and lift.announced
         self._lifts[grasp] = Lift(grasp, stable, features, announced=announced)
+        is_abandoned = False
         if len(self._lifts) > LIFTS_MAX:
-            self._forget(next(iter(self._lifts)))
+            oldest = self._lifts.pop(next(iter(self._lifts)))
+            self._unkept.discard(oldest.id)
+            self.unreported += oldest.is_outstanding
+            is_abandoned = oldest.is_awaited
         self._count()
-        return True
+        return is_abandoned
 
     def claim(self, grasp: GraspId, owner: bytes) -> None:
         """Give a grasp to the peer that asked to lift it, unless another one owns it already."""
@@ -238,13 +240,6 @@ class LiftBook:
         self.told = Counter(state.told)
         self.unreported, self.announced = state.unreported, state.announced
         self._count()
-
-    def _forget(self, grasp: GraspId) -> None:
-        """Drop the oldest grasp: its outcome is refused from now on."""
-        lift = self._lifts.pop(grasp)
-        self._unkept.discard(grasp)
-        self.unreported += lift.is_outstanding
-        self.abandoned += lift.is_awaited
 
     def _count(self) -> None:
         self.outstanding = sum(lift.is_outstanding for lift in self._lifts.values())

@@ -79,7 +79,6 @@ class Trust:
         """
         self._model = model
         self.learns = learns
-        self._report: RiskReport | None = None
         self.learner = Learner(inputs)
         self._judging = self.learner if learns else Learner(inputs)
         """The learner by which grasps are judged; without learning, one that is never taught."""
@@ -96,12 +95,11 @@ class Trust:
         """
         if not 0.0 <= p_slip <= 1.0:  # also true for NaN
             raise ValueError(f"{p_slip} is no probability")
-        report = self.report()
         log_odds, features = self._judging.judge(margin, inputs)
         permission = self.risk.decide(log_odds, self.lifts.awaited)
         return Assessment(
             outcomes=self._judging.outcomes,
-            report=report,
+            report=self.report(),
             p_slip=sigmoid(log_odds) if self._judging.outcomes else p_slip,
             log_odds=log_odds,
             permission=permission,
@@ -121,8 +119,6 @@ class Trust:
         permission = former.permission
         if permission is Permission.ALLOWED and not self.lifts.is_stable(grasp):
             permission = self.risk.decide(former.log_odds, self.lifts.awaited)
-        if permission is former.permission and report is former.report:
-            return former
         return replace(former, permission=permission, report=report)
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
@@ -132,10 +128,7 @@ class Trust:
         features = assessment.features if is_ours else NOT_ASSESSED
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
-        abandoned = self.lifts.abandoned
         if self.lifts.note(grasp, features, stable=stable):
-            self._report = None
-        if self.lifts.abandoned != abandoned:
             self.risk.take_untold()
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
@@ -145,24 +138,20 @@ class Trust:
             self.risk.take(stable=lift.stable, slipped=slipped, proves=bool(lift.features))
             if lift.features and self.learns:
                 self.learner.learn(np.frombuffer(lift.features, "<f8"), slipped=slipped)
-        self._report = None
         return status
 
     def report(self) -> RiskReport:
         """Return the outcomes of the lifts of `stable` verdicts until now."""
-        if self._report is None or self._report.announced != self.lifts.announced:
-            risk = self.risk
-            self._report = RiskReport(
-                target=risk.limits.max_slip_when_stable,
-                lifts=risk.lifts,
-                slips=risk.slips,
-                outstanding=self.lifts.outstanding,
-                bound=risk.bound,
-                warm_up_left=risk.warm_up_left,
-                announced=self.lifts.announced,
-                awaited=self.lifts.awaited,
-            )
-        return self._report
+        return RiskReport(
+            target=self.risk.limits.max_slip_when_stable,
+            lifts=self.risk.lifts,
+            slips=self.risk.slips,
+            outstanding=self.lifts.outstanding,
+            bound=self.risk.bound,
+            warm_up_left=self.risk.warm_up_left,
+            announced=self.lifts.announced,
+            awaited=self.lifts.awaited,
+        )
 
     def sensors_exchanged(self, learned: LearnerState | None = None) -> None:
         """Learn from the start, or from `learned`. Raises `ValueError` for another model's."""
@@ -171,7 +160,6 @@ class Trust:
             self.learner.restore(learned)
         self.risk.exchanged()
         self.lifts.exchanged()
-        self._report = None
 
     def state(self) -> TrustState:
         """Return what `restore` needs; later outcomes do not change it."""
@@ -195,7 +183,6 @@ class Trust:
         self.learner, self.risk = learner, risk
         if self.learns:
             self._judging = learner
-        self._report = None
 
 
 def encode(state: TrustState) -> bytes:

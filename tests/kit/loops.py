@@ -69,6 +69,7 @@ class LoopBench(Companion):
         hand: HandLimits | None = None,
         max_age_ms: int = 100,
         sleep: Sleep | None = None,
+        timing: LoopTiming | None = None,
         cost_ns: Callable[[], int] | None = None,
     ) -> None:
         """Without `stop` the bench has one of its own, which `run` closes.
@@ -91,7 +92,8 @@ class LoopBench(Companion):
             model or FakeModel(), clock, hand=hand, trust=trust, max_age_ns=max_age_ms * MS
         )
         self.pipeline.boot_id = boot_id or ""
-        timing = LoopTiming(max_age_ms * MS, clock, Sleep() if sleep is None else sleep)
+        if timing is None:
+            timing = LoopTiming(max_age_ms * MS, clock, Sleep() if sleep is None else sleep)
         if cost_ns is not None:
             timing = LoopTiming(
                 max_age_ms * MS, clock, rest=self._rest, selector=lambda: ClockSelector(clock)

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.recorder import header_now, header_of
+from graspd.daemon.assembly.parts import header_now, header_of
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests

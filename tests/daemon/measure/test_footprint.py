@@ -37,8 +37,8 @@ NEVER = {
     *("daemon.measure.streams", "daemon.measure.worth", "daemon.measure.cost"),
     *("daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
     *("daemon.scene.errors", "daemon.commands.doctor", "daemon.watch", "daemon.judge.memory"),
-    *("daemon.record", "daemon.assembly.recorder", "daemon.assembly.recordings"),
-    *("daemon.assembly.sources", "daemon.publish.keys"),
+    *("daemon.record", "daemon.assembly.recordings", "daemon.assembly.sources"),
+    "daemon.publish.keys",
 )
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
 for a service, realtime, known keys or a model that is not of the zoo."""

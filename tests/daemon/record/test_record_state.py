@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.recorder import build_recorder
+from graspd.daemon.assembly.parts import build_recorder
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import GateCause

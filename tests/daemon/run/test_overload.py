@@ -7,7 +7,6 @@ import logging
 import selectors
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 
 import msgspec
 import numpy as np
@@ -15,13 +14,11 @@ import pytest
 
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits
 from graspd.daemon.judge.reasons import Decision, Reason
-from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import LoopEvent
-from graspd.daemon.publish.outbox import Outbox
-from graspd.daemon.run.loop import DRAINS_MAX, Loop, LoopTiming
+from graspd.daemon.run.loop import DRAINS_MAX, LoopTiming
 from graspd.daemon.run.overload import YIELD_AFTER_NS, YIELD_MAX_NS, LoadShedder, mark_repeats
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
+from tests.daemon.fakes import MS, Clock, FakeDriver, reading
 from tests.daemon.judge.test_only_stable_if import POSES
 from tests.kit.loops import LoopBench
 
@@ -368,17 +365,8 @@ def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> N
 
     driver.live = True
     began_ns = time.monotonic_ns()
-    with StopSignal() as stop:
-        loop = Loop(
-            [driver],
-            pipeline(FakeModel(), clock, max_age_ns=SECOND_NS),
-            Outbox("right", FINGERS, "fake", "ab" * 32, []),
-            stop,
-            [],
-            LoopTiming(60 * SECOND_NS, rest=rest, selector=BusySelector),
-        )
-        with closing(loop):
-            loop.run()
+    timing = LoopTiming(60 * SECOND_NS, rest=rest, selector=BusySelector)
+    LoopBench(driver, clock, timing=timing).run()
     assert len(rests_s) == 1
     assert 0.0 < rests_s[0] <= YIELD_MAX_NS / 1e9
     assert time.monotonic_ns() - began_ns >= YIELD_AFTER_NS

@@ -4,28 +4,20 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import itertools
 import logging
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from graspd.daemon import scene
-from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.judge.reasons import GateState
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.run.rehearsal import rehearse
 from graspd.daemon.scene.scene import Realtime
-from graspd.drivers.base import TactileReading
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
 from tests.kit.messages import GOLDEN_STATUS
 from tests.threads import at_work
 
@@ -164,34 +156,6 @@ def test_the_rehearsal_goes_through_a_whole_grasp() -> None:
     assert memory.state in (GateState.RELEASED, GateState.IDLE)
     assert pipeline.session is not None
     assert pipeline.session.grasps == 1
-
-
-def test_the_rehearsal_leaves_the_judge_as_it_was(as_before: None, tmp_path: Path) -> None:
-    """Also what its session has learned, which scales the input of its model."""
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
-        "[session]\nlearn = false\n[realtime]\nlock_memory = false\npriority = 1\n"
-    )
-    rows = list(itertools.islice(recorded_counts(DEMO_TABLE), 80))
-    judged = []
-    for rehearsed in (False, True):
-        wanted = scene.load(path)
-        parts = Parts.of(wanted, assembly.load_model(wanted))
-        judged.append(p_slips(parts, rows[:40]))
-        if rehearsed:
-            rehearse(wanted)
-        judged[-1] += p_slips(parts, rows[40:])
-    assert judged[0] == judged[1]
-
-
-def p_slips(parts: Parts, rows: list[Counts]) -> list[float | None]:
-    return [
-        parts.pipeline.judge(
-            TactileReading(time.monotonic_ns(), 0, row, np.zeros(row.shape, dtype=np.uint8))
-        ).p_slip
-        for row in rows
-    ]
 
 
 RTTIME_US = 500_000

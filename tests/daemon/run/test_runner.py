@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import socket
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +24,7 @@ from graspd.daemon.scene import Scene, SceneError
 from graspd.drivers.base import DriverError
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.clients.building import sleep_at_will
-from tests.daemon.processes import GRASPD, put_first
+from tests.daemon.processes import put_first, start
 from tests.kit.messages import decode_status, decode_verdict
 from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S
@@ -69,24 +68,13 @@ class Running:
             self.ears.settimeout(PATIENCE_S)
             self.subscriber.connect(f"ipc://{self.folder}/v")
             self.subscriber.subscribe("")
-            environment = {
-                **os.environ,
-                "NOTIFY_SOCKET": str(self.folder / "notify"),
-                "WATCHDOG_USEC": "400000",
-            }
-            self.process = subprocess.Popen(
-                [*GRASPD, "run", str(self.scene)],
-                stdin=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                env=environment,
-            )
-            put_first(self.process.pid)
-            try:
-                yield self
-            finally:
-                self.process.kill()
-                self.process.communicate()
+            manager = f"NOTIFY_SOCKET={self.folder}/notify", "WATCHDOG_USEC=400000"
+            with start("run", self.scene, before=("env", *manager)) as self.process:
+                put_first(self.process.pid)
+                try:
+                    yield self
+                finally:
+                    self.process.kill()
 
     def told(self, line: str) -> list[str]:
         """The message to the manager that has a line that begins so; others are passed over."""

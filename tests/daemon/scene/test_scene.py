@@ -185,8 +185,7 @@ def test_of_many_mistakes_twenty_are_told(tmp_path: Path) -> None:
     [
         GOOD + f"loop = '{'x' * 100_000}'",
         GOOD + f"{'x' * 100_000} = 1",
-        GOOD + f"loop = {'[' * 100}{']' * 100}",
-        GOOD + f"seed = -0x{'f' * 5000}",
+        GOOD + f"[tactile.faults]\nwrong_counts = 0x{'f' * 5000}",
         f"[tactile]\ndriver = '{'x' * 100_000}'",
         GOOD + f"[publish]\nendpoint = 'tcp://{'x' * 100_000}:1'",
     ],

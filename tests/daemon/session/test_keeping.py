@@ -237,144 +237,132 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
 
 
 def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
-    tmp_path: Path,
+    file: SessionFile,
 ) -> None:
-    session = calibration()
+    session, part = calibration(), trust()
     observe(session, 30)
-    with SessionFile(tmp_path / "right.json") as file:
-        file.save(kept_now(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None))
-        part = trust()
-        keeper = session_keeper(None, sensors(), file, Clock(), part=part)
-        judge(part, 0)
-        keeper.keep(lambda _: None)
-        keeper.save()
-    kept = load(tmp_path / "right.json")
+    file.save(kept_now(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None))
+    keeper = session_keeper(None, sensors(), file, part=part)
+    judge(part, 0)
+    keeper.keep(lambda _: None)
+    keeper.save()
+    kept = load(file.path)
     assert kept is not None
     assert (kept.fingers, kept.statistics, kept.serials) == (FINGERS, None, {})
 
 
 def test_whoever_waits_is_answered_whatever_ends_the_writing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    file: SessionFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(threading, "excepthook", lambda _: None)
     part, found = trust(), list[str | None]()
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(None, sensors(), file, Clock(), part=part)
-        save = file.save
-        monkeypatch.setattr(file, "save", lambda *_: 1 // 0)
-        judge(part, 0)
-        keeper.keep(found.append)
-        keeper.wait(WAIT_S)
-        assert found == ["not kept: it could not be written"]
-        monkeypatch.setattr(file, "save", save)
-        keeper.keep(found.append)
-        keeper.save()
+    keeper = session_keeper(None, sensors(), file, part=part)
+    save = file.save
+    monkeypatch.setattr(file, "save", lambda *_: 1 // 0)
+    judge(part, 0)
+    keeper.keep(found.append)
+    keeper.wait(WAIT_S)
+    assert found == ["not kept: it could not be written"]
+    monkeypatch.setattr(file, "save", save)
+    keeper.keep(found.append)
+    keeper.save()
     assert found[1:] == [None]
 
 
-def test_session_and_what_was_learned_are_restored_together(tmp_path: Path) -> None:
-    path, session, part = tmp_path / "right.json", calibration(), trust()
-    with SessionFile(path) as file:
-        keeper = session_keeper(session, sensors(), file, Clock(), part=part)
-        observe(session, 30)
-        for grasp in range(20):
-            judge(part, grasp)
-            tell(part, grasp)
-        judge(part, 20)
-        keeper.save()
+def test_session_and_what_was_learned_are_restored_together(file: SessionFile) -> None:
+    session, part = calibration(), trust()
+    keeper = session_keeper(session, sensors(), file, part=part)
+    observe(session, 30)
+    for grasp in range(20):
+        judge(part, grasp)
+        tell(part, grasp)
+    judge(part, 20)
+    keeper.save()
     again, other = calibration(), trust()
-    with SessionFile(path) as file:
-        session_keeper(again, sensors(), file, Clock(), part=other)
+    session_keeper(again, sensors(), file, part=other)
     assert (again.state(), other.state()) == (session.state(), part.state())
     assert tell(other, 20) is OutcomeStatus.TAKEN  # of a grasp of the former start
     assert tell(other, 3) is OutcomeStatus.REPEATED
 
 
 def test_with_another_model_the_session_stays_and_learning_begins_anew(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    file: SessionFile, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path, session, part = tmp_path / "right.json", calibration(), trust("a")
+    session, part = calibration(), trust("a")
     observe(session, 30)
     judge(part, 1)
     tell(part, 1)
-    with SessionFile(path) as file:
-        file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
-        again, other = calibration(), trust("b")
-        session_keeper(again, sensors(), file, Clock(), part=other)
+    file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
+    again, other = calibration(), trust("b")
+    session_keeper(again, sensors(), file, part=other)
     assert again.state() == session.state()
     assert other.state() == trust("b").state()
     said = "what was learned is of another model; learning and the count of the risk begin again"
     assert caplog.text.count(said) == 1
 
 
-def test_what_a_run_has_no_use_for_is_kept_as_it_is(tmp_path: Path) -> None:
-    path, session, part, clock = tmp_path / "right.json", calibration(), trust(), Clock()
+def test_what_a_run_has_no_use_for_is_kept_as_it_is(file: SessionFile) -> None:
+    session, part = calibration(), trust()
     observe(session, 30)
     judge(part, 1)
     tell(part, 1)
-    with SessionFile(path) as file:
-        file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
-        image = trust("of images", inputs=0)
-        keeper = session_keeper(None, sensors(), file, clock, part=image)  # a model without session
-        judge(image, 2)
-        tell(image, 2)
-        keeper.save()
-        kept = file.load()
-        assert kept is not None
-        assert kept.statistics == session.state()
-        assert kept_trust(file) == image.state()
-        off = calibration()
-        keeper = session_keeper(off, sensors(), file, clock)  # learning is switched off
-        observe(off, 1, seed=5)
-        keeper.save()
-        assert kept_trust(file) == image.state()
-        keeper = session_keeper(off, sensors(ff="B"), file, clock)
-        read_once(keeper)  # and none of it is left once a sensor is exchanged
-        keeper.save()
+    file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
+    image = trust("of images", inputs=0)
+    keeper = session_keeper(None, sensors(), file, part=image)  # a model without session
+    judge(image, 2)
+    tell(image, 2)
+    keeper.save()
+    kept = file.load()
+    assert kept is not None
+    assert kept.statistics == session.state()
+    assert kept_trust(file) == image.state()
+    off = calibration()
+    keeper = session_keeper(off, sensors(), file)  # learning is switched off
+    observe(off, 1, seed=5)
+    keeper.save()
+    assert kept_trust(file) == image.state()
+    keeper = session_keeper(off, sensors(ff="B"), file)
+    read_once(keeper)  # and none of it is left once a sensor is exchanged
+    keeper.save()
     assert (off.grasps, kept_trust(file)) == (0, None)
 
 
-def test_an_exchanged_sensor_ends_what_was_learned(tmp_path: Path) -> None:
-    path, session, part = tmp_path / "right.json", calibration(), trust()
-    driver = sensors(ff="A")
-    with SessionFile(path) as file:
-        keeper = session_keeper(session, driver, file, Clock(), part=part)
-        read_once(keeper)
-        observe(session, 30)
-        for grasp in range(20):
-            judge(part, grasp)
-            tell(part, grasp)
-        lifts = part.risk.lifts
-        driver.known = {"ff": "B"}
-        read_once(keeper)
-        keeper.save()
+def test_an_exchanged_sensor_ends_what_was_learned(file: SessionFile) -> None:
+    session, part, driver = calibration(), trust(), sensors(ff="A")
+    keeper = session_keeper(session, driver, file, part=part)
+    read_once(keeper)
+    observe(session, 30)
+    for grasp in range(20):
+        judge(part, grasp)
+        tell(part, grasp)
+    lifts = part.risk.lifts
+    driver.known = {"ff": "B"}
+    read_once(keeper)
+    keeper.save()
     again, other = calibration(), trust()
-    with SessionFile(path) as file:
-        session_keeper(again, driver, file, Clock(), part=other)
+    session_keeper(again, driver, file, part=other)
     assert (again.grasps, other.learner.outcomes, other.risk.proven) == (0, 0, 0)
     assert other.risk.lifts == lifts > 0  # slips that were counted stay counted
 
 
 def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
-    tmp_path: Path,
+    file: SessionFile,
 ) -> None:
     driver, part = sensors(ff="A"), trust()
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(None, driver, file, Clock(), part=part)
+    keeper = session_keeper(None, driver, file, part=part)
+    read_once(keeper)
+    for first, sensor in ((0, "B"), (20, "A")):
+        for grasp in range(first, first + 20):
+            judge(part, grasp)
+            tell(part, grasp)
+        learned, counted = part.learner.state(), part.risk.state()
+        if first == 0:
+            taught = learned
+        driver.known = {"ff": sensor}
         read_once(keeper)
-        for first, sensor in ((0, "B"), (20, "A")):
-            for grasp in range(first, first + 20):
-                judge(part, grasp)
-                tell(part, grasp)
-            learned, counted = part.learner.state(), part.risk.state()
-            if first == 0:
-                taught = learned
-            driver.known = {"ff": sensor}
-            read_once(keeper)
-            lifts = part.risk.state().lifts, part.risk.state().slips
-            assert lifts == (counted.lifts, counted.slips)
-            assert part.risk.proven == 0
-        keeper.save()
+        lifts = part.risk.state().lifts, part.risk.state().slips
+        assert lifts == (counted.lifts, counted.slips)
+        assert part.risk.proven == 0
+    keeper.save()
     assert part.learner.state() == taught != learned
     assert part.risk.lifts > 0
 
