@@ -24,6 +24,7 @@ from graspd.models.contract import (
 )
 from graspd.models.inputs import builder, raw_features
 from graspd.models.runtime import TactileModel
+from graspd.models.training.estimators.classical import FittedClassical
 from graspd.models.training.estimators.configs import (
     BoostingConfig,
     ForestConfig,
@@ -33,8 +34,9 @@ from graspd.models.training.estimators.configs import (
     SecondConvolution,
     SvmConfig,
 )
+from graspd.models.training.estimators.graphs import Fitted
 from graspd.models.training.fitting.standards import Standards
-from graspd.models.training.fitting.trained import Fitted, FittedClassical, fit
+from graspd.models.training.fitting.trained import fit
 from graspd.models.training.making.export import ExportError, export
 from graspd.models.training.systems.registry import (
     SESSION,

@@ -12,12 +12,7 @@ import pytest
 from graspd.models import zoo
 from graspd.models.contract import VectorInput
 from graspd.models.runtime import TactileModel
-from graspd.models.training.estimators.configs import (
-    CNN1,
-    PublishedRecipe,
-    Recipe,
-    SvmConfig,
-)
+from graspd.models.training.estimators.configs import CNN1, PublishedRecipe, Recipe, SvmConfig
 from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.jobs import Job
 from graspd.models.training.making.make_model import make_model
