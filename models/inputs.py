@@ -30,8 +30,11 @@ class InputBuilder:
 
     name: str
     """Name of the model's input."""
-    shape: tuple[int, ...]
-    """Shape of one reading's input."""
+
+    def __init__(self, fingers: int, values: int = ELECTRODES) -> None:
+        """`values`: number of inputs of each finger."""
+        self.shape: tuple[int, ...] = (fingers * values,)
+        """Shape of one reading's input."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> Floats:
         """Write the input of `counts` (fingers, 24) into `out`; return each finger's spread.
@@ -55,20 +58,15 @@ def builder(kind: Input, fingers: int) -> InputBuilder:
     """Return the builder that a contract asks for. Raises `ModelError` for an unknown one."""
     match kind:
         case ImageInput():
-            from graspd.models.tactile_image import (  # only where it is needed
-                Composition,
-                Fill,
-                Normalisation,
-                TactileImager,
-            )
+            from graspd.models import tactile_image  # only where it is needed
 
             try:
-                return TactileImager(
+                return tactile_image.TactileImager(
                     fingers,
                     LAYOUTS[kind.layout],
-                    Fill(kind.fill),
-                    Normalisation(kind.normalisation),
-                    Composition(kind.composition),
+                    tactile_image.Fill(kind.fill),
+                    tactile_image.Normalisation(kind.normalisation),
+                    tactile_image.Composition(kind.composition),
                 )
             except (KeyError, ValueError) as error:
                 raise ModelError(f"asks for an image that is not known: {error}") from error
@@ -87,9 +85,6 @@ class VectorBuilder(InputBuilder):
 
     name = "tactile_vector"
 
-    def __init__(self, fingers: int) -> None:
-        self.shape = (fingers * ELECTRODES,)
-
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
         features, spread = _features(counts)
         return features[..., : -2 * spread.shape[-1]], spread
@@ -99,9 +94,6 @@ class CountsBuilder(InputBuilder):
     """Raw counts as one vector."""
 
     name = "tactile_counts"
-
-    def __init__(self, fingers: int) -> None:
-        self.shape = (fingers * ELECTRODES,)
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
         return counts.reshape(*counts.shape[:-2], -1), _features(counts)[1]
@@ -113,7 +105,7 @@ class SessionBuilder(InputBuilder):
     name = "session_features"
 
     def __init__(self, fingers: int, clip: float) -> None:
-        self.shape = (fingers * FEATURES_PER_FINGER,)
+        super().__init__(fingers, FEATURES_PER_FINGER)
         self._low, self._high = -clip, clip
         self._mean, self._spread = np.zeros(self.shape), np.ones(self.shape)
         self._scale = np.ones(self.shape)

@@ -65,7 +65,7 @@ class TactileModel:
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's exceptions share no narrower base
-            raise ModelError(f"{self.path}: {_one_line(error)}") from error
+            raise ModelError(f"{self.path}: {one_line(error)}") from error
         p_stable, p_slip = self._probability[0].tolist()
         return p_stable, p_slip
 
@@ -113,10 +113,11 @@ def _session(path: Path, data: bytes) -> ort.InferenceSession:
     try:
         return single_threaded(data)
     except Exception as error:  # onnxruntime's exceptions share no narrower base
-        raise ModelError(f"{path}: not a usable ONNX model: {_one_line(error)}") from error
+        raise ModelError(f"{path}: not a usable ONNX model: {one_line(error)}") from error
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: Exception) -> str:
+    """Return the text of an error without its line breaks."""
     return " ".join(str(error).split())
 
 

@@ -140,16 +140,6 @@ def test_any_counts_give_a_finite_image_or_zeros(counts: np.ndarray) -> None:
             assert not image[..., finger].any()
 
 
-@given(counts=counts_of_three_fingers)
-@settings(max_examples=50)
-def test_a_finger_does_not_touch_the_channel_of_another(counts: np.ndarray) -> None:
-    whole, single = np.zeros((12, 11, 3), np.float32), np.zeros((12, 11, 1), np.float32)
-    TactileImager(3).build(counts, whole)
-    for finger in range(3):
-        TactileImager(1).build(counts[finger : finger + 1], single)
-        np.testing.assert_allclose(single[..., 0], whole[..., finger], atol=1e-6)
-
-
 def test_not_a_number_has_no_image() -> None:
     counts = np.tile(np.arange(24.0) * 100, (3, 1))
     counts[1, 5] = np.nan
@@ -161,12 +151,11 @@ def test_not_a_number_has_no_image() -> None:
     assert np.isfinite(image).all()
 
 
-@pytest.mark.parametrize("shape", [(12, 11, 2), (11, 12, 3), (396,)])
-def test_a_wrong_buffer_is_refused(shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("shape", "step"), [((12, 11, 2), 1), ((11, 12, 3), 1), ((396,), 1), ((12, 11, 6), 2)]
+)
+def test_a_buffer_of_another_shape_or_with_gaps_is_refused(
+    shape: tuple[int, ...], step: int
+) -> None:
     with pytest.raises(ValueError, match="C-contiguous"):
-        TactileImager(3).build(np.ones((3, 24)), np.empty(shape, np.float32))
-
-
-def test_a_buffer_with_gaps_is_refused() -> None:
-    with pytest.raises(ValueError, match="C-contiguous"):
-        TactileImager(3).build(np.ones((3, 24)), np.empty((12, 11, 6), np.float32)[..., ::2])
+        TactileImager(3).build(np.ones((3, 24)), np.empty(shape, np.float32)[..., ::step])

@@ -60,7 +60,7 @@ def evaluate(args: argparse.Namespace) -> None:
         folds = _enough_folds(tried, protocols, folds, grasps, _seeds(args))
     summaries = _summaries(tried, protocols, folds, grasps, args)
     if args.json:
-        sys.stdout.buffer.write(to_json(summaries))
+        sys.stdout.write(to_json(summaries).decode())
     if args.grid:
         _report_grids(systems, summaries, args)
     if args.table or args.plots:

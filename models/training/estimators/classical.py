@@ -1,14 +1,18 @@
-"""Classifiers of scikit-learn on vectors and features."""
+"""Classifiers of scikit-learn on vectors and features, and their ONNX graphs."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
+from onnx import helper
+from skl2onnx import to_onnx
 from sklearn.ensemble import HistGradientBoostingClassifier, RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPClassifier
@@ -22,6 +26,18 @@ from graspd.models.training.estimators.configs import (
     ForestConfig,
     MlpConfig,
     SvmConfig,
+)
+from graspd.models.training.estimators.graphs import (
+    DOUBLE,
+    FLOAT,
+    MARGIN_NAME,
+    ML_OPSET,
+    OPSET,
+    Fitted,
+    constant,
+    feed,
+    nodes_of,
+    vector_model,
 )
 
 PROBABILITY_FLOOR = 1e-3
@@ -47,9 +63,54 @@ class Boosting(HistGradientBoostingClassifier):  # type: ignore[misc]  # scikit-
 ClassicalModel: TypeAlias = SVC | RandomForestClassifier | MLPClassifier | Boosting
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedClassical(Fitted):
+    """A fitted classifier; `parameters` are weights, support vectors' values or tree nodes."""
+
+    model: ClassicalModel
+
+    @property
+    def parameters(self) -> int:
+        match self.model:
+            case SVC() as model:
+                return int(model.support_vectors_.size + model.dual_coef_.size + 1)
+            case MLPClassifier() as model:
+                return sum(int(part.size) for part in (*model.coefs_, *model.intercepts_))
+            case Boosting() as model:
+                return sum(map(len, model.trees))
+            case model:
+                return sum(int(tree.tree_.node_count) for tree in model.estimators_)
+
+    def margins(self, inputs: Floats32) -> Floats:
+        if not len(inputs):
+            return np.empty(0)
+        with _one_thread():
+            match self.model:
+                case SVC() | Boosting() as model:
+                    margins: Floats = model.decision_function(inputs)
+                case MLPClassifier() as model:
+                    margins = _mlp_margins(model, inputs)
+                case model:
+                    slip = model.predict_proba(inputs)[:, 1]
+                    slip = slip.clip(PROBABILITY_FLOOR, 1.0 - PROBABILITY_FLOOR)
+                    margins = np.log(slip / (1.0 - slip))
+        return margins
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        match self.model:
+            case SVC() as model:
+                return _svm(model, input_name)
+            case MLPClassifier() as model:
+                return _perceptron(model, input_name)
+            case Boosting() as model:
+                return _boosting(model, input_name)
+            case model:
+                return _forest(model, input_name)
+
+
 def fit_classical(
     config: ClassicalConfig, inputs: Floats32, slipped: Bools, seed: int
-) -> ClassicalModel:
+) -> FittedClassical:
     """Fit a classifier to inputs (N, M) and labels (N,), on one thread.
 
     Raises `ValueError` if the inputs are no vectors or a class is missing.
@@ -61,37 +122,7 @@ def fit_classical(
     model = _model(config, seed)
     with _one_thread():
         model.fit(inputs, slipped)
-    return model
-
-
-def classical_margins(model: ClassicalModel, inputs: Floats32) -> Floats:
-    """Return the log-odds of slip (N,), up to a temperature, of inputs (N, M)."""
-    if not len(inputs):
-        return np.empty(0)
-    with _one_thread():
-        match model:
-            case SVC() | Boosting():
-                margins: Floats = model.decision_function(inputs)
-            case MLPClassifier():
-                margins = _mlp_margins(model, inputs)
-            case _:
-                slip = model.predict_proba(inputs)[:, 1]
-                slip = slip.clip(PROBABILITY_FLOOR, 1.0 - PROBABILITY_FLOOR)
-                margins = np.log(slip / (1.0 - slip))
-    return margins
-
-
-def classical_size(model: ClassicalModel) -> int:
-    """Return the number of weights, support vectors' values or tree nodes of a model."""
-    match model:
-        case SVC():
-            return int(model.support_vectors_.size + model.dual_coef_.size + 1)
-        case MLPClassifier():
-            return sum(int(part.size) for part in (*model.coefs_, *model.intercepts_))
-        case Boosting():
-            return sum(map(len, model.trees))
-        case _:
-            return sum(int(tree.tree_.node_count) for tree in model.estimators_)
+    return FittedClassical(model)
 
 
 def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
@@ -147,3 +178,124 @@ def _one_thread() -> Iterator[None]:
             if str(warning).startswith(INTERRUPTED):
                 raise KeyboardInterrupt from warning
             raise
+
+
+def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
+    """Return the graph of a support vector machine in double precision.
+
+    ONNX's own SVMClassifier sums in float32; with large C its margins are wrong by over 0.01.
+    """
+    vectors = model.support_vectors_
+    features = vectors.shape[1]
+    gamma = 1.0 / features if model.gamma == "auto" else float(model.gamma)
+    # -gamma * |x - v|**2 = 2 gamma x.v - gamma |v|**2 - gamma |x|**2
+    constants = [
+        # The support vectors are readings, float32 as the input is: nothing is lost here.
+        constant("vectors", vectors.T.astype(np.float32)),
+        constant("two_gamma", np.array(2.0 * gamma)),
+        constant("minus_gamma", np.array(-gamma)),
+        constant("vector_part", -gamma * np.square(vectors).sum(axis=1)),
+        constant("weights", model.dual_coef_.reshape(-1, 1).astype(np.float64)),
+        constant("bias", model.intercept_.astype(np.float64)),
+        constant("axis", np.array([1])),
+    ]
+    nodes = nodes_of(
+        f"x_64 = Cast <to: int = {DOUBLE}> ({input_name})",
+        f"vectors_64 = Cast <to: int = {DOUBLE}> (vectors)",
+        "products = MatMul (x_64, vectors_64)",
+        "both_part = Mul (products, two_gamma)",
+        "squares = ReduceSumSquare <keepdims: int = 1> (x_64, axis)",
+        "x_part = Mul (squares, minus_gamma)",
+        "without_x = Add (both_part, vector_part)",
+        "exponent = Add (without_x, x_part)",
+        "kernel = Exp (exponent)",
+        "weighted = MatMul (kernel, weights)",
+        "decision = Add (weighted, bias)",
+        f"{MARGIN_NAME} = Cast <to: int = {FLOAT}> (decision)",
+    )
+    return vector_model(nodes, constants, input_name, features)
+
+
+def _boosting(model: Boosting, input_name: str) -> onnx.ModelProto:
+    """Return one TreeEnsembleRegressor; skl2onnx 1.20 cannot write it with onnx 1.23."""
+    trees = model.trees
+    of_tree = np.repeat(np.arange(len(trees)), [len(tree) for tree in trees])
+    of_node = np.concatenate([np.arange(len(tree)) for tree in trees])
+    nodes = np.concatenate(trees)
+    leaf = nodes["is_leaf"].astype(np.bool_)
+    node = helper.make_node(
+        "TreeEnsembleRegressor",
+        [input_name],
+        [MARGIN_NAME],
+        domain="ai.onnx.ml",
+        n_targets=1,
+        aggregate_function="SUM",
+        base_values=[model.base],
+        nodes_treeids=of_tree.tolist(),
+        nodes_nodeids=of_node.tolist(),
+        nodes_modes=np.where(leaf, "LEAF", "BRANCH_LEQ").tolist(),
+        nodes_featureids=np.where(leaf, 0, nodes["feature_idx"]).tolist(),
+        nodes_values=np.where(leaf, 0.0, _float32_below(nodes["num_threshold"])).tolist(),
+        nodes_truenodeids=np.where(leaf, 0, nodes["left"]).tolist(),
+        nodes_falsenodeids=np.where(leaf, 0, nodes["right"]).tolist(),
+        target_treeids=of_tree[leaf].tolist(),
+        target_nodeids=of_node[leaf].tolist(),
+        target_ids=[0] * int(leaf.sum()),
+        target_weights=nodes["value"][leaf].tolist(),
+    )
+    return vector_model([node], [], input_name, model.n_features_in_)
+
+
+def _float32_below(thresholds: Floats) -> Floats32:
+    """Return the largest float32 not above each threshold, so that comparisons agree."""
+    nearest = thresholds.astype(np.float32)
+    return np.where(nearest > thresholds, np.nextafter(nearest, np.float32(-np.inf)), nearest)
+
+
+def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
+    """Return a graph whose trees add votes; shares of 1/199 would round differently."""
+    (trees,) = _from_sklearn(model, input_name).graph.node
+    number = len(model.estimators_)
+    (weights,) = (part for part in trees.attribute if part.name == "class_weights")
+    weights.floats[:] = np.array(weights.floats) * number
+    nodes = nodes_of(
+        "votes = Gather <axis: int = 1> (probabilities, slip_column)",
+        f"votes_64 = Cast <to: int = {DOUBLE}> (votes)",
+        "p = Div (votes_64, trees)",
+        "p_slip = Clip (p, floor, ceiling)",
+        "p_stable = Sub (one, p_slip)",
+        "odds = Div (p_slip, p_stable)",
+        "log_odds = Log (odds)",
+        f"{MARGIN_NAME} = Cast <to: int = {FLOAT}> (log_odds)",
+    )
+    constants = [
+        constant("slip_column", np.array([1])),
+        constant("trees", np.array(float(number))),
+        constant("floor", np.array(PROBABILITY_FLOOR)),
+        constant("ceiling", np.array(1.0 - PROBABILITY_FLOOR)),
+        constant("one", np.array(1.0)),
+    ]
+    return vector_model([trees, *nodes], constants, input_name, model.n_features_in_)
+
+
+def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
+    """Return the graph up to the last logistic function, which loses large margins."""
+    graph = _from_sklearn(model, input_name).graph
+    kinds = [node.op_type for node in graph.node]
+    nodes = list(graph.node[: kinds.index("Sigmoid")])
+    nodes[-1].output[0] = MARGIN_NAME
+    used = {name for node in nodes for name in node.input}
+    constants = [tensor for tensor in graph.initializer if tensor.name in used]
+    return vector_model(nodes, constants, input_name, model.n_features_in_)
+
+
+def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
+    """Return a classifier as ONNX, with the outputs `label` and `probabilities` (N, 2)."""
+    converted: onnx.ModelProto = to_onnx(
+        model,
+        np.zeros((1, model.n_features_in_), dtype=np.float32),
+        target_opset={"": OPSET, "ai.onnx.ml": ML_OPSET},
+        options={id(model): {"zipmap": False}},
+    )
+    feed(converted.graph, converted.graph.input[0].name, input_name)
+    return converted

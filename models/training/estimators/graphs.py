@@ -1,11 +1,11 @@
-"""Make ONNX graphs of trained estimators: input (N, *shape), output margin or probability."""
+"""ONNX graphs of trained systems: input (N, *shape), output margin or probability."""
 
 from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import onnx
@@ -13,15 +13,10 @@ import torch
 from onnx import helper, numpy_helper
 from onnx.compose import add_prefix_graph
 from onnx.parser import parse_node
-from skl2onnx import to_onnx
-from sklearn.ensemble import RandomForestClassifier
-from sklearn.neural_network import MLPClassifier
-from sklearn.svm import SVC
 from torch import nn
 
 from graspd.models.contract import OUTPUT_NAME
 from graspd.models.training.arrays import Floats, Floats32, Numbers
-from graspd.models.training.estimators.classical import PROBABILITY_FLOOR, Boosting, ClassicalModel
 
 OPSET = 18
 """Operator set of the exporters; all allowed versions of onnxruntime have it."""
@@ -33,15 +28,22 @@ MARGIN_NAME = "margin"
 FLOAT, DOUBLE = onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
 
 
-def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
-    """Return the graph of a classifier's log-odds of slip, (N, 1)."""
-    graph_of: dict[type[ClassicalModel], Callable[[Any, str], onnx.ModelProto]] = {
-        SVC: _svm,
-        Boosting: _boosting,
-        RandomForestClassifier: _forest,
-        MLPClassifier: _perceptron,
-    }
-    return graph_of[type(model)](model, input_name)
+class Fitted(Protocol):
+    """A trained system: what gives margins, and what is exported to ONNX."""
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters."""
+
+    def margins(self, inputs: Floats32) -> Floats:
+        """Return the log-odds of slip (N,), uncalibrated, of inputs (N, *shape)."""
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        """Return the graph from inputs (N, *shape) to `margin` (N, 1)."""
+
+    def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
+        """Return the graph from inputs to `probability` (N, 2): sigmoid(margin / temperature)."""
+        return with_probability(self.margin_graph(input_name), temperature)
 
 
 def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> onnx.ModelProto:
@@ -53,12 +55,12 @@ def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> 
     for index, (part, factor) in enumerate(zip(parts, factors, strict=True)):
         prefix = f"member{index}_"
         graph = add_prefix_graph(part.graph, prefix)
-        _feed(graph, prefix + given.name, given.name)
+        feed(graph, prefix + given.name, given.name)
         term, weight = f"{prefix}term", f"{prefix}factor"
-        nodes += [*graph.node, *_nodes(f"{term} = Mul ({prefix}{MARGIN_NAME}, {weight})")]
-        constants += [*graph.initializer, _constant(weight, np.array(factor, np.float32))]
+        nodes += [*graph.node, *nodes_of(f"{term} = Mul ({prefix}{MARGIN_NAME}, {weight})")]
+        constants += [*graph.initializer, constant(weight, np.array(factor, np.float32))]
         terms.append(term)
-    nodes += _nodes(f"{MARGIN_NAME} = Sum ({', '.join(terms)})")
+    nodes += nodes_of(f"{MARGIN_NAME} = Sum ({', '.join(terms)})")
     return _model(nodes, constants, given, MARGIN_NAME, 1)
 
 
@@ -66,156 +68,33 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
     """Return the graph with `probability` (N, 2) of stable and slip: sigmoid(margin / T)."""
     # softmax(-m / 2T, m / 2T) is 1 - sigmoid(m / T), sigmoid(m / T).
     share = np.array([[-0.5, 0.5]]) / temperature
-    nodes = _nodes(
+    nodes = nodes_of(
         f"tempered = MatMul ({MARGIN_NAME}, half_over_temperature)",
         f"{OUTPUT_NAME} = Softmax <axis: int = 1> (tempered)",
     )
-    graph, constant = margin.graph, _constant("half_over_temperature", share.astype(np.float32))
-    return _model(
-        [*graph.node, *nodes], [*graph.initializer, constant], graph.input[0], OUTPUT_NAME, 2
-    )
+    graph, half = margin.graph, constant("half_over_temperature", share.astype(np.float32))
+    return _model([*graph.node, *nodes], [*graph.initializer, half], graph.input[0], OUTPUT_NAME, 2)
 
 
 def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onnx.ModelProto:
     """Put `(input - mean) * scale`, both in the shape of one input, before a graph, in place."""
     graph = model.graph
     given = graph.input[0].name
-    _feed(graph, given, "standardised")
-    steps = _nodes(
+    feed(graph, given, "standardised")
+    steps = nodes_of(
         f"centred = Sub ({given}, input_mean)", "standardised = Mul (centred, input_scale)"
     )
     nodes = [*steps, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)
-    graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
+    graph.initializer.extend((constant("input_mean", mean), constant("input_scale", scale)))
     return model
 
 
-def _feed(graph: onnx.GraphProto, former: str, name: str) -> None:
+def feed(graph: onnx.GraphProto, former: str, name: str) -> None:
     """Let every node that takes `former` take `name` instead."""
     for node in graph.node:
         node.input[:] = [name if given == former else given for given in node.input]
-
-
-def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
-    """Return the graph of a support vector machine in double precision.
-
-    ONNX's own SVMClassifier sums in float32; with large C its margins are wrong by over 0.01.
-    """
-    vectors = model.support_vectors_
-    features = vectors.shape[1]
-    gamma = 1.0 / features if model.gamma == "auto" else float(model.gamma)
-    # -gamma * |x - v|**2 = 2 gamma x.v - gamma |v|**2 - gamma |x|**2
-    constants = [
-        # The support vectors are readings, float32 as the input is: nothing is lost here.
-        _constant("vectors", vectors.T.astype(np.float32)),
-        _constant("two_gamma", np.array(2.0 * gamma)),
-        _constant("minus_gamma", np.array(-gamma)),
-        _constant("vector_part", -gamma * np.square(vectors).sum(axis=1)),
-        _constant("weights", model.dual_coef_.reshape(-1, 1).astype(np.float64)),
-        _constant("bias", model.intercept_.astype(np.float64)),
-        _constant("axis", np.array([1])),
-    ]
-    nodes = _nodes(
-        f"x_64 = Cast <to: int = {DOUBLE}> ({input_name})",
-        f"vectors_64 = Cast <to: int = {DOUBLE}> (vectors)",
-        "products = MatMul (x_64, vectors_64)",
-        "both_part = Mul (products, two_gamma)",
-        "squares = ReduceSumSquare <keepdims: int = 1> (x_64, axis)",
-        "x_part = Mul (squares, minus_gamma)",
-        "without_x = Add (both_part, vector_part)",
-        "exponent = Add (without_x, x_part)",
-        "kernel = Exp (exponent)",
-        "weighted = MatMul (kernel, weights)",
-        "decision = Add (weighted, bias)",
-        f"{MARGIN_NAME} = Cast <to: int = {FLOAT}> (decision)",
-    )
-    return _vector_model(nodes, constants, input_name, features)
-
-
-def _boosting(model: Boosting, input_name: str) -> onnx.ModelProto:
-    """Return one TreeEnsembleRegressor; skl2onnx 1.20 cannot write it with onnx 1.23."""
-    trees = model.trees
-    of_tree = np.repeat(np.arange(len(trees)), [len(tree) for tree in trees])
-    of_node = np.concatenate([np.arange(len(tree)) for tree in trees])
-    nodes = np.concatenate(trees)
-    leaf = nodes["is_leaf"].astype(np.bool_)
-    node = helper.make_node(
-        "TreeEnsembleRegressor",
-        [input_name],
-        [MARGIN_NAME],
-        domain="ai.onnx.ml",
-        n_targets=1,
-        aggregate_function="SUM",
-        base_values=[model.base],
-        nodes_treeids=of_tree.tolist(),
-        nodes_nodeids=of_node.tolist(),
-        nodes_modes=np.where(leaf, "LEAF", "BRANCH_LEQ").tolist(),
-        nodes_featureids=np.where(leaf, 0, nodes["feature_idx"]).tolist(),
-        nodes_values=np.where(leaf, 0.0, _float32_below(nodes["num_threshold"])).tolist(),
-        nodes_truenodeids=np.where(leaf, 0, nodes["left"]).tolist(),
-        nodes_falsenodeids=np.where(leaf, 0, nodes["right"]).tolist(),
-        target_treeids=of_tree[leaf].tolist(),
-        target_nodeids=of_node[leaf].tolist(),
-        target_ids=[0] * int(leaf.sum()),
-        target_weights=nodes["value"][leaf].tolist(),
-    )
-    return _vector_model([node], [], input_name, model.n_features_in_)
-
-
-def _float32_below(thresholds: Floats) -> Floats32:
-    """Return the largest float32 not above each threshold, so that comparisons agree."""
-    nearest = thresholds.astype(np.float32)
-    return np.where(nearest > thresholds, np.nextafter(nearest, np.float32(-np.inf)), nearest)
-
-
-def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
-    """Return a graph whose trees add votes; shares of 1/199 would round differently."""
-    (trees,) = _from_sklearn(model, input_name).graph.node
-    number = len(model.estimators_)
-    (weights,) = (part for part in trees.attribute if part.name == "class_weights")
-    weights.floats[:] = np.array(weights.floats) * number
-    nodes = _nodes(
-        "votes = Gather <axis: int = 1> (probabilities, slip_column)",
-        f"votes_64 = Cast <to: int = {DOUBLE}> (votes)",
-        "p = Div (votes_64, trees)",
-        "p_slip = Clip (p, floor, ceiling)",
-        "p_stable = Sub (one, p_slip)",
-        "odds = Div (p_slip, p_stable)",
-        "log_odds = Log (odds)",
-        f"{MARGIN_NAME} = Cast <to: int = {FLOAT}> (log_odds)",
-    )
-    constants = [
-        _constant("slip_column", np.array([1])),
-        _constant("trees", np.array(float(number))),
-        _constant("floor", np.array(PROBABILITY_FLOOR)),
-        _constant("ceiling", np.array(1.0 - PROBABILITY_FLOOR)),
-        _constant("one", np.array(1.0)),
-    ]
-    return _vector_model([trees, *nodes], constants, input_name, model.n_features_in_)
-
-
-def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
-    """Return the graph up to the last logistic function, which loses large margins."""
-    graph = _from_sklearn(model, input_name).graph
-    kinds = [node.op_type for node in graph.node]
-    nodes = list(graph.node[: kinds.index("Sigmoid")])
-    nodes[-1].output[0] = MARGIN_NAME
-    used = {name for node in nodes for name in node.input}
-    constants = [tensor for tensor in graph.initializer if tensor.name in used]
-    return _vector_model(nodes, constants, input_name, model.n_features_in_)
-
-
-def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
-    """Return a classifier as ONNX, with the outputs `label` and `probabilities` (N, 2)."""
-    converted: onnx.ModelProto = to_onnx(
-        model,
-        np.zeros((1, model.n_features_in_), dtype=np.float32),
-        target_opset={"": OPSET, "ai.onnx.ml": ML_OPSET},
-        options={id(model): {"zipmap": False}},
-    )
-    _feed(converted.graph, converted.graph.input[0].name, input_name)
-    return converted
 
 
 def from_torch(
@@ -272,7 +151,7 @@ def _model(
     return helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION)
 
 
-def _vector_model(
+def vector_model(
     nodes: Sequence[onnx.NodeProto],
     constants: Sequence[onnx.TensorProto],
     input_name: str,
@@ -283,12 +162,14 @@ def _vector_model(
     return _model(nodes, constants, given, MARGIN_NAME, 1)
 
 
-def _nodes(*texts: str) -> list[onnx.NodeProto]:
+def nodes_of(*texts: str) -> list[onnx.NodeProto]:
+    """Return a node for each text, such as `y = Mul (x, factor)`."""
     nodes = [parse_node(text) for text in texts]
     for node in nodes:
         node.ClearField("domain")  # the parser writes "", which stands for itself
     return nodes
 
 
-def _constant(name: str, values: Numbers) -> onnx.TensorProto:
+def constant(name: str, values: Numbers) -> onnx.TensorProto:
+    """Return `values` as a constant of a graph."""
     return numpy_helper.from_array(np.ascontiguousarray(values), name)

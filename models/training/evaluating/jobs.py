@@ -27,6 +27,7 @@ from joblib.externals.loky import get_reusable_executor
 from numpy.typing import DTypeLike
 
 from graspd.models.inputs import raw_features
+from graspd.models.runtime import one_line
 from graspd.models.training.arrays import Bools, Floats, Ints
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import FOLDS, EvalProtocol, fold_seed, splits
@@ -50,10 +51,6 @@ _BY_VARIANT: dict[str, DTypeLike] = {"margins": np.float64, "ages": np.int64, "r
 """Types of the arrays that a result has for each variant."""
 
 _log = logging.getLogger(__name__)
-
-
-class BrokenResultError(Exception):
-    """A stored result is damaged; run the job again."""
 
 
 class ClusterError(Exception):
@@ -133,7 +130,7 @@ class JobResult:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> JobResult:
-        """Return the result in `data`, from `to_bytes`. Raises `BrokenResultError`."""
+        """Return the result in `data`, from `to_bytes`. Raises `ValueError`."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
                 meta = json.loads(arrays["meta"].tobytes())
@@ -152,7 +149,7 @@ class JobResult:
                     **by_variant,
                 )
         except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
-            raise BrokenResultError(f"is no result of a job: {error}") from error
+            raise ValueError(f"is no result of a job: {error}") from error
 
 
 def run(job: Job, grasps: Grasps) -> JobResult:
@@ -197,18 +194,13 @@ def load(folder: Path, job: Job, data: str) -> JobResult | None:
     path = folder / job.file_name(data)
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
-            raise BrokenResultError("is too large")
+            raise ValueError("is too large")
         return JobResult.from_bytes(path.read_bytes())
     except FileNotFoundError:
         return None
-    except BrokenResultError as error:
+    except ValueError as error:
         _log.warning("%s %s; it is run again", path, error)
         return None
-
-
-def save(folder: Path, job: Job, data: str, result: JobResult) -> None:
-    """Store a result for `load`. Raises `OSError`."""
-    write_whole(folder / job.file_name(data), result.to_bytes())
 
 
 def run_jobs(
@@ -247,7 +239,7 @@ def run_jobs(
                 if not isinstance(outcome, tuple):  # what joblib makes of a cancelled task
                     raise ClusterError(f"the cluster lost a job: {outcome!r}")
                 job, result = outcome
-                save(folder, job, data, result)
+                write_whole(folder / job.file_name(data), result.to_bytes())
                 yield job, result
 
 
@@ -279,16 +271,16 @@ def _on_cluster(address: str, grasps: Grasps) -> Iterator[joblib.Parallel]:
             address, timeout=CONNECT_TIMEOUT_S, set_as_default=False
         )
     except (OSError, ValueError) as error:
-        raise ClusterError(f"no Dask scheduler at {address}: {_line(error)}") from error
+        raise ClusterError(f"no Dask scheduler at {address}: {one_line(error)}") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
             # Every worker gets the grasps once, not with each job.
             yield _parallel("dask", client=client, scatter=[grasps], pure=False)
         except KilledWorker as error:
-            raise ClusterError(f"a job lost one worker after the other: {_line(error)}") from error
+            raise ClusterError(f"a job lost several workers: {one_line(error)}") from error
         except (TimeoutError, CancelledError) as error:
-            raise ClusterError(f"the cluster does not answer: {_line(error)}") from error
+            raise ClusterError(f"the cluster does not answer: {one_line(error)}") from error
 
 
 async def _knock(address: str) -> None:
@@ -303,7 +295,3 @@ def _parallel(backend: str, **options: object) -> joblib.Parallel:
     with joblib.parallel_config(backend, **options):
         # All at once, so that workers that join later get their share.
         return joblib.Parallel(batch_size=1, pre_dispatch="all", return_as="generator_unordered")
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())

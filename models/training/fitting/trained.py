@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 import onnx
@@ -16,18 +15,14 @@ from graspd.models.inputs import builder, raw_features
 from graspd.models.training.arrays import Bools, Floats, Floats32, Ints, Numbers
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.estimators import graphs
-from graspd.models.training.estimators.classical import (
-    ClassicalModel,
-    classical_margins,
-    classical_size,
-    fit_classical,
-)
+from graspd.models.training.estimators.classical import FittedClassical, fit_classical
 from graspd.models.training.estimators.configs import (
     AnyRecipe,
     Augmentation,
     ClassicalConfig,
     NetworkConfig,
 )
+from graspd.models.training.estimators.graphs import Fitted
 from graspd.models.training.estimators.networks import (
     for_inference,
     for_margin,
@@ -37,24 +32,6 @@ from graspd.models.training.estimators.networks import (
 from graspd.models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS, seen_counts
 from graspd.models.training.fitting.standards import Standards, TrainingStandards
 from graspd.models.training.systems.registry import BlendConfig, SessionFeatures, System
-
-
-class Fitted(Protocol):
-    """A trained system: what gives margins, and what is exported to ONNX."""
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters."""
-
-    def margins(self, inputs: Floats32) -> Floats:
-        """Return the log-odds of slip (N,), uncalibrated, of inputs (N, *shape)."""
-
-    def margin_graph(self, input_name: str) -> onnx.ModelProto:
-        """Return the graph from inputs (N, *shape) to `margin` (N, 1)."""
-
-    def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
-        """Return the graph from inputs to `probability` (N, 2): sigmoid(margin / temperature)."""
-        return graphs.with_probability(self.margin_graph(input_name), temperature)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,23 +160,6 @@ class FittedNetwork(Fitted):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FittedClassical(Fitted):
-    """A fitted classifier; `parameters` are weights, support vectors' values or tree nodes."""
-
-    model: ClassicalModel
-
-    @property
-    def parameters(self) -> int:
-        return classical_size(self.model)
-
-    def margins(self, inputs: Floats32) -> Floats:
-        return classical_margins(self.model, inputs)
-
-    def margin_graph(self, input_name: str) -> onnx.ModelProto:
-        return graphs.classical_margin(self.model, input_name)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FittedBlend(Fitted):
     """Weighted sum of the margins of trained members."""
 
@@ -255,7 +215,7 @@ def _fit_single(
     seed: int,
 ) -> FittedNetwork | FittedClassical:
     if not isinstance(estimator, NetworkConfig):
-        return FittedClassical(fit_classical(estimator, inputs, slipped, seed))
+        return fit_classical(estimator, inputs, slipped, seed)
     if recipe is None:
         raise ValueError("a network needs a recipe")
     network = train_network(estimator, inputs, slipped, recipe, seed=seed)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from graspd.models.contract import METADATA_KEY, ModelContract
 from graspd.models.inputs import SessionBuilder, builder
 from graspd.models.runtime import TactileModel
+from graspd.models.training.estimators.graphs import Fitted
 from graspd.models.training.evaluating.files import replacing
 from graspd.models.training.fitting.standards import Standards
-from graspd.models.training.fitting.trained import Fitted
 
 TOLERANCE = 1e-5
 """Largest allowed difference of a probability between the trained system and its file."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import os
@@ -15,22 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.models.training.commands import evaluate, evaluation
+from graspd.models.training.commands import evaluation
 from graspd.models.training.commands.evaluation import grid_of
 from graspd.models.training.data.datasets import read_all
 from graspd.models.training.estimators.configs import GRIDS, ForestConfig, SvmConfig
 from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.jobs import Job
 from graspd.models.training.systems.registry import SYSTEMS
+from tests.kit.inside import graspd
 from tests.models.training.samples import OBJECTS, table, write, write_sessions
 
 ROOT = Path(__file__).parents[4]
-
-
-def graspd_evaluate(*arguments: str) -> int:
-    parser = argparse.ArgumentParser()
-    evaluate.add_arguments(parser)
-    return evaluate.run(parser.parse_args(arguments))
 
 
 @pytest.fixture(scope="module")
@@ -40,36 +34,34 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_table_of_ones_own_is_measured_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_of_ones_own_is_measured_alone(tmp_path: Path) -> None:
     own, out = tmp_path / "monday.csv", tmp_path / "out"
     made = table("monday", 80, 0)
     objects = tuple(OBJECTS[grasp % 4] for grasp in range(80))
     write(own, dataclasses.replace(made, objects=objects))
-    options = ["--own", str(own), "--out", str(out), "--seeds", "1", "--quiet"]
-    assert graspd_evaluate("svm-session", *options) == 0
-    printed = capsys.readouterr()
-    assert [line.split()[:2] for line in printed.out.splitlines()] == [
+    options = "svm-session", "--own", own, "--out", out, "--seeds", "1", "--quiet"
+    done = graspd("evaluate", *options)
+    assert [line.split()[:2] for line in done.stdout.splitlines()] == [
         ["svm-session", "cv"],
         ["svm-session", "objects"],
     ]
-    assert printed.err == (
+    assert done.stderr == (
         "graspd evaluate: takes 4 folds: 10 folds need 10 objects, there are 4\n"
     )
     assert len(list((out / "jobs").iterdir())) == 2 * 4
-    assert graspd_evaluate("svm-session", *options, "--table", "x.md") == 2
-    assert "it needs --data" in capsys.readouterr().err
-    assert graspd_evaluate("svm-session") == 2
-    assert "needs --data DIR, --own FILE, or both" in capsys.readouterr().err
+    assert "it needs --data" in graspd("evaluate", *options, "--table", "x.md").stderr
+    nothing = graspd("evaluate", "svm-session")
+    assert (nothing.returncode, nothing.stderr) == (
+        2,
+        "graspd evaluate: needs --data DIR, --own FILE, or both\n",
+    )
 
 
-def test_a_quick_run_writes_summaries_and_table(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_quick_run_writes_summaries_and_table(data: Path, tmp_path: Path) -> None:
     out, table = tmp_path / "out", tmp_path / "tables" / "RESULTS.md"
-    options = ["--data", str(data), "--out", str(out), "--table", str(table), "--quick"]
-    assert graspd_evaluate("svm-session", *options) == 0
+    options = "--data", data, "--out", out, "--table", table, "--quick"
+    done = graspd("evaluate", "svm-session", *options)
+    assert done.returncode == 0
     protocols = ("cv", "unknown", "objects", "objects-whole", "session", "days")
     assert {path.name for path in out.glob("*.json")} == {
         f"svm-session.{protocol}.json" for protocol in protocols
@@ -80,27 +72,24 @@ def test_a_quick_run_writes_summaries_and_table(
     assert "graspd evaluate svm-session --data DIR --out DIR --quick --table FILE" in text
     assert "mean nothing" in text
     assert str(tmp_path) not in text
-    printed = capsys.readouterr()
-    assert [line.split()[:2] for line in printed.out.splitlines()] == [
+    assert [line.split()[:2] for line in done.stdout.splitlines()] == [
         ["svm-session", protocol] for protocol in protocols
     ]
-    assert "svm-session session (n50): F1 " in printed.out
-    assert "palm_45.csv is not the published table" in printed.err
+    assert "svm-session session (n50): F1 " in done.stdout
+    assert "palm_45.csv is not the published table" in done.stderr
 
 
 def test_what_is_finished_is_not_run_again(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = ["svm", "--protocol", "cv", "--data", str(data), "--out", str(tmp_path), "--json"]
-    assert graspd_evaluate(*options, "--seeds", "2") == 0
-    first = json.loads(capsys.readouterr().out)
+    options = "svm", "--protocol", "cv", "--data", data, "--out", tmp_path, "--json", "--seeds", "2"
+    first = json.loads(graspd("evaluate", *options).stdout)
 
     def fail(*_: object) -> None:
         pytest.fail("a finished job was run again")
 
     monkeypatch.setattr(jobs, "run", fail)
-    assert graspd_evaluate(*options, "--seeds", "2") == 0
-    assert json.loads(capsys.readouterr().out) == first
+    assert json.loads(graspd("evaluate", *options).stdout) == first
     (summary,) = first
     assert (summary["system"], summary["protocol"], summary["seeds"]) == ("svm", "cv", [0, 1])
     assert len(summary["variants"]["none"]["figures"]["f1"]) == 2
@@ -109,19 +98,16 @@ def test_what_is_finished_is_not_run_again(
 
 
 def test_a_grid_names_the_best_of_all_its_points(
-    data: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(GRIDS, SvmConfig, [{"c": (0.01, 3.0), "gamma": (1e-4, 0.01)}])
-    options = ["--grid", "--protocol", "cv", "--quick", "--data", str(data)]
-    assert graspd_evaluate("svm", "cnn1", *options, "--out", str(tmp_path)) == 0
+    options = "--grid", "--protocol", "cv", "--quick", "--data", data, "--out", tmp_path
+    done = graspd("evaluate", "svm", "cnn1", *options)
     report = json.loads((tmp_path / "svm.cv.grid.json").read_text())
     assert len(report) == 4
     figures = [point["f1"]["mean"] for point in report]
     assert figures == sorted(figures, reverse=True)
-    assert capsys.readouterr().out.startswith(f"{report[0]['name']} cv: best of 4, F1 ")
+    assert done.stdout.startswith(f"{report[0]['name']} cv: best of 4, F1 ")
     assert not (tmp_path / "svm.cv.json").exists()
 
 
@@ -150,57 +136,51 @@ def test_grids_are_the_papers() -> None:
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(
-    data: Path,
-    tmp_path: Path,
-    arguments: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
+    data: Path, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
-    assert graspd_evaluate("--data", str(data), "--out", str(tmp_path / "out"), *arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.err.startswith(f"graspd evaluate: {message}")
-    assert printed.err.count("\n") == 1
-    assert printed.out == ""
+    done = graspd("evaluate", "--data", data, "--out", tmp_path / "out", *arguments)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"graspd evaluate: {message}")
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
     assert not (tmp_path / "out").exists()
 
 
-def test_data_without_a_later_session_have_no_session_protocol(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_without_a_later_session_have_no_session_protocol(data: Path, tmp_path: Path) -> None:
     folder = tmp_path / "data"
     folder.mkdir()
     for name in ("palm_down.csv", "palm_side.csv"):
         (folder / name).write_bytes((data / name).read_bytes())
-    options = ["svm", "--data", str(folder), "--out", str(tmp_path / "out"), "--quick"]
-    assert graspd_evaluate(*options) == 2
-    assert "graspd evaluate: the data lack palm_45\n" in capsys.readouterr().err
-    assert graspd_evaluate(*options, "--protocol", "objects-whole") == 0
+    options = "svm", "--data", folder, "--out", tmp_path / "out", "--quick"
+    assert graspd("evaluate", *options).stderr.endswith("evaluate: the data lack palm_45\n")
+    assert graspd("evaluate", *options, "--protocol", "objects-whole").returncode == 0
 
 
 def test_no_cluster_is_exit_code_1_and_says_so(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="no extra: cluster")
     monkeypatch.setattr(jobs, "CONNECT_TIMEOUT_S", 1)
-    options = ["--data", str(data), "--out", str(tmp_path), "--dask", "tcp://127.0.0.1:9"]
-    assert graspd_evaluate("svm", "--quick", *options) == 1
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("graspd evaluate: no Dask scheduler at tcp://127.0.0.1:9")
+    options = "--data", data, "--out", tmp_path, "--dask", "tcp://127.0.0.1:9"
+    done = graspd("evaluate", "svm", "--quick", *options)
+    assert done.returncode == 1
+    assert "graspd evaluate: no Dask scheduler at tcp://127.0.0.1:9" in done.stderr
 
 
 def test_what_is_not_installed_is_said_before_any_training(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evaluation, "find_spec", lambda _: None)
-    options = ["svm", "--data", str(data), "--out", str(tmp_path)]
-    assert graspd_evaluate(*options, "--plots", str(tmp_path)) == 2
-    assert graspd_evaluate(*options, "--dask", "tcp://127.0.0.1:9") == 2
-    pip = f"{sys.executable} -m pip install"
-    where = "in the folder of graspd's source"
-    assert capsys.readouterr().err.splitlines() == [
-        f"graspd evaluate: --plots needs the package 'matplotlib': run {pip} '.[report]' {where}",
-        f"graspd evaluate: --dask needs the package 'distributed': run {pip} '.[cluster]' {where}",
-    ]
+    for option, package, extra in (
+        ("--plots", "matplotlib", "report"),
+        ("--dask", "distributed", "cluster"),
+    ):
+        done = graspd("evaluate", "svm", "--data", data, "--out", tmp_path, option, "anything")
+        assert done.returncode == 2
+        assert done.stderr == (
+            f"graspd evaluate: {option} needs the package '{package}': run {sys.executable} "
+            f"-m pip install '.[{extra}]' in the folder of graspd's source\n"
+        )
 
 
 def test_ctrl_c_ends_processes_with_130_and_leaves_results_of_one_process(

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import hashlib
 import json
 import re
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
 
 from graspd.models.contract import Dataset, SessionInput
 from graspd.models.runtime import TactileModel
-from graspd.models.training.commands import train
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.making import make_model
 from graspd.models.training.making.export import ExportError
+from tests.kit.inside import graspd
 from tests.models.training.samples import (
     OBJECTS,
     separable_counts,
@@ -32,10 +32,14 @@ GRASPS = 80
 """Of each of the three tables."""
 
 
-def graspd_train(*arguments: str, system: str = SYSTEM) -> int:
-    parser = argparse.ArgumentParser()
-    train.add_arguments(parser)
-    return train.run(parser.parse_args([system, *arguments]))
+def train(*arguments: object, system: str = SYSTEM) -> CompletedProcess[str]:
+    return graspd("train", system, *arguments)
+
+
+def last_error(done: CompletedProcess[str]) -> str:
+    """The last line of standard error, of a command that was given wrong input or data."""
+    assert done.returncode == 2
+    return done.stderr.splitlines()[-1]
 
 
 def smallest() -> Grasps:
@@ -53,11 +57,11 @@ def data(tmp_path: Path) -> Path:
 
 
 def test_a_session_model_comes_with_all_that_the_daemon_and_its_user_need(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    data: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out" / SYSTEM
-    options = ["--data", str(data), "--out", str(out), "--folds", "2", "--seed", "3"]
-    assert graspd_train(*options) == 0
+    done = train("--data", data, "--out", out, "--folds", "2", "--seed", "3")
+    assert done.returncode == 0
     files = sorted(path.name for path in out.iterdir())
     assert files == [f"{SYSTEM}.json", f"{SYSTEM}.onnx", "trainings"]
     model = TactileModel(out / f"{SYSTEM}.onnx")
@@ -79,10 +83,9 @@ def test_a_session_model_comes_with_all_that_the_daemon_and_its_user_need(
     assert {"A palm_45", "B palm_side", "C palm_down", "A and C", "all"} < set(days["days"])
     assert days["days"]["all"]["every"]["grasps"] == 5 * GRASPS
     assert any("of what it calls stable slips" in point for point in card["weak_points"])
-    printed = capsys.readouterr()
-    assert printed.out.startswith(f"{out / SYSTEM}.onnx: cv F1 ")
-    assert printed.out.count("\n") == 1
-    assert printed.err.splitlines() == [
+    assert done.stdout.startswith(f"{out / SYSTEM}.onnx: cv F1 ")
+    assert done.stdout.count("\n") == 1
+    assert done.stderr.splitlines() == [
         f"graspd train: warning: {name}.csv is not the published table; "
         "the figures are of this data only"
         for name in ("palm_down", "palm_side", "palm_45")
@@ -108,27 +111,22 @@ def assert_starts_from_statistics_of_tables(session: SessionInput, data: Path) -
     assert sharpness[-1] >= 1.0
 
 
-def test_a_model_of_the_later_session_needs_its_table(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (data / "palm_45.csv").unlink()
-    options = ["--data", str(data), "--out", str(tmp_path / "out")]
-    assert graspd_train(*options, system="small-session") == 2
+def test_a_model_of_the_later_session_needs_its_table(data: Path, tmp_path: Path) -> None:
     missing = data / "palm_45.csv"
-    printed = capsys.readouterr()
-    last = printed.err.splitlines()[-1]
-    assert last == f"graspd train: {missing}: is missing, small-session needs it"
-    assert printed.out == ""
+    missing.unlink()
+    done = train("--data", data, "--out", tmp_path / "out", system="small-session")
+    assert last_error(done) == f"graspd train: {missing}: is missing, small-session needs it"
+    assert done.stdout == ""
     assert not (tmp_path / "out").exists()
 
 
 def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    data: Path, tmp_path: Path
 ) -> None:
     write(tmp_path / "lab 1.csv", table("lab 1", 60, 3))
-    own = ["--own", str(tmp_path / "lab 1.csv")]
-    options = ["--data", str(data), "--out", str(tmp_path / "out"), "--folds", "2"]
-    assert graspd_train(*options, *own, system="svm") == 0
+    options = "--data", data, "--own", tmp_path / "lab 1.csv", "--folds", "2"
+    done = train(*options, "--out", tmp_path / "out", system="svm")
+    assert done.returncode == 0
     card = json.loads((tmp_path / "out" / "svm-lab-1.json").read_text())
     assert card["command"] == "graspd train svm --data DIR --own 'lab 1.csv' --seed 0 --folds 2"
     assert [(file["name"], file["rows"]) for file in card["contract"]["datasets"]] == [
@@ -153,15 +151,15 @@ def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
         "The data is of 20 objects in 3 tables. Not published: lab 1.",
         "The figures of another day are of the published tables alone.",
     } < set(card["weak_points"])
-    assert "lab 1.csv is not" not in capsys.readouterr().err
+    assert "lab 1.csv is not" not in done.stderr
 
 
 def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
 ) -> None:
     write(tmp_path / "lab.csv", smallest())
-    options = ["--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path), "--folds", "2"]
-    assert graspd_train(*options) == 0
+    done = train("--own", tmp_path / "lab.csv", "--out", tmp_path, "--folds", "2")
+    assert done.returncode == 0
     contract = TactileModel(tmp_path / f"{SYSTEM}-lab.onnx").contract
     assert [(file.name, file.rows) for file in contract.datasets] == [("lab", 20)]
     assert isinstance(contract.input, SessionInput)
@@ -182,66 +180,57 @@ def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
         "What it is worth on another day than those of its data was not measured.",
     ]
     assert card["weak_points"][3].startswith("20 grasps, 10 of which slipped, are few: the daemon")
-    assert capsys.readouterr().err.startswith("graspd train: warning: 20 grasps are few")
+    assert done.stderr.startswith("graspd train: warning: 20 grasps are few")
 
 
-def test_grasps_of_one_object_measure_known_objects_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_grasps_of_one_object_measure_known_objects_alone(tmp_path: Path) -> None:
     write_table(tmp_path / "lab.csv", *separable_counts(GRASPS))
-    options = ["--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path / "out"), "--folds", "2"]
-    assert graspd_train(*options) == 2
-    assert capsys.readouterr().err.splitlines()[-2:] == [
+    options = "--own", tmp_path / "lab.csv", "--out", tmp_path / "out", "--folds", "2"
+    assert train(*options).stderr.splitlines()[-2:] == [
         "graspd train: these grasps are enough for --folds 2 --only cv",
         "graspd train: 2 folds need 2 objects, there are 1 (see --folds and --only)",
     ]
-    assert graspd_train(*options, "--only", "cv") == 0
+    assert train(*options, "--only", "cv").returncode == 0
     card = json.loads((tmp_path / "out" / f"{SYSTEM}-lab.json").read_text())
     assert card["never_seen"]["held_out_object"] is None
     assert card["calibrated_by"] == "cv"
 
 
-def test_a_session_model_needs_several_objects_of_each_session(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_session_model_needs_several_objects_of_each_session(data: Path, tmp_path: Path) -> None:
     write_table(tmp_path / "lab.csv", *separable_counts(GRASPS))
-    options = ["--data", str(data), "--own", str(tmp_path / "lab.csv"), "--folds", "2"]
-    assert graspd_train(*options, "--out", str(tmp_path / "out")) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
+    options = "--data", data, "--own", tmp_path / "lab.csv", "--folds", "2"
+    last = last_error(train(*options, "--out", tmp_path / "out"))
     assert "leaves out all objects of lab, by whose other grasps" in last
     assert "put the tables of a session together" in last
 
 
-def test_a_fold_that_leaves_one_kind_of_grasps_to_train_on_is_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fold_that_leaves_one_kind_of_grasps_to_train_on_is_exit_code_2(tmp_path: Path) -> None:
     made = smallest()
     objects = tuple("ball" if slip else "box" for slip in made.slipped)
     write(tmp_path / "lab.csv", dataclasses.replace(made, objects=objects))
-    options = ["--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path / "out"), "--folds", "2"]
-    assert graspd_train(*options) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
+    options = "--own", tmp_path / "lab.csv", "--out", tmp_path / "out", "--folds", "2"
+    last = last_error(train(*options))
     assert re.match(r"graspd train: objects, fold 0, has 0 grasps that \w+ to train on", last)
 
 
-def warnings(capsys: pytest.CaptureFixture[str]) -> list[str]:
+def warnings(done: CompletedProcess[str]) -> list[str]:
+    """The warnings of a training that was interrupted."""
+    assert done.returncode == 130
     start = "graspd train: warning: "
-    lines = capsys.readouterr().err.splitlines()
+    lines = done.stderr.splitlines()
     return [line.removeprefix(start) for line in lines if line.startswith(start)]
 
 
 def test_what_a_model_will_not_be_able_to_do_is_said_before_it_is_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(make_model, "make_model", interrupted)
     write(tmp_path / "lab.csv", smallest())
-    small = ["--own", str(tmp_path / "lab.csv"), "--folds", "2", "--only", "cv"]
-    small += ["--out", str(tmp_path / "out")]
-    assert graspd_train(*small, system="svm") == 130
-    said = warnings(capsys)
+    options = "--folds", "2", "--out", tmp_path / "out"
+    small = train("--own", tmp_path / "lab.csv", "--only", "cv", *options, system="svm")
     for wanted, sentence in zip(
         (
             "20 grasps are few",
@@ -252,15 +241,14 @@ def test_what_a_model_will_not_be_able_to_do_is_said_before_it_is_trained(
             "only 10 grasps stayed",
             "with --only cv nothing else is measured",
         ),
-        said,
+        warnings(small),
         strict=True,
     ):
         assert sentence.startswith(wanted)
     for day in range(2):
         write(tmp_path / f"day{day}.csv", table("lab", 120, day))
-    enough = ["--own", str(tmp_path / "day0.csv"), "--own", str(tmp_path / "day1.csv")]
-    assert graspd_train(*enough, "--folds", "2", "--out", str(tmp_path / "out")) == 130
-    assert warnings(capsys) == []
+    enough = "--own", tmp_path / "day0.csv", "--own", tmp_path / "day1.csv"
+    assert warnings(train(*enough, *options)) == []
 
 
 @pytest.mark.parametrize(
@@ -271,39 +259,30 @@ def test_what_a_model_will_not_be_able_to_do_is_said_before_it_is_trained(
     ],
 )
 def test_as_many_folds_are_taken_as_grasps_are_enough_for(
-    options: list[str],
-    folds: int,
-    why: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    options: list[str], folds: int, why: str, tmp_path: Path
 ) -> None:
     made, lab = smallest(), tmp_path / "lab.csv"
     slipped = made.slipped.copy()
     slipped[np.flatnonzero(slipped)[0]] = False  # nine slipped, so ten folds are too many
     write(lab, dataclasses.replace(made, slipped=slipped))
-    words = ["--own", str(lab), "--out", str(tmp_path / "out"), *options]
-    assert graspd_train(*words, "--folds", "10") == 2
-    *_, said, reason = capsys.readouterr().err.splitlines()
+    words = "--own", lab, "--out", tmp_path / "out", *options
+    *_, said, reason = train(*words, "--folds", "10").stderr.splitlines()
     proposal = " ".join([f"--folds {folds}", *options])
     assert said == f"graspd train: these grasps are enough for {proposal}"
     assert "(see --folds and --only)" in reason
-    assert graspd_train(*words, "--quiet") == 0
-    assert f"graspd train: takes {folds} folds: {why}\n" in capsys.readouterr().err
+    assert f"graspd train: takes {folds} folds: {why}\n" in train(*words, "--quiet").stderr
     card = json.loads((tmp_path / "out" / f"{SYSTEM}-lab.json").read_text())
     assert f"--folds {folds}" in card["command"]
 
 
-def test_a_model_is_named_and_its_end_says_how_a_scene_gets_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_is_named_and_its_end_says_how_a_scene_gets_it(tmp_path: Path) -> None:
     write(tmp_path / "lab.csv", smallest())
-    options = ["--own", str(tmp_path / "lab.csv"), "--folds", "2", "--only", "cv"]
     out = tmp_path / "out"
+    options = "--own", tmp_path / "lab.csv", "--out", out, "--folds", "2", "--only", "cv"
     for words, name in (([], f"{SYSTEM}-lab"), (["--name", "cups"], "cups")):
-        assert graspd_train(*options, *words, "--out", str(out)) == 0
-        printed = capsys.readouterr()
-        assert printed.out.startswith(f"{out / name}.onnx: cv F1 ")
-        assert printed.err.splitlines()[-1] == (
+        done = train(*options, *words)
+        assert done.stdout.startswith(f"{out / name}.onnx: cv F1 ")
+        assert done.stderr.splitlines()[-1] == (
             f"graspd train: for a scene: graspd models add {out / name}.onnx --name {name}"
         )
         assert TactileModel(out / f"{name}.onnx").contract.name == name
@@ -312,38 +291,27 @@ def test_a_model_is_named_and_its_end_says_how_a_scene_gets_it(
 
 
 @pytest.mark.parametrize("name", ["svm", "small-session-ff", "a/b", ".hidden", "x.onnx", "a" * 65])
-def test_a_name_that_a_scene_could_not_use_is_refused(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        graspd_train("--data", "anywhere", "--name", name)
-    assert "graspd ships a model" in (said := capsys.readouterr().err) or "is no name" in said
+def test_a_name_that_a_scene_could_not_use_is_refused(name: str) -> None:
+    last = last_error(train("--data", "anywhere", "--name", name))
+    assert "graspd ships a model" in last or "is no name" in last
 
 
-def test_without_any_data_there_is_nothing_to_train_on(capsys: pytest.CaptureFixture[str]) -> None:
-    assert graspd_train() == 2
-    assert capsys.readouterr().err == "graspd train: needs --data DIR, --own FILE, or both\n"
+def test_without_any_data_there_is_nothing_to_train_on() -> None:
+    assert last_error(train()) == "graspd train: needs --data DIR, --own FILE, or both"
 
 
-def test_an_output_folder_that_is_a_file_is_exit_code_2(
-    data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_folder_that_is_a_file_is_exit_code_2(data: Path) -> None:
     out = data / "palm_45.csv"
-    assert graspd_train("--data", str(data), "--out", str(out)) == 2
-    assert capsys.readouterr().err.splitlines()[-1] == f"graspd train: {out}: File exists"
+    assert last_error(train("--data", data, "--out", out)) == f"graspd train: {out}: File exists"
 
 
 @pytest.mark.parametrize(
     ("option", "value"),
     [("--folds", "1"), ("--jobs", "0"), ("--seed", "-1"), ("--seed", "1e3"), ("--folds", "")],
 )
-def test_a_number_out_of_range_is_exit_code_2(
-    option: str, value: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as caught:
-        graspd_train("--data", "anywhere", f"{option}={value}")
-    assert caught.value.code == 2
-    assert f"argument {option}: '{value}' is not a whole number from" in capsys.readouterr().err
+def test_a_number_out_of_range_is_exit_code_2(option: str, value: str) -> None:
+    last = last_error(train("--data", "anywhere", f"{option}={value}"))
+    assert f"argument {option}: '{value}' is not a whole number from" in last
 
 
 @pytest.mark.parametrize(
@@ -360,11 +328,10 @@ def test_a_training_that_does_not_end_says_why(
     data: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def failing(*_: object) -> None:
         raise error
 
     monkeypatch.setattr(make_model, "make_model", failing)
-    assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == code
-    assert capsys.readouterr().err.splitlines()[-1] == f"graspd train: {says}"
+    done = train("--data", data, "--out", tmp_path / "out")
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (code, f"graspd train: {says}")

@@ -78,19 +78,11 @@ def test_a_folder_is_palm_down_then_palm_side_then_palm_45(bts3_dir: Path) -> No
 def test_the_list_of_published_tables_agrees_with_the_record() -> None:
     listed = {table.name: (table.rows, table.sha256) for table in TABLES}
     assert listed == {name: (rows, sha256) for name, (rows, _, _, sha256) in REAL.items()}
-    assert [table.upstream_name for table in TABLES] == [
-        "bts3v2_palm_down.csv",
-        "bts3v2_palm_side.csv",
-        "bts3v2_palm_45.csv",
-    ]
+    assert [table.upstream_name for table in TABLES] == [f"bts3v2_{name}.csv" for name in REAL]
 
 
-def _without_column(text: str) -> str:
-    return text.replace("mf_biotac_7,", "", 1)
-
-
-def _twice(text: str) -> str:
-    return text.replace("mf_biotac_7,", "mf_biotac_7,slipped,", 1)
+def _header(before: str, after: str) -> Callable[[str], str]:
+    return lambda text: text.replace(before, after, 1)
 
 
 def _cell(column: int, value: str) -> Callable[[str], str]:
@@ -107,8 +99,8 @@ def _cell(column: int, value: str) -> Callable[[str], str]:
 BROKEN: list[tuple[str, Callable[[str], str], str]] = [
     ("empty file", lambda _: "", "line 1, column object: column is missing"),
     ("no grasp", lambda text: text.splitlines()[0], "has no grasps"),
-    ("column missing", _without_column, "line 1, column mf_biotac_7: column is missing"),
-    ("column twice", _twice, "line 1, column slipped: column is there more than once"),
+    ("column missing", _header("mf_biotac_7,", ""), "column mf_biotac_7: column is missing"),
+    ("column twice", _header("ff_", "slipped,ff_"), "column slipped: column is there more than"),
     ("row cut off", lambda text: text[:-40], "line 7: has "),
     ("value too many", _cell(73, "1,2"), "line 3: has 75 values, not 74"),
     ("no object", _cell(0, ""), "line 3, column object: object has no name"),
@@ -118,7 +110,6 @@ BROKEN: list[tuple[str, Callable[[str], str], str]] = [
     ("negative", _cell(26, "-1"), "line 3, column mf_biotac_1: '-1' is not a count (0..4095)"),
     ("missing value", _cell(73, ""), "line 3, column th_biotac_24: '' is not a count (0..4095)"),
     ("a float", _cell(5, "12.5"), "line 3, column ff_biotac_4: '12.5' is not a count (0..4095)"),
-    ("not a number", _cell(5, "nan"), "line 3, column ff_biotac_4: 'nan' is not a count (0..4095)"),
     ("python's own", _cell(5, "1_0"), "line 3, column ff_biotac_4: '1_0' is not a count (0..4095)"),
     ("huge", _cell(5, "9" * 5000), "line 3, column ff_biotac_4: '99999999999999999999' is not a"),
     ("open quote", _cell(0, '"ball'), "is not a table"),

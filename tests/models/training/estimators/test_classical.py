@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from graspd.models.inputs import VectorBuilder
-from graspd.models.training.estimators.classical import (
-    classical_margins,
-    classical_size,
-    fit_classical,
-)
+from graspd.models.training.estimators.classical import fit_classical
 from graspd.models.training.estimators.configs import (
     BoostingConfig,
     ClassicalConfig,
@@ -36,39 +32,39 @@ KINDS: list[ClassicalConfig] = [
 def test_a_positive_margin_says_slip(config: ClassicalConfig) -> None:
     counts, slipped = separable_counts(60, seed=9)
     vectors = VectorBuilder(3).build_batch(counts)[0]
-    model = fit_classical(config, VECTORS, SLIPPED, seed=0)
-    margins = classical_margins(model, vectors)
+    fitted = fit_classical(config, VECTORS, SLIPPED, seed=0)
+    margins = fitted.margins(vectors)
     assert margins.dtype == np.float64
     assert ((margins > 0.0) == slipped).all()
-    assert classical_margins(model, vectors[:0]).shape == (0,)
+    assert fitted.margins(vectors[:0]).shape == (0,)
 
 
 def test_an_svm_decides_by_the_radial_kernel() -> None:
-    model = fit_classical(SvmConfig(3.0, "auto"), VECTORS, SLIPPED, seed=0)
-    vectors = model.support_vectors_
-    weights, bias = model.dual_coef_[0], model.intercept_[0]
-    for reading, margin in zip(VECTORS[:10], classical_margins(model, VECTORS[:10]), strict=True):
+    fitted = fit_classical(SvmConfig(3.0, "auto"), VECTORS, SLIPPED, seed=0)
+    vectors = fitted.model.support_vectors_
+    weights, bias = fitted.model.dual_coef_[0], fitted.model.intercept_[0]
+    for reading, margin in zip(VECTORS[:10], fitted.margins(VECTORS[:10]), strict=True):
         distance = ((vectors - reading) ** 2).sum(axis=1)
         expected = (weights * np.exp(-distance / 72.0)).sum() + bias
         assert margin == pytest.approx(expected, abs=1e-9)
-    assert classical_size(model) == vectors.size + len(vectors) + 1
+    assert fitted.parameters == vectors.size + len(vectors) + 1
 
 
 def test_a_forest_of_one_mind_has_a_finite_margin() -> None:
     """All trees agree: 0.999 and 0.001, log-odds 6.9068."""
-    model = fit_classical(ForestConfig(11, None), VECTORS, SLIPPED, seed=0)
-    assert np.abs(classical_margins(model, VECTORS)).max() == pytest.approx(6.90675, abs=1e-4)
+    fitted = fit_classical(ForestConfig(11, None), VECTORS, SLIPPED, seed=0)
+    assert np.abs(fitted.margins(VECTORS)).max() == pytest.approx(6.90675, abs=1e-4)
 
 
 def test_a_perceptron_counts_its_weights_and_keeps_large_margins() -> None:
-    model = fit_classical(MlpConfig((8, 4), epochs=300), VECTORS, SLIPPED, seed=0)
-    assert classical_size(model) == 72 * 8 + 8 + 8 * 4 + 4 + 4 + 1
-    margins = classical_margins(model, 20.0 * VECTORS)
+    fitted = fit_classical(MlpConfig((8, 4), epochs=300), VECTORS, SLIPPED, seed=0)
+    assert fitted.parameters == 72 * 8 + 8 + 8 * 4 + 4 + 4 + 1
+    margins = fitted.margins(20.0 * VECTORS)
     assert np.isfinite(margins).all()
     assert np.abs(margins).max() > 40.0  # where a probability in double precision is 1
-    slip = model.predict_proba(VECTORS)[:, 1]
+    slip = fitted.model.predict_proba(VECTORS)[:, 1]
     expected = np.log(slip / (1.0 - slip))
-    assert classical_margins(model, VECTORS) == pytest.approx(expected, rel=1e-2)
+    assert fitted.margins(VECTORS) == pytest.approx(expected, rel=1e-2)
 
 
 def test_classes_weigh_the_same_however_many_grasps_each_has() -> None:
@@ -76,8 +72,8 @@ def test_classes_weigh_the_same_however_many_grasps_each_has() -> None:
     random = np.random.default_rng(0)
     inputs = random.normal(size=(400, 72)).astype(np.float32)
     slipped = np.arange(400) % 10 > 0
-    model = fit_classical(SvmConfig(0.01, 0.0001), inputs, slipped, seed=0)
-    weights = np.abs(model.dual_coef_[0])
+    fitted = fit_classical(SvmConfig(0.01, 0.0001), inputs, slipped, seed=0)
+    weights = np.abs(fitted.model.dual_coef_[0])
     assert weights.max() / weights.min() == pytest.approx(9.0, rel=0.01)
 
 

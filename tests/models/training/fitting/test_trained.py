@@ -20,15 +20,9 @@ from graspd.models.training.estimators.configs import (
     Recipe,
     SvmConfig,
 )
+from graspd.models.training.estimators.graphs import Fitted
 from graspd.models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
-from graspd.models.training.fitting.trained import (
-    Fitted,
-    FittedBlend,
-    FittedNetwork,
-    augment,
-    fit,
-    train,
-)
+from graspd.models.training.fitting.trained import FittedBlend, FittedNetwork, augment, fit, train
 from graspd.models.training.systems.registry import (
     SYSTEMS,
     BlendConfig,

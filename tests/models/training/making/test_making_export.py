@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
+import functools
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import onnx
 import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
-from graspd.models.bts3 import FINGERS
 from graspd.models.contract import (
-    CLASSES,
     CountsInput,
-    Dataset,
     ImageInput,
-    Input,
-    MeasuredError,
     ModelContract,
-    SeenCounts,
     SessionInput,
     Sharpness,
     VectorInput,
 )
 from graspd.models.inputs import builder, raw_features
 from graspd.models.runtime import TactileModel
+from graspd.models.training.estimators.classical import FittedClassical
 from graspd.models.training.estimators.configs import (
     BoostingConfig,
     ForestConfig,
@@ -38,10 +34,20 @@ from graspd.models.training.estimators.configs import (
     SecondConvolution,
     SvmConfig,
 )
+from graspd.models.training.estimators.graphs import Fitted
 from graspd.models.training.fitting.standards import Standards
-from graspd.models.training.fitting.trained import Fitted, FittedClassical, fit
+from graspd.models.training.fitting.trained import fit
 from graspd.models.training.making.export import ExportError, export
-from graspd.models.training.systems.registry import SESSION, BlendConfig, Estimator, Member, System
+from graspd.models.training.systems.registry import (
+    SESSION,
+    BlendConfig,
+    Estimator,
+    Member,
+    SessionFeatures,
+    System,
+    SystemInput,
+)
+from tests.daemon.fakes import contract
 from tests.models.training.samples import separable_counts
 
 COUNTS, SLIPPED = separable_counts(90)
@@ -50,6 +56,7 @@ RAW = raw_features(COUNTS)
 IMAGE = ImageInput("D1", "neighbour-mean", "filled-image", "channels")
 SIDE_BY_SIDE = ImageInput("D2a", "least-contact", "filled-image", "horizontal")
 VECTOR = VectorInput()
+COUNTS_INPUT = CountsInput()
 STATISTICS = SessionInput(
     mean=tuple(RAW.mean(axis=0).tolist()),
     spread=tuple(RAW.std(axis=0).tolist()),
@@ -71,83 +78,48 @@ BLEND = BlendConfig(
 )
 
 
-@dataclass(frozen=True)
-class Case:
-    input: Input
-    estimator: Estimator
-    recipe: Recipe | None = None
-    standardise: bool = False
+def system(kind: SystemInput, estimator: Estimator, recipe: Recipe | None = None) -> System:
+    return System("made", "Made up.", kind, estimator, recipe, standardise=kind == COUNTS_INPUT)
 
 
 CASES = {
-    "image network": Case(IMAGE, TINY, QUICK),
-    "plain network": Case(SIDE_BY_SIDE, replace(TINY, batch_norm=False), QUICK),
-    "deep network": Case(
+    "image network": system(IMAGE, TINY, QUICK),
+    "plain network": system(SIDE_BY_SIDE, replace(TINY, batch_norm=False), QUICK),
+    "deep network": system(
         IMAGE, replace(TINY, pool=True, second=SecondConvolution(5), dropout=0.3), QUICK
     ),
-    "session network": Case(STATISTICS, replace(TINY, dropout=0.3), QUICK),
-    "svm": Case(VECTOR, SvmConfig(3.0, 0.1)),
-    "hard svm": Case(STATISTICS, SvmConfig(5000.0, "auto")),
-    "mlp": Case(VECTOR, MlpConfig((8, 8), epochs=30)),
-    "forest": Case(VECTOR, ForestConfig(199, None)),
-    "shallow forest": Case(STATISTICS, ForestConfig(11, 2)),
-    "boosting": Case(STATISTICS, BoostingConfig(iterations=30, leaves=5, features=0.5)),
-    "standardised network": Case(CountsInput(), TINY, QUICK, standardise=True),
-    "standardised forest": Case(CountsInput(), ForestConfig(11, None), standardise=True),
-    "blend": Case(STATISTICS, BLEND),
+    "session network": system(SESSION, replace(TINY, dropout=0.3), QUICK),
+    "svm": system(VECTOR, SvmConfig(3.0, 0.1)),
+    "hard svm": system(SESSION, SvmConfig(5000.0, "auto")),
+    "mlp": system(VECTOR, MlpConfig((8, 8), epochs=30)),
+    "forest": system(VECTOR, ForestConfig(199, None)),
+    "shallow forest": system(SESSION, ForestConfig(11, 2)),
+    "boosting": system(SESSION, BoostingConfig(iterations=30, leaves=5, features=0.5)),
+    "standardised network": system(COUNTS_INPUT, TINY, QUICK),
+    "standardised forest": system(COUNTS_INPUT, ForestConfig(11, None)),
+    "blend": system(SESSION, BLEND),
 }
 
 
-def _contract(wanted: Input) -> ModelContract:
-    low, high, centre = ([[value] * 24] * 3 for value in (0, 4095, 2000.0))
-    return ModelContract(
-        version=2,
-        name="made",
-        input=wanted,
-        fingers=FINGERS,
-        classes=CLASSES,
-        seed=0,
-        datasets=(Dataset("made", "0" * 64, 90),),
-        measured=(MeasuredError("cv", 2, 0.9, 0.01, 0.9, 0.01),),
-        confidence=(),
-        seen=SeenCounts(
-            low=tuple(map(tuple, low)),  # type: ignore[arg-type]
-            high=tuple(map(tuple, high)),  # type: ignore[arg-type]
-            margin=10,
-            centre=tuple(map(tuple, centre)),
-            whitening=tuple((0.001,) * (row + 1) for row in range(72)),
-            distance_max=10.0,
-        ),
-    )
+def contract_of(name: str) -> ModelContract:
+    kind = CASES[name].input
+    wanted = STATISTICS if isinstance(kind, SessionFeatures) else kind
+    return msgspec.structs.replace(contract(), input=wanted)
 
 
-def _fit(case: Case, counts: NDArray[np.uint16], slipped: NDArray[np.bool_]) -> Fitted:
-    wanted = case.input
-    inputs = builder(wanted, 3).build_batch(counts)[0]
-    kind = SESSION if isinstance(wanted, SessionInput) else wanted
-    system = System(
-        "made", "Made up.", kind, case.estimator, case.recipe, standardise=case.standardise
-    )
-    return fit(system, inputs, slipped, seed=0)
+def trained(name: str) -> Fitted:
+    inputs = builder(contract_of(name).input, 3).build_batch(COUNTS)[0]
+    return fit(CASES[name], inputs, SLIPPED, seed=0)
 
 
-@pytest.fixture(scope="module")
-def fitted() -> Callable[[str], Fitted]:
-    known: dict[str, Fitted] = {}
-
-    def of(name: str) -> Fitted:
-        if name not in known:
-            known[name] = _fit(CASES[name], COUNTS, SLIPPED)
-        return known[name]
-
-    return of
+fitted = functools.cache(trained)
 
 
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_the_file_judges_as_the_trainer_on_grasps_that_it_never_saw(
-    name: str, fitted: Callable[[str], Fitted], tmp_path: Path
+    name: str, tmp_path: Path
 ) -> None:
-    contract = _contract(CASES[name].input)
+    contract = contract_of(name)
     path = tmp_path / "made.onnx"
     counts = np.concatenate((COUNTS, OTHER_COUNTS))
     parity = export(fitted(name), 1.7, contract, counts, path)
@@ -168,13 +140,12 @@ def test_the_file_judges_as_the_trainer_on_grasps_that_it_never_saw(
 
 @pytest.mark.parametrize("name", ["session network", "svm", "mlp", "forest", "boosting"])
 def test_the_same_training_makes_the_same_bytes_and_tells_nothing_of_the_machine(
-    name: str, fitted: Callable[[str], Fitted], tmp_path: Path
+    name: str, tmp_path: Path
 ) -> None:
-    contract = _contract(CASES[name].input)
+    contract = contract_of(name)
     files = [tmp_path / "once.onnx", tmp_path / "again.onnx"]
-    again = _fit(CASES[name], COUNTS, SLIPPED)
-    for path, trained in zip(files, (fitted(name), again), strict=True):
-        export(trained, 0.8, contract, COUNTS[:5], path)
+    for path, made in zip(files, (fitted(name), trained(name)), strict=True):
+        export(made, 0.8, contract, COUNTS[:5], path)
     once, twice = (path.read_bytes() for path in files)
     assert once == twice
     text = once.decode("latin-1")
@@ -183,13 +154,11 @@ def test_the_same_training_makes_the_same_bytes_and_tells_nothing_of_the_machine
     assert not re.search(r"/(tmp|home|usr|work|root)/", text)
 
 
-def test_a_session_model_is_checked_by_the_statistics_given(
-    fitted: Callable[[str], Fitted], tmp_path: Path
-) -> None:
+def test_a_session_model_is_checked_by_the_statistics_given(tmp_path: Path) -> None:
     """Every reading by its own: first shifted statistics, then those of the contract."""
     seen: list[NDArray[np.float32]] = []
-    trained = fitted("hard svm")
-    assert isinstance(trained, FittedClassical)
+    made = fitted("hard svm")
+    assert isinstance(made, FittedClassical)
 
     class Watched(FittedClassical):
         def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -200,27 +169,25 @@ def test_a_session_model_is_checked_by_the_statistics_given(
     spread = np.repeat(RAW.std(axis=0)[np.newaxis], 4, axis=0)
     mean[0] += 0.5 * spread[0]
     standards = Standards(mean, spread)
-    contract = _contract(STATISTICS)
+    contract = contract_of("hard svm")
     parity = export(
-        Watched(trained.model), 1.0, contract, COUNTS[:4], tmp_path / "made.onnx", standards
+        Watched(made.model), 1.0, contract, COUNTS[:4], tmp_path / "made.onnx", standards
     )
     assert parity.grasps == 4
     expected = np.clip((RAW[:4] - mean) / spread, -3.0, 3.0)
     assert seen[0] == pytest.approx(expected, abs=1e-5)
 
 
-def test_a_file_that_judges_otherwise_is_not_written(
-    fitted: Callable[[str], Fitted], tmp_path: Path
-) -> None:
+def test_a_file_that_judges_otherwise_is_not_written(tmp_path: Path) -> None:
     class Warmer(FittedClassical):
         def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
             return super().to_onnx(temperature * 1.01, input_name)
 
-    trained = fitted("svm")
-    assert isinstance(trained, FittedClassical)
+    made = fitted("svm")
+    assert isinstance(made, FittedClassical)
     path = tmp_path / "made.onnx"
     path.write_bytes(b"the file before")
     with pytest.raises(ExportError, match="differs from the system"):
-        export(Warmer(trained.model), 1.0, _contract(CASES["svm"].input), COUNTS, path)
+        export(Warmer(made.model), 1.0, contract_of("svm"), COUNTS, path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["made.onnx"]
     assert path.read_bytes() == b"the file before"

@@ -10,16 +10,9 @@ import numpy as np
 import pytest
 
 from graspd.models import zoo
-from graspd.models.contract import CountsInput, ImageInput, VectorInput
+from graspd.models.contract import VectorInput
 from graspd.models.runtime import TactileModel
-from graspd.models.training.estimators.configs import (
-    CNN1,
-    ForestConfig,
-    MlpConfig,
-    PublishedRecipe,
-    Recipe,
-    SvmConfig,
-)
+from graspd.models.training.estimators.configs import CNN1, PublishedRecipe, Recipe, SvmConfig
 from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.jobs import Job
 from graspd.models.training.making.make_model import make_model
@@ -28,7 +21,6 @@ from graspd.models.training.systems.registry import (
     SYSTEMS,
     BlendConfig,
     Member,
-    SessionFeatures,
     configuration,
     digest,
     with_recipes,
@@ -57,23 +49,6 @@ def test_each_system_has_its_name_and_one_sentence() -> None:
         assert system.name == name
         assert system.description.endswith(".")
         assert "\n" not in system.description
-
-
-def test_inputs_are_those_that_the_names_promise() -> None:
-    for name, system in SYSTEMS.items():
-        if "-session" in name:
-            assert isinstance(system.input, SessionFeatures)
-        elif name.endswith("-electrodes"):
-            assert isinstance(system.input, CountsInput)
-            assert system.standardise
-        elif isinstance(system.estimator, SvmConfig | MlpConfig | ForestConfig):
-            assert isinstance(system.input, VectorInput)
-        else:
-            assert isinstance(system.input, ImageInput)
-    d3 = SYSTEMS["cnn0-d3-least-contact"].input
-    assert d3 == ImageInput("D3", "least-contact", "filled-image", "channels")
-    horizontal = SYSTEMS["cnn0-horizontal"].input
-    assert horizontal == ImageInput("D1", "neighbour-mean", "filled-image", "horizontal")
 
 
 def test_the_faithful_recipe_and_the_augmented_one_are_the_published_ones() -> None:
