@@ -109,13 +109,12 @@ def _input_errors() -> tuple[type[Exception], ...]:
 
     They are imported only here, when a command has failed.
     """
-    from graspd.daemon.publish.keys import KeysError
     from graspd.daemon.scene import SceneError
     from graspd.daemon.session.file import SessionFileError
     from graspd.drivers.base import DriverError
     from graspd.models.contract import ModelError
 
-    return UsageError, SceneError, ModelError, DriverError, SessionFileError, KeysError
+    return UsageError, SceneError, ModelError, DriverError, SessionFileError
 
 
 def whole_parser() -> Parser:

@@ -70,10 +70,7 @@ class GraspModel:
         Raises `ValueError`, `ModelError` or `SessionFileError` for what does not fit.
         """
         judged = self._counts(counts)
-        calibration = self._calibration(session)
-        now = None if calibration is None else calibration.now
-        if now is not None and not now.calibrated:
-            warnings.warn(self._without_session(), stacklevel=2)
+        now = self._calibration(session)
         probabilities = np.full((len(judged), 2), np.nan)
         for row, values in enumerate(judged):
             p_slip = self._opinion(values, now)[0].p_slip
@@ -92,7 +89,7 @@ class GraspModel:
 
     def _calibration(
         self, session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None
-    ) -> SessionCalibration | None:
+    ) -> Calibration | None:
         """Return what is known of today's sensors; None for a model that needs no session."""
         wanted, electrodes = self._contract.input, self._electrodes
         if not isinstance(wanted, SessionInput):
@@ -109,16 +106,15 @@ class GraspModel:
                     p_slip = opinion.p_slip
                     slip = None if p_slip is None else p_slip >= Limits.slip_threshold
                     calibration.observe(grasp.astype(np.float64), slip=slip)
-        return calibration
-
-    def _without_session(self) -> str:
-        wanted = self._contract.input
-        fewest = wanted.calibrated_from if isinstance(wanted, SessionInput) else 0
-        return (
-            f"{self.name} does not know the sensors of this day: its probabilities mean little on "
-            f"any day but those of its training. Give session= {fewest:g} grasps or more of the "
-            "same sensors; outcomes are not needed."
-        )
+        if not calibration.now.calibrated:
+            warnings.warn(
+                f"{self.name} does not know the sensors of this day: its probabilities mean little "
+                "on any day but those of its training. Give session= "
+                f"{wanted.calibrated_from:g} grasps or more of the same sensors; outcomes are not "
+                "needed.",
+                stacklevel=3,
+            )
+        return calibration.now
 
     def _counts(self, given: ArrayLike | pd.DataFrame) -> NDArray[np.float64]:
         """Return counts of shape (n, fingers, 24). Raises `ValueError`."""

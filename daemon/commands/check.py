@@ -172,13 +172,10 @@ def _try_keys(wanted: scene.Scene) -> None:
         return
     from graspd.daemon.publish.keys import KeysError, load_clients, load_own
 
-    try:
-        load_own(wanted.curve.secret_key)
-        refused = load_clients(wanted.curve.clients).refused
-    except KeysError as error:
-        raise scene.SceneError(str(error)) from error
+    load_own(wanted.curve.secret_key)
+    refused = load_clients(wanted.curve.clients).refused
     if refused:
-        raise scene.SceneError("\n".join(refused))
+        raise KeysError("\n".join(refused))
 
 
 def _model_name(wanted: scene.Scene, model: TactileModel) -> str:

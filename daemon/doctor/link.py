@@ -18,12 +18,10 @@ BAD_MIN = 5
 """With fewer bad frames their share is not known."""
 WHOLES = "frames", "packets", "readings"
 """Counters of what comes, by link."""
-OF_VALUES = frozenset({"not_counts"})
-"""Counters of values: a frame has many."""
-OF_READINGS = frozenset(
-    {"missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
+NOT_FRAMES = frozenset(
+    {"not_counts", "missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
 )
-"""Counters of readings; a reading may take many frames."""
+"""Counters of values, of which a frame has many, and of readings, which may take many frames."""
 JOINING, JOINING_MAX = "unsynchronised", 108
 """Counter, and its most samples that are no trouble: a listener may join in mid-sweep.
 
@@ -275,7 +273,7 @@ def _is_too_much(cause: Cause, names: Sequence[str], counters: Mapping[str, int]
     if share is None:
         return False
     frames = next(filter(None, (counters.get(name, 0) for name in WHOLES)), 0)
-    of_frames = [name for name in names if name not in OF_VALUES | OF_READINGS]
+    of_frames = [name for name in names if name not in NOT_FRAMES]
     pairs = [(sum(counters.get(name, 0) for name in of_frames), frames)]
     if "missed_readings" in names:
         pairs.append((counters.get("missed_readings", 0), counters.get("readings", 0)))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from graspd.daemon.process.files import read_regular
+from graspd.daemon.scene import SceneError
 
 PUBLIC, SECRET = ".key", ".key_secret"
 """Endings of key files, as pyzmq and czmq have them."""
@@ -26,7 +27,7 @@ LINKS_MAX = 40
 """Symbolic links on the way to a file (path_resolution(7))."""
 
 
-class KeysError(Exception):
+class KeysError(SceneError):
     """Keys are missing, wrong, or open to other users."""
 
 

@@ -15,7 +15,7 @@ from graspd.daemon.publish.companion import Companion, PublishedVerdict, Request
 from graspd.daemon.publish.door import Admission, Door
 from graspd.daemon.publish.listener import Listener, PublishError
 from graspd.daemon.publish.messages import Status
-from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Curve
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class Sockets(Companion):
         *,
         awaits_subscriber: bool = False,
     ) -> None:
-        """`clock` gives monotonic ns. Raises `PublishError`, and `SceneError` for wrong keys."""
+        """`clock` gives monotonic ns. Raises `PublishError` or `KeysError`."""
         self.plan = plan(wanted)
         self.endpoint = wanted.endpoint
         self._clock = clock
@@ -89,10 +89,7 @@ class Sockets(Companion):
         from graspd.daemon.publish import keys  # only where there are any
 
         self._keys_seen = _state(curve.clients)
-        try:
-            pair, clients = keys.load_own(curve.secret_key), keys.load_clients(curve.clients)
-        except keys.KeysError as error:
-            raise SceneError(str(error)) from error
+        pair, clients = keys.load_own(curve.secret_key), keys.load_clients(curve.clients)
         _log_refused(clients)
         return Admission(*pair, clients.admitted)
 

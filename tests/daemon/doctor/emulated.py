@@ -10,13 +10,10 @@ import itertools
 import json
 import os
 import socket
-from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from subprocess import CompletedProcess
 
-import pytest
-
-from graspd.daemon.commands import doctor
 from graspd.daemon.commands.doctor import examine
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Finding, Level
@@ -33,6 +30,8 @@ from graspd.drivers.twins.palm import PalmTwin
 from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.can.can_standin import StampingTwin, channel
 from tests.kit.clock import Clock
+from tests.kit.inside import graspd
+from tests.kit.scenes import written
 
 MS = 1_000_000
 FINGERS = ("ff", "mf", "th")
@@ -165,11 +164,6 @@ def faults_told(driver: Driver, statistics: ElectrodeStatistics, seconds: float)
     return [finding for finding in told if finding.level is not Level.OK]
 
 
-def published(folder: Path, more: str = "") -> str:
-    return f'[publish]\nendpoint = "ipc://{folder}/graspd"\n{more}'
-
-
-MODEL = '[model]\nname = "cnn1"\n'
 SPI = '[tactile]\ndriver = "spi"\nport = "{}"\n'
 CAN = '[tactile]\ndriver = "can"\nchannel = "{}"\n'
 
@@ -181,18 +175,23 @@ def refused(number: int) -> Callable[..., object]:
     return open_port
 
 
-def arguments(scene: Path, *more: str) -> Namespace:
-    """Arguments of a doctor that listens for a moment."""
-    parser = ArgumentParser()
-    doctor.add_arguments(parser)
-    return parser.parse_args([str(scene), "--listen", "0.2", *more])
+def scene_of(folder: Path, text: str) -> Path:
+    """A scene with a model and a socket, if the text does not have its own."""
+    if "[model]" not in text:
+        text += '[model]\nname = "cnn1"\n'
+    if "[publish]" not in text:
+        text += f'[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+    return written(folder, text)
 
 
-def look(folder: Path, capsys: pytest.CaptureFixture[str], text: str) -> list[dict[str, str]]:
-    """What the doctor says of a scene that is wrong."""
-    scene = folder / "scene.toml"
-    scene.write_text(text)
-    code = doctor.run(arguments(scene, "--json"))
-    told = [f for f in json.loads(capsys.readouterr().out)["findings"] if f["level"] != "ok"]
-    assert code == int("error" in {finding["level"] for finding in told})
+def asked(folder: Path, text: str, *options: str) -> CompletedProcess[str]:
+    """What a doctor says that listens for a moment."""
+    return graspd("doctor", scene_of(folder, text), "--listen", 0.2, *options)
+
+
+def look(folder: Path, text: str) -> list[dict[str, str]]:
+    """What the doctor says is wrong."""
+    result = asked(folder, text, "--json")
+    told = [f for f in json.loads(result.stdout)["findings"] if f["level"] != "ok"]
+    assert result.returncode == int("error" in {finding["level"] for finding in told})
     return told

@@ -31,15 +31,14 @@ from tests.daemon.doctor.emulated import (
     CAN,
     FINGERS,
     LINKS,
-    MODEL,
     SPI,
     Hand,
-    arguments,
+    asked,
     faults_told,
     listen,
     look,
-    published,
     refused,
+    scene_of,
 )
 from tests.daemon.processes import start, wait_for
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
@@ -72,15 +71,14 @@ def healthy(tmp_path: Path) -> Iterator[str]:
 
 
 def test_a_port_that_is_missing_is_told_with_those_that_there_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = computer.SerialPort("/dev/ttyACM3", "Pico - CDC", "E66", 0x2E8A, "Pico")
     monkeypatch.setattr(computer, "serial_ports", lambda: [port])
-    text = SPI.format(tmp_path / "absent") + MODEL + published(tmp_path)
-    (told,) = look(tmp_path, capsys, text)
+    text = SPI.format(tmp_path / "absent")
+    (told,) = look(tmp_path, text)
     assert told["cause"] == "port-missing"
-    doctor.run(arguments(tmp_path / "scene.toml"))
-    people = capsys.readouterr().out
+    people = asked(tmp_path, text).stdout
     assert "ok serial port /dev/ttyACM3: Pico - CDC, serial number E66\n" in people
 
 
@@ -92,15 +90,11 @@ def test_a_port_that_is_missing_is_told_with_those_that_there_are(
     ],
 )
 def test_a_port_that_is_denied_is_told_with_its_group(
-    group: str,
-    advice: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    group: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("serial.serial_for_url", refused(errno.EACCES))
     monkeypatch.setattr("grp.getgrgid", lambda number: SimpleNamespace(gr_name=group))
-    (told,) = look(tmp_path, capsys, SPI.format("/dev/tty") + MODEL + published(tmp_path))
+    (told,) = look(tmp_path, SPI.format("/dev/tty"))
     assert (told["cause"], told["advice"]) == ("port-denied", advice)
 
 
@@ -133,14 +127,11 @@ def holder(path: object, *locks: str) -> Iterator[int]:
         process.terminate()
 
 
-def test_a_port_that_another_program_holds_is_told_with_its_pid(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_port_that_another_program_holds_is_told_with_its_pid(tmp_path: Path) -> None:
     master, slave = os.openpty()
     try:
         with holder(os.ttyname(slave), "locks") as other:
-            text = SPI.format(os.ttyname(slave)) + MODEL + published(tmp_path)
-            (told,) = look(tmp_path, capsys, text)
+            (told,) = look(tmp_path, SPI.format(os.ttyname(slave)))
     finally:
         os.close(master)
         os.close(slave)
@@ -149,25 +140,20 @@ def test_a_port_that_another_program_holds_is_told_with_its_pid(
     assert told["advice"] == f"end it: kill {other}"
 
 
-def test_a_reader_without_a_lock_is_told_with_its_pid(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], healthy: str
-) -> None:
+def test_a_reader_without_a_lock_is_told_with_its_pid(tmp_path: Path, healthy: str) -> None:
     with holder(tmp_path / "bridge") as other:
-        (told,) = look(tmp_path, capsys, healthy + MODEL + published(tmp_path))
+        (told,) = look(tmp_path, healthy)
     assert (told["cause"], told["level"]) == ("port-held", "warning")
     assert f"{tmp_path / 'bridge'} is open in another program" in told["what"]
     assert f"PID {other}, " in told["what"]
     assert told["advice"] == f"end it: kill {other}"
 
 
-def test_a_port_that_graspd_itself_holds_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], healthy: str
-) -> None:
-    scene = tmp_path / "running.toml"
-    scene.write_text(healthy + MODEL + published(tmp_path))
+def test_a_port_that_graspd_itself_holds_is_told(tmp_path: Path, healthy: str) -> None:
+    scene = scene_of(tmp_path, healthy)
     with start("run", scene) as daemon:
         wait_for(tmp_path / "graspd")
-        (told,) = look(tmp_path, capsys, scene.read_text())
+        (told,) = look(tmp_path, scene.read_text())
         daemon.send_signal(signal.SIGTERM)
     assert told["cause"] == "port-held"
     assert f"PID {daemon.pid}, " in told["what"]
@@ -176,15 +162,15 @@ def test_a_port_that_graspd_itself_holds_is_told(
 
 
 def test_an_interface_that_is_missing_is_told_with_those_that_there_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = [computer.CanInterface("can9", "error-active", 500_000)]
     monkeypatch.setattr(computer, "can_interfaces", lambda: there)
-    (told,) = look(tmp_path, capsys, CAN.format("can7") + MODEL + published(tmp_path))
+    text = CAN.format("can7")
+    (told,) = look(tmp_path, text)
     assert told["cause"] == "interface-missing"
     assert "sudo ip link set can7 up type can bitrate 1000000 restart-ms 100" in told["advice"]
-    doctor.run(arguments(tmp_path / "scene.toml"))
-    people = capsys.readouterr().out
+    people = asked(tmp_path, text).stdout
     assert "ok CAN interface can9 is error-active, 500000 bit/s\n" in people
 
 
@@ -213,15 +199,13 @@ def test_an_interface_that_is_down_or_at_another_rate_is_told_with_the_command(
     cause: str,
     advice: str,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     there = computer.CanInterface(LOOPBACK, *interface)
     monkeypatch.setattr(computer, "can_interfaces", lambda: [there])
     with SocketBus() as bus:
         monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", lambda **_: bus)
-        text = CAN.format(LOOPBACK) + more + MODEL + published(tmp_path)
-        (told,) = look(tmp_path, capsys, text)
+        (told,) = look(tmp_path, CAN.format(LOOPBACK) + more)
     assert told["cause"] == cause
     assert advice in told["advice"]
 
@@ -234,7 +218,7 @@ def test_a_controller_in_trouble_is_not_said_to_be_fine(state: str) -> None:
 
 
 def test_a_board_that_is_heard_has_the_bit_rate_of_its_interface(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = computer.CanInterface(LOOPBACK, "error-active", 500_000)
     monkeypatch.setattr(computer, "can_interfaces", lambda: [there])
@@ -243,8 +227,7 @@ def test_a_board_that_is_heard_has_the_bit_rate_of_its_interface(
         for sweep in range(3):
             for frame in sweep_of_frames(sweep):
                 bus.send(frame)
-        text = CAN.format(LOOPBACK) + 'sequence = "electrodes"\n' + MODEL + published(tmp_path)
-        told = look(tmp_path, capsys, text)
+        told = look(tmp_path, CAN.format(LOOPBACK) + 'sequence = "electrodes"\n')
     assert {finding["cause"] for finding in told} == {"link-lost"}, told
 
 
@@ -252,18 +235,13 @@ def test_a_board_that_is_heard_has_the_bit_rate_of_its_interface(
     ("host", "cause"), [("127.0.0.1", "socket-held"), ("192.0.2.1", "address")]
 )
 def test_a_port_to_publish_on_that_cannot_be_had_is_told(
-    host: str,
-    cause: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    healthy: str,
-    pid: int,
+    host: str, cause: str, tmp_path: Path, healthy: str, pid: int
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as held:
         endpoint = f'[publish]\nendpoint = "tcp://{host}:{held.getsockname()[1]}"\n'
         if cause == "address":
             endpoint += '[curve]\nsecret_key = "k"\nclients = "c"\n'
-        told = look(tmp_path, capsys, healthy + MODEL + endpoint)
+        told = look(tmp_path, healthy + endpoint)
     mine = [finding for finding in told if not finding["what"].startswith("spi: ")]
     assert [finding["cause"] for finding in mine] == [cause]
     assert (f"PID {pid}, " in mine[0]["what"]) == (cause == "socket-held")
@@ -299,17 +277,17 @@ SURROUNDINGS: dict[str, tuple[str, str, str]] = {
     "model of no zoo": ('[model]\nname = "nonesuch"\n', "model-missing", "graspd models"),
     "model that is none": ('[model]\npath = "scene.toml"\n', "model-misfit", "graspd models"),
     "folder missing": (
-        MODEL + '[publish]\nendpoint = "ipc://{folder}/absent/graspd"\n',
+        '[publish]\nendpoint = "ipc://{folder}/absent/graspd"\n',
         "socket-folder",
         "sudo install -d -o $USER {folder}/absent",
     ),
     "no socket there": (
-        MODEL + '[publish]\nendpoint = "ipc://{folder}/scene.toml"\n',
+        '[publish]\nendpoint = "ipc://{folder}/scene.toml"\n',
         "socket-held",
         "mv {folder}/scene.toml",
     ),
     "no such group": (
-        MODEL + '[publish]\nendpoint = "ipc://{folder}/graspd"\ngroup = "nonesuch"\n',
+        '[publish]\nendpoint = "ipc://{folder}/graspd"\ngroup = "nonesuch"\n',
         "socket-group",
         "sudo groupadd --system nonesuch",
     ),
@@ -318,43 +296,37 @@ SURROUNDINGS: dict[str, tuple[str, str, str]] = {
 
 @pytest.mark.parametrize("wrong", SURROUNDINGS)
 def test_what_is_wrong_around_a_healthy_bridge_is_told_by_its_name(
-    wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], healthy: str
+    wrong: str, tmp_path: Path, healthy: str
 ) -> None:
     more, cause, advice = SURROUNDINGS[wrong]
-    text = healthy + more.format(folder=tmp_path)
-    told = look(tmp_path, capsys, text if "[publish]" in text else text + published(tmp_path))
+    told = look(tmp_path, healthy + more.format(folder=tmp_path))
     mine = [finding for finding in told if not finding["what"].startswith("spi: ")]
     assert [finding["cause"] for finding in mine] == [cause], told
     assert advice.format(folder=tmp_path) in mine[0]["advice"]
 
 
-def test_a_socket_that_graspd_holds_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], pid: int
-) -> None:
+def test_a_socket_that_graspd_holds_is_told(tmp_path: Path, pid: int) -> None:
     (tmp_path / "graspd.lock").touch()
     text = (
         f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"\n'
     )
     with (tmp_path / "graspd.lock").open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        told = look(tmp_path, capsys, text + MODEL + published(tmp_path))
+        told = look(tmp_path, text)
     assert [finding["cause"] for finding in told] == ["silent", "socket-held"]
     assert f"PID {pid}, " in told[1]["what"]
 
 
 def test_rights_that_a_user_lacks_are_told(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    healthy: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, healthy: str
 ) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 12345)
     monkeypatch.setattr("os.getegid", lambda: 12345)
     monkeypatch.setattr("os.getgroups", list)
     monkeypatch.setattr("os.sched_setscheduler", refused(errno.EPERM))
     monkeypatch.setattr("os.access", lambda *_: False)
-    text = healthy + MODEL + "[realtime]\npriority = 40\nlock_memory = false\n"
-    told = look(tmp_path, capsys, text + published(tmp_path, 'group = "daemon"\n'))
+    text = f'{healthy}[publish]\nendpoint = "ipc://{tmp_path}/graspd"\ngroup = "daemon"\n'
+    told = look(tmp_path, f"{text}[realtime]\npriority = 40\nlock_memory = false\n")
     mine = {f["cause"]: f["advice"] for f in told if not f["what"].startswith("spi: ")}
     assert mine.keys() == {"socket-denied", "socket-group", "realtime"}
     assert mine["socket-group"] == "sudo usermod -aG daemon $USER, then log in again"
@@ -376,14 +348,10 @@ def test_a_terminal_of_80_columns_is_not_overrun_and_elsewhere_a_finding_is_a_li
 
 
 def test_the_table_of_electrodes_is_shown_with_all_only_and_fits(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], healthy: str
+    tmp_path: Path, healthy: str
 ) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(healthy + MODEL + published(tmp_path))
-    doctor.run(arguments(scene))
-    assert "mean, sd, faulty" not in capsys.readouterr().out
-    doctor.run(arguments(scene, "--all"))
-    _, table = capsys.readouterr().out.split("to look at\n\n")
+    assert "mean, sd, faulty" not in asked(tmp_path, healthy).stdout
+    _, table = asked(tmp_path, healthy, "--all").stdout.split("to look at\n\n")
     lines = table.splitlines()
     assert len(lines) == 25
     assert max(map(len, lines)) <= 80

@@ -20,14 +20,12 @@ from tests.daemon.doctor.emulated import (
     CAN,
     FINGERS,
     LINKS,
-    MODEL,
     SPI,
     STEPS_PER_S,
     Hand,
     faults_told,
     listen,
     look,
-    published,
     refused,
 )
 from tests.drivers.can.can_standin import ScriptedBus, SocketBus, stand_in
@@ -148,21 +146,15 @@ def test_a_bus_that_is_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 @pytest.mark.parametrize("tactile", [SPI, CAN + 'interface = "slcan"\n'], ids=["spi", "slcan"])
 def test_a_port_that_cannot_be_opened_is_told(
-    tactile: str,
-    number: int,
-    cause: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tactile: str, number: int, cause: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("serial.serial_for_url", refused(number))
-    text = tactile.format(tmp_path / "port") + MODEL + published(tmp_path)
-    (finding,) = look(tmp_path, capsys, text)
+    (finding,) = look(tmp_path, tactile.format(tmp_path / "port"))
     assert finding["cause"] == cause
 
 
 def test_an_address_and_a_port_that_cannot_be_had_are_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pid = os.getpid()
     monkeypatch.setattr("os.getpid", lambda: 1)
@@ -170,8 +162,7 @@ def test_an_address_and_a_port_that_cannot_be_had_are_told(
         held.bind(("127.0.0.1", 0))
         here = f"127.0.0.1:{held.getsockname()[1]}"
         for source, cause in ((here, "port-held"), ("192.0.2.1:9870", "address")):
-            text = f'[tactile]\ndriver = "palm"\nsource = "udp://{source}"\n'
-            (finding,) = look(tmp_path, capsys, text + MODEL + published(tmp_path))
+            (finding,) = look(tmp_path, f'[tactile]\ndriver = "palm"\nsource = "udp://{source}"\n')
             assert finding["cause"] == cause
             assert (f"PID {pid}, " in finding["what"]) == (cause == "port-held")
 
