@@ -14,7 +14,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import CanTactile, SpiTactile
-from graspd.drivers.recordings.link_log_player import CANDUMP, SERIAL, LinkLogDriver
+from graspd.drivers.recordings.player import CANDUMP, SERIAL, LinkLogDriver
 from graspd.models.runtime import TactileModel
 
 _DRIVER = {CANDUMP: "can", SERIAL: "spi"}

@@ -27,8 +27,8 @@ from graspd.drivers.base import (
     Annotation,
     ElectrodeFault,
     RecordingError,
+    joint_name,
 )
-from graspd.drivers.hand import joint_name
 
 TIME = "t"
 """Column of seconds, with any zero. Files with it are streams, files without it grasp tables."""

@@ -24,7 +24,6 @@ from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, FingerState, GateState, Moment
 from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
-from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import (
     GraspRow,
     Sampler,
@@ -33,7 +32,13 @@ from graspd.drivers.twins.grasps.whole_grasps import (
 )
 from graspd.models.contract import Finger
 from graspd.models.runtime import TactileModel
-from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
+from tests.drivers.twins.signals import (
+    crept_s,
+    fresh_residuals,
+    played,
+    read_end_points,
+    untouched_counts,
+)
 from tests.drivers.twins.slides import SLIDE_SPREAD, HeldNoise, Hold
 
 TABLES = ("palm_down", "palm_side")
@@ -126,8 +131,7 @@ def end_points(
 
 def residuals(folder: Path) -> NDArray[np.float64]:
     """Noise of the real untouched sensors."""
-    held = np.array(list(recorded_counts(folder / "untouched.csv")))
-    return fresh_residuals(held)
+    return fresh_residuals(untouched_counts(folder / "untouched.csv"))
 
 
 def study(

@@ -20,15 +20,14 @@ from graspd.drivers.base import (
 )
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.joints.driver import JointStreamDriver
-from graspd.drivers.joints.message import JointCounters
+from graspd.drivers.joints import JointCounters, JointStreamDriver
 from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.recordings.faults import ReplayCounters
 from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.spi.messages import FrameCounters
 from graspd.drivers.spi.sweeps import BridgeCounters
-from graspd.drivers.udp.driver import DatagramCounters
+from graspd.drivers.udp import DatagramCounters
 
 COUNTERS = (
     *(DriverCounters, DatagramCounters, JointCounters, PalmCounters),
@@ -54,25 +53,6 @@ def test_a_row_is_where_the_device_has_the_finger(
     fingers: tuple[str, ...], sensors: tuple[str, ...] | None, rows: tuple[int, ...]
 ) -> None:
     assert sensor_rows(fingers, sensors) == rows
-
-
-@pytest.mark.parametrize(
-    ("fingers", "sensors"),
-    [
-        ((), None),
-        (("ff", "ff"), None),
-        (("ff", "pinky"), None),
-        (("ff",), ()),
-        (("ff",), ("ff", "ff")),
-        (("ff",), ("ff", "pinky")),
-        (("ff", "th"), ("ff", "mf")),
-    ],
-)
-def test_fingers_are_different_ones_of_the_hand_and_of_the_device(
-    fingers: tuple[str, ...], sensors: tuple[str, ...] | None
-) -> None:
-    with pytest.raises(ValueError, match="fingers"):
-        sensor_rows(fingers, sensors)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.drivers.spi.bridge_c import HELLO, PING, START, STATUS, STOP, frame, unframe
-from tests.emulated.tools import EMULATOR, boot_rom, emulator_folder
+from tests.emulated.build import EMULATOR, boot_rom, emulator_folder
 
 MS = 1_000_000
 BOARD_ID = "E66118604B2C3A17"

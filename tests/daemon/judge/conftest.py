@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.drivers.twins.grasps.grasps import recorded_counts
 from tests.conftest import data_dir
+from tests.drivers.twins.signals import untouched_counts
 
 
 @pytest.fixture(scope="session")
@@ -16,4 +16,4 @@ def untouched() -> NDArray[np.uint16]:
     folder = data_dir()
     if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
         pytest.skip("the real recording of an untouched hand is not there")
-    return np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
+    return untouched_counts(folder / "untouched" / "untouched.csv")

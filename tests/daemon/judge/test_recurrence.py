@@ -18,11 +18,11 @@ from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.palm.packet import ROUND, PalmPacket
 from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
-from graspd.drivers.twins.palm import PalmTwin
-from tests.bench.recurrence import TABLES, UNTOUCHED, again
+from tests.bench.recurrence import TABLES, again
 from tests.daemon.fakes import FINGERS, MS, Clock
 from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
@@ -217,11 +217,10 @@ def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
         assert Reason.FROZEN not in reasons
 
 
-def test_no_real_sweep_comes_again(bts3_dir: Path) -> None:
+def test_no_real_sweep_comes_again(bts3_dir: Path, untouched: NDArray[np.uint16]) -> None:
     """A grasp in each row of the tables, and 9.8 s of sensors that nothing touches."""
-    untouched = bts3_dir.parent / UNTOUCHED
-    streams = [bts3_dir / f"{name}.csv" for name in TABLES]
-    for path in [*streams, untouched] if untouched.is_file() else streams:
-        number, found = again(recorded_counts(path))
+    tables = [recorded_counts(bts3_dir / f"{name}.csv") for name in TABLES]
+    for stream in (*tables, iter(untouched)):
+        number, found = again(stream)
         assert number > 900
         assert found == 0

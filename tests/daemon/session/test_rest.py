@@ -28,6 +28,7 @@ from graspd.models.runtime import TactileModel
 from tests.bench.recurrence import TABLES, UNTOUCHED
 from tests.daemon.fakes import FINGERS, MS, Clock, reading
 from tests.daemon.session.learning import NOBODY, calibration, observe, sensors
+from tests.drivers.twins.signals import untouched_counts
 
 SHORT = Durations(
     approach_s=(0.3, 0.3),
@@ -57,7 +58,7 @@ def test_every_published_day_rests_otherwise_and_no_half_of_one_does(
 
 
 def test_untouched_sensors_rest_as_they_did(bts3_dir: Path) -> None:
-    sweeps = np.stack(list(recorded_counts(bts3_dir.parent / UNTOUCHED)))
+    sweeps = untouched_counts(bts3_dir.parent / UNTOUCHED)
     first, last = (np.median(part, axis=0) for part in (sweeps[:100], sweeps[-100:]))
     assert moved_fingers(first, last) == []
     assert moved_fingers(first, np.roll(last, 1, axis=0)) != []

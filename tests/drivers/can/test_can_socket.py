@@ -86,7 +86,7 @@ def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
     with SocketBus() as first, SocketBus() as second:
         buses = [first, second]
         stand_in(monkeypatch, lambda: buses.pop(0))
-        with over_socket(clock=clock) as driver:
+        with over_socket(clock=clock, wall_clock=clock) as driver:
             for frame in sweep_of_frames(0) + sweep_of_frames(1)[:9]:
                 first.send(frame)
             first.send(CanFrame(0x040, bytes(8), ERROR))

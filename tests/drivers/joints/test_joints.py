@@ -11,17 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.drivers.base import JointReading
-from graspd.drivers.hand import JOINTS
-from graspd.drivers.joints.driver import JointStreamDriver
-from graspd.drivers.joints.message import (
+from graspd.drivers.base import JOINTS, JointReading
+from graspd.drivers.joints import (
     JointCounters,
     JointMessage,
     JointStream,
+    JointStreamDriver,
 )
 from graspd.drivers.link import LinkState
+from graspd.drivers.twins.datagrams import JointTwin
 from graspd.drivers.twins.faults import LinkFaults
-from graspd.drivers.twins.joints import JointTwin
 from tests.drivers.palm.palm_stream import DatagramClock, Sender, joints
 
 DATAGRAM_BYTES_MAX = 4096
@@ -157,7 +156,7 @@ def test_damage_of_a_message_leaves_no_number_that_is_no_angle(
     found, counters = parse(data[:at] + damage + data[at + len(damage) :])
     assert (found is None) == counters.bad_messages
     if found is not None:
-        assert set(found.names) <= JOINTS
+        assert set(found.names) <= set(JOINTS)
         assert not (np.abs(found.position_rad) > math.radians(200)).any()
 
 

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd.drivers.base import JOINTS
 from graspd.drivers.palm.calibration import (
     HALL_SENSORS,
-    JOINTS,
     CalibrationError,
     CoupledTable,
     JointCalibration,
@@ -52,9 +52,9 @@ def calibration(**joints: list[list[float]]) -> JointCalibration:
 def problems(data: dict[str, object]) -> tuple[str, ...]:
     with pytest.raises(CalibrationError) as caught:
         parse_calibration(data, FILE)
-    for line in str(caught.value).splitlines():
-        assert line.startswith("hand.toml: ")
-    return caught.value.problems
+    lines = str(caught.value).splitlines()
+    assert all(line.startswith("hand.toml: ") for line in lines)
+    return tuple(line.removeprefix("hand.toml: ") for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -179,10 +179,9 @@ def test_what_is_no_recording_is_refused_with_file_line_and_column(
 
 @pytest.mark.parametrize("label", ["", "2", "true", "0.0", "01", "\u0661"])
 def test_a_label_is_0_or_1(label: str) -> None:
-    with pytest.raises(RecordingError, match=r"line 3, column slipped: .* is not a label") as error:
+    told = rf"line 3, column slipped: {re.escape(repr(label))} is not a label"
+    with pytest.raises(RecordingError, match=told):
         rows_of(table(2, {1: {"slipped": label}}))
-    assert repr(label) in str(error.value)
-    assert (error.value.line, error.value.column) == (3, "slipped")
 
 
 @pytest.mark.parametrize("t", ["nan", "-inf", "", "1e999", "1_0", "\u0661"])
@@ -312,9 +311,9 @@ def test_a_value_that_is_no_count_makes_its_electrode_faulty(cell: str) -> None:
     assert row.counts[1, 2] == count(1, 26)
     assert not before.faults.any()
     assert not after.faults.any()
-    with pytest.raises(RecordingError, match=r"is not a count, an integer in 0..4095") as caught:
+    told = r"line 3, column mf_biotac_2: .* is not a count, an integer in 0..4095"
+    with pytest.raises(RecordingError, match=told):
         rows_of(content, strict=True)
-    assert (caught.value.line, caught.value.column) == (3, "mf_biotac_2")
 
 
 @pytest.mark.parametrize(("cell", "expected"), COUNTS.items())
