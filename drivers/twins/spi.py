@@ -102,7 +102,6 @@ class SpiTwin(Opened):
         self.injected_in_sweeps: Counter[str] = Counter()
         """Number of faults that hit sweeps, by name."""
         self._clock = clock
-        self._tick_hz = TICK_HZ
         self._tap = tap
         self._parser = FrameParser(DIGEST)
         self._master: int | None = None
@@ -172,9 +171,6 @@ class SpiTwin(Opened):
     def pull_fingers(self, *fingers: int) -> None:
         """Unplug the sensors of these fingers."""
         self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
-
-    def fileno(self) -> int | None:
-        return self._master
 
     def due_ns(self) -> int | None:
         """Return the time of the next sweep, status or plugging in, ns."""
@@ -269,7 +265,7 @@ class SpiTwin(Opened):
     def _tick(self, host_ns: int) -> int:
         if self._faults.stuck_clock:
             return 0
-        return max((host_ns - self._boot_ns) * self._tick_hz // 1_000_000_000, 0)
+        return max((host_ns - self._boot_ns) * TICK_HZ // 1_000_000_000, 0)
 
     def _hello(self, nonce: int) -> Hello:
         return Hello(
