@@ -20,26 +20,33 @@ ELECTRODES = 24
 """Electrodes of one BioTac SP (manual section 5)."""
 COUNT_MAX = 4095
 """Largest 12-bit reading of an electrode (manual section 5.1)."""
+JOINTS = (
+    *(f"{finger}J{joint}" for finger in ("FF", "MF", "RF") for joint in (1, 2, 3, 4)),
+    *("LFJ1", "LFJ2", "LFJ3", "LFJ4", "LFJ5", "THJ1", "THJ2", "THJ3", "THJ4", "THJ5"),
+    *("WRJ1", "WRJ2", "FFJ0", "MFJ0", "RFJ0", "LFJ0"),
+)
+"""Joints of the Shadow hand: 24 with sensors, then J0 of four fingers.
+
+J0 is the sum of J1 and J2, which one motor moves.
+"""
 
 
-def check_fingers(fingers: Sequence[str]) -> None:
-    """Raise `ValueError` if `fingers` is empty, or has a name twice or one not in `FINGERS`."""
-    if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
-        raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
+def joint_name(column: str) -> str | None:
+    """Return the joint of a column, without Shadow's prefix of the hand; None if it names none.
+
+    `rh_FFJ3` gives `FFJ3`.
+    """
+    name = column[3:] if column.startswith(("rh_", "lh_")) else column
+    return name if name in JOINTS else None
 
 
 def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the number of each finger's sensor at the device, from 0. Raises `ValueError`.
+    """Return the number of each finger's sensor at the device, from 0.
 
-    `sensors`: all fingers in the order of the device; None: the same as `fingers`.
+    `sensors`: all fingers in the order of the device; None: the same as `fingers`. Raises
+    `ValueError` if one of `fingers` is not among them.
     """
-    check_fingers(fingers)
-    if sensors is None:
-        return tuple(range(len(fingers)))
-    check_fingers(sensors)
-    if not set(fingers) <= set(sensors):
-        raise ValueError(f"fingers {list(fingers)} are not all of {list(sensors)}")
-    return tuple(list(sensors).index(finger) for finger in fingers)
+    return tuple((sensors or fingers).index(finger) for finger in fingers)
 
 
 class ElectrodeFault(IntFlag):
@@ -311,5 +318,3 @@ class RecordingError(DriverError):
             place += f", column {column}"
         super().__init__(f"{place}: {problem}")
         self.path = path
-        self.line = line
-        self.column = column

@@ -204,7 +204,7 @@ def build_drivers(scene: Scene) -> list[Driver]:
     with _section("tactile"):
         drivers = [_tactile(scene)]
     if isinstance(scene.joints, StreamJoints):
-        from graspd.drivers.joints.driver import JointStreamDriver
+        from graspd.drivers.joints import JointStreamDriver
 
         with _section("joints"):
             drivers.append(JointStreamDriver(scene.joints.source, only_from=scene.joints.only_from))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from graspd.daemon.record.player import McapReplayDriver
     from graspd.daemon.record.recorder import Recorder
     from graspd.daemon.session.file import SessionFile
-    from graspd.drivers.recordings.link_log_player import LinkLogDriver
+    from graspd.drivers.recordings.player import LinkLogDriver
 
 log = logging.getLogger("graspd")
 

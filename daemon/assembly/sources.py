@@ -17,7 +17,7 @@ from graspd.daemon.scene.scene import Hand
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from graspd.drivers.recordings.link_log_player import LinkLogDriver
+    from graspd.drivers.recordings.player import LinkLogDriver
 
 LINK_LOGS = {".log": "can", ".serial": "spi"}
 """File name endings of link logs, candump text and serial bytes, and the driver of such a link."""

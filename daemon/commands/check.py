@@ -30,7 +30,7 @@ from graspd.daemon.process.text import (
 from graspd.daemon.scene import drivers as scene_drivers
 from graspd.daemon.scene.scene import Realtime, Record, RiskSection
 from graspd.drivers.base import DriverError
-from graspd.drivers.udp.receiver import SCHEME, Endpoint
+from graspd.drivers.udp import SCHEME, Endpoint
 from graspd.models import zoo
 from graspd.models.contract import Finger, ModelError, SessionInput
 from graspd.models.runtime import TactileModel

@@ -233,8 +233,7 @@ def _serve_can(
 def _serve_datagrams(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
 ) -> Mapping[str, int]:
-    from graspd.drivers.twins.joints import JointTwin
-    from graspd.drivers.twins.palm import PalmTwin
+    from graspd.drivers.twins.datagrams import JointTwin, PalmTwin
 
     twin: JointTwin | PalmTwin
     if args.kind == "palm":

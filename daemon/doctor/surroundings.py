@@ -17,7 +17,7 @@ from graspd.daemon.doctor.finding import Cause, Finding, Level, fine
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
-from graspd.drivers.udp.receiver import Endpoint
+from graspd.drivers.udp import Endpoint
 from graspd.models.contract import ModelError
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000

@@ -21,8 +21,7 @@ from graspd.daemon.publish import messages
 from graspd.daemon.publish.messages import WIRE_VERSION, Count, Tactile
 from graspd.daemon.record.viewers import Log, RawImage
 from graspd.daemon.trust.learner import LearnerState
-from graspd.drivers.base import ELECTRODES, JointReading, TactileReading
-from graspd.drivers.hand import JOINTS
+from graspd.drivers.base import ELECTRODES, JOINTS, JointReading, TactileReading
 from graspd.models.session_statistics import SessionState
 
 JsonSchema = dict[str, Any]

@@ -20,6 +20,7 @@ from typing import Any, Final
 import can
 
 from graspd.drivers.base import DriverError, LinkCause, LinkError
+from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.can.frames import (
     CANFD_FRAME,
     ERROR,
@@ -41,6 +42,9 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """Receive buffer asked of the kernel, bytes; the usual 208 KiB hold 60 ms at 4400 frames/s."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
+
+FD_CLOCK_HZ: Final = 80_000_000
+"""Clock of slcan adapters with CAN FD, Hz; bit times are counted in it (CANable 2)."""
 
 _OPTIONS: Final[dict[str, dict[str, Any]]] = {
     # The defaults wait: 2 s after opening, 1 ms in every read.
@@ -81,6 +85,30 @@ def _what_is_missing(interface: str, error: Exception) -> str:
     return (
         f"python-can's interface {interface!r} needs the package {name}: run {installer()} {name}"
     )
+
+
+def bus_options(
+    interface: str,
+    frame_format: CanFormat,
+    bitrate: int | None = None,
+    data_bitrate: int | None = None,
+) -> dict[str, Any]:
+    """Return arguments of python-can's bus. Raises `ValueError` for rates it would ignore."""
+    if interface == "socketcan" and (bitrate is not None or data_bitrate is not None):
+        raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
+    wants_fd = frame_format is CanFormat.SWEEP_FD
+    if data_bitrate is not None and (bitrate is None or not wants_fd):
+        raise ValueError("data_bitrate needs a bitrate and the format sweep_fd")
+    if interface == "slcan" and data_bitrate is not None and bitrate is not None:
+        timing = can.BitTimingFd.from_sample_point(FD_CLOCK_HZ, bitrate, 80.0, data_bitrate, 80.0)
+        return {"timing": timing}
+    rates = {"bitrate": bitrate, "data_bitrate": data_bitrate}
+    options: dict[str, Any] = {name: rate for name, rate in rates.items() if rate is not None}
+    if interface == "virtual":
+        options["protocol"] = can.CanProtocol.CAN_FD if wants_fd else can.CanProtocol.CAN_20
+    elif wants_fd and interface != "slcan":
+        options["fd"] = True
+    return options
 
 
 class CanBus:

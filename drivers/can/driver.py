@@ -9,17 +9,14 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Unpack
-
-import can
+from typing import Final, Unpack
 
 from graspd.drivers.base import DriverError, Fact, LinkError, Opened, Reading
-from graspd.drivers.can.bus import STAMPED_INTERFACES, CanBus
-from graspd.drivers.can.decoders import BoardOptions
+from graspd.drivers.can.bus import STAMPED_INTERFACES, CanBus, bus_options
 from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.can.frames import LOST, Stamped
 from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.can.stream import NAME, CanStream
+from graspd.drivers.can.stream import NAME, BoardOptions, CanStream
 from graspd.drivers.link import LinkState
 
 POLL_NS: Final = 1_000_000
@@ -33,8 +30,6 @@ should be complete.
 """
 RATE_WINDOW_NS: Final = 1_000_000_000
 """Time over which frames per second are counted, ns."""
-FD_CLOCK_HZ: Final = 80_000_000
-"""Clock of slcan adapters with CAN FD, Hz; bit times are counted in it (CANable 2)."""
 
 
 class CanBridgeDriver(Opened):
@@ -61,7 +56,7 @@ class CanBridgeDriver(Opened):
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`fingers` and `board`: see `graspd.drivers.can.decoders.make_decoder`.
+        """`fingers` and `board`: see `graspd.drivers.can.stream.make_decoder`.
 
         `bitrate`, `data_bitrate`: bit/s; not for socketcan, where `ip link` sets them.
         """
@@ -69,7 +64,7 @@ class CanBridgeDriver(Opened):
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)
         self.stream = self._make_stream()
         frame_format = CanFormat(board.get("format", CanFormat.SYNTOUCH))
-        options = _bus_options(interface, frame_format, bitrate, data_bitrate)
+        options = bus_options(interface, frame_format, bitrate, data_bitrate)
         self._bus = CanBus(interface, channel, options, clock, wall_clock)
         self._clock = clock
         self._resting_until_ns: int | None = None
@@ -186,29 +181,3 @@ class CanBridgeDriver(Opened):
         if expected_ns is None or expected_ns - REST_MARGIN_NS <= now_ns:
             return None
         return min(expected_ns - REST_MARGIN_NS, now_ns + REST_MAX_NS)
-
-
-def _bus_options(
-    interface: str, frame_format: CanFormat, bitrate: int | None, data_bitrate: int | None
-) -> dict[str, Any]:
-    """Return arguments of python-can's bus. Raises `ValueError` for rates it would ignore."""
-    if interface == "socketcan" and (bitrate is not None or data_bitrate is not None):
-        raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
-    wants_fd = frame_format is CanFormat.SWEEP_FD
-    if data_bitrate is not None and (bitrate is None or not wants_fd):
-        raise ValueError("data_bitrate needs a bitrate and the format sweep_fd")
-    options: dict[str, Any] = {}
-    if interface == "slcan" and data_bitrate is not None and bitrate is not None:
-        options["timing"] = can.BitTimingFd.from_sample_point(
-            FD_CLOCK_HZ, bitrate, 80.0, data_bitrate, 80.0
-        )
-        return options
-    if bitrate is not None:
-        options["bitrate"] = bitrate
-    if data_bitrate is not None:
-        options["data_bitrate"] = data_bitrate
-    if interface == "virtual":
-        options["protocol"] = can.CanProtocol.CAN_FD if wants_fd else can.CanProtocol.CAN_20
-    elif wants_fd and interface != "slcan":
-        options["fd"] = True
-    return options

@@ -6,7 +6,7 @@ word (`graspd.drivers.biotac`). Source: the public driver `clearpathrobotics/num
 gives them. The sweep frame is graspd's own: one CAN FD frame per finger and sweep.
 `deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc` describe both.
 
-A new format needs a member of `CanFormat`, a decoder in `decoders.make_decoder`, a name in
+A new format needs a member of `CanFormat`, a decoder in `stream.make_decoder`, a name in
 `daemon/scene/drivers.py`, a twin that sends it, and a description on the two pages above.
 """
 
@@ -22,8 +22,6 @@ from graspd.drivers.base import ELECTRODES
 from graspd.drivers.biotac import channel_of, sample_command
 from graspd.drivers.can.frames import CLASSIC_DATA_MAX, FD_DATA_MAX
 
-SENSORS_MAX: Final = 3
-"""Most sensors whose words fit into a classic frame behind the command byte."""
 WORD_BYTES: Final = 2
 
 SWEEP_VERSION: Final = 1
@@ -119,14 +117,11 @@ def parse_sweep(data: bytes) -> SweepFrame | Reject:
 def sample_length(sensors: int, length: int | None) -> int:
     """Return the number of data bytes of a SynTouch frame with the samples of `sensors` fingers.
 
-    `length`: length set in the scene, bytes; None: just long enough. Raises `ValueError` for more
-    sensors than `SENSORS_MAX`, and for a `length` that is too short, or over `CLASSIC_DATA_MAX`.
+    `length`: length set in the scene, bytes; None: just long enough. Raises `ValueError` for a
+    length that is too short, or over `CLASSIC_DATA_MAX`.
     """
-    if sensors > SENSORS_MAX:
-        raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
     used = 1 + WORD_BYTES * sensors
-    if length is None:
-        return used
+    length = length or used
     if not used <= length <= CLASSIC_DATA_MAX:
         raise ValueError(f"frames of {length} bytes cannot carry {sensors} sensors' samples")
     return length

@@ -45,13 +45,11 @@ class SampleAssembler:
         counters: CanCounters,
         rows: Sequence[int],
     ) -> None:
-        """Raises `ValueError` if `sequence`, the channels in order, lacks an electrode.
+        """`sequence`: one of `SEQUENCES`. `sensors`: number of words in a sample.
 
-        `sensors`: number of words in a sample. `rows`: number of each row's sensor, from 0.
+        `rows`: number of each row's sensor, from 0.
         """
         electrodes = [channel for channel in sequence if E1 <= channel <= E24]
-        if sorted(electrodes) != list(range(E1, E24 + 1)):
-            raise ValueError("the sequence does not have every electrode exactly once")
         self._place = {channel: place for place, channel in enumerate(electrodes)}
         self._others = frozenset(sequence) - set(electrodes)
         self._electrodes = np.array(electrodes, dtype=np.intp) - E1

@@ -1,17 +1,40 @@
-"""Decode the frames of one CAN bus, with their times, into readings. No I/O."""
+"""Decode the frames of one CAN bus, with their times, into readings. No I/O; no frame raises."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Unpack
+from typing import Final, TypedDict, Unpack
 
-from graspd.drivers.base import DeviceFault, Fact, LinkCause, LinkError, Reading
-from graspd.drivers.can.decoders import BoardOptions, make_decoder
-from graspd.drivers.can.formats import CanFormat
+import numpy as np
+
+from graspd.drivers.base import (
+    FINGERS,
+    DeviceFault,
+    ElectrodeFault,
+    Fact,
+    LinkCause,
+    LinkError,
+    Reading,
+    TactileReading,
+    sensor_rows,
+)
+from graspd.drivers.biotac import SEQUENCES, decode_words
+from graspd.drivers.can.formats import (
+    SWEEP_BASE_ID,
+    CanFormat,
+    Reject,
+    SweepStatus,
+    parse_sample,
+    parse_sweep,
+    sample_length,
+)
 from graspd.drivers.can.frames import (
     ERROR,
+    EXTENDED,
+    FD,
     LOST,
     REMOTE,
+    STANDARD_ID_MAX,
     CanFrame,
     Stamped,
     describe_error,
@@ -19,6 +42,8 @@ from graspd.drivers.can.frames import (
     is_overflow,
 )
 from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.samples import SampleAssembler
+from graspd.drivers.can.sweep_frames import FrameAssembler
 from graspd.drivers.link import Link, LinkState, longest_silence_ns
 
 NAME: Final = "can"
@@ -121,3 +146,168 @@ class CanStream:
             return None
         self.counters.bus_off += 1
         return LinkError(LinkCause.BUS_OFF, "bus-off")
+
+
+class SynTouchDecoder:
+    """Decoder of SynTouch's board. Without an id it takes that of the first sound sample."""
+
+    def __init__(
+        self,
+        fingers: Sequence[str],
+        sensors: Sequence[str] | None,
+        arbitration_id: int | None,
+        sequence: str,
+        data_length: int | None,
+        counters: CanCounters,
+    ) -> None:
+        rows = sensor_rows(fingers, sensors)
+        self._sensors = len(fingers if sensors is None else sensors)
+        self._length = sample_length(self._sensors, data_length)
+        self._configured_id = self.arbitration_id = arbitration_id
+        """Id of the frames that are decoded; None: not known yet."""
+        self._flags = _id_flags(arbitration_id)
+        self._counters = counters
+        self.sweeps = SampleAssembler(self._sensors, SEQUENCES[sequence], counters, rows)
+
+    def push(
+        self, frame: CanFrame, t_ns: int, until_ns: int | None = None
+    ) -> Sequence[TactileReading]:
+        """Return the readings that a data frame completes, oldest first.
+
+        It arrived at `t_ns`, or between `t_ns` and `until_ns` if that is given.
+        """
+        identifier = self.arbitration_id
+        if identifier is not None and (
+            frame.arbitration_id != identifier or frame.flags & EXTENDED != self._flags
+        ):
+            self._counters.foreign_frames += 1
+            return ()
+        sample = parse_sample(frame.data, self._sensors, self._length)
+        if frame.flags & FD:
+            sample = Reject.CONTENT
+        if isinstance(sample, Reject):
+            _count_reject(self._counters, sample, identifier)
+            return ()
+        channel, words = sample
+        if identifier is None:
+            if not _is_sound(words):
+                self._counters.foreign_frames += 1
+                return ()
+            self.arbitration_id, self._flags = frame.arbitration_id, frame.flags & EXTENDED
+        self._counters.accepted_frames += 1
+        return self.sweeps.push(channel, words, t_ns, until_ns)
+
+    def interrupt(self) -> None:
+        """Drop the current sweep. Another board may come next."""
+        self.sweeps.interrupt()
+        self.arbitration_id = self._configured_id
+
+
+class SweepFrameDecoder:
+    """Decoder of graspd's own format: one frame per finger and sweep."""
+
+    def __init__(self, fingers: Sequence[str], base_id: int, counters: CanCounters) -> None:
+        self._rows = {FINGERS.index(finger): row for row, finger in enumerate(fingers)}
+        self.arbitration_id = base_id
+        """Id of the frames of finger 0."""
+        self._flags = _id_flags(base_id + len(FINGERS) - 1)
+        if _id_flags(base_id) != self._flags:
+            raise ValueError(f"arbitration_id {base_id:#x}: the fingers' ids are of two kinds")
+        self._ticks: dict[int, tuple[int, int]] = {}
+        self._counters = counters
+        self.sweeps = FrameAssembler(list(self._rows), counters)
+
+    def push(
+        self, frame: CanFrame, t_ns: int, _until_ns: int | None = None
+    ) -> Sequence[TactileReading]:
+        base_id, counters = self.arbitration_id, self._counters
+        finger = frame.arbitration_id - base_id
+        if finger not in self._rows or frame.flags & EXTENDED != self._flags:
+            counters.foreign_frames += 1
+            return ()
+        sweep = parse_sweep(frame.data) if frame.flags & FD else Reject.CONTENT
+        if not isinstance(sweep, Reject) and sweep.finger != finger:
+            sweep = Reject.CONTENT
+        if isinstance(sweep, Reject):
+            _count_reject(counters, sweep, base_id)
+            return ()
+        counters.accepted_frames += 1
+        stands = self._tick_stands(finger, sweep.sequence, sweep.tick_us)
+        counters.overruns += bool(sweep.status & SweepStatus.OVERRUN)
+        faults = ElectrodeFault.NONE
+        if sweep.status & SweepStatus.ABSENT:
+            faults |= ElectrodeFault.MISSING
+        if stands or sweep.status & SweepStatus.REPEATED:
+            faults |= ElectrodeFault.HELD
+        row = self._rows[finger]
+        return self.sweeps.push(row, sweep.sequence, sweep.tick_us, sweep.words, faults, t_ns)
+
+    def interrupt(self) -> None:
+        self.sweeps.interrupt()
+
+    def _tick_stands(self, finger: int, sequence: int, tick_us: int) -> bool:
+        """Return True if the sweep before ended at the same tick: nothing was sampled."""
+        before = self._ticks.get(finger)
+        stands = before is not None and before[1] == tick_us and before[0] != sequence
+        self._counters.stuck_ticks += stands
+        self._ticks[finger] = (sequence, tick_us)
+        return stands
+
+
+CanDecoder = SynTouchDecoder | SweepFrameDecoder
+
+
+class BoardOptions(TypedDict, total=False):
+    """Options of `make_decoder` that describe a board."""
+
+    sensors: Sequence[str] | None
+    format: str
+    arbitration_id: int | None
+    sequence: str
+    data_length: int | None
+
+
+def make_decoder(
+    fingers: Sequence[str],
+    counters: CanCounters,
+    *,
+    sensors: Sequence[str] | None = None,
+    format: str = CanFormat.SYNTOUCH,  # noqa: A002 (the key of the scene)
+    arbitration_id: int | None = None,
+    sequence: str = "interleaved",
+    data_length: int | None = None,
+) -> CanDecoder:
+    """Return the decoder of a `CanFormat`. Raises `ValueError` for options that do not fit it.
+
+    `fingers`: the rows of a reading. `arbitration_id`: id of the samples, or of finger 0 (`ff`) of
+    the sweep frames (default 0x5B0); ids above 0x7FF have 29 bits. A decoder of samples without one
+    takes the id of the first sound sample until the link is lost; use that for bring-up only.
+
+    For `syntouch` only: `sensors`, the fingers in the order of the board's words, three at most, by
+    default `fingers`; `sequence`, a key of `graspd.drivers.biotac.SEQUENCES`; `data_length`, bytes
+    of a frame that the board pads.
+    """
+    if CanFormat(format) is CanFormat.SYNTOUCH:
+        return SynTouchDecoder(fingers, sensors, arbitration_id, sequence, data_length, counters)
+    if data_length is not None:
+        raise ValueError("data_length is for the format syntouch; sweep frames have 64 bytes")
+    base_id = SWEEP_BASE_ID if arbitration_id is None else arbitration_id
+    return SweepFrameDecoder(fingers, base_id, counters)
+
+
+def _is_sound(words: bytes) -> bool:
+    """Return True if at least one word is a count and all others are of absent sensors."""
+    _, faults = decode_words(np.frombuffer(words, dtype=">u2"))
+    return not (faults & ~np.uint8(ElectrodeFault.MISSING)).any() and not faults.all()
+
+
+def _id_flags(identifier: int | None) -> int:
+    if identifier is None or identifier <= STANDARD_ID_MAX:
+        return 0
+    return EXTENDED
+
+
+def _count_reject(counters: CanCounters, reject: Reject, identifier: int | None) -> None:
+    """Count a refused frame by its kind; as foreign while the id is not known."""
+    name = "foreign_frames" if identifier is None else reject.value
+    setattr(counters, name, getattr(counters, name) + 1)

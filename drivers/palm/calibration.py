@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
@@ -29,16 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.drivers import toml
-from graspd.drivers.base import COUNT_MAX, DriverError
+from graspd.drivers.base import COUNT_MAX, JOINTS, DriverError
 
 HALL_SENSORS: Final = {
-    **{
-        f"{finger}J{joint}": (4 * at + joint - 1,)
-        for at, finger in enumerate(("FF", "MF", "RF"))
-        for joint in (1, 2, 3, 4)
-    },
-    **{f"LFJ{joint}": (11 + joint,) for joint in (1, 2, 3, 4, 5)},
-    **{f"THJ{joint}": (16 + joint,) for joint in (1, 2, 3, 4)},
+    **{joint: (word,) for word, joint in enumerate(JOINTS[:21])},
     "THJ5": (21, 22),
     "WRJ1": (23, 24),
     "WRJ2": (25,),
@@ -47,8 +41,6 @@ HALL_SENSORS: Final = {
 COUPLED = ("THJ1", "THJ2")
 """Joints whose angles come from the raw values of both."""
 SUMS: Final = {f"{finger}J0": (f"{finger}J1", f"{finger}J2") for finger in ("FF", "MF", "RF", "LF")}
-JOINTS: Final = (*HALL_SENSORS, *SUMS)
-"""All joints of a reading, in its order: 24 with sensors, then the four J0."""
 
 _FINGER_RANGES: Final = {0: (0, 180), 1: (0, 90), 2: (0, 90), 3: (-15, 90), 4: (-20, 20)}
 RANGE_DEG: Final[Mapping[str, tuple[int, int]]] = {
@@ -190,8 +182,6 @@ class CalibrationError(DriverError):
 
     def __init__(self, path: Path, problems: Sequence[str]) -> None:
         super().__init__("\n".join(f"{path}: {problem}" for problem in problems))
-        self.problems = tuple(problems)
-        """Mistakes; each text begins with the name of its joint."""
 
 
 def load_calibration(path: Path) -> JointCalibration:
@@ -253,9 +243,13 @@ def _joint_problems(joint: str, rows: object) -> Iterator[str]:
         yield from shape
         if not shape and isinstance(rows, list):
             points = sorted(rows)
+            degrees = [point[1] for point in points]
             yield from _raw_problems([raw for raw, _ in points])
-            yield from _degree_problems(joint, [degrees for _, degrees in points])
-            yield from _curve_problems(points)
+            yield from _degree_problems(joint, degrees)
+            yield from _steepness_problems(itertools.pairwise(points))
+            steps = [later - former for former, later in itertools.pairwise(degrees)]
+            if not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
+                yield "is not monotone: degrees must only rise or only fall with raw"
 
 
 def _coupled_problems(rows: object) -> Iterator[str]:
@@ -269,7 +263,7 @@ def _coupled_problems(rows: object) -> Iterator[str]:
             f"{joint}: {problem}"
             for problem in _degree_problems(joint, [point[2 + at] for point in rows])
         ]
-    problems += _steepness_problems(rows)
+    problems += _steepness_problems(itertools.combinations(rows, 2))
     yield from problems
     if not problems:
         try:
@@ -306,35 +300,15 @@ def _degree_problems(joint: str, degrees: Sequence[float]) -> Iterator[str]:
             yield f"{angle} degrees is out of reach, the joint goes from {low} to {high}"
 
 
-def _curve_problems(points: Points) -> Iterator[str]:
-    """Yield the mistakes of a table whose `points` are sorted by raw value."""
-    slopes = []
-    for (raw, degrees), (next_raw, next_degrees) in itertools.pairwise(points):
-        if raw == next_raw:
-            yield f"raw {raw} stands twice"
-            continue
-        slope = (next_degrees - degrees) / (next_raw - raw)
-        slopes.append(slope)
-        if abs(slope) > SLOPE_MAX_DEG:
-            yield (
-                f"{abs(slope):.2f} degrees per count from raw {raw} to {next_raw} "
-                f"is steeper than {SLOPE_MAX_DEG}"
-            )
-    if not (all(slope > 0 for slope in slopes) or all(slope < 0 for slope in slopes)):
-        yield "is not monotone: degrees must only rise or only fall with raw"
-
-
-def _steepness_problems(points: Points) -> list[str]:
-    """Return the mistakes of a coupled table: segments that are too steep, and equal points."""
-    problems = []
-    for first, second in itertools.combinations(points, 2):
-        distance = float(np.hypot(first[0] - second[0], first[1] - second[1]))
-        turn = max(abs(first[2] - second[2]), abs(first[3] - second[3]))
+def _steepness_problems(pairs: Iterable[tuple[Sequence[float], Sequence[float]]]) -> Iterator[str]:
+    """Yield the mistakes of pairs of points; the first half of a point is raw values."""
+    for first, second in pairs:
+        half = len(first) // 2
+        distance = math.dist(first[:half], second[:half])
+        turn = max(abs(one - other) for one, other in zip(first[half:], second[half:], strict=True))
+        place, end = (", ".join(map(str, point[:half])) for point in (first, second))
         if distance == 0:
-            problems.append(f"raw {first[0]}, {first[1]} stands twice")
+            yield f"raw {place} stands twice"
         elif turn / distance > SLOPE_MAX_DEG:
-            problems.append(
-                f"{turn / distance:.2f} degrees per count from raw {first[0]}, {first[1]} to "
-                f"{second[0]}, {second[1]} is steeper than {SLOPE_MAX_DEG}"
-            )
-    return problems
+            slope = f"{turn / distance:.2f} degrees per count from raw {place} to {end}"
+            yield f"{slope} is steeper than {SLOPE_MAX_DEG}"

@@ -11,7 +11,7 @@ from graspd.drivers.base import Reading
 from graspd.drivers.link import LinkState, longest_silence_ns
 from graspd.drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX
 from graspd.drivers.palm.stream import ROUND_NS, PalmStream
-from graspd.drivers.udp.driver import DatagramDriver
+from graspd.drivers.udp import DatagramDriver
 
 SPARE_CYCLES: Final = 2
 """Cycles before the end of a round from which the driver waits for packets again."""

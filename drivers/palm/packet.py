@@ -14,7 +14,7 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from graspd.drivers.base import ELECTRODES
-from graspd.drivers.udp.driver import DatagramCounters
+from graspd.drivers.udp import DatagramCounters
 
 CYCLE_NS = 1_000_000
 """Time between two packets of a palm, ns."""

@@ -28,11 +28,11 @@ from graspd.drivers.base import (
     COUNT_MAX,
     ELECTRODES,
     FINGERS,
+    JOINTS,
     ElectrodeFault,
     JointReading,
     Reading,
     TactileReading,
-    check_fingers,
 )
 from graspd.drivers.link import OUTAGE_NS
 from graspd.drivers.palm.packet import (
@@ -88,13 +88,12 @@ class PalmStream:
         calibration: Path | None = None,
         heed_finger_bits: bool = True,
     ) -> None:
-        """Raises `ValueError` for wrong fingers, and `CalibrationError`.
+        """Raises `CalibrationError`.
 
         `fingers`: the rows of a reading. `calibration`: the hand's file; None: no joint readings.
         `heed_finger_bits`: False ignores `tactile_valid`, as Shadow's driver does; some palms do
         not set it.
         """
-        check_fingers(fingers)
         self.counters = PalmCounters()
         self.palm: Palm | None = None
         """Kind of palm; None before the first packet, and after `interrupt`."""
@@ -110,7 +109,6 @@ class PalmStream:
         """Furthest place so far, counted over all rounds; None before the first round."""
         self._place_t_ns: int | None = None
         self._begin(0)
-        self._previous = b""
         self._calibration: JointCalibration | None = None
         self._joint_due_ns = 0
         self._joint_seq = 0
@@ -140,10 +138,10 @@ class PalmStream:
         if packet.palm is not self.palm:
             self.counters.other_palms += 1
             return None
-        if data == self._previous or self._repeats(packet):
+        position = position_of(packet.tactile_type)
+        if position is not None and self.packets[position] == packet:
             self.counters.duplicate_packets += 1
             return None
-        self._previous = data
         readings = self.push(packet, t_ns)
         joints = self._joint_reading(packet, t_ns)
         return readings if joints is None else (joints, *readings)
@@ -183,10 +181,6 @@ class PalmStream:
             self.counters.reordered_packets += 1
         self._store(position, packet, t_ns)
         return (*finished, self._finish()) if self._have == _COMPLETE else finished
-
-    def _repeats(self, packet: PalmPacket) -> bool:
-        position = position_of(packet.tactile_type)
-        return position is not None and self.packets[position] == packet
 
     def _place_of(self, position: int, t_ns: int) -> int | None:
         if self._place is not None and self._place_t_ns is not None:
@@ -289,7 +283,7 @@ class PalmStream:
     def _joint_reading(self, packet: PalmPacket, t_ns: int) -> JointReading | None:
         if self._calibration is None or t_ns < self._joint_due_ns:
             return None
-        from graspd.drivers.palm.calibration import JOINTS, impossible_angles
+        from graspd.drivers.palm.calibration import impossible_angles
 
         self._joint_due_ns += JOINT_PERIOD_NS
         if self._joint_due_ns <= t_ns:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final, Unpack
 
 from graspd.drivers.base import Reading
-from graspd.drivers.can.decoders import BoardOptions
 from graspd.drivers.can.frames import (
     CLASSIC_DATA_MAX,
     ERR_FLAG,
@@ -29,9 +28,9 @@ from graspd.drivers.can.frames import (
     CanFrame,
     Stamped,
 )
-from graspd.drivers.can.stream import CanStream
+from graspd.drivers.can.stream import BoardOptions, CanStream
 from graspd.drivers.recordings.csv_rows import open_recording
-from graspd.drivers.recordings.link_log_player import LinkLogDriver
+from graspd.drivers.recordings.player import LinkLogDriver
 
 LINE_MAX: Final = 256
 """Longest line, characters; a frame of CAN FD takes 170."""

@@ -15,7 +15,6 @@ from graspd.drivers.base import (
     JointReading,
     Reading,
     TactileReading,
-    check_fingers,
 )
 from graspd.drivers.recordings.csv_rows import Row, columns_of, read_rows
 from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
@@ -59,13 +58,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Raises `ValueError` for a wrong number.
-
-        `speed`: factor of real time; None: fast. `rate_hz`: grasps of a table per second.
-        """
-        check_fingers(fingers)
-        if not rate_hz > 0.0:
-            raise ValueError(f"rate_hz is {rate_hz}, must be positive")
+        """`speed`: factor of real time; None: fast. `rate_hz`: grasps of a table per second."""
         super().__init__(paths, speed, clock, delay_ns=round(faults.delayed_s * _NS_PER_S))
         self._fingers = tuple(fingers)
         self._table_period_ns = _NS_PER_S / rate_hz

@@ -27,8 +27,8 @@ from graspd.drivers.base import (
     Annotation,
     ElectrodeFault,
     RecordingError,
+    joint_name,
 )
-from graspd.drivers.hand import joint_name
 
 TIME = "t"
 """Column of seconds, with any zero. Files with it are streams, files without it grasp tables."""
@@ -158,11 +158,9 @@ class Recording:
     def _refuse_header(self) -> None:
         """Raise if a column is missing or there twice, or a joint under two names."""
         missing = [name for name in self.columns.electrodes if name not in self._names]
-        if len(missing) == 1:
-            raise self._error("this column is missing", missing[0])
         if missing:
-            problem = f"this column is missing, the first of {len(missing)} that are"
-            raise self._error(problem, missing[0])
+            others = f", the first of {len(missing)} that are" if len(missing) > 1 else ""
+            raise self._error(f"this column is missing{others}", missing[0])
         joints = self.columns.joints
         read = {*self.columns.electrodes, TIME, OBJECT, SLIPPED, *joints}
         column_of: dict[str, str] = {}

@@ -13,7 +13,7 @@ from graspd.drivers.base import Reading, RecordingError
 from graspd.drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, parse_packet
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.csv_rows import open_recording
-from graspd.drivers.recordings.link_log_player import LinkLogDriver
+from graspd.drivers.recordings.player import LinkLogDriver
 
 PACKETS_TRIED: Final = 64
 """Number of packets by which the packet length of a file is found."""
@@ -35,7 +35,7 @@ class PalmFile(LinkLogDriver[bytes]):
         heed_finger_bits: bool = True,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Take the arguments of `PalmStream`; `begin` reads the file. Raises `ValueError`."""
+        """Take the arguments of `PalmStream`; `begin` reads the file."""
         super().__init__([path], 1.0, clock)
         self._calibration = calibration
         self._make_stream = functools.partial(

@@ -1,16 +1,20 @@
-"""Base of drivers that play files: items are read one ahead, and each is due at its time."""
+"""Bases of drivers that play files: items are read one ahead, and each is due at its time."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import msgspec
 
-from graspd.drivers.base import Fact, Opened, Reading, RecordingError
+from graspd.drivers.base import DriverCounters, Fact, Opened, Reading, RecordingError
+from graspd.drivers.recordings.csv_rows import open_recording
 
+CANDUMP, SERIAL = ".log", ".serial"
+"""File name endings of the two kinds of link log that graspd writes."""
 Item = TypeVar("Item")
 
 
@@ -32,14 +36,7 @@ class RecordedDriver(Opened, Generic[Item]):
         *,
         delay_ns: int = 0,
     ) -> None:
-        """Raises `ValueError` without `paths`, or for a `speed` of 0 or less.
-
-        `speed`: factor of real time; None: as fast as possible. `delay_ns`: lateness of each item.
-        """
-        if not paths:
-            raise ValueError("no recording to replay")
-        if speed is not None and not speed > 0.0:
-            raise ValueError(f"{speed} is no positive speed")
+        """`speed`: factor of real time; None: as fast as possible. `delay_ns`: delay of items."""
         self.paths = tuple(paths)
         self.speed = speed
         self.exhausted = False
@@ -125,3 +122,70 @@ class RecordedDriver(Opened, Generic[Item]):
         except RecordingError as error:
             self._failure = error
             self.exhausted = False
+
+
+class LinkDecoder(Protocol):
+    """Decoder of one link, the same as in its driver."""
+
+    @property
+    def counters(self) -> DriverCounters: ...
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between readings, ns, as recorded; None until it is known."""
+
+
+class LinkLogDriver(RecordedDriver[Item]):
+    """Play one or more link logs as one run, through the decoder of the live link."""
+
+    stream: LinkDecoder
+
+    @abstractmethod
+    def records(self, path: Path) -> Iterator[tuple[int, Item]]:
+        """Yield times, ns, and records of a file; skip damage. Raises `RecordingError`."""
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Make a new `stream`. Raises `DriverError`."""
+
+    @abstractmethod
+    def feed(self, t_ns: int, record: Item) -> Sequence[Reading]:
+        """Return the readings that a record of `t_ns` completes."""
+
+    @property
+    def counters(self) -> DriverCounters:
+        return self.stream.counters
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between readings as played, ns; None: not known yet."""
+        recorded_ns = self.stream.period_ns
+        return None if recorded_ns is None else round(recorded_ns / (self.speed or 1.0))
+
+    def open(self) -> None:
+        """Start from the first file."""
+        self.close()
+        for path in self.paths:
+            open_recording(path).close()
+        self.begin()
+        logs = [self.records(path) for path in self.paths]
+        self.start(self._records(logs))
+        if self.exhausted:
+            raise RecordingError(self.paths[0], "has nothing that came over a link")
+
+    def _records(
+        self, logs: Sequence[Iterator[tuple[int, Item]]]
+    ) -> Generator[tuple[int, Item], None, None]:
+        for path, records in zip(self.paths, logs, strict=True):
+            try:
+                yield from records
+            except OSError as error:
+                raise RecordingError(path, f"cannot be read: {error.strerror}") from error
+
+    def read_ready(self) -> Sequence[Reading]:
+        """Return the readings of the first due record that completes some."""
+        while (due := self.take()) is not None:
+            t_ns, record, _ = due
+            if readings := self.feed(t_ns, record):
+                return [self.hand_over(reading, t_ns) for reading in readings]
+        return ()

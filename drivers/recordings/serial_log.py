@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from graspd.drivers.base import Reading
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.csv_rows import open_recording
-from graspd.drivers.recordings.link_log_player import LinkLogDriver
+from graspd.drivers.recordings.player import LinkLogDriver
 from graspd.drivers.spi.conversation import Conversation
-from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.driver import LineEvent
 from graspd.drivers.spi.messages import FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960
@@ -30,14 +29,8 @@ _TIME: Final = struct.Struct("<Q")
 _EVENTS: Final = frozenset(event.value for event in LineEvent)
 
 
-@dataclass(frozen=True, slots=True)
-class SerialRecord:
-    """Bytes of one read or write."""
-
-    event: LineEvent
-    t_ns: int
-    """Monotonic time of the read or write, ns."""
-    data: bytes
+Record = tuple[LineEvent, bytes]
+"""An event on the line, and the bytes of one read or write."""
 
 
 def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
@@ -49,15 +42,15 @@ def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
     )
 
 
-def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[SerialRecord]:
-    """Yield the records that `chunk` completes. Never raises."""
+def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[tuple[int, Record]]:
+    """Yield monotonic time, ns, and content of each record that `chunk` completes. Never raises."""
     for kind, payload in parser.feed(chunk):
         if kind in _EVENTS and len(payload) >= _TIME.size:
             (t_ns,) = _TIME.unpack_from(payload)
-            yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
+            yield t_ns, (LineEvent(kind), payload[_TIME.size :])
 
 
-class SerialLog(LinkLogDriver[SerialRecord]):
+class SerialLog(LinkLogDriver[Record]):
     """Play serial link logs through the driver's `Conversation`; nothing is sent."""
 
     stream: Conversation
@@ -70,31 +63,31 @@ class SerialLog(LinkLogDriver[SerialRecord]):
         *,
         speed: float | None = None,
     ) -> None:
-        """Take the arguments of `RecordedDriver` and `Conversation`. Raises `ValueError`."""
+        """Take the arguments of `RecordedDriver` and `Conversation`."""
         super().__init__(paths, speed)
         self._fingers, self._sensors = fingers, sensors
         self.begin()
 
-    def records(self, path: Path) -> Iterator[tuple[int, SerialRecord]]:
+    def records(self, path: Path) -> Iterator[tuple[int, Record]]:
         parser = FrameParser()
         with open_recording(path) as stream:
             while chunk := stream.read(CHUNK_BYTES):
-                for record in parse_records(parser, chunk):
-                    yield record.t_ns, record
+                yield from parse_records(parser, chunk)
 
     def begin(self) -> None:
         self.stream = Conversation("link log", self._fingers, self._sensors)
         self.stream.opened(0)
         self._idle_ns = 0
 
-    def feed(self, t_ns: int, record: SerialRecord) -> Sequence[Reading]:
+    def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:
+        event, data = record
         conversation, readings = self.stream, []
-        if record.event is LineEvent.SENT:
-            conversation.sent(record.data, t_ns)
+        if event is LineEvent.SENT:
+            conversation.sent(data, t_ns)
             return ()
-        if record.event is LineEvent.OPENED:
+        if event is LineEvent.OPENED:
             conversation.opened(t_ns)
         elif conversation.link.state is not LinkState.WAITING:
-            readings = conversation.receive(record.data, t_ns, self._idle_ns)
+            readings = conversation.receive(data, t_ns, self._idle_ns)
         self._idle_ns = t_ns
         return readings

@@ -15,7 +15,6 @@ from graspd.drivers.spi.messages import (
     BridgeStatus,
     FrameParser,
     Hello,
-    Message,
     Ping,
     Start,
     Stop,
@@ -65,9 +64,7 @@ class Conversation:
         *,
         nonce: int = 0,
     ) -> None:
-        """Raises `ValueError` for wrong fingers.
-
-        `port`: its name in messages. `fingers`: the rows of a reading. `sensors`: fingers in the
+        """`port`: its name in messages. `fingers`: the rows of a reading. `sensors`: fingers in the
         order of the chip selects; None: `fingers`. `nonce`: the first PING has the next one.
         """
         self.link = Link(NAME)
@@ -188,8 +185,15 @@ class Conversation:
                 reading = self._on_sweep(message, arrival_ns, idle_ns)
                 if reading is not None:
                     readings.append(reading)
+            elif isinstance(message, Hello):
+                self._on_hello(message, arrival_ns)
+            elif isinstance(message, BridgeStatus):
+                self.status = message
+                self.counters.bridge_overruns = message.overruns
+                self.counters.bridge_tx_dropped = message.tx_dropped
+                self.counters.bridge_rx_errors = message.rx_errors
             else:
-                self._on_message(message, arrival_ns)
+                self.counters.unknown_frames += 1  # an echo of our own frame
         return readings
 
     def _next_ping(self) -> bytes:
@@ -212,17 +216,6 @@ class Conversation:
     def _refuse(self, cause: LinkCause, why: str, now_ns: int) -> None:
         self.counters.refused_bridges += 1
         self.lost(cause, f"{self._port}: the bridge {why}", now_ns)
-
-    def _on_message(self, message: Message, arrival_ns: int) -> None:
-        if isinstance(message, Hello):
-            self._on_hello(message, arrival_ns)
-        elif isinstance(message, BridgeStatus):
-            self.status = message
-            self.counters.bridge_overruns = message.overruns
-            self.counters.bridge_tx_dropped = message.tx_dropped
-            self.counters.bridge_rx_errors = message.rx_errors
-        else:
-            self.counters.unknown_frames += 1  # an echo of our own frame
 
     def _on_hello(self, hello: Hello, arrival_ns: int) -> None:
         if hello.nonce == 0:

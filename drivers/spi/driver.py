@@ -1,15 +1,25 @@
-"""Driver of the SPI bridge: a microcontroller that samples BioTac SPs and streams their words."""
+"""Driver of the SPI bridge: a microcontroller that samples BioTac SPs and streams their words.
+
+Its serial port never blocks; all failures of pyserial become `LinkError`.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import logging
+import os
+import select
+import termios
 import time
 from collections.abc import Callable, Sequence
+from enum import IntEnum
 
-from graspd.drivers.base import Fact, LinkError, Opened, Reading
+import serial
+
+from graspd.drivers.base import DriverError, Fact, LinkCause, LinkError, Opened, Reading
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.conversation import NAME, NONCES, Conversation
-from graspd.drivers.spi.line import LineEvent, SerialLine
 from graspd.drivers.spi.messages import Stop, encode
 from graspd.drivers.spi.sweeps import BridgeCounters
 
@@ -17,6 +27,18 @@ BAUD = 921_600
 """Bits per second: 92 kB/s, three times the longest sequence; 115200 is too slow for any."""
 POLL_NS = 2_000_000
 """Time between reads of a port without a descriptor, ns."""
+READ_BYTES = 4096
+"""Bytes of one read: a terminal of Linux returns at most this many."""
+SHORT_BYTES = READ_BYTES // 2
+"""A read of fewer bytes has emptied the terminal; the kernel keeps it full while more waits."""
+READS_MAX = 32
+"""Most reads in one call: twice the kernel's buffer of 64 KiB. A flood cannot hold the loop."""
+DRAIN_TRIES, DRAIN_TRY_S = 10, 0.002
+"""Number and length, s, of the waits for the last bytes to leave before a port is closed."""
+WRITE_TIMEOUT_S = 0.05
+"""Longest wait for room in the port's buffer, s; `select` has just reported room."""
+
+_log = logging.getLogger(__name__)
 
 
 class SpiBridgeDriver(Opened):
@@ -24,8 +46,8 @@ class SpiBridgeDriver(Opened):
 
     `t_ns` of a reading: when the bridge finished the sweep. `seq` goes on after a loss of the link.
     Electrodes that are not sampled, and those of an absent sensor, are `MISSING`. Ports without a
-    descriptor (`rfc2217://`, `loop://`) are polled. The constructor raises `ValueError` for wrong
-    fingers or baud. A missing device raises nothing; `describe` reports it.
+    descriptor (`rfc2217://`, `loop://`) are polled. A missing device
+    raises nothing; `describe` reports it.
     """
 
     name = NAME
@@ -41,8 +63,6 @@ class SpiBridgeDriver(Opened):
         baud: int = BAUD,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        if baud < 1:
-            raise ValueError(f"baud is {baud}, must be positive")
         self._fingers, self._sensors = fingers, sensors
         self._clock = clock
         self._line = SerialLine(port, baud)
@@ -145,3 +165,139 @@ class SpiBridgeDriver(Opened):
     def _lose(self, error: LinkError) -> None:
         self._line.close()
         self.conversation.lost(error.cause, str(error), self._clock())
+
+
+class LineEvent(IntEnum):
+    """Kind of an event on a line, as passed to the tap and written to a link log."""
+
+    RECEIVED = 1
+    SENT = 2
+    OPENED = 3
+
+
+class SerialLine:
+    """One port, by device name (better `/dev/serial/by-id/...`) or URL of pyserial.
+
+    Methods raise `LinkError` if the device is missing or went away. Use `socket://` and
+    `rfc2217://` only to try things out: opening and closing them can take seconds.
+    """
+
+    def __init__(self, port: str, baud: int) -> None:
+        self.port = port
+        self.drained = True
+        """True if the last `read` took all bytes that waited."""
+        self.tap: Callable[[LineEvent, bytes], None] | None = None
+        """Called with the bytes of each read, and before each write with its bytes."""
+        self.descriptor: int | None = None
+        """Descriptor to wait on; None while closed, or if the port must be polled."""
+        self._baud = baud
+        self._serial: serial.Serial | None = None
+        self._terminal: int | None = None
+        """Descriptor if the port is a terminal; it is read without pyserial."""
+
+    def open(self) -> None:
+        """Open the port exclusively. Raises `LinkError`; `DriverError` if no retry can help."""
+        self.close()
+        try:
+            self._serial = serial.serial_for_url(
+                self.port,
+                self._baud,
+                timeout=0,
+                write_timeout=WRITE_TIMEOUT_S,
+                exclusive=True,
+            )
+        except (OSError, termios.error) as error:
+            raise LinkError.from_errno(error, f"{self.port}: {_reason(error)}") from error
+        except ValueError as error:
+            raise DriverError(f"{self.port}: {error}") from error
+        with contextlib.suppress(OSError, AttributeError):
+            self.descriptor = self._serial.fileno()
+        self._terminal = self.descriptor if type(self._serial) is serial.Serial else None
+        try:  # an FTDI adapter then sends every 1 ms, not every 16
+            self._serial.set_low_latency_mode(True)
+        except (OSError, ValueError, AttributeError) as error:
+            _log.debug("%s: no low latency mode: %s", self.port, error)
+        if self.tap is not None:
+            self.tap(LineEvent.OPENED, b"")
+
+    def close(self) -> None:
+        """Release the port; does nothing if it is closed. The device may be gone."""
+        port, self._serial, self.descriptor = self._serial, None, None
+        if port is None:
+            return
+        try:
+            for _ in range(DRAIN_TRIES):
+                if not port.out_waiting:
+                    break
+                time.sleep(DRAIN_TRY_S)
+            else:
+                port.reset_output_buffer()  # with bytes left, closing would wait up to 30 s
+        except AttributeError:
+            pass  # a port without a buffer of its own
+        except (OSError, termios.error) as error:
+            _log.debug("%s: %s", self.port, error)
+        # pyserial drops a socket that its peer has reset, but does not close it.
+        held = getattr(port, "_socket", None)
+        try:
+            port.close()
+        except (OSError, termios.error) as error:
+            _log.debug("%s: %s", self.port, error)
+        if held is not None:
+            held.close()
+
+    def read(self) -> bytes:
+        """Return all bytes that have arrived. Raises `LinkError`."""
+        port, data = self._opened(), b""
+        self.drained = False
+        try:
+            for _ in range(READS_MAX):
+                chunk = b"" if self._terminal is None else os.read(self._terminal, READ_BYTES)
+                self.drained = 0 < len(chunk) < SHORT_BYTES
+                if not chunk:  # pyserial also notices that a terminal is gone
+                    chunk = port.read(READ_BYTES)
+                    self.drained = not chunk
+                data += chunk
+                if self.drained:
+                    break
+        except BlockingIOError:
+            self.drained = True
+        except (OSError, termios.error) as error:
+            if not data:  # else the next call raises, after these bytes
+                raise self._loss(error) from error
+        if self.tap is not None and data:
+            self.tap(LineEvent.RECEIVED, data)
+        return data
+
+    def write(self, data: bytes) -> bool:
+        """Write a frame and return True, or return False if there is no room."""
+        port = self._opened()
+        try:
+            if self.descriptor is not None and not select.select([], [self.descriptor], [], 0)[1]:
+                return False
+            if self.tap is not None:
+                self.tap(LineEvent.SENT, data)
+            port.write(data)
+        except serial.SerialTimeoutException:
+            return False
+        except (OSError, termios.error) as error:
+            raise self._loss(error) from error
+        return True
+
+    def _loss(self, error: Exception) -> LinkError:
+        _log.debug("%s", error)
+        return LinkError(LinkCause.DISCONNECTED, f"{self.port}: the device went away")
+
+    def _opened(self) -> serial.Serial:
+        if self._serial is None:
+            raise RuntimeError(f"{self.port} is not open")
+        return self._serial
+
+
+def _reason(error: Exception) -> str:
+    """Return the error in one short line; pyserial's own texts repeat the port's name."""
+    code = getattr(error, "errno", None)
+    if code in (errno.EAGAIN, errno.EBUSY):
+        return "another program has it open"
+    if code is not None:
+        return os.strerror(code).lower()
+    return str(error).partition("\n")[0]

@@ -26,21 +26,11 @@ ENCODED_MAX_BYTES = 1024
 VERSION = 1
 FIRMWARE = 0x0002
 """Version of the firmware in `deploy/bridge`, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
-SCHEMA = """\
-graspd bridge 1
-01 HELLO   u8 version; u32 digest; u32 nonce; u64 tick; u32 tick_hz; u16 firmware; char board[16]; \
-u32 period_ticks; u8 sensors; u8 slots; char serial[sensors][16]; u8 command[slots]
-02 SWEEP   u32 seq; u64 tick_start; u64 tick_end; u8 present; u8 sensors; u8 slots; \
-u8 word[slots][sensors][2]
-03 STATUS  u64 tick; u32 sweeps; u32 overruns; u32 tx_dropped; u32 rx_errors; u8 sensors; \
-u32 spi_errors[sensors]
-81 PING    u32 nonce
-82 START   (nothing)
-83 STOP    (nothing)
+DIGEST: Final = 0x0D99E4D6
+"""CRC-32 of the protocol's schema: start value of the checksum of frames, except HELLO and PING.
+
+A peer with another layout fails the check and is not misread.
 """
-DIGEST = zlib.crc32(SCHEMA.encode("ascii"))
-"""Start value of the checksum of all frames except HELLO and PING, so that a peer with another
-layout fails the check and is not misread."""
 
 SENSORS_MAX = 5
 """Most sensors of a bridge: one for each finger of a hand."""
@@ -196,20 +186,10 @@ class Hello:
         )
 
     def to_bytes(self) -> bytes:
-        head = _HELLO.pack(
-            self.version,
-            self.digest,
-            self.nonce,
-            self.tick,
-            self.tick_hz,
-            self.firmware,
-            _text_to_bytes(self.board),
-            self.period_ticks,
-            self.sensors,
-            self.slots,
-        )
+        bridge = (self.version, self.digest, self.nonce, self.tick, self.tick_hz, self.firmware)
+        sampling = (_text_to_bytes(self.board), self.period_ticks, self.sensors, self.slots)
         serials = b"".join(_text_to_bytes(serial) for serial in self.serials)
-        return head + serials + bytes(self.commands)
+        return _HELLO.pack(*bridge, *sampling) + serials + bytes(self.commands)
 
     @classmethod
     def from_bytes(cls, payload: bytes) -> Hello | None:

@@ -6,13 +6,13 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 import can
 
 from graspd.drivers.base import FINGERS, Opened
 from graspd.drivers.biotac import E1, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
-from graspd.drivers.can.bus import open_bus
+from graspd.drivers.can.bus import bus_options, open_bus
 from graspd.drivers.can.formats import (
     SWEEP_BASE_ID,
     SWEEP_VERSION,
@@ -63,10 +63,6 @@ class CanTwin(Opened):
     ) -> None:
         self._format = CanFormat(format)
         is_sweep = self._format is CanFormat.SWEEP_FD
-        if interface not in can.VALID_INTERFACES:
-            raise ValueError(f"python-can has no interface {interface!r}")
-        if sequence not in SEQUENCES:
-            raise ValueError(f"sequence {sequence!r} is not one of {sorted(SEQUENCES)}")
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
         faults.refuse("CAN", "one_byte_at_a_time")
@@ -83,11 +79,7 @@ class CanTwin(Opened):
         self.injected = self._injector.injected
         self._clock = clock
         self._interface, self._channel = interface, channel
-        self._options: dict[str, Any] = {}
-        if is_sweep and interface == "virtual":
-            self._options["protocol"] = can.CanProtocol.CAN_FD
-        elif is_sweep:
-            self._options["fd"] = True
+        self._options = bus_options(interface, self._format)
         self._send_timeout_s = 0.0 if interface == "virtual" else SEND_TIMEOUT_S
         self._bus: can.BusABC | None = None
         self._sweep = first_sweep
@@ -181,27 +173,23 @@ class CanTwin(Opened):
         return True
 
     def _put_all(self, frames: Sequence[bytes]) -> None:
-        for frame in frames:
-            self.put((int.from_bytes(frame[:ID_BYTES]), frame[ID_BYTES:]))
-
-    def put(self, outgoing: Outgoing) -> None:
-        """Put a frame on the bus; count it in `unsent` if the bus refuses it."""
-        identifier, data = outgoing
-        message = can.Message(
-            timestamp=self._clock() / 1e9,  # only a bus with preserve_timestamps keeps this time
-            arbitration_id=identifier,
-            is_extended_id=identifier > STANDARD_ID_MAX,
-            data=data,
-            is_fd=self._format is CanFormat.SWEEP_FD,
-            bitrate_switch=self._format is CanFormat.SWEEP_FD,
-        )
-        bus = self._bus
-        if bus is None:
+        """Put frames on the bus; count in `unsent` those that it refuses."""
+        if self._bus is None:
             raise RuntimeError("the twin is not open")
-        try:
-            bus.send(message, timeout=self._send_timeout_s)
-        except can.CanError:
-            self.unsent += 1
+        for frame in frames:
+            identifier = int.from_bytes(frame[:ID_BYTES])
+            message = can.Message(
+                timestamp=self._clock() / 1e9,  # kept only by a bus with preserve_timestamps
+                arbitration_id=identifier,
+                is_extended_id=identifier > STANDARD_ID_MAX,
+                data=frame[ID_BYTES:],
+                is_fd=self._format is CanFormat.SWEEP_FD,
+                bitrate_switch=self._format is CanFormat.SWEEP_FD,
+            )
+            try:
+                self._bus.send(message, timeout=self._send_timeout_s)
+            except can.CanError:
+                self.unsent += 1
 
     def _discard_received(self) -> None:
         if self._interface == "virtual" and self._bus is not None:

@@ -1,33 +1,192 @@
-"""Send datagrams at a steady pace, for the twins of datagram senders."""
+"""Twins that send UDP datagrams: a Shadow hand's palm, and a stream of joint angles."""
 
 from __future__ import annotations
 
+import itertools
+import math
 import socket
 import threading
 import time
-from collections.abc import Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 
-from graspd.drivers.udp.receiver import Endpoint
+import numpy as np
+
+from graspd.drivers.base import FINGERS
+from graspd.drivers.joints import JointMessage
+from graspd.drivers.palm.packet import (
+    CHANNELS,
+    COMMAND_SENSOR_DATA,
+    CYCLE_NS,
+    ROUND,
+    VALID_ALL,
+    Channel,
+    Palm,
+    PalmPacket,
+    TactileSlot,
+)
+from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
+from graspd.drivers.twins.grasps.grasps import Counts
+from graspd.drivers.udp import Endpoint
+
+SENSORS_AT_REST = (
+    *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706),
+    *(1730, 1434, 3060, 1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377),
+    *range(26, 37),
+)
+"""Raw sensor words of a real hand at rest (Shadow's documentation)."""
+HALL_WORDS = 26
+"""Number of these words that get noise of one count."""
+OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
+PAC_COUNT = 2048
+ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
+"""Words of a finger without a sensor, from a real recording; its electrodes are 0."""
+OUTAGE_CYCLES = 500
+"""Cycles that a broken link is silent, half a second; the palm goes on meanwhile."""
+LATER_VERSION_BYTES = 4
+"""Bytes by which packets of a later kind of palm are longer."""
+
+JOINTS = ("FFJ3", "MFJ3", "THJ5")
+JOINT_RATE_HZ = 100.0
+SWING_S = 4.0
+SWING_RAD = 0.2
+MIDDLE_RAD = 0.4
+"""Middle of the swing of a joint, rad; each joint is a little behind the one before."""
 
 BEHIND_MAX_NS = 100_000_000
 """Longest delay, ns, that a sender catches up with; after more, its schedule starts again."""
 
 
-def send_paced(
-    cycles: Iterable[list[bytes]], target: Endpoint, stop: threading.Event, period_ns: int | None
-) -> None:
-    """Send the datagrams of each cycle until `stop` is set; `period_ns` None: without a pause."""
-    with socket.socket(target.family, socket.SOCK_DGRAM) as sender:
-        due_ns = time.monotonic_ns()
-        for datagrams in cycles:
-            if period_ns is not None:
+class DatagramTwin(ABC):
+    """Base of twins that send UDP datagrams at a steady pace."""
+
+    period_ns: int
+    """Time between two cycles, ns."""
+
+    @abstractmethod
+    def cycles(self) -> Iterator[list[bytes]]:
+        """Yield the datagrams of each cycle, with faults of the link."""
+
+    def serve(self, target: str, stop: threading.Event) -> None:
+        """Send to `udp://ADDRESS:PORT` until `stop` is set or the end. Raises `ValueError`."""
+        endpoint = Endpoint.parse(target)
+        with socket.socket(endpoint.family, socket.SOCK_DGRAM) as sender:
+            due_ns = time.monotonic_ns()
+            for datagrams in self.cycles():
                 now_ns = time.monotonic_ns()
                 if now_ns - due_ns > BEHIND_MAX_NS:
                     due_ns = now_ns
                 if due_ns > now_ns:
                     time.sleep((due_ns - now_ns) / 1e9)
-                due_ns += period_ns
-            if stop.is_set():
-                return
-            for datagram in datagrams:
-                sender.sendto(datagram, (target.address, target.port))
+                due_ns += self.period_ns
+                if stop.is_set():
+                    return
+                for datagram in datagrams:
+                    sender.sendto(datagram, (endpoint.address, endpoint.port))
+
+
+class PalmTwin(DatagramTwin):
+    """Send counts, shape (fingers, 24) for each round of 14 packets, as a palm does.
+
+    `stuck_clock`: the palm always answers the same request. Fingers not in `fingers` have no
+    sensor, and their words show it; the words of fingers unplugged by a fault do not.
+    """
+
+    period_ns = CYCLE_NS
+
+    def __init__(
+        self,
+        counts: Iterable[Counts],
+        fingers: Sequence[str] = ("ff", "mf", "th"),
+        *,
+        palm: Palm = Palm.PALM_0220,
+        faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
+        seed: int = 0,
+    ) -> None:
+        """Raises `ValueError` for a fault that datagrams cannot have."""
+        faults.refuse("the palm", "one_byte_at_a_time")
+        self._counts = iter(counts)
+        self._rows = {finger: row for row, finger in enumerate(fingers)}
+        self._palm = palm
+        self._faults = faults
+        self._injector = LinkFaultInjector(faults)
+        self.injected = self._injector.injected
+        """Number of faults by name; `silenced`: packets made while the link was broken."""
+        self._random = np.random.default_rng(seed)
+        self._dead = frozenset(faults.dead_electrodes)
+
+    def packets(self) -> Iterator[PalmPacket]:
+        """Yield the palm's packets, without faults of the link."""
+        for counts in self._counts:
+            for position in range(ROUND):
+                yield self._packet(position, counts)
+
+    def cycles(self) -> Iterator[list[bytes]]:
+        silent = 0
+        for packet in self.packets():
+            if silent:
+                silent -= 1
+                self.injected["silenced"] += 1
+                yield []
+                continue
+            data = packet.to_bytes()
+            if self._faults.wrong_version:
+                data += bytes(LATER_VERSION_BYTES)
+            if self._injector.breaks_here():
+                silent = OUTAGE_CYCLES
+                yield [*self._injector.flush(), data[: len(data) // 2]]
+                continue
+            yield self._injector.spoil(data)
+        yield self._injector.flush()
+
+    def _packet(self, position: int, counts: Counts) -> PalmPacket:
+        sensors = np.array(SENSORS_AT_REST)
+        sensors[:HALL_WORDS] += self._random.integers(-1, 2, HALL_WORDS)
+        asked = 0 if self._faults.stuck_clock else position
+        fitted = sum(1 << FINGERS.index(finger) for finger in self._rows)
+        return PalmPacket(
+            palm=self._palm,
+            command=COMMAND_SENSOR_DATA,
+            sensors=tuple(sensors.tolist()),
+            which_motors=position % 2,
+            tactile_type=2 * asked + 1,
+            tactile_valid=fitted,
+            tactile=tuple(self._slot(finger, asked, counts) for finger in FINGERS),
+        )
+
+    def _slot(self, finger: str, position: int, counts: Counts) -> TactileSlot:
+        first, second = (self._value(finger, channel, counts) for channel in CHANNELS[position])
+        valid = VALID_ALL if finger in self._rows else 0
+        pac_0, pac_1 = (PAC_COUNT + self._random.integers(-12, 13, 2)).tolist() if valid else (0, 0)
+        return TactileSlot(pac_0, pac_1, first, valid, second)
+
+    def _value(self, finger: str, channel: Channel | None, counts: Counts) -> int:
+        row = self._rows.get(finger)
+        absent = row is None or row in self._faults.unplugged_fingers
+        if channel is None:
+            return 0
+        if channel.electrode is None:
+            return (ABSENT_WORDS if absent else OTHER_COUNTS)[channel.name]
+        if row is None or absent or (row, channel.electrode) in self._dead:
+            return 0
+        return int(counts[row, channel.electrode])
+
+
+class JointTwin(DatagramTwin):
+    """Send messages of joints that swing slowly."""
+
+    period_ns = round(1e9 / JOINT_RATE_HZ)
+
+    def __init__(self, faults: LinkFaults = LinkFaults()) -> None:  # noqa: B008 (immutable)
+        """Raises `ValueError` for a fault that datagrams cannot have."""
+        faults.refuse("the joint stream", "burst_frames", "one_byte_at_a_time")
+        faults.refuse("the joint stream", "dead_electrodes", "unplugged_fingers")
+        self._injector = LinkFaultInjector(faults)
+        self.injected = self._injector.injected
+
+    def cycles(self) -> Iterator[list[bytes]]:
+        behind = 0.1 * np.arange(len(JOINTS))
+        for seq in itertools.count():
+            t_s = seq / JOINT_RATE_HZ
+            angles = MIDDLE_RAD + SWING_RAD * np.sin(2.0 * math.pi * t_s / SWING_S - behind)
+            yield self._injector.spoil(JointMessage(seq, t_s, JOINTS, angles).to_bytes())

@@ -173,9 +173,6 @@ class SpiTwin(Opened):
         """Unplug the sensors of these fingers."""
         self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
 
-    def fileno(self) -> int | None:
-        return self._master
-
     def due_ns(self) -> int | None:
         """Return the time of the next sweep, status or plugging in, ns."""
         if self._master is None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.drivers.twins.grasps.grasps import recorded_counts
+from tests.drivers.twins.signals import untouched_counts
 
 
 @pytest.fixture(scope="session")
@@ -17,4 +17,4 @@ def untouched(bts3_dir: Path) -> NDArray[np.uint16]:
     path = bts3_dir.parent / "untouched" / "untouched.csv"
     if not path.is_file():
         pytest.skip("the real recording of an untouched hand is not there")
-    return np.array(list(recorded_counts(path)))
+    return untouched_counts(path)

@@ -1,11 +1,13 @@
-"""What all drivers have in common: counters, fingers, readings."""
+"""What all drivers have in common: counters, fingers, readings, links, words of a BioTac SP."""
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from graspd.drivers.base import (
     ELECTRODES,
@@ -18,17 +20,32 @@ from graspd.drivers.base import (
     TactileReading,
     sensor_rows,
 )
+from graspd.drivers.biotac import (
+    CHANNELS,
+    ERROR_WORDS,
+    FORBIDDEN_COMMAND,
+    PAC,
+    PDC,
+    SEQUENCES,
+    TAC,
+    TDC,
+    channel_of,
+    decode_words,
+    encode_word,
+    sample_command,
+)
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.joints.driver import JointStreamDriver
-from graspd.drivers.joints.message import JointCounters
+from graspd.drivers.joints import JointCounters, JointStreamDriver
+from graspd.drivers.link import Link, LinkState
 from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.recordings.faults import ReplayCounters
 from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.spi.messages import FrameCounters
 from graspd.drivers.spi.sweeps import BridgeCounters
-from graspd.drivers.udp.driver import DatagramCounters
+from graspd.drivers.udp import DatagramCounters
+from tests.kit.clock import Clock
 
 COUNTERS = (
     *(DriverCounters, DatagramCounters, JointCounters, PalmCounters),
@@ -54,25 +71,6 @@ def test_a_row_is_where_the_device_has_the_finger(
     fingers: tuple[str, ...], sensors: tuple[str, ...] | None, rows: tuple[int, ...]
 ) -> None:
     assert sensor_rows(fingers, sensors) == rows
-
-
-@pytest.mark.parametrize(
-    ("fingers", "sensors"),
-    [
-        ((), None),
-        (("ff", "ff"), None),
-        (("ff", "pinky"), None),
-        (("ff",), ()),
-        (("ff",), ("ff", "ff")),
-        (("ff",), ("ff", "pinky")),
-        (("ff", "th"), ("ff", "mf")),
-    ],
-)
-def test_fingers_are_different_ones_of_the_hand_and_of_the_device(
-    fingers: tuple[str, ...], sensors: tuple[str, ...] | None
-) -> None:
-    with pytest.raises(ValueError, match="fingers"):
-        sensor_rows(fingers, sensors)
 
 
 @pytest.mark.parametrize(
@@ -123,3 +121,192 @@ def test_a_link_that_is_closed_says_so_and_reads_nothing(
         driver.read_ready()
     driver.close()
     driver.close()
+
+
+def test_patience_grows_up_to_a_second_and_begins_anew_when_the_link_is_up() -> None:
+    clock = Clock()
+    link = Link("spi")
+    link.start(clock.now_ns)
+    assert link.retry_ns == clock.now_ns
+    waits_s = []
+    for _ in range(2000):  # half an hour
+        link.failed(LinkCause.UNKNOWN, "not there", clock.now_ns)
+        assert link.retry_ns is not None
+        waits_s.append((link.retry_ns - clock.now_ns) / 1e9)
+        assert not link.is_due(link.retry_ns - 1)
+        clock.now_ns = link.retry_ns
+        assert link.is_due(clock.now_ns)
+        assert link.is_due(clock.now_ns + 1)
+    # From 50 ms on, each 1.8 times the one before.
+    first_s = [0.05, 0.09, 0.162, 0.2916, 0.52488, 0.944784, 1.0]
+    assert waits_s == pytest.approx(first_s + [1.0] * (2000 - 7))
+    link.greeting()
+    assert link.is_due(0), "nothing to wait for"
+    link.up("a device", clock.now_ns)
+    link.failed(LinkCause.UNKNOWN, "gone", clock.now_ns)
+    assert link.retry_ns == clock.now_ns + 50_000_000
+
+
+def test_the_journal_says_how_long_a_link_was_down(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link("spi")
+    with caplog.at_level(logging.INFO):
+        link.start(2_000_000_000)
+        link.up("a device", 5_250_000_000)
+        link.failed(LinkCause.UNKNOWN, "gone", 8_000_000_000)
+        link.failed(LinkCause.UNKNOWN, "not there", 8_100_000_000)
+        link.up("a device", 9_000_000_000)
+    assert [r.getMessage() for r in caplog.records if r.levelname == "INFO"] == [
+        "spi: up after 3.25 s: a device",
+        "spi: up after 1.00 s: a device",
+    ]
+
+
+def test_only_a_link_that_was_up_is_lost() -> None:
+    link = Link("spi")
+    link.start(0)
+    link.failed(LinkCause.UNKNOWN, "not there", 0)
+    link.greeting()
+    link.failed(LinkCause.UNKNOWN, "no answer", 0)
+    assert link.losses == 0
+    link.greeting()
+    link.up("a device", 0)
+    assert (link.state, link.reason, link.retry_ns) == (LinkState.UP, None, None)
+    link.failed(LinkCause.UNKNOWN, "gone", 0)
+    assert link.losses == 1
+    assert link.reason == "gone"
+    link.close()
+    assert (link.state, link.retry_ns) == (LinkState.CLOSED, None)
+
+
+def test_a_reason_is_warned_of_once_per_outage(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link("spi")
+    with caplog.at_level(logging.DEBUG):
+        link.start(0)
+        for _ in range(50):
+            link.failed(LinkCause.UNKNOWN, "not there", 0)
+            link.failed(LinkCause.UNKNOWN, "wrong version", 0)
+        link.up("a device", 0)
+        link.failed(LinkCause.UNKNOWN, "not there", 0)
+    warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert warnings == [
+        "spi: not there; trying again",
+        "spi: wrong version; trying again",
+        "spi: not there; trying again",
+    ]
+
+
+def test_reasons_that_never_repeat_do_not_fill_the_journal(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    link = Link("spi")
+    link.start(0)
+    with caplog.at_level(logging.WARNING):
+        for number in range(1000):
+            link.failed(LinkCause.UNKNOWN, f"reason {number}", 0)
+    assert len(caplog.records) == 8
+
+
+# Manual table 7.
+COMMANDS = {
+    **{0: 0x80, 1: 0x83, 2: 0x85, 3: 0x86},
+    **{17: 0xA2, 18: 0xA4, 19: 0xA7, 20: 0xA8, 21: 0xAB, 22: 0xAD, 23: 0xAE, 24: 0xB0},
+    **{25: 0xB3, 26: 0xB5, 27: 0xB6, 28: 0xB9, 29: 0xBA, 30: 0xBC, 31: 0xBF, 32: 0xC1},
+    **{33: 0xC2, 34: 0xC4, 35: 0xC7, 36: 0xC8, 37: 0xCB, 38: 0xCD, 39: 0xCE, 40: 0xD0},
+}
+# Cross-checked with the table of the C library, compiled and run.
+WORDS = """
+0:0101 1:0108 31:01F8 32:0201 63:02F8 64:0401 100:0720 137:0849 500:1FA1 981:3DA8 1000:3E40
+1234:4C91 1760:6E01 2047:7FF8 2048:8001 2602:A251 2815:AEF8 3000:BAC1 3099:C1D9 4000:FB01
+4064:FE01 4094:FEF1 4095:FEF8 2713:A8C8 2391:94B9
+"""
+VECTORS = [
+    (int(count), int(word, 16)) for count, word in (pair.split(":") for pair in WORDS.split())
+]
+
+
+def words(*values: int) -> NDArray[np.uint16]:
+    return np.array(values, dtype=np.uint16)
+
+
+@pytest.mark.parametrize(("channel", "command"), COMMANDS.items())
+def test_a_channel_has_the_command_of_the_manual(channel: int, command: int) -> None:
+    assert sample_command(channel) == command
+    assert channel_of(command) == channel
+
+
+def test_there_are_the_28_channels_of_the_manual_and_no_more() -> None:
+    assert set(CHANNELS) == set(COMMANDS)
+    assert {command for command in range(256) if channel_of(command) is not None} == set(
+        COMMANDS.values()
+    )
+
+
+def test_the_command_that_hangs_a_sensor_is_never_made() -> None:
+    assert FORBIDDEN_COMMAND == 0xA1
+    assert channel_of(0xA1) is None
+    made = []
+    for channel in range(-1, 300):
+        try:
+            made.append(sample_command(channel))
+        except ValueError:
+            assert channel not in COMMANDS
+    assert 0xA1 not in made
+    with pytest.raises(ValueError, match="no channel 16"):
+        sample_command(16)
+
+
+@pytest.mark.parametrize(("count", "word"), VECTORS)
+def test_a_count_has_the_word_of_the_manual(count: int, word: int) -> None:
+    assert encode_word(count) == word
+    counts, faults = decode_words(words(word))
+    assert counts.tolist() == [count]
+    assert faults.tolist() == [0]
+
+
+@pytest.mark.parametrize("count", [-1, 4096])
+def test_a_count_of_more_than_12_bits_has_no_word(count: int) -> None:
+    with pytest.raises(ValueError, match="12-bit"):
+        encode_word(count)
+
+
+def test_every_count_survives_the_way() -> None:
+    counts, faults = decode_words(words(*(encode_word(count) for count in range(4096))))
+    assert counts.tolist() == list(range(4096))
+    assert not faults.any()
+
+
+@pytest.mark.parametrize("word", [0xA52D, 0xA558, 0xA552, 0xA545, 0xA53F, 0xA52E, 0xA55F, 0xA557])
+def test_an_error_word_never_becomes_a_reading(word: int) -> None:
+    assert word in ERROR_WORDS
+    counts, faults = decode_words(words(word))
+    assert faults.tolist() == [ElectrodeFault.ERROR_WORD]
+    assert counts.tolist() == [0]
+    # What a decoder without parity would make of it: a perfectly plausible electrode.
+    assert 2629 <= (word >> 9) * 32 + ((word & 0xFF) >> 3) <= 2635
+
+
+@pytest.mark.parametrize("word", [0x0000, 0xFFFF])
+def test_a_line_that_nothing_drives_is_a_missing_sensor(word: int) -> None:
+    counts, faults = decode_words(words(word))
+    assert faults.tolist() == [ElectrodeFault.MISSING]
+    assert counts.tolist() == [0]
+
+
+def test_one_random_word_in_16_passes_and_never_with_a_flipped_bit() -> None:
+    _, faults = decode_words(np.arange(1 << 16, dtype=np.uint16))
+    assert (faults == 0).mean() == 0.0625
+    good = words(*(encode_word(count) for count in range(4096)))
+    for bit in range(16):
+        counts, faults = decode_words(good ^ np.uint16(1 << bit))
+        assert faults.all()
+        assert not counts.any()
+
+
+def test_sequences_are_those_of_the_manual() -> None:
+    electrodes = list(range(17, 41))
+    assert list(SEQUENCES["electrodes"]) == electrodes
+    assert sorted(SEQUENCES["all"]) == [0, 1, 2, 3, *electrodes]
+    lengths = (SEQUENCES["interleaved"], SEQUENCES["all"], SEQUENCES["electrodes"])
+    assert [len(sequence) for sequence in lengths] == [54, 28, 24]
+    assert set(SEQUENCES["interleaved"][1::2]) == {PAC}
+    assert list(SEQUENCES["interleaved"][::2]) == [*electrodes, PDC, TAC, TDC]

@@ -18,17 +18,17 @@ from hypothesis import strategies as st
 
 from graspd.drivers.base import Reading
 from graspd.drivers.biotac import SEQUENCES
-from graspd.drivers.can.decoders import CanDecoder, make_decoder
 from graspd.drivers.can.formats import CanFormat, SweepFrame, encode_sample
 from graspd.drivers.can.frames import FD, CanFrame
 from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.joints.message import JointMessage, JointStream
+from graspd.drivers.can.stream import CanDecoder, make_decoder
+from graspd.drivers.joints import JointMessage, JointStream
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
 from graspd.drivers.recordings.serial_log import SerialLog, encode_records, parse_records
-from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.driver import LineEvent
 from graspd.drivers.spi.messages import FrameParser, Ping, Sweep, encode
-from graspd.drivers.twins.palm import PalmTwin
+from graspd.drivers.twins.datagrams import PalmTwin
 from tests.drivers.can.can_words import SLOT_NS, word
 from tests.drivers.one_sweep import (
     Step,
@@ -167,7 +167,7 @@ def bridge_log(_first: int) -> Feed:
 
     def feed(event: LineEvent, data: bytes, t_ns: int) -> list[Reading]:
         records = parse_records(FrameParser(), encode_records(event, t_ns, data))
-        return [reading for record in records for reading in log.feed(t_ns, record)]
+        return [reading for record in records for reading in log.feed(*record)]
 
     for nonce in (1, 2):
         feed(LineEvent.SENT, encode(Ping(nonce)), T0)

@@ -11,8 +11,13 @@ import pytest
 
 from graspd.drivers.base import Fact, LinkCause, LinkError, Reading
 from graspd.drivers.link import LinkState
-from graspd.drivers.udp.driver import DatagramCounters, DatagramDriver
-from graspd.drivers.udp.receiver import Datagram, DatagramReceiver, Endpoint
+from graspd.drivers.udp import (
+    Datagram,
+    DatagramCounters,
+    DatagramDriver,
+    DatagramReceiver,
+    Endpoint,
+)
 from tests.drivers.spi.bridge_bench import MS
 from tests.kit.clock import Clock
 
@@ -83,7 +88,7 @@ class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, only_from: str | None = None) -> None:
         self.sockets = [Receiver(3), Receiver(4)]
         waiting = list(self.sockets)
-        monkeypatch.setattr("graspd.drivers.udp.driver.DatagramReceiver", lambda *_: waiting.pop(0))
+        monkeypatch.setattr("graspd.drivers.udp.DatagramReceiver", lambda *_: waiting.pop(0))
         self.clock = Clock()
         self.link = Listener(self.clock, only_from)
         self.link.open()
@@ -268,8 +273,8 @@ def noted(
 ) -> tuple[DatagramReceiver, Kernel]:
     kernel = Kernel()
     kernel.script += script
-    monkeypatch.setattr("graspd.drivers.udp.receiver.socket.socket", lambda *_: kernel)
-    monkeypatch.setattr("graspd.drivers.udp.receiver.time.time_ns", lambda: 5_000_000_010)
+    monkeypatch.setattr("graspd.drivers.udp.socket.socket", lambda *_: kernel)
+    monkeypatch.setattr("graspd.drivers.udp.time.time_ns", lambda: 5_000_000_010)
     return DatagramReceiver(Endpoint("::1", 5700), 100), kernel
 
 

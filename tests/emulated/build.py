@@ -1,4 +1,4 @@
-"""Builds the firmware of the bridge for a Raspberry Pi Pico: the C port and the Arduino sketch."""
+"""Builds the bridge's firmware for a Raspberry Pi Pico, and the emulator, which npm fetches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ BRIDGE: Final = ROOT / "deploy" / "bridge"
 SKETCH: Final = Path(__file__).parent / "firmware" / "sketch.cmake"
 SOURCES: Final = (BRIDGE / "src", BRIDGE / "pico", BRIDGE / "rp2040", SKETCH.parent)
 FOLDER: Final = ROOT / "build" / "pico"
-"""Everything made here, outside of the sources and of git."""
+EMULATOR_FOLDER: Final = ROOT / "build" / "emulated"
+"""Everything made here is in these two, which git does not see."""
 TARGETS: Final[dict[Port, str]] = {"pico": "bridge", "sketch": "sketch"}
 CLOCKS_MHZ: Final = (125, 133, 200)
 COMPILER: Final = "arm-none-eabi-gcc"
@@ -32,6 +33,10 @@ NEEDED: Final = {
     "ninja": "ninja-build",
 }
 """Programs that a build calls, and the Debian packages that have them."""
+EMULATOR: Final = ROOT / "tests" / "emulated" / "emulator"
+HOST: Final = BRIDGE / "host"
+_ADDON: Final = (EMULATOR / "sensors.c", HOST / "sim_sensor.c", HOST / "counts.c")
+_PARTS: Final = (EMULATOR / "package-lock.json", *_ADDON, HOST / "sim_sensor.h", HOST / "counts.h")
 SUBSET: Final = "pico-sdk-*-subset.tar.xz"
 RAM: Final = range(0x20000000, 0x20042000)
 """Addresses of the RP2040's RAM (datasheet section 2.6.2)."""
@@ -169,3 +174,43 @@ def _run(*command: str | Path) -> None:
     if done.returncode != 0:
         told = (done.stdout + done.stderr).splitlines()[-40:]
         raise BuildError("\n".join([f"{command[0]}:", *(line[:300] for line in told)]))
+
+
+def missing() -> str | None:
+    """Why nothing can be emulated here, in one line, or None."""
+    absent = [command for command in ("node", "npm", "cc") if shutil.which(command) is None]
+    if absent:
+        return f"no {', '.join(absent)} for the emulated chip"
+    try:
+        check_tools()
+    except MissingError as error:
+        return f"{error}, for the emulated chip"
+    if shared_dir() is None:
+        return "no pico-sdk and boot ROM (shared/pico beside the project), for the emulated chip"
+    return None
+
+
+def boot_rom() -> Path:
+    """The RP2040's boot ROM. Raises `MissingError`."""
+    shared = shared_dir()
+    if shared is None:
+        raise MissingError("no boot ROM of the RP2040")
+    return shared / "bootrom_b1.bin"
+
+
+def emulator_folder() -> Path:
+    """The folder with `node_modules` and `sensors.node`, made if anything that it is of changed."""
+    digest = hashlib.sha256(b"".join(part.read_bytes() for part in _PARTS)).hexdigest()
+    folder = EMULATOR_FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    made = folder / "made_of"
+    with _alone(folder / "lock"):
+        if not made.is_file() or made.read_text() != digest:
+            for name in ("package.json", "package-lock.json"):
+                shutil.copy(EMULATOR / name, folder)
+            _run("npm", "--prefix", folder, "ci", "--no-audit", "--no-fund")
+            headers = folder / "node_modules" / "node-api-headers" / "include"
+            flags = ("-O2", "-shared", "-fPIC", "-std=c99", "-D_XOPEN_SOURCE=700", f"-I{headers}")
+            _run("cc", *flags, f"-I{HOST}", *_ADDON, "-o", folder / "sensors.node")
+            made.write_text(digest)
+    return folder

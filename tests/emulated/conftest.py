@@ -10,7 +10,7 @@ import pytest
 from tests.drivers.spi.conftest import bridge_folder, bridge_program, start_bridge
 from tests.emulated.board import Board
 from tests.emulated.build import image as build_image
-from tests.emulated.tools import missing
+from tests.emulated.build import missing
 
 __all__ = ["bridge_folder", "bridge_program", "start_bridge"]
 

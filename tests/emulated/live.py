@@ -18,8 +18,7 @@ from pathlib import Path
 
 from tests.drivers.spi.bridge_c import START, STOP, frame
 from tests.emulated.board import MS, Board
-from tests.emulated.build import image
-from tests.emulated.tools import missing
+from tests.emulated.build import image, missing
 
 NEEDS = (
     "It needs node, npm, cc, cmake, ninja, gcc-arm-none-eabi, and the pico-sdk and boot ROM in "

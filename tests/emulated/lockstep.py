@@ -10,8 +10,7 @@ from pathlib import Path
 
 from graspd.drivers.base import TactileReading
 from graspd.drivers.link import LinkState
-from graspd.drivers.spi.driver import SpiBridgeDriver
-from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.driver import LineEvent, SpiBridgeDriver
 from tests.drivers.spi.bridge_c import START, frame
 from tests.emulated.board import MS, Board
 

@@ -22,7 +22,7 @@ from graspd.drivers.recordings.can_log import line_of
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from graspd.drivers.recordings.serial_log import encode_records
 from graspd.drivers.spi.conversation import Conversation
-from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.driver import LineEvent
 from graspd.drivers.spi.messages import (
     DIGEST,
     FrameParser,
@@ -34,9 +34,9 @@ from graspd.drivers.spi.messages import (
     encode,
 )
 from graspd.drivers.twins.can import CanTwin
+from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
-from graspd.drivers.twins.palm import PalmTwin
 from graspd.models.contract import Finger
 from tests.kit.clock import Clock
 

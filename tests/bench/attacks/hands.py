@@ -18,8 +18,8 @@ from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.scene import load as load_scene
 from graspd.daemon.session.file import SessionFile, kept_now, load
 from graspd.drivers.spi.messages import Hello
+from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
-from graspd.drivers.twins.palm import PalmTwin
 from graspd.drivers.twins.spi import SpiTwin
 from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import SEED, STOP_S, Subscriber, held_grasp, running, spi_section

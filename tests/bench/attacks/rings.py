@@ -18,7 +18,7 @@ import numpy as np
 
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.publish.messages import Verdict
-from graspd.drivers.joints.message import JointMessage
+from graspd.drivers.joints import JointMessage
 from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ

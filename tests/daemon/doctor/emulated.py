@@ -19,14 +19,13 @@ from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Finding, Level
 from graspd.drivers.base import Driver, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
-from graspd.drivers.joints.driver import JointStreamDriver
+from graspd.drivers.joints import JointStreamDriver
 from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.twins.datagrams import JointTwin, PalmTwin
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
-from graspd.drivers.twins.joints import JointTwin
-from graspd.drivers.twins.palm import PalmTwin
 from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.can.can_standin import StampingTwin, channel
 from tests.kit.clock import Clock

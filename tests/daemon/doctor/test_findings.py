@@ -16,7 +16,7 @@ from graspd.daemon.doctor.link import COUNTERS, counter_findings, device_finding
 from graspd.daemon.record.player import McapCounters
 from graspd.drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
 from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.joints.message import JointCounters
+from graspd.drivers.joints import JointCounters
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.recordings.faults import ReplayCounters
 from graspd.drivers.spi.sweeps import BridgeCounters

@@ -14,8 +14,8 @@ from graspd.drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
 from graspd.drivers.palm.packet import ROUND
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
+from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.faults import LinkFaults
-from graspd.drivers.twins.palm import PalmTwin
 from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.fault_bench import Fault, Step
 from tests.drivers.one_sweep import tactile

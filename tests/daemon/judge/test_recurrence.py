@@ -18,10 +18,10 @@ from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.palm.packet import ROUND, PalmPacket
 from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
-from graspd.drivers.twins.palm import PalmTwin
 from tests.daemon.fakes import FINGERS, MS, Clock, sound
 from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm

@@ -32,7 +32,7 @@ NEVER = {
     "difflib",
 } | ours(
     *("models.training", "models.onnx_file", "drivers.twins", "drivers.recordings.can_log"),
-    *("drivers.recordings.serial_log", "drivers.recordings.link_log_player"),
+    "drivers.recordings.serial_log",
     *("daemon.measure.candidates", "daemon.measure.error_vs_time", "daemon.measure.stability"),
     *("daemon.measure.streams", "daemon.measure.worth", "daemon.measure.cost"),
     *("daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
@@ -46,12 +46,12 @@ BUSES = {
     "replay": ours(
         *(f"drivers.recordings.{name}" for name in ("csv_player", "csv_rows", "faults"))
     ),
-    "spi": {"serial", "cobs"} | ours("drivers.spi.driver", "drivers.spi.line"),
+    "spi": {"serial", "cobs"} | ours("drivers.spi.driver"),
     "can": {"can", "asyncio", "sqlite3"} | ours("drivers.can.driver", "drivers.can.bus"),
     "palm": ours("drivers.palm.driver", "drivers.palm.packet"),
 }
 """Modules that only this driver needs; python-can brings asyncio and sqlite3."""
-JOINTS = ours("daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message")
+JOINTS = ours("daemon.judge.joint_motion", "drivers.joints")
 HALL = ours("drivers.palm.calibration")
 GATE = ours(*(f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")))
 STATISTICS = ours("daemon.judge.calibration", "models.session_statistics")
@@ -62,7 +62,7 @@ FORBIDDEN = {
     # The demo's recording has joints; nothing is kept of a replay.
     "demo": {
         *(BUSES["spi"] | BUSES["can"] | BUSES["palm"] | HALL | KEPT | ASK),
-        "graspd.drivers.joints.driver",
+        "graspd.drivers.joints",
     },
     "spi": BUSES["replay"] | BUSES["can"] | BUSES["palm"] | JOINTS | HALL | ASK,
     "can": BUSES["replay"] | BUSES["spi"] | BUSES["palm"] | JOINTS | HALL | ASK,
@@ -200,7 +200,7 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     found = measured(written(tmp_path, text))
     parts = {part["name"]: part for part in found["parts"]}
     assert HALL | ASK | {"graspd.daemon.judge.joint_motion"} <= set(found["modules"])
-    others = {"graspd.drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}
+    others = {"graspd.drivers.joints", *BUSES["spi"], *BUSES["can"]}
     assert below(others, found["modules"]) == []
     assert parts["sockets"]["threads"] == ZMQ_THREADS + 1
     assert parts["sockets"]["descriptors"] == SOCKET + ASK_SOCKET

@@ -19,7 +19,7 @@ import numpy as np
 
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.messages import Verdict
-from graspd.drivers.joints.message import JointMessage
+from graspd.drivers.joints import JointMessage
 from graspd.drivers.twins.spi import SpiTwin
 from tests.bench.live import Subscriber, held_grasp, running, spi_section
 from tests.daemon.processes import before_others

@@ -14,13 +14,15 @@ import pytest
 
 from graspd.drivers.base import TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
-from graspd.drivers.can.formats import encode_sample
-from graspd.drivers.can.frames import CanFrame
+from graspd.drivers.can.formats import CanFormat, SweepFrame, encode_sample
+from graspd.drivers.can.frames import FD, CanFrame
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.stream import CanDecoder, make_decoder
 from graspd.drivers.kernel_stamps import SO_TIMESTAMPNS
 from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
-from tests.drivers.can.can_words import pack_frame, samples
+from tests.drivers.can.can_words import pack_frame, samples, truth, word
 from tests.drivers.one_sweep import tactile
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
@@ -173,3 +175,37 @@ class TwinLink:
             self.readings += tactile(self.driver.read_ready())
         assert twin.unsent == 0
         return twin
+
+
+def decoder(
+    frame_format: CanFormat, arbitration_id: int | None = SAMPLE_ID, **options: int
+) -> tuple[CanDecoder, CanCounters]:
+    counters = CanCounters()
+    made = make_decoder(
+        ("ff", "mf", "th"),
+        counters,
+        format=frame_format,
+        arbitration_id=arbitration_id,
+        sequence="electrodes",
+        data_length=options.get("data_length"),
+    )
+    return made, counters
+
+
+def sweep_frames(frame_format: CanFormat, sweep: int) -> list[CanFrame]:
+    """Undamaged frames of one sweep."""
+    if frame_format is CanFormat.SYNTOUCH:
+        return sweep_of_frames(sweep)
+    return [
+        CanFrame(
+            SAMPLE_ID + finger,
+            SweepFrame(
+                finger,
+                sweep % (1 << 16),
+                10_000 * sweep,
+                b"".join(word(int(count)) for count in truth(sweep)[row]),
+            ).to_bytes(),
+            FD,
+        )
+        for row, finger in enumerate((0, 1, 4))
+    ]

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
+import numpy as np
 import pytest
 
-from graspd.drivers.base import TactileReading
+from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.can.formats import CanFormat, SweepFrame, SweepStatus, encode_sample
 from graspd.drivers.can.frames import EXTENDED, FD, CanFrame
-from tests.drivers.can.can_fuzz import SAMPLE_ID, decoder
+from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.stream import make_decoder
+from graspd.drivers.twins.can import SAMPLE_ID
+from tests.drivers.can.can_standin import decoder
 from tests.drivers.can.can_words import samples, truth, word
 from tests.drivers.can.test_can_formats import E1_SAMPLE, SWEEP_EXAMPLE
 
@@ -109,6 +115,55 @@ def test_a_board_that_pads_its_frames_is_read_when_told_so() -> None:
         readings += made.push(CanFrame(SAMPLE_ID, encode_sample(channel, words) + b"\x55"), t_ns)
     assert (readings[0].counts == truth(0)).all()
     assert counters.faulty_readings == 0
+
+
+ORDER = ("th", "ff", "mf")
+"""The board's sensors: its first word is the thumb's."""
+
+
+def with_sensors(
+    fingers: Sequence[str], spoilt: Mapping[int, bytes] | None = None
+) -> tuple[list[TactileReading], CanCounters]:
+    """What becomes of two sweeps of `ORDER`. `spoilt`: words of channels of the first sweep."""
+    counters = CanCounters()
+    made = make_decoder(
+        fingers, counters, sensors=ORDER, arbitration_id=SAMPLE_ID, sequence="electrodes"
+    )
+    changed = [(at, (spoilt or {}).get(at, words), t_ns) for at, words, t_ns in samples(0)]
+    readings: list[TactileReading] = []
+    for channel, words, t_ns in (*changed, *samples(1)):
+        readings += made.push(CanFrame(SAMPLE_ID, encode_sample(channel, words)), t_ns)
+    assert (len(readings), counters.wrong_length_frames, counters.lost_frames) == (2, 0, 0)
+    return readings, counters
+
+
+@pytest.mark.parametrize("fingers", [("ff", "mf", "th"), ("th", "ff", "mf"), ("mf", "th"), ("ff",)])
+def test_rows_are_fingers_and_words_are_sensors(fingers: Sequence[str]) -> None:
+    readings, _ = with_sensors(fingers)
+    rows = [ORDER.index(finger) for finger in fingers]
+    for sweep, reading in enumerate(readings):
+        assert not reading.faults.any()
+        assert (reading.counts == truth(sweep)[rows]).all()
+
+
+@pytest.mark.parametrize(("fingers", "flagged"), [(("ff", "mf", "th"), [[2, 4]]), (("ff",), [])])
+def test_a_damaged_word_is_flagged_at_its_finger_only(
+    fingers: Sequence[str], flagged: list[list[int]]
+) -> None:
+    channel, words, _ = samples(0)[4]
+    readings, counters = with_sensors(fingers, {channel: bytes([words[0] ^ 1]) + words[1:]})
+    assert np.argwhere(readings[0].faults == ElectrodeFault.PARITY).tolist() == flagged
+    assert np.count_nonzero(readings[0].faults) == len(flagged)
+    assert counters.parity_words == counters.faulty_readings == len(flagged)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "says"),
+    [(("ff", "mf"), "not in"), (("ff", "mf", "th", "rf"), "9 bytes cannot carry 4 sensors")],
+)
+def test_sensors_that_cannot_be_are_refused(sensors: Sequence[str], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        make_decoder(("ff", "mf", "th"), CanCounters(), sensors=sensors)
 
 
 def test_a_tick_that_stands_and_a_sweep_that_began_late_are_counted() -> None:

@@ -1,20 +1,32 @@
-"""The CAN twin: what it refuses, how it paces, and how it says that it cannot work here."""
+"""The CAN twin, and the CAN bridge against it: count for count, fault for fault."""
 
 from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import can
 import pytest
 
-from graspd.drivers.base import DriverError, TactileReading
+from graspd.drivers.base import DriverError, ElectrodeFault, LinkError, TactileReading
+from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.can.formats import CanFormat
+from graspd.drivers.link import LinkState
 from graspd.drivers.twins.can import CanTwin
 from graspd.drivers.twins.faults import LinkFaults
-from tests.drivers.can.can_standin import bridge, channel
+from graspd.drivers.twins.grasps.grasps import Counts
+from tests.drivers.can.can_standin import (
+    TwinLink,
+    bridge,
+    channel,
+    contact,
+    message,
+    sweep_messages,
+)
+from tests.drivers.can.can_words import truth
 from tests.drivers.one_sweep import tactile
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
@@ -26,7 +38,6 @@ MS = 1_000_000
     "options",
     [
         {"format": "brand_new"},
-        {"sequence": "backwards"},
         {"rate_hz": 0.0},
         {"rate_hz": 1e6},
         {"faults": LinkFaults(one_byte_at_a_time=True)},
@@ -94,3 +105,173 @@ def test_packages_are_named_as_they_are_installed(
     monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", refuse)
     with pytest.raises(DriverError, match=f"-m pip install {package}$"):
         CanTwin("slcan", "/dev/null", iter(())).open()
+
+
+FORMATS = list(CanFormat)
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+@pytest.mark.parametrize(
+    "faults",
+    [
+        LinkFaults(drop_probability=0.02),
+        LinkFaults(duplicate_probability=0.05),
+        LinkFaults(reorder_probability=0.05),
+        LinkFaults(burst_frames=6),
+        LinkFaults(disconnect_every_frames=50),
+    ],
+    ids=["drop", "duplicate", "reorder", "burst", "disconnect"],
+)
+def test_link_faults_are_counted_one_by_one_and_invent_nothing(
+    frame_format: str, faults: LinkFaults
+) -> None:
+    link = TwinLink(frame_format)
+    before, during, after = contact(2, 1), contact(200, 2), contact(2, 3)
+    with link.driver:
+        link.send(before)
+        twin = link.send(during, faults)
+        link.send(after)
+    injected, counters = twin.injected, link.driver.counters
+    sent = [*before, *during, *after]
+    assert_only_what_was_sent(link.readings, sent)
+    assert [reading.seq for reading in link.readings] == list(range(len(sent)))
+    late = counters.late_frames
+    assert counters.duplicate_frames == injected["duplicate"]
+    assert counters.lost_frames == injected["drop"] + injected["disconnect"] + late
+    assert counters.reordered_frames + late == injected["reorder"]
+    assert counters.faulty_readings == sum(bool(r.faults.any()) for r in link.readings)
+    assert injected.total() > 10
+    assert_same_tail(link.readings, after)
+
+
+def assert_only_what_was_sent(readings: Sequence[TactileReading], sent: Sequence[Counts]) -> None:
+    """Every sound electrode holds the count of its own sweep."""
+    for reading in readings:
+        sound = reading.faults == 0
+        assert (reading.counts[sound] == sent[reading.seq][sound]).all()
+
+
+def assert_same_tail(readings: Sequence[TactileReading], counts: Sequence[Counts]) -> None:
+    for reading, expected in zip(readings[-len(counts) :], counts, strict=True):
+        assert not reading.faults.any()
+        assert (reading.counts == expected).all()
+
+
+def test_flipped_bits_are_counted_and_never_become_counts() -> None:
+    link = TwinLink("syntouch")
+    sent = contact(300)
+    with link.driver:
+        link.send(sent[:2])
+        twin = link.send(sent[2:298], LinkFaults(bit_flip_probability=0.05))
+        link.send(sent[298:])
+    counters = link.driver.counters
+    words = counters.parity_words + counters.error_words + counters.unplugged_words
+    assert words + counters.unknown_commands == twin.injected["bit_flip"] > 100
+    assert counters.lost_frames == counters.unknown_commands
+    assert_only_what_was_sent(link.readings, sent)
+    assert_same_tail(link.readings, sent[298:])
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+def test_an_unplugged_sensor_is_missing_and_the_others_are_not(frame_format: str) -> None:
+    link = TwinLink(frame_format)
+    with link.driver:
+        link.send(contact(20), LinkFaults(unplugged_fingers=(1,)))
+    assert len(link.readings) == 20
+    for reading, expected in zip(link.readings, contact(20), strict=True):
+        assert (reading.faults[1] != 0).all()
+        assert not reading.counts[1].any()
+        assert not reading.faults[[0, 2]].any()
+        assert (reading.counts[[0, 2]] == expected[[0, 2]]).all()
+    assert link.driver.counters.unplugged_words == 20 * 24
+
+
+def test_a_stuck_clock_is_counted() -> None:
+    link = TwinLink("sweep_fd")
+    with link.driver:
+        link.send(contact(5), LinkFaults(stuck_clock=True))
+    assert link.driver.counters.stuck_ticks == 3 * 4
+    assert not link.readings[0].faults.any()
+    assert len(link.readings) == 5
+    assert all((reading.faults == ElectrodeFault.HELD).all() for reading in link.readings[1:])
+
+
+def assert_same(readings: Sequence[TactileReading], counts: Sequence[Counts]) -> None:
+    assert [reading.seq for reading in readings] == list(range(len(counts)))
+    assert_same_tail(readings, counts)
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+def test_every_sweep_arrives_count_for_count(frame_format: str, sequence: str) -> None:
+    counts = contact(200)
+    link = TwinLink(frame_format, sequence)
+    with link.driver:
+        link.send(counts)
+        assert_same(link.readings, counts)
+        assert link.driver.period_ns == pytest.approx(10 * MS, abs=1000)
+        assert link.driver.stream.link.state is LinkState.UP
+        assert link.driver.counters.missed_readings == 0
+        assert link.driver.counters.frames == link.driver.counters.accepted_frames
+
+
+def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
+    where = channel()
+    ours = sweep_messages()
+    strange: list[tuple[can.Message, str]] = [
+        (message(bytes(ours[5].data), is_extended_id=True), "foreign_frames"),
+        (message(), "wrong_length_frames"),
+        (message(is_remote_frame=True), "remote_frames"),
+        (message(bytes(8), 0x80, is_error_frame=True), "error_frames"),
+        (message(bytes(range(64)), is_fd=True), "malformed_frames"),
+    ]
+    clock = Clock()  # a stalled machine would cut the sweep
+    driver = bridge(where, clock=clock, wall_clock=clock)
+    with driver, can.Bus(interface="virtual", channel=where, ignore_config=True) as bus:
+        for at, (sent, _) in enumerate(strange):
+            bus.send(ours[at])
+            bus.send(sent)
+        for sent in ours[len(strange) :]:
+            bus.send(sent)
+        (reading,) = tactile(driver.read_ready())
+        assert (reading.counts == truth(0)).all()
+        assert not reading.faults.any()
+        counted = driver.counters.as_dict()
+        names = [name for _, name in strange]
+        assert {name: counted[name] for name in names} == {
+            name: names.count(name) for name in names
+        }
+        assert counted["frames"] == len(ours) + len(strange)
+        assert driver.stream.link.state is LinkState.UP
+        assert driver.stream.last_error == "bus error"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"format": "brand_new"},
+        {"fingers": ("ff", "mf", "rf", "th")},
+        {"data_length": 6},
+        {"data_length": 9},
+        {"format": "sweep_fd", "data_length": 7},
+        {"format": "sweep_fd", "arbitration_id": 0x7FC},
+        {"data_bitrate": 5_000_000},
+        {"format": "sweep_fd", "data_bitrate": 5_000_000},
+    ],
+)
+def test_arguments_out_of_range_are_refused(options: Mapping[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        CanBridgeDriver("virtual", "x", **options)
+
+
+def test_a_bit_rate_that_socketcan_would_ignore_is_refused() -> None:
+    with pytest.raises(ValueError, match="ip link set"):
+        CanBridgeDriver("socketcan", "can0", bitrate=1_000_000)
+
+
+def test_an_interface_that_python_can_does_not_have_is_no_matter_of_trying_again() -> None:
+    driver = CanBridgeDriver("carrier_pigeon", "x")
+    with pytest.raises(DriverError, match="carrier_pigeon") as raised:
+        driver.open()
+    assert not isinstance(raised.value, LinkError)
+    assert driver.stream.link.state is LinkState.CLOSED

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from graspd.drivers.joints.driver import JointStreamDriver
+from graspd.drivers.joints import JointStreamDriver
 from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.palm.packet import Palm, PalmCounters, PalmPacket
 from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.grasps.grasps import Counts
-from graspd.drivers.twins.palm import PalmTwin
-from graspd.drivers.udp.receiver import Datagram, DatagramReceiver
+from graspd.drivers.udp import Datagram, DatagramReceiver
 from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 

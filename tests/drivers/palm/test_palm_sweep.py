@@ -12,8 +12,8 @@ import pytest
 from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.palm.packet import PalmPacket
 from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.faults import LinkFaults
-from graspd.drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import (
     FINGERS,
     MS,

@@ -132,10 +132,6 @@ BAD_FILES = {
         GOOD + b"apple,0,12",
         "line 4: the row has 3 cells, the header 74; the file ends here without a line end",
     ),
-    "long line": (
-        GOOD + b"7" * (LINE_BYTES_MAX + 1) + b"\n",
-        "line 4: the line is longer than 65536 bytes",
-    ),
     "no line ends": (b"7," * LINE_BYTES_MAX, "line 1: the line is longer than 65536 bytes"),
     "old Mac line ends": (GOOD.replace(b"\n", b"\r"), "line 1: this is not CSV: new-line"),
     "open quote": (GOOD.replace(b"thing_1", b'"thing_1'), "line 3: this is not CSV: unexpected"),
@@ -179,10 +175,9 @@ def test_what_is_no_recording_is_refused_with_file_line_and_column(
 
 @pytest.mark.parametrize("label", ["", "2", "true", "0.0", "01", "\u0661"])
 def test_a_label_is_0_or_1(label: str) -> None:
-    with pytest.raises(RecordingError, match=r"line 3, column slipped: .* is not a label") as error:
+    told = rf"line 3, column slipped: {re.escape(repr(label))} is not a label"
+    with pytest.raises(RecordingError, match=told):
         rows_of(table(2, {1: {"slipped": label}}))
-    assert repr(label) in str(error.value)
-    assert (error.value.line, error.value.column) == (3, "slipped")
 
 
 @pytest.mark.parametrize("t", ["nan", "-inf", "", "1e999", "1_0", "\u0661"])
@@ -312,9 +307,9 @@ def test_a_value_that_is_no_count_makes_its_electrode_faulty(cell: str) -> None:
     assert row.counts[1, 2] == count(1, 26)
     assert not before.faults.any()
     assert not after.faults.any()
-    with pytest.raises(RecordingError, match=r"is not a count, an integer in 0..4095") as caught:
+    told = r"line 3, column mf_biotac_2: .* is not a count, an integer in 0..4095"
+    with pytest.raises(RecordingError, match=told):
         rows_of(content, strict=True)
-    assert (caught.value.line, caught.value.column) == (3, "mf_biotac_2")
 
 
 @pytest.mark.parametrize(("cell", "expected"), COUNTS.items())

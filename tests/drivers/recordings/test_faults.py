@@ -204,8 +204,3 @@ def test_the_largest_word_that_is_a_count_is_4095() -> None:
         injector.inject(counts, flags)
         largest = max(largest, int(counts.max()))
     assert largest == 4095
-
-
-def test_a_fault_of_a_finger_that_does_not_play_is_refused() -> None:
-    with pytest.raises(ValueError, match="faults name finger rf, the run has ff, mf"):
-        ReplayDriver([DEMO_TABLE], ("ff", "mf"), faults=ReplayFaults(fingers=("rf",)))

@@ -1,27 +1,36 @@
-"""Logged frames and bytes come back as they were; damage costs what is damaged and no more."""
+"""Link logs and palm packets play as they were; damage costs what is damaged and no more."""
 
 from __future__ import annotations
 
 import io
+import os
+from collections.abc import Generator
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.drivers.base import RecordingError, TactileReading
+from graspd.drivers.base import JointReading, RecordingError, TactileReading
 from graspd.drivers.biotac import sample_command
 from graspd.drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
+from graspd.drivers.palm.packet import Palm
 from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
+from graspd.drivers.recordings.palm_file import PalmFile
+from graspd.drivers.recordings.player import RecordedDriver
 from graspd.drivers.recordings.serial_log import (
+    Record,
     SerialLog,
-    SerialRecord,
     encode_records,
     parse_records,
 )
-from graspd.drivers.spi.line import LineEvent
+from graspd.drivers.spi.driver import LineEvent
 from graspd.drivers.spi.messages import FrameParser
+from graspd.drivers.twins.datagrams import PalmTwin
+from tests.drivers.one_sweep import tactile
+from tests.drivers.palm.palm_stream import MS, datagrams, rows
 from tests.kit.clock import Clock
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -100,18 +109,18 @@ def test_no_text_makes_the_line_parser_raise(text: str) -> None:
     frame_of(text)
 
 
-records = st.builds(
-    SerialRecord, st.sampled_from(LineEvent), st.integers(0, 2**64 - 1), st.binary(max_size=900)
+records = st.tuples(
+    st.integers(0, 2**64 - 1), st.tuples(st.sampled_from(LineEvent), st.binary(max_size=900))
 )
 
 
-def encoded(found: list[SerialRecord]) -> bytes:
-    return b"".join(encode_records(record.event, record.t_ns, record.data) for record in found)
+def encoded(made: list[tuple[int, Record]]) -> bytes:
+    return b"".join(encode_records(event, t_ns, data) for t_ns, (event, data) in made)
 
 
 @given(st.lists(records, max_size=10), st.integers(1, 50))
 def test_records_come_back_however_the_file_is_cut_into_chunks(
-    made: list[SerialRecord], size: int
+    made: list[tuple[int, Record]], size: int
 ) -> None:
     data = encoded(made)
     parser = FrameParser()
@@ -130,14 +139,14 @@ def test_records_come_back_however_the_file_is_cut_into_chunks(
 @given(st.binary(min_size=961, max_size=2000))
 def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
     found = list(parse_records(FrameParser(), encode_records(LineEvent.RECEIVED, 5, data)))
-    assert b"".join(record.data for record in found) == data
-    assert max(len(record.data) for record in found) == 960
-    assert {(record.event, record.t_ns) for record in found} == {(LineEvent.RECEIVED, 5)}
+    assert b"".join(piece for _, (_, piece) in found) == data
+    assert max(len(piece) for _, (_, piece) in found) == 960
+    assert {(t_ns, event) for t_ns, (event, _) in found} == {(5, LineEvent.RECEIVED)}
 
 
 @given(st.lists(records, min_size=3, max_size=6), st.data())
 def test_damage_costs_the_record_that_is_damaged_and_the_one_after_it_at_most(
-    made: list[SerialRecord], data: st.DataObject
+    made: list[tuple[int, Record]], data: st.DataObject
 ) -> None:
     whole = bytearray(encoded(made))
     at = data.draw(st.integers(0, len(whole) - 1))
@@ -160,10 +169,6 @@ def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content:
     for driver in (CanLog([path], fingers), SerialLog([path], fingers)):
         with pytest.raises(RecordingError, match="nothing that came over a link"), driver:
             pass
-    for speed in (0.0, -1.0, float("nan")):
-        with pytest.raises(ValueError, match="positive speed"):
-            CanLog([path], fingers, speed=speed)
-    CanLog([path], fingers, speed=0.5)
 
 
 @pytest.mark.parametrize(("length", "taken"), [(256, True), (257, False)])
@@ -214,3 +219,148 @@ def test_a_link_log_plays_at_its_own_pace_times_speed(tmp_path: Path) -> None:
     with CanLog([path], fingers, sequence="electrodes", clock=clock) as driver:
         assert len([reading for _ in range(7) for reading in driver.read_ready()]) == 7
         assert driver.period_ns == 24 * 400_000
+
+
+RECORDED_NS = (500 * MS, 510 * MS, 530 * MS)
+
+
+class Player(RecordedDriver[str]):
+    def __init__(self, speed: float | None, clock: Clock, delay_ns: int = 0) -> None:
+        super().__init__([Path("x.csv")], speed, clock, delay_ns=delay_ns)
+
+    def open(self) -> None:
+        self.start(items())
+
+
+def items() -> Generator[tuple[int, str], None, None]:
+    yield from ((at_ns, f"at {at_ns // MS}") for at_ns in RECORDED_NS)
+
+
+@pytest.mark.parametrize(("speed", "steps_ms"), [(1.0, [0, 10, 30]), (2.0, [0, 5, 15])])
+@pytest.mark.parametrize("delay_ms", [0, 7])
+def test_items_are_due_as_recorded_over_the_speed(
+    speed: float, steps_ms: list[int], delay_ms: int
+) -> None:
+    clock = Clock()
+    player = Player(speed, clock, delay_ms * MS)
+    player.open()
+    assert player.due_ns() == clock.now_ns, "the first one begins the run"
+    began_ns = clock.now_ns
+    assert (player.take() is None) == (delay_ms > 0)
+    for at_ns, step_ms in list(zip(RECORDED_NS, steps_ms, strict=True))[0 if delay_ms else 1 :]:
+        due_ns = began_ns + (step_ms + delay_ms) * MS
+        assert player.due_ns() == due_ns
+        clock.now_ns = due_ns - 1
+        assert player.take() is None
+        clock.now_ns = due_ns + 2
+        assert player.take() == (at_ns, f"at {at_ns // MS}", 2)
+        assert player.played_ns(at_ns) == began_ns + step_ms * MS
+    assert player.exhausted
+    assert player.due_ns() is None
+
+
+def test_without_a_speed_all_is_due_at_once_and_keeps_its_recorded_times() -> None:
+    clock = Clock()
+    player = Player(None, clock)
+    player.open()
+    taken = [player.take() for _ in RECORDED_NS]
+    assert [at_ns for at_ns, _, _ in filter(None, taken)] == list(RECORDED_NS)
+    assert [player.played_ns(at_ns) - clock.now_ns for at_ns in RECORDED_NS] == [
+        *(0, 10 * MS, 30 * MS),
+    ]
+    assert player.exhausted
+
+
+def test_a_reading_is_handed_over_as_old_as_it_was() -> None:
+    clock = Clock()
+    player = Player(None, clock)
+    clock.now_ns += 5 * MS
+    made = JointReading(480 * MS, 3, (), np.zeros(0))
+    given = player.hand_over(made, 500 * MS, 100 * MS)
+    assert (given.t_ns, given.recorded_ns) == (clock.now_ns - 20 * MS, 380 * MS)
+    assert player.hand_over(made, 500 * MS).recorded_ns == 480 * MS
+    assert player.handed_over_ns == clock.now_ns
+
+
+def test_an_error_waits_until_what_is_before_it_was_taken() -> None:
+    def broken() -> Generator[tuple[int, str], None, None]:
+        yield 0, "first"
+        raise RecordingError("x.csv", "no more")  # type: ignore[arg-type]
+
+    player = Player(None, Clock())
+    with pytest.raises(RuntimeError, match="not open"):
+        player.take()
+    player.start(broken())
+    assert player.take() == (0, "first", 0)
+    assert not player.exhausted
+    with pytest.raises(RecordingError, match="no more"):
+        player.take()
+    assert player.exhausted
+
+
+@pytest.mark.parametrize(("palm", "appended"), [(Palm.PALM_0220, bytes(12)), (Palm.PALM_0250, b"")])
+def test_a_file_of_packets_plays_count_for_count(
+    tmp_path: Path, palm: Palm, appended: bytes
+) -> None:
+    twin = PalmTwin(rows(40), palm=palm)
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(packet.to_bytes() + appended for packet in twin.packets()) + bytes(5))
+    readings = []
+    clock = Clock()
+    with PalmFile(path, clock=clock) as driver:
+        while not driver.exhausted:
+            clock.now_ns = driver.due_ns() or clock.now_ns
+            readings += tactile(driver.read_ready())
+        assert driver.stream.counters.bad_lengths == 1  # the file ends in the middle of a packet
+        assert driver.due_ns() is None
+    assert np.array_equal([reading.counts for reading in readings], rows(40))
+
+
+@pytest.mark.parametrize(
+    ("good", "nonsense", "plays"),
+    # One packet and 20 bytes may be a packet with a CAN record (12 bytes) and 8 bytes.
+    [(14, 14 * 220, True), (13, 15 * 220, False), (1, 12, True), (1, 20, False)],
+)
+def test_half_of_the_packets_of_a_file_make_sense_and_with_one_length(
+    tmp_path: Path, good: int, nonsense: int, plays: bool
+) -> None:
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(datagrams(1)[:good]) + bytes(nonsense))
+    driver = PalmFile(path)
+    if plays:
+        driver.open()
+        driver.close()
+    else:
+        with pytest.raises(RecordingError, match="not a file of palm packets"):
+            driver.open()
+
+
+def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
+    clock = Clock()
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(datagrams(10)))
+    times = []
+    with PalmFile(path, clock=clock) as driver:
+        start_ns = clock.now_ns
+        while (due_ns := driver.due_ns()) is not None:
+            clock.now_ns = due_ns
+            times += [reading.t_ns - start_ns for reading in driver.read_ready()]
+    assert times == [(14 * number + 13) * MS for number in range(10)]
+
+
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "hand.palm"
+    os.mkfifo(path)
+    with pytest.raises(RecordingError, match="is not a regular file"):
+        PalmFile(path).open()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no packets at all" * 500, bytes(22000)])
+def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "hand.palm"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"hand\.palm"):
+        PalmFile(path).open()
+    with pytest.raises(RecordingError, match="is a directory"):
+        PalmFile(tmp_path).open()

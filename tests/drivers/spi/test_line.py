@@ -11,7 +11,7 @@ import pytest
 import serial
 
 from graspd.drivers.base import DriverError, LinkError
-from graspd.drivers.spi.line import LineEvent, SerialLine
+from graspd.drivers.spi.driver import LineEvent, SerialLine
 
 
 class Port:
@@ -54,7 +54,7 @@ class Port:
 
 
 def opened(monkeypatch: pytest.MonkeyPatch, port: Port) -> SerialLine:
-    monkeypatch.setattr("graspd.drivers.spi.line.serial.serial_for_url", lambda *_, **__: port)
+    monkeypatch.setattr("graspd.drivers.spi.driver.serial.serial_for_url", lambda *_, **__: port)
     line = SerialLine("port", 115_200)
     line.open()
     return line
@@ -112,7 +112,7 @@ def test_closing_waits_20_ms_for_the_last_bytes_and_no_longer(
     monkeypatch: pytest.MonkeyPatch, waiting: tuple[int, ...], sleeps: int, discarded: bool
 ) -> None:
     slept: list[float] = []
-    monkeypatch.setattr("graspd.drivers.spi.line.time.sleep", slept.append)
+    monkeypatch.setattr("graspd.drivers.spi.driver.time.sleep", slept.append)
     port = Port(waiting=waiting)
     line = opened(monkeypatch, port)
     line.close()
@@ -139,7 +139,7 @@ def test_why_a_port_cannot_be_opened_is_one_short_line(
     def refuse(*_: object, **__: object) -> None:
         raise failure
 
-    monkeypatch.setattr("graspd.drivers.spi.line.serial.serial_for_url", refuse)
+    monkeypatch.setattr("graspd.drivers.spi.driver.serial.serial_for_url", refuse)
     with pytest.raises(kind, match=told):
         SerialLine("port", 9600).open()
 

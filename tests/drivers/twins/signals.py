@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import csv
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -14,13 +16,13 @@ from graspd.drivers.base import COUNT_MAX, ELECTRODES
 from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.grasps import Counts
-from graspd.drivers.twins.grasps.tactile_noise import (
+from graspd.drivers.twins.grasps.whole_grasps import (
     DRIFT_COUNTS_PER_S,
     NOISE_COUNTS,
     SPIKE_COUNTS,
     SPIKE_PROBABILITY,
+    Counting,
 )
-from graspd.drivers.twins.grasps.whole_grasps import Counting
 
 UNTOUCHED_COUNTS = (2400.0, 3400.0)
 """Range in which untouched electrodes rest, counts."""
@@ -108,6 +110,18 @@ def crept_s(timetable: Timetable, rate_counts_per_s: float) -> float:
     if rate <= rate_counts_per_s:
         return timetable.closed_s
     return timetable.closed_s + timetable.creep_tau_s * math.log(rate / rate_counts_per_s)
+
+
+def untouched_counts(path: Path) -> NDArray[np.uint16]:
+    """Counts of ff, mf, th, shape (rows, 3, 24), of the recording of an untouched hand.
+
+    It was exported from a ROS bag: finger i of FF, MF, RF, LF, TH has its electrodes, as a list, in
+    cell 13 + 6 i of a row.
+    """
+    with path.open(newline="") as file:
+        _header, *rows = csv.reader(file)
+    fingers = [[ast.literal_eval(row[13 + 6 * i]) for i in (0, 1, 4)] for row in rows]
+    return np.array(fingers, dtype=np.uint16)
 
 
 def read_end_points(path: Path) -> list[EndPoint]:

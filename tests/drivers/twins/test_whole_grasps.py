@@ -1,21 +1,39 @@
-"""Whole grasps: their course, the truth told about them, and the demo recording."""
+"""Whole grasps: their course, sampling and noise, the demos, synthetic grasps, and slides.
+
+Figures of the untouched recording of a palm (`biotacs-noise`, 100 Hz): robust sigma 2.9 to 4.3
+counts, 0.75 to 1.22 % spikes of 25 to 150 counts, all downward, drift 0.56 to 0.84 counts/s, pairs
+unchanged in 2 of 7 rows.
+"""
 
 from __future__ import annotations
 
+import csv
 import itertools
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
+from graspd.drivers.recordings.csv_player import (
+    DEMO_DAY,
+    DEMO_RECORDING,
+    DEMO_TABLE,
+    SHOW_RECORDING,
+)
+from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint, Timetable
 from graspd.drivers.twins.grasps.whole_grasps import (
     GraspRow,
+    MeasuredNoise,
     WholeGrasps,
     synthetic_grasps,
 )
 from tests.drivers.recordings.tables import rows_of
 from tests.drivers.twins.signals import played
+from tests.drivers.twins.slides import HeldNoise, held
+from tests.kit import demos
 from tests.kit.demos import STREAM_DURATIONS
 
 REST = np.full((3, 24), 3000.0)
@@ -103,3 +121,192 @@ def test_the_demo_is_a_small_stream_of_twelve_synthetic_grasps_half_of_them_slip
         row = rows[round(timetable.lift_s * 100.0)]
         assert row.annotation.slipped is timetable.slipped
         assert row.annotation.object_name == timetable.object_name
+
+
+UNPRESSED = EndPoint(REST.astype(np.uint16), False, "nothing")
+LONG_REST = Durations(first_rest_s=(60.0, 60.0))
+PAIRS = [(0,), *((first, first + 1) for first in range(1, 23, 2)), (23,)]
+"""Electrodes sampled by one request, from 0: E1 (with TDC), E2/E3 ... E22/E23, E24."""
+
+
+def counts_of(moments: list[GraspRow]) -> NDArray[np.float64]:
+    return np.array([moment.counts for moment in moments], dtype=np.float64)
+
+
+def untouched() -> NDArray[np.float64]:
+    """A minute of rest, shape (6000, 3, 24)."""
+    grasps = WholeGrasps(REST, [UNPRESSED], durations=LONG_REST, seed=3)
+    return counts_of(list(itertools.islice(grasps, 6000)))
+
+
+def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_palm() -> None:
+    numbers = np.broadcast_to(np.arange(1000.0)[:, np.newaxis, np.newaxis], (1000, 3, 24))
+    for seed in range(20):
+        grasps = WholeGrasps(
+            np.ones((3, 24)),
+            [EndPoint(np.ones((3, 24), dtype=np.uint16), False, "")],
+            held=True,
+            noise=played(numbers),
+            seed=seed,
+        )
+        rows = counts_of(list(itertools.islice(grasps, 100)))
+        if rows[0, 0, 0] < 800:  # the loop does not begin again within these rows
+            break
+    for row, counts in enumerate(rows):
+        for place, pair in enumerate(PAIRS, 1):
+            rounds_ago = (10 * row - place) // 14 + 1
+            assert (counts[:, list(pair)] == rows[0, 0, 0] + rounds_ago).all()
+
+
+def test_fresh_values_repeat_no_more_than_noise_does() -> None:
+    repeats = np.diff(untouched(), axis=0) == 0.0
+    # Two whole numbers of sigma 3.5 are equal with a chance of 1 / (2 sqrt(pi) 3.5) = 0.0806.
+    assert repeats.mean() == pytest.approx(0.0806, abs=0.003)
+    assert not any(repeats[:, :, pair].all(axis=(1, 2)).any() for pair in PAIRS[1:-1])
+
+
+def test_noise_has_the_measured_width_drift_and_spikes() -> None:
+    counts = untouched()
+    times = np.arange(len(counts)) * 0.01
+    slopes = np.polyfit(times, counts.reshape(len(counts), -1), 1)[0]
+    assert slopes.mean() == pytest.approx(0.7, abs=0.01)
+    residuals = counts - 3000.0 - 0.7 * times[:, np.newaxis, np.newaxis]
+    sigma = 1.4826 * np.median(np.abs(residuals), axis=0)
+    assert ((sigma > 2.9) & (sigma < 4.3)).all()
+    assert residuals.max() < 6 * 3.5
+    spikes = residuals < -6 * 3.5
+    assert 0.0075 < spikes.mean() < 0.0122
+    assert residuals.min() > -(150 + 6 * 3.5)
+    assert spikes.sum(axis=2).max() == 1, "one electrode of a finger at a time"
+    assert not (spikes[1:] & spikes[:-1]).any(), "isolated in time"
+
+
+def test_drift_ends_with_the_warm_up() -> None:
+    noise = MeasuredNoise(3, np.random.default_rng(0))
+    assert np.median(noise.sweep(np.asarray(1e7))) == pytest.approx(210.0, abs=3.0)
+
+
+def test_no_electrode_drifts_out_of_its_range() -> None:
+    rest, after_s = REST.copy(), Durations(first_rest_s=(1e4, 1e4))
+    rest[0, 2] = 3975.0  # where the third electrode of the synthetic first finger rests
+    unpressed = EndPoint(rest.astype(np.uint16), False, "nothing")
+    grasps = WholeGrasps(rest, [unpressed], rate_hz=0.1, durations=after_s)
+    counts = counts_of(list(itertools.islice(grasps, 900)))
+    assert counts.max() < 4094, "cut off"
+    assert counts[100:, 0, 2].std() > 2.9
+    assert np.median(counts[100:, 0, 2]) == pytest.approx(4045.0, abs=1.0)
+    assert np.median(counts[100:, 1]) == pytest.approx(3210.0, abs=1.0)
+
+
+def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Counts (grasps, 72) and labels, read without the code under test."""
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))[1:]
+    return np.array([row[2:] for row in rows], dtype=float), np.array([int(row[1]) for row in rows])
+
+
+def test_the_demos_are_made_again_byte_for_byte(tmp_path: Path) -> None:
+    demos.main(tmp_path)
+    for demo in (DEMO_TABLE, DEMO_DAY, DEMO_RECORDING, SHOW_RECORDING):
+        assert (tmp_path / demo.name).read_bytes() == demo.read_bytes()
+
+
+def test_the_demo_day_is_labelled_within_the_range_and_called_synthetic() -> None:
+    counts, slipped = load(DEMO_DAY)
+    assert counts.shape == (300, 72)
+    assert slipped.sum() == 150
+    assert counts.min() >= 1
+    assert counts.max() <= 4094
+    with DEMO_DAY.open(newline="") as file:
+        assert all(row["object"].startswith("synthetic") for row in csv.DictReader(file))
+
+
+def test_the_demo_is_small_labelled_and_called_synthetic() -> None:
+    assert DEMO_TABLE.stat().st_size < 120_000
+    with DEMO_TABLE.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 200
+    assert sum(row["slipped"] == "1" for row in rows) == 100
+    assert all(row["object"].startswith("synthetic") for row in rows)
+
+
+def test_no_synthetic_grasp_is_a_real_one(bts3_dir: Path) -> None:
+    counts, _ = load(DEMO_TABLE)
+    real = np.vstack([load(bts3_dir / f"palm_{pose}.csv")[0] for pose in ("down", "side")])
+    nearest = [np.abs(real - grasp).max(axis=1).min() for grasp in counts]
+    assert min(nearest) > 100, "counts, at the electrode that differs most"
+
+
+STREAMS = 40
+# Mean over 24 electrodes of the absolute fitted slope, counts/s, of 306 real streams at 100 Hz, by
+# sweeps of 10 ms: quantiles of held touches at 5, 50, 90, 95, 99 %, ...
+TOUCH_QUANTILES = (0.05, 0.5, 0.9, 0.95, 0.99)
+TOUCHES = {
+    5: (80, 110, 138, 147, 165),
+    12: (28, 38, 49, 53, 63),
+    24: (10, 14, 22, 25, 34),
+}
+# ... and of slides at 5, 10, 25, 50, 75, 90, 95, 99 %.
+SLIDE_QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
+SLIDES = {
+    5: (90, 98, 113, 133, 163, 216, 277, 520),
+    12: (36, 39, 47, 62, 91, 142, 194, 369),
+    24: (16, 19, 25, 39, 65, 108, 147, 270),
+}
+
+
+@cache
+def streams(*, sliding: bool) -> list[NDArray[np.float64]]:
+    """Counts of streams of one finger, each of shape (300, 24)."""
+    return [
+        np.array([counts[0] for _, counts in held([sliding], seed=seed)], dtype=np.float64)
+        for seed in range(STREAMS)
+    ]
+
+
+def mean_slopes(counts: NDArray[np.float64], sweeps: int) -> NDArray[np.float64]:
+    """Of every third window of so many sweeps, 10 ms apart, counts/s."""
+    windows = np.lib.stride_tricks.sliding_window_view(counts, sweeps, axis=0)[::3]
+    columns = windows.reshape(-1, sweeps).T
+    slopes = np.polyfit(0.01 * np.arange(sweeps), columns, 1)[0]
+    return np.asarray(np.abs(slopes).reshape(len(windows), -1).mean(axis=1), dtype=np.float64)
+
+
+@pytest.mark.parametrize(
+    ("sliding", "shares", "measured"),
+    [(False, TOUCH_QUANTILES, TOUCHES), (True, SLIDE_QUANTILES, SLIDES)],
+    ids=["touch", "slide"],
+)
+@pytest.mark.parametrize("sweeps", TOUCHES)
+def test_slopes_are_those_of_real_touches_and_slides(
+    sweeps: int,
+    sliding: bool,
+    shares: tuple[float, ...],
+    measured: Mapping[int, tuple[float, ...]],
+) -> None:
+    slopes = [mean_slopes(counts, sweeps) for counts in streams(sliding=sliding)]
+    quantiles = np.quantile(np.concatenate(slopes), shares)
+    np.testing.assert_allclose(quantiles[:-1], measured[sweeps][:-1], rtol=0.27)
+    # One window of a hundred is of a stream or two.
+    assert quantiles[-1] == pytest.approx(measured[sweeps][-1], rel=0.35)
+
+
+def test_electrodes_of_a_held_touch_range_as_far_as_real_ones() -> None:
+    # Real ones range over 32 to 44 counts in three seconds.
+    ranges = [np.ptp(counts, axis=0).mean() for counts in streams(sliding=False)]
+    np.testing.assert_allclose(np.quantile(ranges, (0.05, 0.95)), (32.0, 44.0), rtol=0.15)
+
+
+def test_noise_is_correlated_and_spikes_go_down_alone() -> None:
+    # Measured: 2.9 to 4.2 counts (successive differences over the square root of two), correlations
+    # of 0.32 at one sweep and 0.03 at two; 0.17 % of values are more than 25 below, none above.
+    noise = HeldNoise(3, np.random.default_rng(1))
+    sweeps = np.array([noise.sweep(np.asarray(0.0)) for _ in range(4000)])
+    assert (sweeps > 25.0).mean() < 1e-5
+    assert (sweeps < -25.0).mean() == pytest.approx(0.0017, rel=0.2)
+    sweeps[sweeps < -20.0] = 0.0
+    deviations = np.diff(sweeps, axis=0).std(axis=(0, 2)) / np.sqrt(2.0)
+    assert ((deviations > 2.6) & (deviations < 4.3)).all()
+    unit = sweeps / sweeps.std(axis=(0, 2), keepdims=True)
+    assert (unit[1:] * unit[:-1]).mean() == pytest.approx(0.32, abs=0.03)
+    assert (unit[2:] * unit[:-2]).mean() == pytest.approx(0.03, abs=0.04)

@@ -1,4 +1,7 @@
-"""The plain joint stream: one JSON object per datagram. Bytes only; see deploy/wire/JOINTS.md."""
+"""Joint angles of a hand from any source that can send JSON: see deploy/wire/JOINTS.md.
+
+The joint stream has one JSON object per datagram.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import JointReading
-from graspd.drivers.hand import joint_name
-from graspd.drivers.udp.driver import DatagramCounters
+from graspd.drivers.base import JointReading, joint_name
+from graspd.drivers.udp import DatagramCounters, DatagramDriver
 
 DATAGRAM_BYTES_MAX = 4096
 """Longest message, bytes; all 28 joints in full precision take about 900."""
@@ -181,3 +183,16 @@ def _finite(value: object) -> float:
 def _angle(value: object) -> float:
     angle = _finite(value)
     return angle if abs(angle) <= ANGLE_MAX_RAD else math.nan
+
+
+class JointStreamDriver(DatagramDriver[JointStream]):
+    """Driver of the joint stream: one `JointReading` per message."""
+
+    name = "joints"
+    bytes_max = DATAGRAM_BYTES_MAX
+    silence_ns = 500_000_000
+    """Timeout, ns: 50 messages at 100 Hz. A sender of 10 Hz passes."""
+    period_ns: int | None = None
+
+    def _new_stream(self) -> JointStream:
+        return JointStream()
