@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import struct
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,6 @@ from typing import TYPE_CHECKING, Final
 import zmq
 
 from graspd.daemon.publish.listener import Listener, PublishError
-from graspd.daemon.publish.lookout import EVENTS, Lookout
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
@@ -58,6 +58,15 @@ SUBSCRIBES_S: Final = 0.1
 """Longest time from a peer's handshake to its first subscription, s."""
 ZAP_DOMAIN: Final = "graspd"
 """libzmq asks the authenticator only if there is a domain (RFC 27)."""
+FAILED: Final = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
+"""Events of failed handshakes; the second one if the peer hangs up first."""
+EVENT: Final = struct.Struct("=HI")
+"""First frame of a monitor's message: event and value (zmq_socket_monitor(3))."""
+PROBLEMS: Final = {
+    0x11000001: "it takes another key for the daemon's",
+    0x11000002: "it has no key",
+}
+"""Problem of a peer by the value of its failed handshake (ZMQ_PROTOCOL_ERROR_*)."""
 
 
 @dataclass(slots=True)
@@ -135,6 +144,34 @@ class Courier(Proxy):
                 frames.append(frame)
         self._back.send_multipart(frames)
         return True
+
+
+class Lookout(threading.Thread):
+    """Warns of peers whose handshake fails: reads monitors until their context ends; closes them.
+
+    Monitors must be read all the time: libzmq waits where the queue of one is full.
+    """
+
+    def __init__(self, monitors: Sequence[Socket]) -> None:
+        """`monitors`: sockets that only this thread may use after `start`."""
+        super().__init__(name="lookout", daemon=True)
+        self._monitors = monitors
+
+    def run(self) -> None:
+        poller = zmq.Poller()
+        for monitor in self._monitors:
+            poller.register(monitor, zmq.POLLIN)
+        try:
+            while True:
+                for monitor, _ in poller.poll():
+                    _, value = EVENT.unpack(monitor.recv_multipart()[0])
+                    problem = PROBLEMS.get(value, "it does not speak ZeroMQ with keys")
+                    log.warning("turned away a peer: %s", problem)
+        except zmq.ContextTerminated:
+            pass
+        finally:
+            for monitor in self._monitors:
+                monitor.close(0)
 
 
 class Door:
@@ -235,7 +272,7 @@ class Door:
                 made.curve_server = True
                 made.zap_domain = ZAP_DOMAIN.encode()
                 if made is not self._subscribers or self._monitor is None:  # a socket has one
-                    self._watched.append(made.get_monitor_socket(EVENTS))
+                    self._watched.append(made.get_monitor_socket(FAILED))
         try:
             made.bind(listener.endpoint)
         except zmq.ZMQError as error:

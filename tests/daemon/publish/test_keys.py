@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import socket
 import stat
 from collections.abc import Callable, Iterator
@@ -60,13 +61,14 @@ def test_a_key_that_is_not_on_the_list_is_turned_away_and_named(
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
-def test_a_peer_without_a_key_is_warned_of_with_its_address(
+def test_a_peer_without_a_key_is_warned_of(
     door: KeyedDoor, caplog: pytest.LogCaptureFixture
 ) -> None:
-    warning = "turned away a peer from 127.0.0.1: it has no key"
     for kind in (zmq.SUB, zmq.SUB, zmq.DEALER):
         assert not door.hears(door.connect(None, kind), QUIET_S)
-    wait_until(lambda: warning in caplog.text or "unknown address: it has no" in caplog.text)
+    # A peer that sees what the daemon wants may hang up before it has said that it has no key.
+    told = re.compile("turned away a peer: it (has no key|does not speak ZeroMQ with keys)")
+    wait_until(lambda: told.search(caplog.text))
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
