@@ -152,7 +152,6 @@ class GraspLog:
                 boot_id=verdict.boot_id,
                 grasp=verdict.grasp,
                 ago_s=(now_ns - judged_ns) / 1e9,
-                ended=self._ended.get(key),
                 lift=lift(verdict, self._ended.get(key)),
                 supervised=verdict.supervised,
                 held=key == held,

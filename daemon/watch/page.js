@@ -319,7 +319,7 @@ class Hand {
         text(word, grasp.verdict);
         text(node.children[2], likely(grasp)); node.children[2].className = "likely";
         text(node.children[3], grasp.lift + (grasp.supervised ? ", supervised" : ""));
-        node.children[3].className = grasp.ended === null ? "faint" : grasp.verdict === "stable" && grasp.ended === "slip" ? "bad" : "";
+        node.children[3].className = !["held", "slipped"].includes(grasp.lift) ? "faint" : grasp.verdict === "stable" && grasp.lift === "slipped" ? "bad" : "";
       });
     for (const name of ["learning", "timing", "session", "drivers"]) rows(this.part(name), this.seen[name]);
   }

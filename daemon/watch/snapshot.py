@@ -71,8 +71,6 @@ class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
     """Start of the daemon that `grasp` counts from."""
     grasp: int
     ago_s: float
-    ended: str | None
-    """Outcome of its lift, `stable` or `slip`; None: not told."""
     lift: str
     """`held`, `slipped`, `not told`, or `-`."""
     supervised: bool

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 import zlib
 from functools import cache
 from pathlib import Path
@@ -22,7 +23,8 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.models.training.data.datasets import read_table
-from tests.daemon.processes import graspd, start, wait_for
+from tests.bench.live import Subscriber
+from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import (
     Lab,
     compared,
@@ -32,8 +34,11 @@ from tests.daemon.record.recorded import (
     without_null,
     work,
 )
+from tests.kit.messages import decode_verdict
 
 GRASPS = 4
+FLUSH_S = 1.0
+"""Default of `[record] flush_ms`."""
 
 
 @pytest.fixture(scope="module")
@@ -255,3 +260,28 @@ def test_a_file_that_was_cut_anywhere_is_played_as_far_as_it_goes(lab: Lab, tmp_
     played = [compared(verdict) for verdict in again(path)]
     assert played[: len(now)] == [compared(verdict) for verdict in before[: len(now)]]
     assert len(played) - len(now) in {0, 1}  # cut between a reading and its verdict
+
+
+@pytest.mark.parametrize("life_s", [1.6, 2.7])
+def test_a_killed_daemon_loses_no_more_than_the_flush_interval(
+    tmp_path: Path, life_s: float
+) -> None:
+    published: dict[int, float] = {}
+    with (
+        start("run", scene(tmp_path)) as daemon,
+        Subscriber(f"ipc://{tmp_path}/graspd") as subscriber,
+    ):
+        end_s, wait_s = None, float(TIMEOUT_S)
+        while (message := subscriber.take(wait_s)) is not None:
+            verdict = decode_verdict(message[1])
+            published[verdict.seq] = verdict.t
+            end_s = time.monotonic() + life_s if end_s is None else end_s
+            if time.monotonic() > end_s:
+                daemon.kill()
+                wait_s = 0.2
+        daemon.communicate(timeout=TIMEOUT_S)
+    (path,) = files(tmp_path)
+    recorded = [content["seq"] for kind, content in messages(path) if kind == "verdict"]
+    assert recorded == list(range(len(recorded)))
+    lost = [t for seq, t in published.items() if seq >= len(recorded)]
+    assert max(published.values()) - min(lost, default=max(published.values())) <= FLUSH_S

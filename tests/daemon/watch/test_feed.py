@@ -16,7 +16,7 @@ from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import KeyedDoor, Publisher
 from tests.daemon.watch.watch_fakes import MS, verdict
 from tests.kit.messages import decode_verdict
-from tests.kit.waiting import PATIENCE_S
+from tests.kit.waiting import PATIENCE_S, wait_until
 
 Keys = tuple[bytes, bytes, bytes]
 
@@ -26,41 +26,41 @@ def endpoint(tmp_path: Path) -> str:
     return f"ipc://{tmp_path}/v"
 
 
+def first_of(publisher: Publisher, feed: Feed, seq: int, decision: Decision) -> list[bytes]:
+    """Publish a verdict until messages come; return their payloads."""
+    found: list[bytes] = []
+
+    def has_come() -> bool:
+        publisher.send(b"verdict.right", verdict(seq, decision))
+        found.extend(payload for _, payload in feed.take())
+        return bool(found)
+
+    wait_until(has_come, 0.01)
+    return found
+
+
 def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
     clock = Clock()
     with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
-
-        def came(decision: Decision, seq: int) -> list[bytes]:
-            deadline_s = time.monotonic() + PATIENCE_S
-            while not (found := [payload for _, payload in feed.take()]):
-                assert time.monotonic() < deadline_s
-                publisher.send(b"verdict.right", verdict(seq, decision))
-                time.sleep(0.01)
-            return found
-
-        came(Decision.STABLE, 0)
+        first_of(publisher, feed, 0, Decision.STABLE)
         for seq in range(1, 50):
             publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
         time.sleep(0.1)
         clock.now_ns += 1001 * MS
         assert list(feed.take()) == []
-        for payload in came(Decision.SLIP, 50):
+        for payload in first_of(publisher, feed, 50, Decision.SLIP):
             assert decode_verdict(payload).seq == 50
 
 
 def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoint: str) -> None:
     clock = Clock()
     with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
-        deadline_s, seq = time.monotonic() + PATIENCE_S, 0
-        while not list(feed.take()):
-            assert time.monotonic() < deadline_s
-            publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
-            seq += 1
-            time.sleep(0.01)
+        first_of(publisher, feed, 0, Decision.STABLE)
+        time.sleep(0.1)
         while list(feed.take()):
             pass
         looked_ns = clock.now_ns
-        publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
+        publisher.send(b"verdict.right", verdict(1, Decision.STABLE))
         time.sleep(0.2)
         clock.now_ns += 900 * MS
         view = View(endpoint)

@@ -11,7 +11,8 @@ from msgspec import structs
 from rich.console import Console
 
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.publish.messages import DECISION_CODE, encode
+from graspd.daemon.publish.messages import DECISION_CODE, LearnerHealth, encode
+from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.risk import RiskReport
 from graspd.daemon.watch.snapshot import Snapshot
 from graspd.daemon.watch.terminal import draw
@@ -87,6 +88,7 @@ def after(*messages: tuple[bytes, bytes], at_ns: int = 0) -> View:
 
 
 FIVE = ["ff", "mf", "rf", "lf", "th"]
+LEARNER = LearnerHealth(enabled=True, outcomes=5, told={OutcomeStatus.TAKEN: 5}, uncertainty=0.4)
 
 
 def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snapshot:
@@ -103,7 +105,7 @@ def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snaps
         motion=dict.fromkeys(FIVE, 1.2),
         motion_limits=dict.fromkeys(FIVE, 1.5),
     )
-    view.take(f"status.{hand}".encode(), status(seq), 0)
+    view.take(f"status.{hand}".encode(), status(seq, learner=LEARNER), 0)
     message = json.dumps(json.loads(tactile(0)) | reading).encode()
     view.take(f"tactile.{hand}".encode(), message, 0)
     view.take(f"verdict.{hand}".encode(), said, 0)
