@@ -40,9 +40,6 @@ NO_SILENCE_NS = 3_600_000_000_000
 """Time without a reading, ns, that counts as silence: no pause of a recording does."""
 MCAP = ".mcap"
 
-Clock = Callable[[], int]
-"""Clock that returns monotonic ns."""
-
 
 def model_path(scene: Scene) -> Path:
     """Return the model file for the hand's fingers. Raises `ModelError`."""
@@ -60,7 +57,7 @@ def load_model(scene: Scene) -> TactileModel:
 def build_pipeline(
     scene: Scene,
     model: TactileModel,
-    clock: Clock = time.monotonic_ns,
+    clock: Callable[[], int] = time.monotonic_ns,
     *,
     learns: bool = True,
 ) -> Pipeline:

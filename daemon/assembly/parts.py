@@ -104,26 +104,15 @@ class Assembly:
 
         Return False if no session is kept. The last save is when the stack closes.
         """
-        scene, pipeline = self._parts.scene, self._parts.pipeline
+        pipeline, tactile = self._parts.pipeline, self._parts.drivers[0]
         file = self._session_file()
         if file is None:
-            watch = SensorWatch(
-                self._parts.drivers[0], pipeline.sensors_exchanged, pipeline.read_rest
-            )
-            self.companions.append(watch)
+            self.companions.append(SensorWatch(pipeline, tactile))
             return False
         from graspd.daemon.session.keeper import SessionKeeper
 
         self._stack.callback(file.close)
-        keeper = SessionKeeper(
-            pipeline.session,
-            scene.hand.fingers,
-            self._parts.drivers[0],
-            file,
-            pipeline.sensors_exchanged,
-            trust=pipeline.trust,
-            read_rest=pipeline.read_rest,
-        )
+        keeper = SessionKeeper(pipeline, self._parts.scene.hand.fingers, tactile, file)
         self._stack.callback(keeper.save)
         self.keep = keeper.keep
         self.companions.insert(0, keeper)  # its answers must come before the socket is read

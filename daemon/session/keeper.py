@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Answer, Requests
 from graspd.daemon.session.file import (
@@ -25,14 +25,8 @@ from graspd.daemon.session.file import (
     others,
     restore_kept,
 )
-from graspd.daemon.session.sensors import (
-    UNTOLD,
-    OnExchange,
-    Rest,
-    SensorWatch,
-    moved_fingers,
-)
-from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.daemon.session.sensors import UNTOLD, Rest, SensorWatch, moved_fingers
+from graspd.daemon.trust.trust import TrustState, decode
 from graspd.drivers.base import ELECTRODES, Driver
 from graspd.models.session_statistics import SessionState
 
@@ -69,24 +63,19 @@ class SessionKeeper(SensorWatch):
 
     def __init__(
         self,
-        session: SessionCalibration | None,
+        pipeline: Pipeline,
         fingers: Sequence[str],
         tactile: Driver,
         file: SessionFile,
-        on_exchange: OnExchange,
-        *,
-        trust: Trust | None = None,
-        read_rest: Callable[[], Rest] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Restore the session in `file`; warn, and start a new one, if it is of other fingers.
 
-        `session`: None for a model without a session. `trust`: None without learning. The file's
-        content for a None is kept. `on_exchange`: must reset session and trust to its arguments.
+        The file keeps its session or trust if `pipeline` has none.
         """
-        self._session = session
-        self._trust = trust
-        super().__init__(tactile, on_exchange, read_rest)
+        self._session = pipeline.session
+        self._trust = pipeline.trust
+        super().__init__(pipeline, tactile)
         self._fingers = tuple(fingers)
         self._file = file
         self._clock = clock
@@ -264,7 +253,7 @@ class SessionKeeper(SensorWatch):
             self._leaving.append(leaving)
         self._unused = SavedState({})
         if former is None or not self._take_up(former):
-            self._on_exchange(None, None)
+            self._sensors_exchanged()
         self._save_due_ns = self._clock()
 
     def _take_up(self, former: SavedState) -> bool:
@@ -273,7 +262,8 @@ class SessionKeeper(SensorWatch):
         if trust is not None and self._trust is not None and not self._trust.fits(trust):
             trust = None
         try:
-            self._on_exchange(former.statistics, None if trust is None else trust.learner)
+            learned = None if trust is None else trust.learner
+            self._sensors_exchanged(former.statistics, learned)
         except ValueError as error:
             log.warning("what was kept of these sensors %s; a new session begins", error)
             return False

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.drivers.base import Driver, Reading
 
-if TYPE_CHECKING:
-    from graspd.daemon.trust.learner import LearnerState
-    from graspd.models.session_statistics import SessionState
-
-OnExchange = Callable[["SessionState | None", "LearnerState | None"], None]
-"""Called with the states of the new sensors' session and learning; None: unknown."""
 Rest = NDArray[np.float64]
 """Resting counts, shape (fingers, 24); 0: not known. They differ between sensors."""
 
@@ -46,16 +41,10 @@ log = logging.getLogger("graspd")
 class SensorWatch(Companion):
     """Make the judge forget exchanged sensors before it judges the new ones."""
 
-    def __init__(
-        self,
-        tactile: Driver,
-        on_exchange: OnExchange,
-        read_rest: Callable[[], Rest] | None = None,
-    ) -> None:
-        """`read_rest`: returns the resting counts now; None: they are never known."""
+    def __init__(self, pipeline: Pipeline, tactile: Driver) -> None:
         self._tactile = tactile
-        self._on_exchange = on_exchange
-        self._read_rest = read_rest
+        self._sensors_exchanged = pipeline.sensors_exchanged
+        self._read_rest = pipeline.read_rest
         self._serials: dict[str, str] = {}
         """Last known serial numbers, by finger."""
         self._rest: Rest | None = None
@@ -107,11 +96,11 @@ class SensorWatch(Companion):
 
     def _exchange_untold(self, moved: int, _rest: Rest) -> None:
         log.warning(UNTOLD, moved)
-        self._on_exchange(None, None)
+        self._sensors_exchanged()
 
     def _exchange(self, changed: list[str], _serials: Mapping[str, str]) -> None:
         log.warning("new sensor on %s: the hand must be seen open first", ", ".join(changed))
-        self._on_exchange(None, None)
+        self._sensors_exchanged()
 
 
 def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

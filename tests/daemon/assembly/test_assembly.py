@@ -14,12 +14,21 @@ import pytest
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.judge.reasons import Decision
-from graspd.daemon.scene import Scene, parse
+from graspd.daemon.scene import Scene, SceneError, parse
+from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
+from graspd.drivers.palm.calibration import CalibrationError
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.faults import ReplayFaults
 from graspd.models.contract import ModelError
-from tests.daemon.fakes import Clock, reading
+from tests.daemon.fakes import Clock, FakeDriver, reading
 
 REPLAY = {"driver": "replay", "recordings": [str(DEMO_TABLE)]}
+SPI: dict[str, Any] = {"driver": "spi", "port": "/nowhere"}
+PALM: dict[str, Any] = {"driver": "palm", "source": "udp://127.0.0.1:9870"}
+
+
+def scene_of(tactile: dict[str, Any], **sections: dict[str, Any]) -> Scene:
+    return parse({"tactile": tactile, **sections}, Path("scene.toml"))
 
 
 TRUST = {
@@ -32,8 +41,7 @@ TRUST = {
 
 @pytest.mark.parametrize("text", TRUST)
 def test_outcomes_teach_and_a_risk_is_kept_as_the_scene_says(text: str) -> None:
-    data = {"tactile": REPLAY, **tomllib.loads(text)}
-    scene = parse(data, Path("scene.toml"))
+    scene = scene_of(REPLAY, **tomllib.loads(text))
     trust = assembly.build_pipeline(scene, assembly.load_model(scene), Clock()).trust
     if TRUST[text] is None:
         assert trust is None
@@ -45,10 +53,7 @@ def test_outcomes_teach_and_a_risk_is_kept_as_the_scene_says(text: str) -> None:
 
 @pytest.mark.parametrize("threshold", [1e-9, 1 - 1e-9])
 def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
-    scene = parse(
-        {"tactile": REPLAY, "model": {"slip_threshold": threshold}, "gate": {"max_age_ms": 1.0}},
-        Path("scene.toml"),
-    )
+    scene = scene_of(REPLAY, model={"slip_threshold": threshold}, gate={"max_age_ms": 1.0})
     driver = assembly.build_drivers(scene)[0]
     driver.open()
     (first,) = driver.read_ready()
@@ -62,14 +67,11 @@ def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
     assert pipeline.judge(reading(clock() - 1_500_000)).decision is Decision.UNKNOWN
 
 
-SPI: dict[str, Any] = {"driver": "spi", "port": "/nowhere"}
-PALM: dict[str, Any] = {"driver": "palm", "source": "udp://127.0.0.1:9870"}
 OTHERS = "cnn1, cnn1-session, mlp, rf, small-electrodes, small-session, svm"
 
 
 def hand(fingers: tuple[str, ...], tactile: dict[str, Any] = SPI, **model: str) -> Scene:
-    content = {"hand": {"fingers": fingers}, "tactile": tactile, "model": model}
-    return parse(content, Path("scene.toml"))
+    return scene_of(tactile, hand={"fingers": fingers}, model=model)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +156,7 @@ def test_fingers_in_another_order_are_told_what_to_write_instead(
 def test_grasps_are_named_by_the_start_that_tells_of_them_also_where_a_former_scene_goes_on() -> (
     None
 ):
-    parts = Parts.of(scene := parse({"tactile": REPLAY}, Path("s")), assembly.load_model(scene))
+    parts = Parts.of(scene := scene_of(REPLAY), assembly.load_model(scene))
     named = []
     for _ in range(2):
         with ExitStack() as stack:
@@ -163,3 +165,97 @@ def test_grasps_are_named_by_the_start_that_tells_of_them_also_where_a_former_sc
         named.append(outbox.verdict(judgement, 0, 1)[0].boot_id)
         assert parts.pipeline.boot_id == named[-1]
     assert named[0] != named[1]
+
+
+class Constructed:
+    """Takes a driver's place and keeps the arguments."""
+
+    def __init__(self, *_positional: object, **named: object) -> None:
+        self.named = named
+
+
+BEHIND = ("th", "ff", "mf")
+
+
+@pytest.mark.parametrize(
+    ("driver", "tactile", "told"),
+    [
+        ("palm.driver.PalmDriver", PALM, {"only_from": None, "heed_finger_bits": True}),
+        (
+            "palm.driver.PalmDriver",
+            PALM | {"only_from": "10.0.0.2", "heed_finger_bits": False},
+            {"only_from": "10.0.0.2", "heed_finger_bits": False},
+        ),
+        (
+            "can.driver.CanBridgeDriver",
+            {"driver": "can", "sensors": BEHIND},
+            {"sensors": BEHIND, "fingers": ("ff", "mf", "th")},
+        ),
+        (
+            "spi.driver.SpiBridgeDriver",
+            {"driver": "spi", "port": "/dev/serial/by-id/mine", "sensors": BEHIND},
+            {"port": "/dev/serial/by-id/mine", "sensors": BEHIND},
+        ),
+        (
+            "recordings.csv_player.ReplayDriver",
+            REPLAY | {"rate_hz": 20.0, "speed": 2.0, "faults": {"slow_every": 7}},
+            {"rate_hz": 20.0, "speed": 2.0, "faults": ReplayFaults(slow_every=7)},
+        ),
+        ("recordings.csv_player.ReplayDriver", REPLAY | {"pace": "fast"}, {"speed": None}),
+    ],
+)
+def test_a_driver_is_told_what_the_scene_says(
+    monkeypatch: pytest.MonkeyPatch, driver: str, tactile: dict[str, Any], told: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(f"graspd.drivers.{driver}", Constructed)
+    (constructed,) = assembly.build_drivers(scene_of(tactile))
+    assert isinstance(constructed, Constructed)
+    assert constructed.named | told == constructed.named
+
+
+@pytest.mark.parametrize(
+    ("sections", "says"),
+    [
+        (
+            {"tactile": {"driver": "can", "bitrate": 500_000}},
+            r"^\[tactile\] bit rates of socketcan",
+        ),
+        ({"tactile": {"driver": "can", "data_length": 3}}, r"^\[tactile\] frames of 3 bytes"),
+        ({"tactile": {"driver": "palm", "source": "udp://nowhere"}}, r"^\[tactile\] "),
+        ({"tactile": PALM, "joints": {"driver": "stream", "source": "udp://x"}}, r"^\[joints\] "),
+    ],
+)
+def test_what_a_driver_refuses_is_one_line_naming_the_section(
+    sections: dict[str, dict[str, Any]], says: str
+) -> None:
+    with pytest.raises(SceneError, match=says) as error:
+        assembly.build_drivers(scene_of(**sections))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("raised", "expected"),
+    [
+        (LinkError(LinkCause.UNKNOWN, "gone"), LinkError),
+        (DriverError("no such interface"), SceneError),
+        (RecordingError(Path("a.csv"), "empty"), SceneError),
+        (CalibrationError(Path("hand.toml"), ["no joint"]), SceneError),
+        (ValueError("baud"), SceneError),
+    ],
+)
+def test_only_a_link_is_worth_another_try(raised: Exception, expected: type[Exception]) -> None:
+    class Refusing(FakeDriver):
+        def open(self) -> None:
+            raise raised
+
+    with pytest.raises(expected, match=str(raised)):
+        assembly.open_driver(Refusing([], Clock()))
+
+
+def test_outcomes_that_no_recording_has_cannot_be_told(tmp_path: Path) -> None:
+    bare = tmp_path / "bare.csv"
+    header, row, *_ = DEMO_TABLE.read_text().splitlines()
+    bare.write_text(header.replace("slipped", "other") + f"\n{row}\n")
+    wanted = scene_of({"driver": "replay", "recordings": [str(bare)], "outcomes": True})
+    with pytest.raises(SceneError, match="outcomes needs the column `slipped`"):
+        assembly.build_drivers(wanted)

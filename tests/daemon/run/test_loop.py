@@ -23,7 +23,6 @@ from graspd.daemon.publish.companion import (
 )
 from graspd.daemon.publish.messages import Lifts, State
 from graspd.daemon.run.loop import UNKNOWN_START, Ended
-from graspd.daemon.session.sensors import SensorWatch
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus, Report
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import (
@@ -35,6 +34,7 @@ from graspd.drivers.base import (
     TactileReading,
 )
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, reading
+from tests.daemon.session.learning import sensor_watch
 from tests.kit.loops import LoopBench
 from tests.kit.messages import decode_tactile
 
@@ -384,7 +384,7 @@ def test_an_exchanged_sensor_is_noticed_before_its_first_reading_is_published_or
     clock = Clock()
     driver = Exchanging([reading(clock(), seed) for seed in range(4)], clock)
     published_at_exchange: list[int] = []
-    watch = SensorWatch(driver, lambda *_: published_at_exchange.append(len(bench.output.sent)))
+    watch = sensor_watch(driver, lambda: published_at_exchange.append(len(bench.output.sent)))
     bench = LoopBench(driver, clock, companions=[watch])
     bench.output.wants_tactile = True
     bench.run()

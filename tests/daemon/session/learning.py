@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion, Requests
 from graspd.daemon.session.file import KeptSession, SessionFile
 from graspd.daemon.session.keeper import SessionKeeper
+from graspd.daemon.session.sensors import SensorWatch
 from graspd.daemon.trust.learner import LearnerState, sigmoid
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.risk import Permission, RiskLimits
@@ -89,23 +92,46 @@ def read_once(companion: Companion) -> None:
     companion.before_wait(NOBODY)
 
 
+class FakeJudge:
+    """What is asked of a pipeline where sensors are watched: at an exchange it forgets."""
+
+    def __init__(
+        self,
+        session: SessionCalibration | None = None,
+        part: Trust | None = None,
+        read_rest: Callable[[], NDArray[np.float64]] | None = None,
+        hear: Callable[[], object] = list,
+    ) -> None:
+        """`hear`: called at each exchange."""
+        self.session, self.trust, self.read_rest, self.hear = session, part, read_rest, hear
+
+    def sensors_exchanged(
+        self, known: SessionState | None = None, learned: LearnerState | None = None
+    ) -> None:
+        self.hear()
+        if self.session is not None:
+            self.session.reset()
+            if known is not None:
+                self.session.restore(known)
+        if self.trust is not None:
+            self.trust.sensors_exchanged(learned)
+
+
 def session_keeper(
     session: SessionCalibration | None,
     tactile: Driver,
     file: SessionFile,
     clock: Clock | None = None,
     part: Trust | None = None,
+    read_rest: Callable[[], NDArray[np.float64]] | None = None,
 ) -> SessionKeeper:
-    """A keeper that resets session and trust at an exchange, as the pipeline does."""
+    judge = cast(Pipeline, FakeJudge(session, part, read_rest))
+    return SessionKeeper(judge, FINGERS, tactile, file, clock or Clock())
 
-    def exchanged(known: SessionState | None, learned: LearnerState | None) -> None:
-        if session is not None:
-            session.reset()
-            if known is not None:
-                session.restore(known)
-        if part is not None:
-            part.sensors_exchanged(learned)
 
-    return SessionKeeper(
-        session, FINGERS, tactile, file, exchanged, trust=part, clock=clock or Clock()
-    )
+def sensor_watch(
+    tactile: Driver,
+    hear: Callable[[], object],
+    read_rest: Callable[[], NDArray[np.float64]] | None = None,
+) -> SensorWatch:
+    return SensorWatch(cast(Pipeline, FakeJudge(None, None, read_rest, hear)), tactile)

@@ -21,7 +21,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.session.file import SessionFile, load, others
 from graspd.daemon.session.keeper import SessionKeeper
-from graspd.daemon.session.sensors import LOOK_EVERY, SensorWatch, moved_fingers
+from graspd.daemon.session.sensors import LOOK_EVERY, moved_fingers
 from graspd.drivers.base import TactileReading
 from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint
 from graspd.drivers.twins.grasps.grasps import recorded_counts
@@ -29,7 +29,15 @@ from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, Clock, reading
-from tests.daemon.session.learning import NOBODY, calibration, observe, read_once, sensors
+from tests.daemon.session.learning import (
+    NOBODY,
+    calibration,
+    observe,
+    read_once,
+    sensor_watch,
+    sensors,
+    session_keeper,
+)
 
 SHORT = Durations(
     approach_s=(0.3, 0.3),
@@ -46,7 +54,7 @@ def test_another_sensor_is_told_once_and_before_its_readings(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     driver, exchanges = sensors(), []
-    watch = SensorWatch(driver, lambda *_: exchanges.append(dict(driver.known)))
+    watch = sensor_watch(driver, lambda: exchanges.append(dict(driver.known)))
     steps: list[dict[str, str]] = [
         {},
         {"ff": "A", "mf": "B"},
@@ -148,15 +156,7 @@ class Robot:
             hand=HandLimits(),
         )
         self.file = SessionFile(self.folder / "right.json")
-        self.keeper = SessionKeeper(
-            self.pipeline.session,
-            FINGERS,
-            sensors(),
-            self.file,
-            self.pipeline.sensors_exchanged,
-            read_rest=self.pipeline.read_rest,
-            clock=self.clock,
-        )
+        self.keeper = SessionKeeper(self.pipeline, FINGERS, sensors(), self.file, self.clock)
 
     def stop(self) -> None:
         self.keeper.save()
@@ -251,14 +251,7 @@ def test_a_hand_that_is_tared_while_it_holds_is_itself_again_once_it_opens(tmp_p
     session, now = calibration(), [np.full((3, 24), 2000.0)]
     observe(session, 30)
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(
-            session,
-            FINGERS,
-            sensors(),
-            file,
-            lambda known, _: session.reset() if known is None else session.restore(known),
-            read_rest=lambda: now[0],
-        )
+        keeper = session_keeper(session, sensors(), file, read_rest=lambda: now[0])
         opened = now[0]
         held = opened - np.linspace(0.0, 400.0, 24)
         grasps = []
@@ -274,7 +267,7 @@ def test_a_hand_that_is_tared_while_it_holds_is_itself_again_once_it_opens(tmp_p
 def test_a_finger_that_is_tared_alone_ends_nothing() -> None:
     """It may be one that touches the table for half a minute."""
     now, exchanges = np.full((3, 24), 2000.0), list[object]()
-    watch = SensorWatch(sensors(), lambda *known: exchanges.append(known), now.copy)
+    watch = sensor_watch(sensors(), lambda: exchanges.append(None), now.copy)
     for rest in (2000.0, 0.0, np.linspace(1500.0, 2000.0, 24), 2000.0):
         now[1] = rest
         for _ in range(LOOK_EVERY):
