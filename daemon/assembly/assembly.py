@@ -269,7 +269,7 @@ def _palm(scene: Scene, options: PalmTactile) -> Driver:
     calibration = joints.calibration if isinstance(joints, PalmJoints) else None
     heed = options.heed_finger_bits
     if options.source.startswith("udp://"):
-        from graspd.drivers.palm.driver import PalmDriver
+        from graspd.drivers.palm.stream import PalmDriver
 
         return PalmDriver(
             options.source,

@@ -10,9 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from tests.emulated.board import Board
+from tests.emulated.board import Board, sweeps, timing, transactions
 from tests.emulated.build import CLOCKS_MHZ, TARGETS, Port, Sequence, flash_and_ram, image
-from tests.emulated.bus import sweeps, timing, transactions
 
 SECONDS = 2
 """In which STATUS is sent twice."""

@@ -23,8 +23,16 @@ from tests.drivers.spi.bridge_c import (
     seq_of,
     words_of,
 )
-from tests.emulated.board import BOARD_ID, Board, serials
-from tests.emulated.bus import Timing, Transaction, sweeps, timing, transactions
+from tests.emulated.board import (
+    BOARD_ID,
+    Board,
+    Timing,
+    Transaction,
+    serials,
+    sweeps,
+    timing,
+    transactions,
+)
 from tests.emulated.conftest import Image
 
 PERIOD_MS = 10.0
