@@ -59,14 +59,10 @@ def test_an_absent_socketcan_interface_is_waited_for(caplog: pytest.LogCaptureFi
 
 FAILURES = [
     can.CanOperationError("adapter says no"),
-    can.CanTimeoutError("too late"),
-    can.CanInitializationError("gone"),
     OSError(errno.ENETDOWN, "Network is down"),
-    OSError(errno.ENODEV, "No such device"),
     struct.error("unpack requires a buffer of 4 bytes"),
     ValueError("invalid literal for int() with base 16"),
     TypeError("ord() expected a character"),
-    IndexError("string index out of range"),
     AssertionError("only requested a single extra field"),
     RuntimeError("whatever"),
 ]
