@@ -25,17 +25,11 @@ JOINTS = (
     *("LFJ1", "LFJ2", "LFJ3", "LFJ4", "LFJ5", "THJ1", "THJ2", "THJ3", "THJ4", "THJ5"),
     *("WRJ1", "WRJ2", "FFJ0", "MFJ0", "RFJ0", "LFJ0"),
 )
-"""Joints of the Shadow hand: 24 with sensors, then J0 of four fingers.
-
-J0 is the sum of J1 and J2, which one motor moves.
-"""
+"""Joints of the Shadow hand: 24 with sensors, then J0, the sum of J1 and J2, of four fingers."""
 
 
 def joint_name(column: str) -> str | None:
-    """Return the joint of a column, without Shadow's prefix of the hand; None if it names none.
-
-    `rh_FFJ3` gives `FFJ3`.
-    """
+    """Return the joint of a column (`rh_FFJ3` gives `FFJ3`); None if it names no joint."""
     name = column[3:] if column.startswith(("rh_", "lh_")) else column
     return name if name in JOINTS else None
 

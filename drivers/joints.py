@@ -1,7 +1,4 @@
-"""Joint angles of a hand from any source that can send JSON: see deploy/wire/JOINTS.md.
-
-The joint stream has one JSON object per datagram.
-"""
+"""The joint stream: one JSON object of angles per datagram; see deploy/wire/JOINTS.md."""
 
 from __future__ import annotations
 
@@ -59,14 +56,11 @@ class JointMessage:
     """Shape (joints,); NaN for a value that is no angle."""
 
     def to_bytes(self) -> bytes:
-        """Return the datagram. Raises `ValueError` for NaN and more than 4096 bytes."""
+        """Return the datagram. Raises `ValueError` for NaN."""
         joints = dict(zip(self.names, self.position_rad, strict=True))
         fields = {"seq": self.seq, "t": self.t_s, "joints": joints}
         message = {name: value for name, value in fields.items() if value is not None}
-        data = json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
-        if len(data) > DATAGRAM_BYTES_MAX:
-            raise ValueError(f"{len(data)} bytes are more than {DATAGRAM_BYTES_MAX}")
-        return data
+        return json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
 
 
 class JointStream:

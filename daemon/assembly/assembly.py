@@ -267,7 +267,7 @@ def _palm(scene: Scene, options: PalmTactile) -> Driver:
         "heed_finger_bits": options.heed_finger_bits,
     }
     if options.source.startswith("udp://"):
-        from graspd.drivers.palm.driver import PalmDriver
+        from graspd.drivers.palm.stream import PalmDriver
 
         return PalmDriver(options.source, only_from=options.only_from, **common)
     from graspd.drivers.recordings.palm_file import PalmFile

@@ -29,7 +29,7 @@ Waking for each frame costs more than the frame, so the loop rests until shortly
 should be complete.
 """
 RATE_WINDOW_NS: Final = 1_000_000_000
-"""Time over which frames per second are counted, ns."""
+"""Time over which frames of all kinds per second are counted, ns."""
 
 
 class CanBridgeDriver(Opened):
@@ -74,12 +74,6 @@ class CanBridgeDriver(Opened):
         return self.stream.counters
 
     @property
-    def frames_per_s(self) -> float:
-        """Frames of all kinds in the last full second."""
-        silent = self._clock() - self._window_start_ns > 2 * RATE_WINDOW_NS
-        return 0.0 if silent else self._frames_per_s
-
-    @property
     def period_ns(self) -> int | None:
         return self.stream.period_ns
 
@@ -91,7 +85,8 @@ class CanBridgeDriver(Opened):
     def describe(self) -> dict[str, Fact]:
         facts = self.stream.describe()
         if self.stream.link.state is LinkState.UP:
-            facts["frames"] = Fact(f"{self.frames_per_s:.0f} /s")
+            is_silent = self._clock() - self._window_start_ns > 2 * RATE_WINDOW_NS
+            facts["frames"] = Fact("0 /s" if is_silent else f"{self._frames_per_s:.0f} /s")
         return facts
 
     def open(self) -> None:

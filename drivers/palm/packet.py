@@ -103,16 +103,13 @@ class PalmPacket:
     """Five slots, in the order of `graspd.drivers.base.FINGERS`."""
 
     def to_bytes(self) -> bytes:
-        """Return the packet as bytes; skipped fields are zero. Raises `ValueError`."""
+        """Return the packet as bytes; skipped fields are zero."""
         layout = _LAYOUTS[self.palm]
         tactile = [self.tactile_type, self.tactile_valid]
         tactile += [word for slot in self.tactile for word in slot]
         motors = [self.which_motors]
         blocks = motors + tactile if layout.motors_first else tactile + motors
-        try:
-            return layout.format.pack(self.command, *self.sensors, *blocks)
-        except struct.error as error:
-            raise ValueError(f"this is no palm packet: {error}") from error
+        return layout.format.pack(self.command, *self.sensors, *blocks)
 
 
 @dataclass(slots=True)

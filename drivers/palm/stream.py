@@ -1,4 +1,4 @@
-"""Decode the packets of one palm, with their times, into tactile and joint readings. No I/O.
+"""A Shadow hand's palm: its packets, by UDP from a relay, become tactile and joint readings.
 
 A packet carries two channels of each BioTac; its `tactile_type` names them. Packets have no number,
 so the place of a packet is its type, counted on from the furthest packet before it:
@@ -18,7 +18,8 @@ socket look like one, so use one port for each hand.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -34,10 +35,11 @@ from graspd.drivers.base import (
     Reading,
     TactileReading,
 )
-from graspd.drivers.link import OUTAGE_NS
+from graspd.drivers.link import OUTAGE_NS, LinkState, longest_silence_ns
 from graspd.drivers.palm.packet import (
     CHANNELS,
     CYCLE_NS,
+    PACKET_BYTES_MAX,
     ROUND,
     SENSORS,
     TYPE_METADATA_FIRST,
@@ -50,6 +52,7 @@ from graspd.drivers.palm.packet import (
     parse_packet,
     position_of,
 )
+from graspd.drivers.udp import DatagramDriver
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,10 +64,10 @@ ROUND_NS: Final = ROUND * CYCLE_NS
 JOINT_PERIOD_NS: Final = 10_000_000
 """Time between joint readings, ns: 100 Hz is enough for a hand, and 1000 Hz costs more."""
 LATE_MAX: Final = 10
-"""Most cycles by which a packet may be late; after that a whole round counts as lost.
+"""Most cycles by which a packet may be late; after that a whole round counts as lost."""
 
-After `ROUND - 1 + LATE_MAX` cycles of silence, no packet counts for the round before.
-"""
+SPARE_CYCLES: Final = 2
+"""Cycles before the end of a round from which the driver waits for packets again."""
 
 _COMPLETE: Final = (1 << ROUND) - 1
 _TELLING: Final = 0b11
@@ -74,9 +77,9 @@ _TELLING: Final = 0b11
 class PalmStream:
     """Make a `TactileReading` of each round of 14 packets, and a `JointReading` every 10 ms.
 
-    Packets must arrive one a millisecond, as the palm makes them. If a relay sends batches longer
-    than 10 ms, sound rounds are flagged or counted as missed. If it delays packets by more than
-    3 ms, the loss of a whole round may go unnoticed.
+    It does no I/O. Packets must arrive one a millisecond, as the palm makes them. If a relay sends
+    batches longer than 10 ms, sound rounds are flagged or counted as missed. If it delays packets
+    by more than 3 ms, the loss of a whole round may go unnoticed.
     """
 
     period_ns: int | None = ROUND_NS
@@ -295,6 +298,58 @@ class PalmStream:
         reading = JointReading(t_ns, self._joint_seq, JOINTS, angles)
         self._joint_seq += 1
         return reading
+
+
+class PalmDriver(DatagramDriver[PalmStream]):
+    """Driver of the readings of a `PalmStream`. `open` also raises `CalibrationError`."""
+
+    name = "palm"
+    bytes_max = PACKET_BYTES_MAX
+    silence_ns = longest_silence_ns(ROUND_NS)
+    period_ns: int | None = ROUND_NS
+
+    def __init__(
+        self,
+        source: str,
+        fingers: Sequence[str] = ("ff", "mf", "th"),
+        *,
+        calibration: Path | None = None,
+        only_from: str | None = None,
+        heed_finger_bits: bool = True,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._fingers = tuple(fingers)
+        self._heed_finger_bits = heed_finger_bits
+        self._calibration: Path | None = None  # `open` reads it
+        super().__init__(source, only_from=only_from, clock=clock)
+        self._calibration = calibration
+        self._attention_ns = 0
+
+    def _new_stream(self) -> PalmStream:
+        return PalmStream(
+            self._fingers, calibration=self._calibration, heed_finger_bits=self._heed_finger_bits
+        )
+
+    @property
+    def serials(self) -> dict[str, str]:
+        """The sender for each finger, because packets have no serial number."""
+        return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
+
+    def fileno(self) -> int | None:
+        """Return the socket; None while no round can end, for 71 wakes a second, not 1000."""
+        return None if self._clock() < self._attention_ns else super().fileno()
+
+    def due_ns(self) -> int | None:
+        due_ns = super().due_ns()
+        if self.link.state is LinkState.CLOSED or self._clock() >= self._attention_ns:
+            return due_ns
+        return self._attention_ns if due_ns is None else min(due_ns, self._attention_ns)
+
+    def read_ready(self) -> Sequence[Reading]:
+        readings = super().read_ready()
+        cycles = max(0, self.stream.cycles_to_go - SPARE_CYCLES)
+        self._attention_ns = self._clock() + cycles * CYCLE_NS
+        return readings
 
 
 def _step(place: int, position: int, elapsed_ns: int) -> int:

@@ -1,7 +1,7 @@
 """Frames and messages of `deploy/bridge/PROTOCOL.md`, version 1. Bytes only.
 
 A frame is `COBS(type: u8 | payload | crc: u32) 0x00`. For a message of a wrong length, or with
-contents that the protocol forbids, encoding raises `ValueError` and decoding returns None.
+contents that the protocol forbids, decoding returns None.
 """
 
 from __future__ import annotations
@@ -187,8 +187,8 @@ class Hello:
 
     def to_bytes(self) -> bytes:
         bridge = (self.version, self.digest, self.nonce, self.tick, self.tick_hz, self.firmware)
-        sampling = (_text_to_bytes(self.board), self.period_ticks, self.sensors, self.slots)
-        serials = b"".join(_text_to_bytes(serial) for serial in self.serials)
+        sampling = (self.board.encode(), self.period_ticks, self.sensors, self.slots)
+        serials = b"".join(serial.encode().ljust(TEXT_BYTES, b"\0") for serial in self.serials)
         return _HELLO.pack(*bridge, *sampling) + serials + bytes(self.commands)
 
     @classmethod
@@ -338,15 +338,9 @@ _MESSAGES: dict[int, type[Message]] = {
 }
 
 
-def encode(message: Message, digest: int = DIGEST) -> bytes:
-    """Return the frame of a message. Raises `ValueError`."""
-    if not message.is_sound():
-        raise ValueError(f"{message} is forbidden by the protocol")
-    try:
-        payload = message.to_bytes()
-    except struct.error as error:
-        raise ValueError(f"{message}: {error}") from error
-    return encode_frame(message.TYPE, payload, digest)
+def encode(message: Message) -> bytes:
+    """Return the frame of a message."""
+    return encode_frame(message.TYPE, message.to_bytes(), DIGEST)
 
 
 def decode(kind: int, payload: bytes) -> Message | None:
@@ -359,12 +353,6 @@ def decode(kind: int, payload: bytes) -> Message | None:
 def layout_of(payload: bytes) -> tuple[int, int] | None:
     """Return version and digest of a HELLO of any version; None if it is too short."""
     return _LAYOUT.unpack_from(payload) if len(payload) >= _LAYOUT.size else None
-
-
-def _text_to_bytes(text: str) -> bytes:
-    if not text.isascii() or "\0" in text or len(text) > TEXT_BYTES:
-        raise ValueError(f"{text!r} is not at most {TEXT_BYTES} ASCII characters")
-    return text.encode("ascii").ljust(TEXT_BYTES, b"\0")
 
 
 def _text(padded: bytes) -> str:

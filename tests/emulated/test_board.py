@@ -95,16 +95,11 @@ def test_picotool_is_fetched_if_the_option_asks_for_it(image: Image, tmp_path: P
     nowhere = tmp_path / "nowhere"
     options = {"PICO_NO_PICOTOOL": 0, "PICOTOOL_GIT_REPOSITORY_URL": nowhere}
     settings = [f"-D{name}={value}" for name, value in options.items()]
-    command: list[str | Path] = [
-        "cmake",
-        "-S",
-        build.BRIDGE / "pico",
-        "-B",
-        tmp_path / "build",
-        *settings,
-    ]
-    command.append(f"-DPICO_SDK_PATH={build.pico_sdk()}")
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    settings.append(f"-DPICO_SDK_PATH={build.pico_sdk()}")
+    folders: list[str | Path] = ["-S", build.BRIDGE / "pico", "-B", tmp_path / "build"]
+    done = subprocess.run(
+        ["cmake", *folders, *settings], check=False, capture_output=True, text=True
+    )
     assert done.returncode != 0, done.stdout
     assert "Downloading Picotool" in done.stderr
     assert str(nowhere) in done.stdout + done.stderr

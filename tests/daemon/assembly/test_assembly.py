@@ -180,9 +180,9 @@ BEHIND = ("th", "ff", "mf")
 @pytest.mark.parametrize(
     ("driver", "tactile", "told"),
     [
-        ("palm.driver.PalmDriver", PALM, {"only_from": None, "heed_finger_bits": True}),
+        ("palm.stream.PalmDriver", PALM, {"only_from": None, "heed_finger_bits": True}),
         (
-            "palm.driver.PalmDriver",
+            "palm.stream.PalmDriver",
             PALM | {"only_from": "10.0.0.2", "heed_finger_bits": False},
             {"only_from": "10.0.0.2", "heed_finger_bits": False},
         ),

@@ -20,7 +20,7 @@ from graspd.daemon.doctor.finding import Finding, Level
 from graspd.drivers.base import Driver, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.joints import JointStreamDriver
-from graspd.drivers.palm.driver import PalmDriver
+from graspd.drivers.palm.stream import PalmDriver
 from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.twins.datagrams import JointTwin, PalmTwin
 from graspd.drivers.twins.faults import LinkFaults

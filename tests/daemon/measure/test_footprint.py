@@ -48,7 +48,7 @@ BUSES = {
     ),
     "spi": {"serial", "cobs"} | ours("drivers.spi.driver"),
     "can": {"can", "asyncio", "sqlite3"} | ours("drivers.can.driver", "drivers.can.bus"),
-    "palm": ours("drivers.palm.driver", "drivers.palm.packet"),
+    "palm": ours("drivers.palm.stream", "drivers.palm.packet"),
 }
 """Modules that only this driver needs; python-can brings asyncio and sqlite3."""
 JOINTS = ours("daemon.judge.joint_motion", "drivers.joints")

@@ -59,14 +59,10 @@ def test_an_absent_socketcan_interface_is_waited_for(caplog: pytest.LogCaptureFi
 
 FAILURES = [
     can.CanOperationError("adapter says no"),
-    can.CanTimeoutError("too late"),
-    can.CanInitializationError("gone"),
     OSError(errno.ENETDOWN, "Network is down"),
-    OSError(errno.ENODEV, "No such device"),
     struct.error("unpack requires a buffer of 4 bytes"),
     ValueError("invalid literal for int() with base 16"),
     TypeError("ord() expected a character"),
-    IndexError("string index out of range"),
     AssertionError("only requested a single extra field"),
     RuntimeError("whatever"),
 ]
@@ -157,9 +153,9 @@ def test_frames_per_second_are_told_until_there_are_none() -> None:
                 driver.read_ready()
             assert driver.describe()["frames"].text == "240 /s"  # 24 in each tenth
         clock.now_ns += 1_900 * MS
-        assert driver.frames_per_s == 240.0
+        assert driver.describe()["frames"].text == "240 /s"
         clock.now_ns += 1
-        assert driver.frames_per_s == 0.0
+        assert driver.describe()["frames"].text == "0 /s"
 
 
 def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(

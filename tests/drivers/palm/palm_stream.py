@@ -12,9 +12,8 @@ import pytest
 
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from graspd.drivers.joints import JointStreamDriver
-from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.palm.packet import Palm, PalmCounters, PalmPacket
-from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.palm.stream import PalmDriver, PalmStream
 from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.udp import Datagram, DatagramReceiver

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from graspd.drivers.palm.calibration import CalibrationError
-from graspd.drivers.palm.driver import PalmDriver
 from graspd.drivers.palm.packet import Palm
+from graspd.drivers.palm.stream import PalmDriver
 from graspd.drivers.twins.datagrams import PalmTwin
 from tests.conftest import ROOT
 from tests.drivers.one_sweep import tactile
@@ -106,7 +106,7 @@ def test_the_loop_is_not_woken_in_the_middle_of_a_round(
 def test_without_a_calibration_there_are_no_joints_and_no_joint_code() -> None:
     program = (
         "import sys\n"
-        "from graspd.drivers.palm.driver import PalmDriver\n"
+        "from graspd.drivers.palm.stream import PalmDriver\n"
         f"with PalmDriver({LOOPBACK!r}):\n"
         "    sys.exit(any('calibration' in name or 'twins' in name for name in sys.modules))\n"
     )
