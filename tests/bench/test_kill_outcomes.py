@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import zmq
 from numpy.typing import NDArray
 
 from deploy.clients.python.graspd_client import Client, Outcome, Verdict
@@ -26,6 +25,7 @@ from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.trust import Trust, TrustState, decode
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
+from tests.bench.live import Subscriber
 from tests.daemon.fakes import sound
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict
@@ -89,11 +89,8 @@ class Bench:
         self._scene = scene.load(self._path)
         self._seed_session()
         self._reference = Reference(self._scene)
-        context = stack.enter_context(zmq.Context())
-        self._log = stack.enter_context(context.socket(zmq.SUB))
-        self._log.connect(f"ipc://{folder}/graspd")
-        self._log.subscribe("tactile.")
-        self._log.subscribe("verdict.")
+        topics = ("tactile.", "verdict.")
+        self._log = stack.enter_context(Subscriber(f"ipc://{folder}/graspd", topics=topics))
         self._slipped = {
             row.counts.tobytes(): bool(row.annotation.slipped)
             for row in read_rows(DEMO_TABLE, self._scene.hand.fingers)
@@ -183,8 +180,8 @@ class Bench:
 
     def _hear(self) -> None:
         """Note what was published."""
-        while self._log.poll(0):
-            topic, payload = self._log.recv_multipart()
+        while (message := self._log.take(0.0)) is not None:
+            topic, payload = message
             if topic.startswith(b"tactile."):
                 reading = decode_tactile(payload)
                 self._counts[reading.t_mono_ns] = np.array(reading.counts, dtype=np.uint16)
