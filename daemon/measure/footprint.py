@@ -48,8 +48,7 @@ class Meter:
     def __init__(self, started_ns: int) -> None:
         """Begin with the interpreter, started at monotonic `started_ns`."""
         self.parts: list[dict[str, float | str]] = []
-        self._first = dict.fromkeys(_now(), 0) | {"wall_ms": started_ns / 1e6}
-        self._last = self._first
+        self._first = self._last = dict.fromkeys(_now(), 0) | {"wall_ms": started_ns / 1e6}
         self.take("interpreter")
 
     def take(self, name: str) -> None:
