@@ -155,16 +155,17 @@ def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
         read_all(tmp_path)
 
 
-def test_a_table_with_other_bytes_is_known_as_not_published(tmp_path: Path) -> None:
-    for name in ("palm_down", "palm_side"):
-        write_table(tmp_path / f"{name}.csv", *separable_counts(6))
-    assert unpublished(read_all(tmp_path).files) == ["palm_down", "palm_side"]
-
-
-def test_some_rows_keep_counts_labels_objects_and_tables_together(tmp_path: Path) -> None:
+@pytest.fixture
+def made_up(tmp_path: Path) -> Path:
+    """Folder of two tables of six grasps."""
     for seed, name in enumerate(("palm_down", "palm_side")):
         write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))
-    whole = read_all(tmp_path)
+    return tmp_path
+
+
+def test_some_rows_keep_counts_labels_objects_and_tables_together(made_up: Path) -> None:
+    whole = read_all(made_up)
+    assert unpublished(whole.files) == ["palm_down", "palm_side"]
     some = whole.rows(np.array([1, 5, 7]))
     assert np.array_equal(some.counts, whole.counts[[1, 5, 7]])
     assert some.slipped.tolist() == [True, True, True]
@@ -174,10 +175,8 @@ def test_some_rows_keep_counts_labels_objects_and_tables_together(tmp_path: Path
     assert whole.rows(np.arange(12)).digest() == whole.digest()
 
 
-def test_the_digest_of_grasps_is_of_counts_labels_objects_and_tables(tmp_path: Path) -> None:
-    for seed, name in enumerate(("palm_down", "palm_side")):
-        write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))
-    down, side = (read_table(tmp_path / f"{name}.csv") for name in ("palm_down", "palm_side"))
+def test_the_digest_of_grasps_is_of_counts_labels_objects_and_tables(made_up: Path) -> None:
+    down, side = (read_table(made_up / f"{name}.csv") for name in ("palm_down", "palm_side"))
     digests = {
         concatenate([down, side]).digest(),
         concatenate([side, down]).digest(),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from graspd.models.inputs import VectorBuilder
@@ -30,21 +29,8 @@ from tests.models.training.samples import separable_counts
 
 TINY = NetworkConfig(filters=4, hidden=16)
 QUICK = Recipe(epochs=4)
-
-
-@pytest.fixture(scope="module")
-def images() -> NDArray[np.float32]:
-    return TactileImager(3).build_batch(separable_counts(160)[0])[0]
-
-
-@pytest.fixture(scope="module")
-def vectors() -> NDArray[np.float32]:
-    return VectorBuilder(3).build_batch(separable_counts(160)[0])[0]
-
-
-@pytest.fixture(scope="module")
-def slipped() -> NDArray[np.bool_]:
-    return separable_counts(160)[1]
+COUNTS, SLIPPED = separable_counts(160)
+IMAGES, VECTORS = (inputs.build_batch(COUNTS)[0] for inputs in (TactileImager(3), VectorBuilder(3)))
 
 
 @pytest.fixture
@@ -58,62 +44,54 @@ def plain_network(inputs: int = 72) -> nn.Sequential:
 
 
 @pytest.fixture(scope="module")
-def trained(images: NDArray[np.float32], slipped: NDArray[np.bool_]) -> nn.Sequential:
-    return train_network(TINY, images, slipped, QUICK, seed=1)
+def trained() -> nn.Sequential:
+    return train_network(TINY, IMAGES, SLIPPED, QUICK, seed=1)
 
 
 def _weights(network: nn.Sequential) -> list[float]:
     return [value for tensor in network.state_dict().values() for value in tensor.ravel().tolist()]
 
 
-def test_a_tiny_training_learns_what_can_be_separated(
-    trained: nn.Sequential, images: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
+def test_a_tiny_training_learns_what_can_be_separated(trained: nn.Sequential) -> None:
     counts, labels = separable_counts(100, seed=8)
     unseen = TactileImager(3).build_batch(counts)[0]
-    assert ((logits(trained, images).argmax(axis=1) == 1) == slipped).all()
+    assert ((logits(trained, IMAGES).argmax(axis=1) == 1) == SLIPPED).all()
     assert ((logits(trained, unseen).argmax(axis=1) == 1) == labels).all()
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_gives_others(
-    trained: nn.Sequential, images: NDArray[np.float32], slipped: NDArray[np.bool_]
+    trained: nn.Sequential,
 ) -> None:
     torch.manual_seed(99)  # the state around a training does not matter
-    assert _weights(train_network(TINY, images, slipped, QUICK, seed=1)) == _weights(trained)
-    assert _weights(train_network(TINY, images, slipped, QUICK, seed=2)) != _weights(trained)
+    assert _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=1)) == _weights(trained)
+    assert _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=2)) != _weights(trained)
 
 
-def test_training_leaves_torch_as_it_was(
-    images: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
+def test_training_leaves_torch_as_it_was() -> None:
     threads, state = torch.get_num_threads(), torch.random.get_rng_state()
-    train_network(TINY, images, slipped, Recipe(epochs=1, threads=threads + 1), seed=1)
+    train_network(TINY, IMAGES, SLIPPED, Recipe(epochs=1, threads=threads + 1), seed=1)
     assert torch.get_num_threads() == threads
     assert not torch.are_deterministic_algorithms_enabled()
     assert torch.equal(torch.random.get_rng_state(), state)
 
 
 @pytest.mark.parametrize("grasps", [0, 1])
-def test_training_on_less_than_two_grasps_is_refused(
-    grasps: int, images: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
+def test_training_on_less_than_two_grasps_is_refused(grasps: int) -> None:
     with pytest.raises(ValueError, match=f"cannot train on {grasps} grasps"):
-        train_network(TINY, images[:grasps], slipped[:grasps], QUICK, seed=1)
+        train_network(TINY, IMAGES[:grasps], SLIPPED[:grasps], QUICK, seed=1)
 
 
 @pytest.mark.usefixtures("dense")
-def test_the_published_recipe_updates_as_keras_does(
-    vectors: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
+def test_the_published_recipe_updates_as_keras_does() -> None:
     """Forward, backward, L2 loss term, Adam and time decay of Keras 2.0.8, in numpy."""
     recipe = PublishedRecipe(epochs=6, batch=160, learning_rate=0.01, decay=0.5, l2=0.03)
-    network = train_network(TINY, vectors, slipped, recipe, seed=4)
+    network = train_network(TINY, VECTORS, SLIPPED, recipe, seed=4)
     with reproducible(seed=4):
         start = plain_network()
     weights = [tensor.detach().double().numpy().copy() for tensor in start.parameters()]
     first = [np.zeros_like(weight) for weight in weights]
     second = [np.zeros_like(weight) for weight in weights]
-    inputs, truth = vectors.astype(np.float64), np.eye(2)[slipped.astype(np.int64)]
+    inputs, truth = VECTORS.astype(np.float64), np.eye(2)[SLIPPED.astype(np.int64)]
     for update in range(6):
         w1, b1, w2, b2 = weights
         before = inputs @ w1.T + b1
@@ -142,14 +120,11 @@ def test_the_published_recipe_updates_as_keras_does(
     [(Recipe(epochs=1, batch=160), 0.1), (PublishedRecipe(epochs=1, batch=160), 0.01)],
 )
 def test_batch_norm_remembers_as_the_recipe_says(
-    recipe: Recipe | PublishedRecipe,
-    momentum: float,
-    images: NDArray[np.float32],
-    slipped: NDArray[np.bool_],
+    recipe: Recipe | PublishedRecipe, momentum: float
 ) -> None:
     with reproducible(seed=4), torch.no_grad():
-        first = build(TINY)[:2](torch.from_numpy(images)).double().numpy()
-    norm = train_network(TINY, images, slipped, recipe, seed=4)[2]
+        first = build(TINY)[:2](torch.from_numpy(IMAGES)).double().numpy()
+    norm = train_network(TINY, IMAGES, SLIPPED, recipe, seed=4)[2]
     assert isinstance(norm, nn.BatchNorm2d)
     assert norm.running_mean is not None
     expected = momentum * first.mean(axis=(0, 2, 3))
@@ -166,12 +141,7 @@ def test_batch_norm_remembers_as_the_recipe_says(
     ],
 )
 def test_an_epoch_sees_each_grasp_at_most_once(
-    recipe: Recipe | PublishedRecipe,
-    grasps: int,
-    seen: int,
-    vectors: NDArray[np.float32],
-    slipped: NDArray[np.bool_],
-    monkeypatch: pytest.MonkeyPatch,
+    recipe: Recipe | PublishedRecipe, grasps: int, seen: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batches: list[torch.Tensor] = []
 
@@ -182,43 +152,39 @@ def test_an_epoch_sees_each_grasp_at_most_once(
 
     network = nn.Sequential(Recorder(), *plain_network())
     monkeypatch.setattr(networks, "build", lambda *_: network)
-    train_network(TINY, vectors[:grasps], slipped[:grasps], recipe, seed=0)
+    train_network(TINY, VECTORS[:grasps], SLIPPED[:grasps], recipe, seed=0)
     rows = {tuple(row) for row in torch.cat(batches).tolist()}
     assert len(rows) == sum(map(len, batches)) == seen
 
 
 @pytest.mark.usefixtures("dense")
-def test_label_smoothing_bounds_the_margin(
-    vectors: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
+def test_label_smoothing_bounds_the_margin() -> None:
     """Smoothed by 0.2 the targets are 0.9 and 0.1: margins of log(9)."""
     recipe = Recipe(epochs=60, weight_decay=0.0, peak_learning_rate=0.01, label_smoothing=0.2)
-    values = logits(train_network(TINY, vectors, slipped, recipe, seed=0), vectors)
+    values = logits(train_network(TINY, VECTORS, SLIPPED, recipe, seed=0), VECTORS)
     margins = values[:, 1] - values[:, 0]
-    assert margins[slipped].mean() == pytest.approx(np.log(9.0), rel=0.05)
-    assert margins[~slipped].mean() == pytest.approx(-np.log(9.0), rel=0.05)
+    assert margins[SLIPPED].mean() == pytest.approx(np.log(9.0), rel=0.05)
+    assert margins[~SLIPPED].mean() == pytest.approx(-np.log(9.0), rel=0.05)
 
 
 @pytest.mark.usefixtures("dense")
-def test_input_noise_is_drawn_from_the_seed(
-    vectors: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
+def test_input_noise_is_drawn_from_the_seed() -> None:
     noisy = Recipe(epochs=2, input_noise=0.3)
-    first = _weights(train_network(TINY, vectors, slipped, noisy, seed=1))
-    assert first == _weights(train_network(TINY, vectors, slipped, noisy, seed=1))
-    assert first != _weights(train_network(TINY, vectors, slipped, Recipe(epochs=2), seed=1))
+    first = _weights(train_network(TINY, VECTORS, SLIPPED, noisy, seed=1))
+    assert first == _weights(train_network(TINY, VECTORS, SLIPPED, noisy, seed=1))
+    assert first != _weights(train_network(TINY, VECTORS, SLIPPED, Recipe(epochs=2), seed=1))
 
 
 def test_days_are_drawn_from_the_seed_and_change_what_is_learned(
-    slipped: NDArray[np.bool_], monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(networks, "build", lambda *_: plain_network(26))
-    features = np.random.default_rng(0).normal(size=(len(slipped), 26)).astype(np.float32)
+    features = np.random.default_rng(0).normal(size=(len(SLIPPED), 26)).astype(np.float32)
     shifted = SessionRecipe(epochs=2)
-    first = _weights(train_network(TINY, features, slipped, shifted, seed=1))
-    assert first == _weights(train_network(TINY, features, slipped, shifted, seed=1))
+    first = _weights(train_network(TINY, features, SLIPPED, shifted, seed=1))
+    assert first == _weights(train_network(TINY, features, SLIPPED, shifted, seed=1))
     same_day = SessionRecipe(epochs=2, day_shift=DayShift(0.0, 0.0, 0.0))
-    assert first != _weights(train_network(TINY, features, slipped, same_day, seed=1))
+    assert first != _weights(train_network(TINY, features, SLIPPED, same_day, seed=1))
 
 
 def test_weight_decay_spares_biases_and_norms() -> None:
