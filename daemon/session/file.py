@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Self
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, Self
 
 import msgspec
 
@@ -52,6 +52,21 @@ class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of learning, from `graspd.daemon.trust.trust.encode`; None without learning."""
     rest: tuple[Annotated[float, msgspec.Meta(ge=0.0, le=COUNT_MAX)], ...] | None = None
     """Resting count of each electrode, finger by finger; 0: not known."""
+
+
+class SavedState(NamedTuple):
+    """Decoded content of the session file."""
+
+    serials: dict[str, str]
+    statistics: SessionState | None = None
+    trust: TrustState | None = None
+    rest: tuple[float, ...] | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """True if it has neither a grasp nor an outcome."""
+        no_grasps = self.statistics is None or not self.statistics.grasps
+        return no_grasps and (self.trust is None or not self.trust.learner.outcomes)
 
 
 class _Sealed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="version", tag=2):

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from graspd.daemon.publish.companion import Answer, Requests
 from graspd.daemon.session.file import (
     OTHERS_MAX,
     KeptSession,
+    SavedState,
     SessionFile,
     SessionFileError,
     kept_now,
@@ -25,10 +26,9 @@ from graspd.daemon.session.file import (
     others,
     restore_kept,
 )
-from graspd.daemon.session.sensors import UNTOLD, Rest, SensorWatch, moved_fingers
-from graspd.daemon.trust.trust import TrustState, decode
+from graspd.daemon.session.sensors import Rest, SensorWatch, moved_fingers
+from graspd.daemon.trust.trust import decode
 from graspd.drivers.base import ELECTRODES, Driver
-from graspd.models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 
@@ -41,21 +41,6 @@ WAITING_MAX: Final = 64
 BUSY: Final = "busy: too many wait for the disk, tell it again"
 UNEXPECTED: Final = "it could not be written"
 HANGS: Final = "not kept: the disk does not answer"
-
-
-class SavedState(NamedTuple):
-    """Decoded content of the session file."""
-
-    serials: dict[str, str]
-    statistics: SessionState | None = None
-    trust: TrustState | None = None
-    rest: tuple[float, ...] | None = None
-
-    @property
-    def is_empty(self) -> bool:
-        """True if it has neither a grasp nor an outcome."""
-        no_grasps = self.statistics is None or not self.statistics.grasps
-        return no_grasps and (self.trust is None or not self.trust.learner.outcomes)
 
 
 class SessionKeeper(SensorWatch):
@@ -214,23 +199,11 @@ class SessionKeeper(SensorWatch):
             lost = "learning and the count of the risk begin again"
             log.warning("%s: what was learned %s; %s", self._file.path, error, lost)
 
-    def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
-        """Change to the session of sensors with other serial numbers."""
-        grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
-        log.warning("new sensor on %s: the session%s no longer count", ", ".join(changed), grasps)
+    def _with_serials(self, serials: Mapping[str, str]) -> SavedState | None:
         now = serials.items()
-        former = next((each for each in self._others if now <= each.serials.items()), None)
-        self._begin(former)
-
-    def _is_known(self, rest: Rest) -> bool:
-        return self._with_rest(rest) is not None
-
-    def _exchange_untold(self, moved: int, rest: Rest) -> None:
-        log.warning(UNTOLD, moved)
-        self._begin(self._with_rest(rest))
+        return next((each for each in self._others if now <= each.serials.items()), None)
 
     def _with_rest(self, rest: Rest) -> SavedState | None:
-        """Return the session of other sensors with this resting pattern."""
         for each in self._others:
             former = self._rest_of(each.rest)
             same_serials = each.serials == self._serials

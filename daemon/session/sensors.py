@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.drivers.base import Driver, Reading
+
+if TYPE_CHECKING:
+    from graspd.daemon.session.file import SavedState
 
 Rest = NDArray[np.float64]
 """Resting counts, shape (fingers, 24); 0: not known. They differ between sensors."""
@@ -60,7 +63,10 @@ class SensorWatch(Companion):
         if serials != self._serials:
             changed = exchanged(self._serials, serials)
             if changed:
-                self._exchange(changed, serials)
+                log.warning(
+                    "new sensor on %s: the hand must be seen open first", ", ".join(changed)
+                )
+                self._begin(self._with_serials(serials))
                 self._rest = None
             self._serials.update(serials)
         self._readings += 1
@@ -82,24 +88,26 @@ class SensorWatch(Companion):
             self._rest = rest
         elif has_drifted(self._rest, rest):
             moved = moved_fingers(self._rest, rest)
+            former = self._with_rest(rest) if moved else None
             # A later tare of a single finger may be of one that touches.
-            if moved and (self._is_first_tare or self._is_known(rest)):
-                self._exchange_untold(len(moved), rest)
+            if moved and (self._is_first_tare or former is not None):
+                log.warning(UNTOLD, len(moved))
+                self._begin(former)
                 self._rest = rest
             elif not moved:
                 self._rest = rest
         self._is_first_tare = False
 
-    def _is_known(self, _rest: Rest) -> bool:
-        """Return True if this is the rest of other, known sensors."""
-        return False
+    def _with_serials(self, _serials: Mapping[str, str]) -> SavedState | None:
+        """Return the session of the sensors with these serial numbers; None: not known."""
+        return None
 
-    def _exchange_untold(self, moved: int, _rest: Rest) -> None:
-        log.warning(UNTOLD, moved)
-        self._sensors_exchanged()
+    def _with_rest(self, _rest: Rest) -> SavedState | None:
+        """Return the session of the sensors that rest like this; None: not known."""
+        return None
 
-    def _exchange(self, changed: list[str], _serials: Mapping[str, str]) -> None:
-        log.warning("new sensor on %s: the hand must be seen open first", ", ".join(changed))
+    def _begin(self, _former: SavedState | None) -> None:
+        """Continue a former session, or begin a new one: the sensors are others."""
         self._sensors_exchanged()
 
 

@@ -58,18 +58,6 @@ def test_a_grasp_is_entered_again_once_it_is_assessed() -> None:
     assert lift.features == b"features"
 
 
-def test_all_grasps_are_kept_for_the_next_start() -> None:
-    """A replay that begins in the middle forgets the same grasps as the whole one."""
-    lifts = LiftBook()
-    lifts.note(named(1), NOT_ASSESSED, stable=True)
-    lifts.note(named(2), bytes(8), stable=True)
-    other = LiftBook()
-    other.restore(lifts.state(), 1)
-    assert named(1) in other
-    assert named(2) in other
-    assert other.outstanding == 2
-
-
 def test_an_outcome_is_kept_once_the_disk_has_it() -> None:
     lifts = LiftBook()
     lifts.note(named(1), bytes(8), stable=True)
