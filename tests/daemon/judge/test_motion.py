@@ -151,6 +151,17 @@ def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
     assert (moves(motion) > 5.0).all()
 
 
+def test_a_value_that_is_held_is_believed_in_its_fourth_sweep() -> None:
+    motion, sweep = Motion(1, 0.05), np.full((1, 24), 2000, dtype=np.uint16)
+    motion.add(0, sweep, None)
+    fallen, believed = sweep.copy(), []
+    fallen[0, 0] -= 120
+    for number in range(1, 5):
+        motion.add(number * 10_000_000, fallen, None)
+        believed.append(motion.memory.clean[0, 0] == fallen[0, 0])
+    assert believed == [False, False, False, True]
+
+
 @pytest.mark.parametrize(
     ("electrodes", "counts", "believed"), [(4, 20, True), (4, 21, False), (5, 21, True)]
 )
@@ -212,6 +223,10 @@ def test_a_finger_that_is_lost_as_a_whole_is_not_known_and_no_error() -> None:
 def test_no_such_share_of_false_alarms_can_be_wanted(share: float) -> None:
     with pytest.raises(ValueError, match="false_alarms"):
         Motion(3, share)
+
+
+def test_nearly_half_of_the_sweeps_may_be_false_alarms() -> None:
+    assert Motion(3, 0.49).strict == Motion(3, 0.01).strict, "nothing is known yet"
 
 
 def test_no_finger_may_waver_so_much_that_motion_passes_for_noise() -> None:
