@@ -211,6 +211,16 @@ def test_memory_is_bounded_however_fast_readings_come() -> None:
     assert replace(motion.memory).number == STEPS, "what is full may be taken over"
 
 
+def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
+    motion, all_but_one = Motion(1, 0.05), np.ones((1, 24), dtype=np.bool_)
+    all_but_one[0, 0] = False
+    sweep = np.full((1, 24), 2000, dtype=np.uint16)
+    for number in range(26):
+        sweep[0, 0] = 2000 + 10 * (number % 2)  # the others read the same all the time
+        motion.add(number * 10_000_000, sweep.copy(), all_but_one if number > 20 else None)
+    assert motion.memory.block[0, 0] > 0.0
+
+
 def test_a_finger_that_is_lost_as_a_whole_is_not_known_and_no_error() -> None:
     motion, counts = Motion(1, 0.05), np.rint(wavering(2.0, 100.0, 3.5, 15)).astype(np.uint16)
     for index, sweep in enumerate(counts):
