@@ -35,7 +35,7 @@ RATE_HZ: Final = 50.0
 ANSWER_S: Final = 0.5
 """How long the client waits for an answer unless told otherwise."""
 LATE_S: Final = 0.1
-"""The kill comes so long after the outcome that it was drawn for, at most."""
+"""Longest time from an outcome to the kill that was drawn for it, s."""
 KNOWN_MAX: Final = 1000
 """Published grasps that are remembered here."""
 

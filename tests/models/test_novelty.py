@@ -98,7 +98,7 @@ def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
 ) -> None:
     check = Electrodes(seen(spread=1 / 100))
     values = np.full((3, 24), 2000.0 + 100.0 * distance)
-    deviations = Electrodes(seen(spread=1 / 100)).compare(values)
+    deviations = check.compare(values)
     assert check.is_near(deviations.mean_square()) is near
     assert check.is_near(deviations.mean_square(2), 1) is near_though_contradicted
     assert check.is_learned(deviations.mean_square()) is learned
@@ -107,6 +107,6 @@ def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
 def test_a_reading_that_is_not_finite_is_neither_near_nor_learned() -> None:
     check, values = Electrodes(seen(spread=1 / 100)), np.full((3, 24), 2000.0)
     values[0, 0] = np.nan
-    square = Electrodes(seen(spread=1 / 100)).compare(values).mean_square()
+    square = check.compare(values).mean_square()
     assert not check.is_near(square)
     assert not check.is_learned(square)

@@ -64,7 +64,7 @@ class JsonLines:
             except (FileNotFoundError, ConnectionRefusedError) as error:
                 if time.monotonic() > deadline_s:
                     self._socket.close()
-                    raise ProtocolError(f"{self._name}: nobody listens") from error
+                    raise ProtocolError(f"{self._name}: its socket has no listener") from error
                 time.sleep(RETRY_S)
             else:
                 return

@@ -85,7 +85,7 @@ class Reloaded:
 
 @dataclass(slots=True)
 class Running:
-    """A daemon, its service manager, and somebody who hears its verdicts."""
+    """A daemon, its service manager, and a subscriber of its verdicts."""
 
     folder: Path
     manager: socket.socket

@@ -72,17 +72,17 @@ def other_user(plan: Plan) -> Outcome:
     try:
         with hand(plan.folder, publish='file_mode = "0666"\n') as daemon:
             for _ in plan.rounds():
-                if not _nobody_connects(daemon.publish):
-                    raise PermissionError("nobody may listen, though all shall")
-                got_in += _nobody_connects(daemon.ask)
+                if not _stranger_connects(daemon.publish):
+                    raise PermissionError("the user nobody cannot listen at mode 0666")
+                got_in += _stranger_connects(daemon.ask)
                 tried += 1
     finally:
         os.umask(former)
     return Outcome(tried, f"{got_in} could ask", held=not got_in)
 
 
-def _nobody_connects(endpoint: str) -> bool:
-    """Whether a process of nobody's gets a connection to a socket file."""
+def _stranger_connects(endpoint: str) -> bool:
+    """Return True if a process of the user `nobody` can connect to a socket file."""
     path = endpoint.removeprefix("ipc://")
     command = [sys.executable, "-I", "-c", CONNECTING, path, str(NOBODY)]
     return subprocess.run(command, check=False, timeout=HEARD_S).returncode == 0

@@ -321,7 +321,7 @@ def test_what_a_run_has_no_use_for_is_kept_as_it_is(file: SessionFile) -> None:
     keeper.save()
     assert kept_trust(file) == image.state()
     keeper = session_keeper(off, sensors(ff="B"), file)
-    read_once(keeper)  # and none of it is left once a sensor is exchanged
+    read_once(keeper)  # it has another sensor: what was learned must go
     keeper.save()
     assert (off.grasps, kept_trust(file)) == (0, None)
 

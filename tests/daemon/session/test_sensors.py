@@ -224,7 +224,7 @@ def first_slips(robot: Robot, day: Day, number: int, grasps: int) -> list[Decisi
 
 
 @pytest.mark.parametrize("interruption", ["restart", "outage"])
-def test_an_exchange_that_nobody_tells_ends_the_session(
+def test_an_exchange_without_serial_numbers_ends_the_session(
     bts3_dir: Path, tmp_path: Path, interruption: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Without it 10 of the first 12 slips were called stable."""

@@ -243,7 +243,7 @@ def test_a_stream_of_counts_ends_the_bridge_when_it_ends(start_bridge: StartBrid
     for row, sweep in enumerate(host.next_of(SWEEP, 10)):
         np.testing.assert_array_equal(counts_of(sweep), rows[row])
     assert host.process.stdin is not None
-    host.process.stdin.close()  # not earlier: what nobody has read is lost with the terminal
+    host.process.stdin.close()  # not earlier: bytes not yet read are lost with the terminal
     assert host.process.wait(100) == 0
 
 

@@ -265,7 +265,7 @@ def streams(*, sliding: bool) -> list[NDArray[np.float64]]:
 
 
 def mean_slopes(counts: NDArray[np.float64], sweeps: int) -> NDArray[np.float64]:
-    """Of every third window of so many sweeps, 10 ms apart, counts/s."""
+    """Return mean absolute slopes of every third window of `sweeps` sweeps at 100 Hz, counts/s."""
     windows = np.lib.stride_tricks.sliding_window_view(counts, sweeps, axis=0)[::3]
     columns = windows.reshape(-1, sweeps).T
     slopes = np.polyfit(0.01 * np.arange(sweeps), columns, 1)[0]
