@@ -62,11 +62,20 @@ class GateLimits:
     Above it the grasp is a different one, and must settle again.
     """
     gap_ns: int = 100_000_000
-    """Time without a usable reading after which the grasp must settle again, ns."""
+    """Time without a usable reading after which the grasp must settle again, ns.
+
+    The default is the most: what a verdict rests on has no longer silence in it, whatever the scene
+    says.
+    """
     release_ns: int = 100_000_000
     """How long the gate stays in `released` before `idle`, ns."""
     request_ns: int = 1_000_000_000
     """Time after which an unanswered request to judge is dropped, ns."""
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for a `gap_ns` above the default."""
+        if self.gap_ns > GateLimits.gap_ns:
+            raise ValueError(f"gap_ns is {self.gap_ns}, must be at most {GateLimits.gap_ns}")
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,9 @@ class GateSection(Section):
     """Longest time for which missing joint angles block a verdict."""
     request_ms: Milliseconds = GateLimits.request_ns / 1e6
     """Time after which a question is answered with `unknown`."""
-    gap_ms: Milliseconds = GateLimits.gap_ns / 1e6
+    gap_ms: Annotated[float, Field(gt=0.0, le=GateLimits.gap_ns / 1e6), unit("ms")] = (
+        GateLimits.gap_ns / 1e6
+    )
     """Time without a usable reading after which a grasp must settle again; more than two periods of
     the readings."""
     change_counts: Annotated[float, Field(ge=10, le=1000), unit("counts")] = (
