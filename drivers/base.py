@@ -87,6 +87,8 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     annotation: Annotation | None = None
     recorded_ns: int | None = None
     """Time since the recording's zero, ns; None for live readings. Playing has any speed."""
+    interrupted: bool = False
+    """True if it does not continue the reading before: its sender restarted or was lost."""
 
     @property
     def made_ns(self) -> int:
@@ -111,6 +113,7 @@ class JointReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     position_rad: NDArray[np.float64]
     """Shape (joints,), radians; NaN where a joint has no valid angle."""
     recorded_ns: int | None = None
+    interrupted: bool = False
 
     @property
     def made_ns(self) -> int:

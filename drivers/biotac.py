@@ -117,7 +117,12 @@ class WordCounters(Protocol):
 
 
 def make_reading(
-    words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int, counters: WordCounters
+    words: NDArray[np.intp],
+    marks: NDArray[np.uint8],
+    t_ns: int,
+    counters: WordCounters,
+    *,
+    interrupted: bool = False,
 ) -> TactileReading:
     """Return the reading of `words`, shape (fingers, 24), and count it in `counters`.
 
@@ -135,4 +140,4 @@ def make_reading(
         counters.faulty_readings += bool(faults.any())
     seq = counters.readings + counters.missed_readings
     counters.readings += 1
-    return TactileReading(t_ns, seq, counts, faults)
+    return TactileReading(t_ns, seq, counts, faults, interrupted=interrupted)

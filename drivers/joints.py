@@ -80,14 +80,15 @@ class JointStream:
 
     def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
         """Return the reading, none if no joint is known; None if the message is dropped."""
-        message = self.parse(data)
+        message, restarts = self.parse(data), self.counters.restarts
         if message is None or not self.admits(message):
             return None
         if not message.names:
             return []
         seq = self.counters.readings + self.counters.missed_readings
         self.counters.readings += 1
-        return [JointReading(t_ns, seq, message.names, message.position_rad)]
+        names, angles, restarted = message.names, message.position_rad, self.counters.restarts
+        return [JointReading(t_ns, seq, names, angles, interrupted=restarted > restarts)]
 
     def parse(self, data: bytes) -> JointMessage | None:
         """Return the message of a datagram; None, and count it, if it is not valid."""

@@ -162,7 +162,7 @@ class HandMemory:
     last_ns: int | None = None
     """Time of the last usable reading."""
     unsettled: Annotated[int, msgspec.Meta(ge=0, le=MEDIAN_SWEEPS)] = 0
-    """Readings to come whose median may be of values from before some that are missing."""
+    """Readings to come that do not continue those before: 1 or 0, in older recordings up to 3."""
 
 
 class HandTracker:
@@ -220,7 +220,7 @@ class HandTracker:
 
     def interrupt(self) -> None:
         """Have the current grasp settle again. Call when readings before the next are missing."""
-        self.memory.unsettled = MEDIAN_SWEEPS
+        self.memory.unsettled = 1
 
     def memories(self) -> dict[str, dict[str, Any]]:
         """Return the state of the hand's parts, by group and part; see `Pipeline.memories`."""
@@ -312,6 +312,7 @@ class HandTracker:
         self.memory.last_ns = t_ns
         if self.memory.unsettled:
             self.memory.unsettled -= 1
+            self._fresh.reset()
             self.gate.restart(t_ns)
 
     def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:

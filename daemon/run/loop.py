@@ -215,6 +215,8 @@ class Loop:
         for reading in readings:
             for on_reading in self._on_reading:
                 on_reading(reading)
+            if reading.interrupted:
+                self._interrupt()
             if isinstance(reading, JointReading):
                 self._pipeline.observe_joints(reading)
                 self._joints = reading
@@ -257,10 +259,14 @@ class Loop:
     ) -> TactileReading:
         """Report skipped readings; return `newest`, with repeats of them marked."""
         self._shedder.skip(len(skipped), self._clock())
+        self._interrupt()
+        return mark_repeats(newest, skipped[-1])
+
+    def _interrupt(self) -> None:
+        """Have the grasp settle again: readings before the next one are missing."""
         self._pipeline.skip()
         for on_event in self._on_event:
             on_event(LoopEvent.SKIPPED)
-        return mark_repeats(newest, skipped[-1])
 
     def _judge(self, reading: TactileReading, received_ns: int) -> bool:
         """Judge and publish a reading; return False if the computer slept since it arrived."""
@@ -352,7 +358,7 @@ class Loop:
         if status is OutcomeStatus.TAKEN:
             self._outbox.outcome(report)
             for on_outcome in self._on_outcome:
-                on_outcome(report)
+                on_outcome(report._replace(grasp=grasp))
         elif lifts.is_kept(grasp):
             answer(REPEATED)
             return

@@ -68,6 +68,7 @@ class SampleAssembler:
         self._widest_ns = 0
         self._broken = False
         self._origin_ns = 0.0
+        self._interrupted = False
         self._forget()
 
     def _forget(self) -> None:
@@ -141,6 +142,7 @@ class SampleAssembler:
     def interrupt(self) -> None:
         """Drop the current sweep. Call after the link broke."""
         self._counters.interrupted_sweeps += not self._finished and self._have != 0
+        self._interrupted = self._previous_start_ns is not None
         self._forget()
 
     def _count_run(self, place: int, t_ns: int) -> None:
@@ -249,7 +251,8 @@ class SampleAssembler:
             places = [place for place in range(ELECTRODES) if not self._have >> place & 1]
             marks[:, self._electrodes[places]] = ElectrodeFault.MISSING
             self._counters.lost_frames += lost
-        return (make_reading(words, marks, self._t_ns, self._counters),)
+        interrupted, self._interrupted = self._interrupted, False
+        return (make_reading(words, marks, self._t_ns, self._counters, interrupted=interrupted),)
 
     def _check_time(self) -> None:
         """Count lost whole sweeps; learn the period from two complete sweeps in a row."""

@@ -46,7 +46,7 @@ class FrameAssembler:
         self._synchronised = False
         self._finished_ns: int | None = None
         self._follows: int | None = None
-        """Number expected after the last finished sweep; None after a restart."""
+        """Number expected after the last finished sweep; None if the next one does not follow."""
         self._begin(0, 0)
 
     def _begin(self, tick_us: int, t_ns: int) -> None:
@@ -83,7 +83,6 @@ class FrameAssembler:
             # The board was reset and has the same numbers again, so frames may be of either start.
             self.interrupt()
             self._counters.restarts += 1
-            self._follows = None
             self._begin(tick_us, t_ns)
         elif t_ns - self._begun_ns > self._patience_ns():
             self._counters.restarts += 1
@@ -113,6 +112,7 @@ class FrameAssembler:
             self._counters.missed_readings += 1
             self._finished = True
         self._synchronised = False
+        self._follows = None
 
     def _patience_ns(self) -> int:
         period_ns = self._period.period_ns
@@ -153,16 +153,17 @@ class FrameAssembler:
             return ()
         self._synchronised = True
         self._counters.lost_frames += self._fingers - here
+        interrupted = self._finished_ns is not None and self._follows is None
         if self._finished_ns is not None and self._current == self._follows:
             self._period.learn(self._t_ns - self._finished_ns)
         self._finished_ns = self._t_ns
         self._follows = None if self._current is None else (self._current + 1) % (1 << 16)
-        return (self._reading(),)
+        return (self._reading(interrupted=interrupted),)
 
-    def _reading(self) -> TactileReading:
+    def _reading(self, *, interrupted: bool) -> TactileReading:
         came = np.array([bool(self._have >> row & 1) for row in range(self._fingers)])
         reported = came & (self._faults & np.uint8(ElectrodeFault.MISSING) != 0)
         self._counters.unplugged_words += ELECTRODES * int(reported.sum())
         fingers = np.where(came, self._faults, np.uint8(ElectrodeFault.MISSING))
         marks = np.repeat(fingers[:, np.newaxis], ELECTRODES, axis=1)
-        return make_reading(self._words, marks, self._t_ns, self._counters)
+        return make_reading(self._words, marks, self._t_ns, self._counters, interrupted=interrupted)

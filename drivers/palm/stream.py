@@ -111,6 +111,7 @@ class PalmStream:
         self._place: int | None = None
         """Furthest place so far, counted over all rounds; None before the first round."""
         self._place_t_ns: int | None = None
+        self._interrupted = False
         self._begin(0)
         self._calibration: JointCalibration | None = None
         self._joint_due_ns = 0
@@ -154,6 +155,7 @@ class PalmStream:
         self.palm = None
         self.counters.interrupted_rounds += not self._finished and self._have != 0
         self._place = None
+        self._interrupted = self.counters.readings > 0
         self._known[:] = False
 
     def push(self, packet: PalmPacket, t_ns: int) -> Sequence[TactileReading]:
@@ -268,7 +270,9 @@ class PalmStream:
         faults = self._faults.copy()
         self.counters.readings += 1
         self.counters.faulty_readings += bool(faults.any())
-        return TactileReading(self._t_ns, self._round, self._counts.copy(), faults)
+        interrupted, self._interrupted = self._interrupted, False
+        counts = self._counts.copy()
+        return TactileReading(self._t_ns, self._round, counts, faults, interrupted=interrupted)
 
     def _drop_absent_fingers(self) -> None:
         """Flag fingers without a sensor: they show unwritten memory, no counts or only zeros."""

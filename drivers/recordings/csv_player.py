@@ -73,6 +73,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         """Time between readings as played, ns; for a stream the shortest step so far."""
         self._injector = FaultInjector(self._faults, self._fingers, self.counters)
         self._row_index = 0
+        self._interrupted = False
 
     def open(self) -> None:
         """Check the header of each file, then start from the first file."""
@@ -93,6 +94,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
             return ()
         at_ns, (row, recorded_period_ns), late_ns = due
         speed = self.speed
+        self._interrupted |= recorded_period_ns is None and at_ns > 0  # another stream begins
         if recorded_period_ns is not None:
             self.period_ns = round(recorded_period_ns / (speed or 1.0))
             self.counters.late += speed is not None and late_ns > self.period_ns
@@ -138,9 +140,12 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
             self.counters.bad_angles += int(np.isnan(angles).sum())
         seq = self._injector.inject(row.counts, row.faults)
         if seq is not None:
-            note = row.annotation
-            readings.append(TactileReading(t_ns, seq, row.counts, row.faults, note, recorded_ns))
-            self._count(row.faults)
+            interrupted, self._interrupted = self._interrupted, False
+            counts, faults, note = row.counts, row.faults, row.annotation
+            readings.append(
+                TactileReading(t_ns, seq, counts, faults, note, recorded_ns, interrupted)
+            )
+            self._count(faults)
         return readings
 
     def _count(self, faults: NDArray[np.uint8]) -> None:

@@ -115,6 +115,7 @@ class SweepDecoder:
         self._sensors = tuple(sensors)
         self._counters = counters
         self._bridge_seq: int | None = None
+        self._interrupted = counters.readings > 0
         self._source = np.zeros((len(sensors), ELECTRODES), dtype=np.intp)
         """Index of each electrode's word in a sweep, shape (fingers, 24)."""
         self._marks = np.full(self._source.shape, ElectrodeFault.MISSING, dtype=np.uint8)
@@ -135,7 +136,9 @@ class SweepDecoder:
         self.longest_ticks = max(self.longest_ticks, sweep.tick_end - sweep.tick_start)
         t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
         words = sweep.words.ravel().astype(np.intp)[self._source]
-        return make_reading(words, self._marks_of(sweep), t_ns, self._counters)
+        interrupted, self._interrupted = self._interrupted, False
+        marks = self._marks_of(sweep)
+        return make_reading(words, marks, t_ns, self._counters, interrupted=interrupted)
 
     def _is_next(self, sweep: Sweep) -> bool:
         """Return True if the sweep is newer than all before, and count the missing ones."""

@@ -370,3 +370,20 @@ def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> N
     assert len(rests_s) == 1
     assert 0.0 < rests_s[0] <= YIELD_MAX_NS / 1e9
     assert time.monotonic_ns() - began_ns >= YIELD_AFTER_NS
+
+
+def test_a_reading_that_does_not_follow_makes_the_grasp_settle_again() -> None:
+    """The counts go on as before; only the sender says that it began again."""
+    clock = Clock()
+    came = [item for item in grasps(3) if item.seq < 150]
+    for seq in range(150, 250):
+        counts = POSES["grasp"] + np.random.default_rng(seq).integers(-2, 3, (3, 24))
+        one = msgspec.structs.replace(came[0], t_ns=START_NS + seq * PERIOD_NS, seq=seq)
+        came.append(msgspec.structs.replace(one, counts=counts.astype(np.uint16)))
+    came[200] = msgspec.structs.replace(came[200], interrupted=True)
+    bench = OverloadedLoop(LiveDriver(came, clock), clock, lambda: 0, hand=LIMITS)
+    said = {seen.seq: verdict for verdict, seen in bench.judged}
+    assert said[199].verdict is Decision.STABLE
+    assert said[200].reasons == [Reason.SEQUENCE_GAP]
+    assert {said[seq].verdict for seq in range(200, 224)} == {Decision.UNKNOWN}
+    assert said[224].verdict is Decision.STABLE
