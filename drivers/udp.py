@@ -22,7 +22,8 @@ Packets that wait longer are too old to judge, and a full buffer drops the newes
 """
 DRAIN_MAX = 256
 """Most datagrams of one call, so that a flood does not keep the loop from its other work."""
-
+STEP_NS: Final = 5_000_000
+"""Change of the wall clock against the monotonic one, ns, that is a step, no adjustment."""
 Sender = tuple[str, int]
 """Numeric address and port of a sender."""
 
@@ -64,7 +65,8 @@ class Datagram(NamedTuple):
     data: bytes
     """Content; one byte longer than the receiver's limit if the datagram was too long."""
     age_ns: int
-    """Time since the kernel received it, ns, 0 or more; wrong if the wall clock just stepped."""
+    """Time since the kernel received it, ns, 0 or more; the most that it can be if the wall clock
+    stepped meanwhile."""
     sender: Sender
 
 
@@ -76,6 +78,8 @@ class DatagramReceiver:
         self._bytes_max = bytes_max
         self.dropped = 0
         """Datagrams that the kernel dropped because they were not read in time."""
+        self._empty_ns = time.monotonic_ns()
+        self._ahead_ns = self._empty_ns - time.time_ns()
         self._socket = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         try:
             self._socket.setblocking(False)
@@ -101,12 +105,16 @@ class DatagramReceiver:
 
     def receive(self, most: int) -> Iterator[Datagram]:
         """Yield up to `most` datagrams, oldest first. Raises `LinkError`."""
+        now_ns = time.monotonic_ns()
+        ahead_ns = now_ns - time.time_ns()
+        has_stepped = abs(ahead_ns - self._ahead_ns) > STEP_NS
         for _ in range(most):
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(
                     self._bytes_max + 1, ANCILLARY_BYTES
                 )
             except BlockingIOError:
+                self._empty_ns, self._ahead_ns = now_ns, ahead_ns
                 return
             except InterruptedError:
                 continue
@@ -115,6 +123,8 @@ class DatagramReceiver:
                 raise LinkError.from_errno(error, text) from error
             wall_ns, drops = read_stamps(ancillary)
             age_ns = 0 if wall_ns is None else max(0, time.time_ns() - wall_ns)
+            if has_stepped:
+                age_ns = now_ns - self._empty_ns
             self.dropped = self.dropped if drops is None else drops
             yield Datagram(data, age_ns, sender[:2])
 

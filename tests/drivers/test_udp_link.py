@@ -275,6 +275,7 @@ def noted(
     kernel.script += script
     monkeypatch.setattr("graspd.drivers.udp.socket.socket", lambda *_: kernel)
     monkeypatch.setattr("graspd.drivers.udp.time.time_ns", lambda: 5_000_000_010)
+    monkeypatch.setattr("graspd.drivers.udp.time.monotonic_ns", lambda: 900_000_000)
     return DatagramReceiver(Endpoint("::1", 5700), 100), kernel
 
 
@@ -309,6 +310,22 @@ def test_age_and_losses_are_what_the_kernel_notes(
     assert receiver.dropped == dropped
     assert kernel.options[STAMP]
     assert kernel.options[LOST]
+
+
+@pytest.mark.parametrize(("step_ms", "age_ms"), [(-350, 450), (-440, 450), (350, 450), (2, 252)])
+def test_a_wall_clock_that_steps_makes_nothing_younger(
+    monkeypatch: pytest.MonkeyPatch, step_ms: int, age_ms: int
+) -> None:
+    """A stall of 450 ms; the datagram came after 200 ms of it. A change of 2 ms is no step."""
+    stamp = struct.pack("@ll", 5, 200_000_010)
+    receiver, kernel = noted(monkeypatch)
+    assert list(receiver.receive(5)) == []
+    kernel.script += [(b"a", [(SOL, STAMP, stamp)])] * 2
+    wall_ns = 5_000_000_010 + (450 + step_ms) * 1_000_000
+    monkeypatch.setattr("graspd.drivers.udp.time.time_ns", lambda: wall_ns)
+    monkeypatch.setattr("graspd.drivers.udp.time.monotonic_ns", lambda: 1_350_000_000)
+    ages = [datagram.age_ns for most in (1, 5) for datagram in receiver.receive(most)]
+    assert ages == [age_ms * 1_000_000] * 2
 
 
 def test_a_datagram_that_is_too_long_shows_by_one_byte(monkeypatch: pytest.MonkeyPatch) -> None:
