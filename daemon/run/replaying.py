@@ -100,7 +100,7 @@ class Comparison(Companion):
         self._grasp = verdict.grasp
         slipped = None if reading.annotation is None else reading.annotation.slipped
         judgement = self._pipeline.judge(reading)
-        self._result.compare(self._how, judgement, slipped, verdict.grasp)
+        self._result.compare(self._how, judgement, slipped, published.grasp)
 
 
 def trained_on(recordings: Sequence[Path], model: TactileModel) -> list[str]:

@@ -17,7 +17,7 @@ from graspd.daemon.process.text import Colour, coloured, printable
 from graspd.daemon.publish.companion import Companion, PublishedVerdict
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.outbox import LatencyHistogram
-from graspd.daemon.trust.lift_book import Report
+from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Annotation
 
@@ -158,7 +158,7 @@ class RunSummary:
         self.compared = {WITHOUT_SESSION: Tally(), WITHOUT_LEARNING: Tally()}
         """Tallies of the same grasps judged in another way; empty if not tried."""
         self.trained_on: Sequence[str] = ()
-        self._waiting: dict[int, list[tuple[Tally, Decision]]] = {}
+        self._waiting: dict[GraspId, list[tuple[Tally, Decision]]] = {}
         self.repaired = 0
         """Number of verdicts with at least one repaired electrode."""
         self.latency = LatencyHistogram()
@@ -167,28 +167,35 @@ class RunSummary:
         self.grasps = 0
         self.again = 0
         """Number of further judgements of the same grasp."""
-        self._judged_grasp: int | None = None
+        self._last = GraspId("", 0)
+        self._judged_grasp: GraspId | None = None
 
-    def add(self, verdict: Verdict, slipped: bool | None) -> None:
-        """Count one verdict. `slipped`: its recorded outcome; None: not recorded."""
+    def add(self, verdict: Verdict, slipped: bool | None, grasp: GraspId | None = None) -> None:
+        """Count one verdict. `slipped`: its recorded outcome; None: not recorded.
+
+        `grasp`: its grasp, if that is of another start than the verdict, as in a replay.
+        """
+        grasp = grasp or GraspId(verdict.boot_id, verdict.grasp)
         self.latency.add(verdict.latency_us)
         if verdict.gate is not None:
             self.readings += 1
-            self.grasps = max(self.grasps, verdict.grasp)
+            same_start = grasp.boot_id == self._last.boot_id
+            self.grasps += grasp.grasp - (self._last.grasp if same_start else 0)
+            self._last = grasp
             if not verdict.judged:
                 return
-            if verdict.grasp == self._judged_grasp:
+            if grasp == self._judged_grasp:
                 self.again += 1
                 return
-            self._judged_grasp = verdict.grasp
-        self._add(self.tally, verdict.grasp, verdict.verdict, verdict.reasons, slipped)
+            self._judged_grasp = grasp
+        self._add(self.tally, grasp, verdict.verdict, verdict.reasons, slipped)
         self.repaired += verdict.valid and bool(verdict.repaired)
 
-    def compare(self, how: str, judgement: Judgement, slipped: bool | None, grasp: int) -> None:
+    def compare(self, how: str, judgement: Judgement, slipped: bool | None, grasp: GraspId) -> None:
         tally = self.compared[how]
         self._add(tally, grasp, judgement.decision, judgement.reasons, slipped)
 
-    def outcome(self, grasp: int, *, slipped: bool) -> None:
+    def outcome(self, grasp: GraspId, *, slipped: bool) -> None:
         """Count the outcome of a grasp after its verdict; only the first counts."""
         for tally, decision in self._waiting.pop(grasp, ()):
             tally.outcome(decision, slipped=slipped)
@@ -196,7 +203,7 @@ class RunSummary:
     def _add(
         self,
         tally: Tally,
-        grasp: int,
+        grasp: GraspId,
         decision: Decision,
         reasons: Iterable[Reason],
         slipped: bool | None,
@@ -297,7 +304,7 @@ class Printer(Companion):
         """Print a verdict, and the recorded outcome of its lift, if there is one."""
         verdict, reading = published.verdict, published.reading
         annotation = reading.annotation if reading else None
-        self.result.add(verdict, annotation.slipped if annotation else None)
+        self.result.add(verdict, annotation.slipped if annotation else None, published.grasp)
         if not self._as_json and not self._is_news(verdict):
             return
         line = published.payload.decode() if self._as_json else _line(verdict, annotation)
@@ -312,7 +319,7 @@ class Printer(Companion):
         return False
 
     def on_outcome(self, report: Report) -> None:
-        self.result.outcome(report.grasp.grasp, slipped=report.outcome == "slip")
+        self.result.outcome(report.grasp, slipped=report.outcome == "slip")
 
     def summary(self, trust: Trust | None) -> None:
         """Print the summary since the start. `trust`: what outcomes taught, if anything."""

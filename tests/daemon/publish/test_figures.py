@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.outbox import BUCKETS, Deadlines, LatencyHistogram
 from graspd.daemon.run.summary import WITHOUT_LEARNING, RunSummary, Tally
@@ -151,10 +151,26 @@ def test_an_outcome_that_comes_later_counts_as_if_it_had_been_recorded() -> None
         said = msgspec.structs.replace(said, grasp=grasp)
         early.add(said, slipped)
         late.add(said, None)
-        late.outcome(grasp, slipped=slipped)
-        late.outcome(grasp, slipped=not slipped)  # told twice: the first counts
+        late.outcome(GraspId(said.boot_id, grasp), slipped=slipped)
+        # Told twice: the first counts.
+        late.outcome(GraspId(said.boot_id, grasp), slipped=not slipped)
     assert late.tally.labelled == 4
     assert late.tally.as_dict() == early.tally.as_dict()
+
+
+def test_a_grasp_of_another_start_is_another_grasp() -> None:
+    summary = RunSummary()
+    for boot in "ab":
+        said = verdict(Decision.STABLE)
+        summary.add(
+            msgspec.structs.replace(said, boot_id=boot * 32, gate=GateState.JUDGED, judged=True),
+            None,
+        )
+    assert (summary.grasps, summary.again) == (2, 0)
+    summary.outcome(GraspId("c" * 32, 1), slipped=True)
+    assert summary.tally.labelled == 0
+    summary.outcome(GraspId("a" * 32, 1), slipped=False)
+    assert (summary.tally.held, summary.tally.slipped) == (1, 0)
 
 
 def test_without_learning_is_shown_where_something_was_learned() -> None:
