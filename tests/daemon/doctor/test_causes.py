@@ -42,6 +42,7 @@ from tests.daemon.doctor.emulated import (
 )
 from tests.daemon.processes import start, wait_for
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
+from tests.kit.crowd import crowded
 from tests.ports import free_port
 
 
@@ -356,3 +357,8 @@ def test_the_table_of_electrodes_is_shown_with_all_only_and_fits(
     assert len(lines) == 25
     assert max(map(len, lines)) <= 80
     assert [line.split()[0] for line in lines[1:]] == [str(number) for number in range(1, 25)]
+
+
+def test_the_doctor_listens_above_descriptor_1024(tmp_path: Path, healthy: str) -> None:
+    with crowded():
+        assert look(tmp_path, healthy) == []
