@@ -57,6 +57,18 @@ class Endpoint:
     def family(self) -> socket.AddressFamily:
         return socket.AF_INET6 if ":" in self.address else socket.AF_INET
 
+    def is_reached_from(self, address: str) -> bool:
+        """Return True unless a sender's address, as `plain` gives it, is of the other family."""
+        own = plain(self.address)
+        return own == "::" or (":" in own) == (":" in address)
+
+
+def plain(address: str) -> str:
+    """Return an address as senders are compared: IPv4 in IPv6 as IPv4, and without a scope."""
+    parsed = ipaddress.ip_address(address.partition("%")[0])
+    mapped = parsed.ipv4_mapped if isinstance(parsed, ipaddress.IPv6Address) else None
+    return str(mapped or parsed)
+
 
 class Datagram(NamedTuple):
     """One datagram."""
@@ -116,7 +128,8 @@ class DatagramReceiver:
             wall_ns, drops = read_stamps(ancillary)
             age_ns = 0 if wall_ns is None else max(0, time.time_ns() - wall_ns)
             self.dropped = self.dropped if drops is None else drops
-            yield Datagram(data, age_ns, sender[:2])
+            address = plain(sender[0]) if ":" in sender[0] else sender[0]
+            yield Datagram(data, age_ns, (address, sender[1]))
 
 
 @dataclass(slots=True)
@@ -177,10 +190,12 @@ class DatagramDriver(Opened, Generic[Stream]):
     ) -> None:
         """`source`: `udp://ADDRESS:PORT` to listen on.
 
-        `only_from`: IP address whose datagrams are taken; None: any.
+        `only_from`: IP address whose datagrams are taken; None: any. `::` hears IPv4 senders too.
         """
         self._endpoint = Endpoint.parse(source)
-        self._only_from = None if only_from is None else str(ipaddress.ip_address(only_from))
+        self._only_from = None if only_from is None else plain(only_from)
+        if self._only_from is not None and not self._endpoint.is_reached_from(self._only_from):
+            raise ValueError(f"only_from {only_from}: no such sender reaches {source}")
         self._clock = clock
         self._receiver: DatagramReceiver | None = None
         self._reset()
@@ -265,6 +280,8 @@ class DatagramDriver(Opened, Generic[Stream]):
             for data, age_ns, sender in receiver.receive(DRAIN_MAX):
                 if not self._is_heard(sender):
                     self.stream.counters.foreign_datagrams += 1
+                    if self._sender is None:
+                        self.link.refused(f"datagrams of {sender[0]} are refused by only_from")
                     continue
                 self._heard = sender
                 self._t_ns = max(self._t_ns, self._clock() - age_ns)
