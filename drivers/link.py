@@ -107,23 +107,15 @@ class Link:
         if self.state is LinkState.UP:
             self.losses += 1
             self._down_since_ns = now_ns
-        self._explain(cause, why, "; trying again")
-        self.retry_ns = now_ns + round(self._wait_s * 1e9)
-        self._wait_s = min(BACKOFF_FACTOR * self._wait_s, BACKOFF_MAX_S)
-        self.state = LinkState.WAITING
-
-    def refused(self, why: str) -> None:
-        """Call while the link is not up, for data of a sender that is refused."""
-        if why != self.reason:
-            self._explain(LinkCause.FOREIGN, why)
-
-    def _explain(self, cause: LinkCause, why: str, then: str = "") -> None:
         self.cause, self.reason = cause, why
         level = logging.DEBUG
         if why not in self._warned and len(self._warned) < WARNINGS_MAX:
             self._warned.add(why)
             level = logging.WARNING
-        _log.log(level, "%s: %s%s", self.name, why, then)
+        _log.log(level, "%s: %s; trying again", self.name, why)
+        self.retry_ns = now_ns + round(self._wait_s * 1e9)
+        self._wait_s = min(BACKOFF_FACTOR * self._wait_s, BACKOFF_MAX_S)
+        self.state = LinkState.WAITING
 
     def close(self) -> None:
         self.state = LinkState.CLOSED

@@ -7,14 +7,10 @@ from __future__ import annotations
 
 import errno
 import os
-from typing import TYPE_CHECKING
 
 import serial
 
 from graspd.drivers.link import is_ready
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer as Buffer
 
 SCHEME = "polled://"
 
@@ -28,21 +24,20 @@ class PolledSerial(serial.Serial):
         """Return the bytes that have arrived, at most `size`. Raises `OSError` after a hang-up."""
         try:
             data = os.read(self.fileno(), size)
-            if not data and is_ready(self.fileno()):
-                data = os.read(self.fileno(), size)
-                if not data:  # a terminal that was hung up is always ready and has nothing
-                    raise serial.SerialException(errno.EIO, os.strerror(errno.EIO))
+            # A terminal that was hung up is always ready and has nothing.
+            if data or not is_ready(self.fileno()) or (data := os.read(self.fileno(), size)):
+                return data
         except BlockingIOError:
             return b""
-        return data
+        raise serial.SerialException(errno.EIO, os.strerror(errno.EIO))
 
-    def write(self, data: Buffer, /) -> int:
+    def write(self, data: bytes, /) -> int:  # type: ignore[override]
         """Write all bytes. Raises `SerialTimeoutException` if there is no room, else `OSError`."""
         try:
             written = os.write(self.fileno(), data)
         except BlockingIOError:
             written = 0
-        if written < memoryview(data).nbytes:
+        if written < len(data):
             raise serial.SerialTimeoutException("the port has no room")
         return written
 

@@ -57,11 +57,6 @@ class Endpoint:
     def family(self) -> socket.AddressFamily:
         return socket.AF_INET6 if ":" in self.address else socket.AF_INET
 
-    def is_reached_from(self, address: str) -> bool:
-        """Return True unless a sender's address, as `plain` gives it, is of the other family."""
-        own = plain(self.address)
-        return own == "::" or (":" in own) == (":" in address)
-
 
 def plain(address: str) -> str:
     """Return an address as senders are compared: IPv4 in IPv6 as IPv4, and without a scope."""
@@ -190,12 +185,10 @@ class DatagramDriver(Opened, Generic[Stream]):
     ) -> None:
         """`source`: `udp://ADDRESS:PORT` to listen on.
 
-        `only_from`: IP address whose datagrams are taken; None: any. `::` hears IPv4 senders too.
+        `only_from`: IP address whose datagrams are taken; None: any.
         """
         self._endpoint = Endpoint.parse(source)
         self._only_from = None if only_from is None else plain(only_from)
-        if self._only_from is not None and not self._endpoint.is_reached_from(self._only_from):
-            raise ValueError(f"only_from {only_from}: no such sender reaches {source}")
         self._clock = clock
         self._receiver: DatagramReceiver | None = None
         self._reset()
@@ -281,7 +274,7 @@ class DatagramDriver(Opened, Generic[Stream]):
                 if not self._is_heard(sender):
                     self.stream.counters.foreign_datagrams += 1
                     if self._sender is None:
-                        self.link.refused(f"datagrams of {sender[0]} are refused by only_from")
+                        self._refuse(sender[0])
                     continue
                 self._heard = sender
                 self._t_ns = max(self._t_ns, self._clock() - age_ns)
@@ -319,6 +312,12 @@ class DatagramDriver(Opened, Generic[Stream]):
         if self._sender is not None:
             return sender == self._sender
         return self._only_from is None or sender[0] == self._only_from
+
+    def _refuse(self, address: str) -> None:
+        why = f"datagrams of {address} are refused by only_from"
+        if why != self.link.reason:
+            self._lose(LinkError(LinkCause.FOREIGN, why))
+            self.link.greeting()
 
     def _lose(self, error: LinkError) -> None:
         self.link.failed(error.cause, str(error), self._clock())

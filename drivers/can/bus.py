@@ -229,24 +229,15 @@ class CanBus:
         self._drops_seen = total
 
     def _drain_bus(self, bus: can.BusABC, frames: list[Stamped]) -> None:
-        if not self._stamped:
-            self._drain_unstamped(bus, frames)
-            return
-        now_ns = self._clock()
+        now_ns, since_ns = self._clock(), self._idle_ns
         ahead_ns = now_ns - self._wall_clock()
-        for _ in range(FRAMES_PER_DRAIN):
-            message = bus.recv(timeout=0)
-            if message is None:
-                return
-            t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
-            frames.append((_frame_of(message), t_ns, t_ns))
-
-    def _drain_unstamped(self, bus: can.BusABC, frames: list[Stamped]) -> None:
-        since_ns = self._idle_ns
         for _ in range(FRAMES_PER_DRAIN):
             before_ns = self._clock()
             message = bus.recv(timeout=0)
-            if message is not None:
+            if message is not None and self._stamped:
+                t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
+                frames.append((_frame_of(message), t_ns, t_ns))
+            elif message is not None:
                 frames.append((_frame_of(message), since_ns, self._clock()))
             # slcan returns no frame for an adapter's answer, although frames wait behind it.
             elif self.descriptor is None or not is_ready(self.descriptor):

@@ -159,7 +159,8 @@ def test_a_refused_sender_is_named_as_the_cause(
     bench.hear(Datagram(b"a", 0, other))
     assert bench.link.describe()["link"] == Fact("greeting", LinkCause.FOREIGN)
     told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert told == [f"test: {why}", "test: nothing good for 100 ms; trying again", f"test: {why}"]
+    silence = "nothing good for 100 ms"
+    assert told == [f"test: {each}; trying again" for each in (why, silence, why)]
 
 
 @pytest.mark.parametrize(
@@ -187,15 +188,6 @@ def test_only_from_compares_addresses_and_not_their_spelling(
         near.sendto(b'{"joints":{"FFJ3":0.1}}', (sender, driver.port or 0))
         assert bool(driver.read_ready()) == is_heard
         assert driver.counters.foreign_datagrams == (not is_heard)
-
-
-@pytest.mark.parametrize(
-    ("source", "only_from"),
-    [("udp://0.0.0.0:0", "::1"), ("udp://[::1]:0", "127.0.0.1"), ("udp://10.0.0.1:0", "fe80::1")],
-)
-def test_a_sender_that_can_never_reach_the_address_is_refused(source: str, only_from: str) -> None:
-    with pytest.raises(ValueError, match=f"only_from {only_from}: no such sender reaches"):
-        JointStreamDriver(source, only_from=only_from)
 
 
 def test_a_datagram_is_as_old_as_the_kernel_says_and_never_older_than_the_one_before(
