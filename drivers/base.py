@@ -155,6 +155,8 @@ class LinkCause(Enum):
     SILENT = auto()
     """The port is open, but no byte has arrived yet."""
     NO_ANSWER = auto()
+    FOREIGN = auto()
+    """The only data comes from a sender that is refused."""
     TIMEOUT = auto()
     """Readings came, then stopped for longer than the timeout."""
     DISCONNECTED = auto()

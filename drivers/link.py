@@ -1,8 +1,9 @@
-"""State of a link, and its retries with a capped backoff."""
+"""State of a link, its retries with a capped backoff, and whether its descriptor is ready."""
 
 from __future__ import annotations
 
 import logging
+import select
 from enum import StrEnum
 from typing import Final
 
@@ -43,6 +44,13 @@ class LinkState(StrEnum):
 def longest_silence_ns(period_ns: int | None) -> int:
     """Return how long a link with this time between readings may be silent, ns."""
     return max(SILENCE_PERIODS * (period_ns or 0), SILENCE_MIN_NS)
+
+
+def is_ready(descriptor: int, event: int = select.POLLIN) -> bool:
+    """Return True if the descriptor has this event of `poll` now, or is broken."""
+    poll = select.poll()
+    poll.register(descriptor, event)
+    return bool(poll.poll(0))
 
 
 class Link:

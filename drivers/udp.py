@@ -59,6 +59,13 @@ class Endpoint:
         return socket.AF_INET6 if ":" in self.address else socket.AF_INET
 
 
+def plain(address: str) -> str:
+    """Return an address as senders are compared: IPv4 in IPv6 as IPv4, and without a scope."""
+    parsed = ipaddress.ip_address(address.partition("%")[0])
+    mapped = parsed.ipv4_mapped if isinstance(parsed, ipaddress.IPv6Address) else None
+    return str(mapped or parsed)
+
+
 class Datagram(NamedTuple):
     """One datagram."""
 
@@ -126,7 +133,8 @@ class DatagramReceiver:
             if has_stepped:
                 age_ns = now_ns - self._empty_ns
             self.dropped = self.dropped if drops is None else drops
-            yield Datagram(data, age_ns, sender[:2])
+            address = plain(sender[0]) if ":" in sender[0] else sender[0]
+            yield Datagram(data, age_ns, (address, sender[1]))
 
 
 @dataclass(slots=True)
@@ -190,7 +198,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         `only_from`: IP address whose datagrams are taken; None: any.
         """
         self._endpoint = Endpoint.parse(source)
-        self._only_from = None if only_from is None else str(ipaddress.ip_address(only_from))
+        self._only_from = None if only_from is None else plain(only_from)
         self._clock = clock
         self._receiver: DatagramReceiver | None = None
         self._reset()
@@ -275,6 +283,8 @@ class DatagramDriver(Opened, Generic[Stream]):
             for data, age_ns, sender in receiver.receive(DRAIN_MAX):
                 if not self._is_heard(sender):
                     self.stream.counters.foreign_datagrams += 1
+                    if self._sender is None:
+                        self._refuse(sender[0])
                     continue
                 self._heard = sender
                 self._t_ns = max(self._t_ns, self._clock() - age_ns)
@@ -312,6 +322,12 @@ class DatagramDriver(Opened, Generic[Stream]):
         if self._sender is not None:
             return sender == self._sender
         return self._only_from is None or sender[0] == self._only_from
+
+    def _refuse(self, address: str) -> None:
+        why = f"datagrams of {address} are refused by only_from"
+        if why != self.link.reason:
+            self._lose(LinkError(LinkCause.FOREIGN, why))
+            self.link.greeting()
 
     def _lose(self, error: LinkError) -> None:
         self.link.failed(error.cause, str(error), self._clock())

@@ -218,8 +218,11 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     """Feed the statistics for `listen_s`; return the time that the readings took, s."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
-        descriptors = [driver.fileno() for driver in drivers]
-        select.select([fd for fd in descriptors if fd is not None], [], [], WAIT_S)
+        poll = select.poll()
+        for driver in drivers:
+            if (descriptor := driver.fileno()) is not None:
+                poll.register(descriptor, select.POLLIN)
+        poll.poll(WAIT_S * 1000)
         for driver in drivers:
             for reading in driver.read_ready():
                 if isinstance(reading, TactileReading):

@@ -47,9 +47,6 @@ NOT_OURS = {
     ("bad_messages",): Trouble(
         Cause.JOINTS, "what comes are no joint angles: deploy/wire/JOINTS.md"
     ),
-    ("foreign_datagrams",): Trouble(
-        Cause.FOREIGN_SENDER, "only_from names another sender than this one"
-    ),
     ("error_frames", "bus_off"): Trouble(
         Cause.BITRATE, "the board has another bit rate than the interface: set that of the board"
     ),
@@ -168,6 +165,9 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     ),
     LinkCause.NO_ANSWER: Trouble(
         Cause.SILENT, f"plug it in again; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
+    ),
+    LinkCause.FOREIGN: Trouble(
+        Cause.FOREIGN_SENDER, "name the sender in only_from if it is the right one"
     ),
     LinkCause.TIMEOUT: Trouble(
         Cause.LINK_LOST,

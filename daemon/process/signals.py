@@ -32,7 +32,9 @@ class StopSignal:
 
     def wait(self, seconds: float) -> bool:
         """Wait up to `seconds` for a signal; return True if one has stopped the process."""
-        select.select([self._read], [], [], seconds)
+        poll = select.poll()
+        poll.register(self._read, select.POLLIN)
+        poll.poll(seconds * 1000)
         self._empty()
         return self.received is not None
 

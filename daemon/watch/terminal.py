@@ -124,12 +124,13 @@ class Keyboard:
         self.spaces = 0
         """How often space was typed since then."""
         self._stop = stop
-        self._waited = [stop.fileno()]
-        """Descriptors of signals and, while keys are read, of the keyboard."""
+        self._waited = select.poll()
+        """Waits for signals and, while keys are read, for the keyboard."""
+        self._waited.register(stop.fileno(), select.POLLIN)
 
     def wait(self) -> bool:
         """Wait for a tick; return True after a signal that ends, or `q`."""
-        ready, _, _ = select.select(self._waited, [], [], TICK_S)
+        ready = [descriptor for descriptor, _ in self._waited.poll(TICK_S * 1000)]
         if self._stop.fileno() in ready:
             os.read(self._stop.fileno(), SIGNALS_MAX)  # also of signals that do not end it
         if self._stop.received is not None:
@@ -151,12 +152,12 @@ class Keyboard:
             return
         keyboard = sys.stdin.fileno()
         former = termios.tcgetattr(keyboard)
-        self._waited.append(keyboard)
+        self._waited.register(keyboard, select.POLLIN)
         try:
             tty.setcbreak(keyboard)
             yield
         finally:
-            self._waited.remove(keyboard)
+            self._waited.unregister(keyboard)
             termios.tcsetattr(keyboard, termios.TCSADRAIN, former)
 
 

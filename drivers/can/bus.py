@@ -1,8 +1,9 @@
 """One bus of python-can, read without waiting; all its exceptions become link failures.
 
-On `socketcan` the bus's socket is read directly, because python-can's `recv` is several times
-slower. Its stamps are wall time, which can step. The difference of the two clocks when a frame is
-read turns them into monotonic time, so only a step between arrival and reading makes them wrong.
+The sockets of `socketcan` and `udp_multicast` are read directly, because python-can's `recv` is
+several times slower, and fails for descriptors of 1024 and more. Stamps are wall time, which can
+step. The difference of the two clocks when a frame is read turns them into monotonic time, so only
+a step between arrival and reading makes them wrong.
 A frame without a stamp arrived after the last time at which the bus was empty.
 """
 
@@ -11,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import select
 import socket
 import stat
 from collections.abc import Callable, Mapping
@@ -34,12 +34,15 @@ from graspd.drivers.can.frames import (
 )
 from graspd.drivers.can.readings import CanCounters
 from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
+from graspd.drivers.link import is_ready
 from graspd.extras import installer
 
 FRAMES_PER_DRAIN: Final = 512
 """Most frames of one call: about 100 ms of a full bus. The loop must get its turn."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """Receive buffer asked of the kernel, bytes; the usual 208 KiB hold 60 ms at 4400 frames/s."""
+DATAGRAM_BYTES_MAX: Final = 4096
+"""Longest datagram of `udp_multicast` that is read, bytes, as in python-can."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
 
@@ -69,6 +72,10 @@ def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.Bu
         except OSError as error:
             raise LinkError(LinkCause.NO_INTERFACE, f"{where}: {error}") from error
     try:
+        if interface == "slcan" and "://" not in channel:
+            from graspd.drivers.protocol_polled import SCHEME  # needs pyserial
+
+            channel = SCHEME + channel
         return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
     except (NotImplementedError, ImportError) as error:
         raise DriverError(_what_is_missing(interface, error)) from error
@@ -150,7 +157,9 @@ class CanBus:
         if self.descriptor is not None:
             _enlarge_buffer(self.descriptor)
         raw = getattr(bus, "socket", None)
-        if self._interface == "socketcan" and isinstance(raw, socket.socket):
+        if self._interface == "udp_multicast" and self.descriptor is not None:
+            raw = socket.socket(fileno=os.dup(self.descriptor))
+        if self._interface in _UNPACK and isinstance(raw, socket.socket):
             self._drops_seen = 0
             with contextlib.suppress(OSError):
                 raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
@@ -158,6 +167,8 @@ class CanBus:
 
     def close(self) -> None:
         bus, self._bus = self._bus, None
+        if self._socket is not None:
+            self._socket.close()
         self._socket = self.descriptor = None
         if bus is None:
             return
@@ -192,13 +203,14 @@ class CanBus:
         now_ns = self._clock()
         ahead_ns = now_ns - self._wall_clock()
         receive, flags = raw.recvmsg, int(socket.MSG_DONTWAIT)
+        unpack, record_bytes = _UNPACK[self._interface]
         for _ in range(FRAMES_PER_DRAIN):
-            record, ancillary, _, _ = receive(CANFD_FRAME.size, ANCILLARY_BYTES, flags)
+            record, ancillary, _, _ = receive(record_bytes, ANCILLARY_BYTES, flags)
             wall_ns, drops = read_stamps(ancillary)
             t_ns = now_ns if wall_ns is None else min(wall_ns + ahead_ns, now_ns)
             if drops is not None:
                 self._count_drops(drops, frames)
-            frame = unpack_frame(record)
+            frame = unpack(record)
             if frame is None:
                 self.counters.malformed_frames += 1
             else:
@@ -217,26 +229,18 @@ class CanBus:
         self._drops_seen = total
 
     def _drain_bus(self, bus: can.BusABC, frames: list[Stamped]) -> None:
-        if not self._stamped:
-            self._drain_unstamped(bus, frames)
-            return
-        now_ns = self._clock()
+        now_ns, since_ns = self._clock(), self._idle_ns
         ahead_ns = now_ns - self._wall_clock()
-        for _ in range(FRAMES_PER_DRAIN):
-            message = bus.recv(timeout=0)
-            if message is None:
-                return
-            t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
-            frames.append((_frame_of(message), t_ns, t_ns))
-
-    def _drain_unstamped(self, bus: can.BusABC, frames: list[Stamped]) -> None:
-        since_ns = self._idle_ns
         for _ in range(FRAMES_PER_DRAIN):
             before_ns = self._clock()
             message = bus.recv(timeout=0)
-            if message is not None:
+            if message is not None and self._stamped:
+                t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
+                frames.append((_frame_of(message), t_ns, t_ns))
+            elif message is not None:
                 frames.append((_frame_of(message), since_ns, self._clock()))
-            elif not _has_more(self.descriptor):
+            # slcan returns no frame for an adapter's answer, although frames wait behind it.
+            elif self.descriptor is None or not is_ready(self.descriptor):
                 self._idle_ns = before_ns
                 return
 
@@ -249,16 +253,21 @@ def _fileno(bus: can.BusABC) -> int | None:
     return descriptor if descriptor >= 0 else None
 
 
-def _has_more(descriptor: int | None) -> bool:
-    """Return True if the descriptor is readable.
+def _unpack_datagram(data: bytes) -> CanFrame | None:
+    """Return the frame in a datagram of `udp_multicast`; None if it is malformed."""
+    from can.interfaces.udp_multicast.utils import unpack_message
 
-    slcan returns no frame for an adapter's answer, although frames wait behind it.
-    """
-    if descriptor is None:
-        return False
-    poll = select.poll()
-    poll.register(descriptor, select.POLLIN)
-    return any(event & select.POLLIN for _, event in poll.poll(0))
+    try:
+        return _frame_of(unpack_message(data, check=True))
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+_UNPACK: Final[dict[str, tuple[Callable[[bytes], CanFrame | None], int]]] = {
+    "socketcan": (unpack_frame, CANFD_FRAME.size),
+    "udp_multicast": (_unpack_datagram, DATAGRAM_BYTES_MAX),
+}
+"""Interfaces whose socket is read directly: what unpacks a record, and its most bytes."""
 
 
 def _enlarge_buffer(descriptor: int) -> None:

@@ -73,6 +73,12 @@ COUPLED_POINTS_MIN, COUPLED_POINTS_MAX = 3, 49
 SLOPE_MAX_DEG = 0.5
 """Steepest allowed segment, degrees per count; usual are 0.03 to 0.1."""
 
+SHEAR: Final = np.array([[1.0, 1e-5], [0.0, 1.0 + 1.618e-5]])
+"""Change of raw pairs after which no square has its corners on one circle.
+
+With two ways to cut a square, the angles would jump where one takes over from the other.
+"""
+
 Points = Sequence[Sequence[float]]
 """Rows of (raw, degrees), or of (raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
 
@@ -161,8 +167,9 @@ def _raw(sensors: Sequence[int], words: Sequence[int]) -> float | None:
 def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return the triangles, shape (n, 3), whose circumcircle has no point inside.
 
-    `points`: shape (p, 2). Four points on one circle give both pairs of triangles.
+    `points`: shape (p, 2). `SHEAR` decides between the triangles of four points on one circle.
     """
+    points = points @ SHEAR
     triples = np.array(list(itertools.combinations(range(len(points)), 3)), dtype=np.intp)
     a, b, c = (points[triples[:, corner]] for corner in range(3))
     edges = np.stack([b - a, c - a], axis=1)

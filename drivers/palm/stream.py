@@ -143,7 +143,7 @@ class PalmStream:
             self.counters.other_palms += 1
             return None
         position = position_of(packet.tactile_type)
-        if position is not None and self.packets[position] == packet:
+        if position is not None and self._is_duplicate(packet, position, t_ns):
             self.counters.duplicate_packets += 1
             return None
         readings = self.push(packet, t_ns)
@@ -186,6 +186,15 @@ class PalmStream:
             self.counters.reordered_packets += 1
         self._store(position, packet, t_ns)
         return (*finished, self._finish()) if self._have == _COMPLETE else finished
+
+    def _is_duplicate(self, packet: PalmPacket, position: int, t_ns: int) -> bool:
+        """Return True for a packet that came before; one of a later round may equal it too."""
+        if self.packets[position] != packet or self._place is None or self._place_t_ns is None:
+            return False
+        elapsed_ns = t_ns - self._place_t_ns
+        step = _step(self._place, position, elapsed_ns)
+        is_in_time = step == 1 or (step < ROUND and elapsed_ns >= step * CYCLE_NS // 2)
+        return not is_in_time or (self._place + step) // ROUND == self._round
 
     def _place_of(self, position: int, t_ns: int) -> int | None:
         if self._place is not None and self._place_t_ns is not None:

@@ -18,7 +18,8 @@ from enum import IntEnum
 import serial
 
 from graspd.drivers.base import DriverError, Fact, LinkCause, LinkError, Opened, Reading
-from graspd.drivers.link import LinkState
+from graspd.drivers.link import LinkState, is_ready
+from graspd.drivers.protocol_polled import SCHEME, PolledSerial
 from graspd.drivers.spi.conversation import NAME, NONCES, Conversation
 from graspd.drivers.spi.messages import Stop, encode
 from graspd.drivers.spi.sweeps import BridgeCounters
@@ -36,7 +37,9 @@ READS_MAX = 32
 DRAIN_TRIES, DRAIN_TRY_S = 10, 0.002
 """Number and length, s, of the waits for the last bytes to leave before a port is closed."""
 WRITE_TIMEOUT_S = 0.05
-"""Longest wait for room in the port's buffer, s; `select` has just reported room."""
+"""Longest wait of a URL's port for room in its buffer, s; `poll` has just reported room."""
+FAILURES = (OSError, termios.error, ValueError)
+"""Exceptions of an open port; `ValueError`: a URL's port has a descriptor too high for `select`."""
 
 _log = logging.getLogger(__name__)
 
@@ -190,29 +193,30 @@ class SerialLine:
         """Descriptor to wait on; None while closed, or if the port must be polled."""
         self._baud = baud
         self._serial: serial.Serial | None = None
-        self._terminal: int | None = None
-        """Descriptor if the port is a terminal; it is read without pyserial."""
 
     def open(self) -> None:
         """Open the port exclusively. Raises `LinkError`; `DriverError` if no retry can help."""
         self.close()
         try:
-            self._serial = serial.serial_for_url(
-                self.port,
-                self._baud,
-                timeout=0,
-                write_timeout=WRITE_TIMEOUT_S,
-                exclusive=True,
-            )
-        except (OSError, termios.error) as error:
+            try:
+                port = serial.serial_for_url(
+                    self.port if "://" in self.port else SCHEME + self.port,
+                    self._baud,
+                    timeout=0,
+                    write_timeout=WRITE_TIMEOUT_S,
+                    exclusive=True,
+                    do_not_open=True,
+                )
+            except ValueError as error:
+                raise DriverError(f"{self.port}: {error}") from error
+            port.open()
+        except FAILURES as error:
             raise LinkError.from_errno(error, f"{self.port}: {_reason(error)}") from error
-        except ValueError as error:
-            raise DriverError(f"{self.port}: {error}") from error
+        self._serial = port
         with contextlib.suppress(OSError, AttributeError):
-            self.descriptor = self._serial.fileno()
-        self._terminal = self.descriptor if type(self._serial) is serial.Serial else None
+            self.descriptor = port.fileno()
         try:  # an FTDI adapter then sends every 1 ms, not every 16
-            self._serial.set_low_latency_mode(True)
+            port.set_low_latency_mode(True)
         except (OSError, ValueError, AttributeError) as error:
             _log.debug("%s: no low latency mode: %s", self.port, error)
         if self.tap is not None:
@@ -232,13 +236,13 @@ class SerialLine:
                 port.reset_output_buffer()  # with bytes left, closing would wait up to 30 s
         except AttributeError:
             pass  # a port without a buffer of its own
-        except (OSError, termios.error) as error:
+        except FAILURES as error:
             _log.debug("%s: %s", self.port, error)
         # pyserial drops a socket that its peer has reset, but does not close it.
         held = getattr(port, "_socket", None)
         try:
             port.close()
-        except (OSError, termios.error) as error:
+        except FAILURES as error:
             _log.debug("%s: %s", self.port, error)
         if held is not None:
             held.close()
@@ -249,17 +253,13 @@ class SerialLine:
         self.drained = False
         try:
             for _ in range(READS_MAX):
-                chunk = b"" if self._terminal is None else os.read(self._terminal, READ_BYTES)
-                self.drained = 0 < len(chunk) < SHORT_BYTES
-                if not chunk:  # pyserial also notices that a terminal is gone
-                    chunk = port.read(READ_BYTES)
-                    self.drained = not chunk
+                chunk = port.read(READ_BYTES)
+                is_short = isinstance(port, PolledSerial) and len(chunk) < SHORT_BYTES
+                self.drained = is_short or not chunk
                 data += chunk
                 if self.drained:
                     break
-        except BlockingIOError:
-            self.drained = True
-        except (OSError, termios.error) as error:
+        except FAILURES as error:
             if not data:  # else the next call raises, after these bytes
                 raise self._loss(error) from error
         if self.tap is not None and data:
@@ -270,14 +270,14 @@ class SerialLine:
         """Write a frame and return True, or return False if there is no room."""
         port = self._opened()
         try:
-            if self.descriptor is not None and not select.select([], [self.descriptor], [], 0)[1]:
+            if self.descriptor is not None and not is_ready(self.descriptor, select.POLLOUT):
                 return False
             if self.tap is not None:
                 self.tap(LineEvent.SENT, data)
             port.write(data)
         except serial.SerialTimeoutException:
             return False
-        except (OSError, termios.error) as error:
+        except FAILURES as error:
             raise self._loss(error) from error
         return True
 

@@ -198,9 +198,9 @@ class SpiTwin(Opened):
         master = self._master
         if master is None:
             return
-        waiting = [master] if self._unsent else []
-        readable, _, _ = select.select([master], waiting, [], timeout_s)
-        if readable:
+        poll = select.poll()
+        poll.register(master, select.POLLIN | (select.POLLOUT if self._unsent else 0))
+        if any(event & select.POLLIN for _, event in poll.poll(timeout_s * 1000)):
             self._hear(os.read(master, READ_BYTES))
         self._drain()
         self._do_what_is_due()

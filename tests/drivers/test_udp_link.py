@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from graspd.drivers.base import Fact, LinkCause, LinkError, Reading
+from graspd.drivers.joints import JointStreamDriver
 from graspd.drivers.link import LinkState
 from graspd.drivers.udp import (
     Datagram,
@@ -139,6 +140,54 @@ def test_only_one_address_is_heard_if_that_is_wanted(
     bench = Bench(monkeypatch, only_from)
     assert bool(bench.hear(Datagram(b"a", 0, HERE))) == heard
     assert bench.counters.foreign_datagrams == (not heard)
+
+
+def test_a_refused_sender_is_named_as_the_cause(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = Bench(monkeypatch, "127.0.0.1")
+    other = ("10.0.0.5", 7)
+    why = "datagrams of 10.0.0.5 are refused by only_from"
+    bench.hear(*[Datagram(b"a", 0, other)] * 3)
+    assert bench.link.describe()["link"] == Fact("greeting", LinkCause.FOREIGN)
+    assert bench.link.describe()["why"] == Fact(why)
+    bench.hear(Datagram(b"a", 0, HERE), Datagram(b"a", 0, other))
+    assert bench.link.describe()["link"] == Fact("up")
+    assert "why" not in bench.link.describe()
+    bench.clock.now_ns += SILENCE_NS
+    assert bench.fell_silent()
+    bench.hear(Datagram(b"a", 0, other))
+    assert bench.link.describe()["link"] == Fact("greeting", LinkCause.FOREIGN)
+    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    silence = "nothing good for 100 ms"
+    assert told == [f"test: {each}; trying again" for each in (why, silence, why)]
+
+
+@pytest.mark.parametrize(
+    ("source", "only_from", "sender", "is_heard"),
+    [
+        ("udp://[::]:0", "127.0.0.1", "127.0.0.1", True),
+        ("udp://[::]:0", "::ffff:127.0.0.1", "127.0.0.1", True),
+        ("udp://[::]:0", "0:0::1", "::1", True),
+        ("udp://[::]:0", "127.0.0.2", "127.0.0.1", False),
+        ("udp://[::]:0", "::1", "127.0.0.1", False),
+        ("udp://0.0.0.0:0", "::ffff:127.0.0.1", "127.0.0.1", True),
+        ("udp://[::ffff:127.0.0.1]:0", "127.0.0.1", "127.0.0.1", True),
+    ],
+)
+def test_only_from_compares_addresses_and_not_their_spelling(
+    source: str, only_from: str, sender: str, is_heard: bool
+) -> None:
+    family = socket.AF_INET6 if ":" in sender else socket.AF_INET
+    driver = JointStreamDriver(source, only_from=only_from)
+    try:
+        driver.open()
+    except LinkError:
+        pytest.skip("this machine has no IPv6")
+    with driver, socket.socket(family, socket.SOCK_DGRAM) as near:
+        near.sendto(b'{"joints":{"FFJ3":0.1}}', (sender, driver.port or 0))
+        assert bool(driver.read_ready()) == is_heard
+        assert driver.counters.foreign_datagrams == (not is_heard)
 
 
 def test_a_datagram_is_as_old_as_the_kernel_says_and_never_older_than_the_one_before(

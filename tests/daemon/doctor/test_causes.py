@@ -24,6 +24,7 @@ from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Finding, Level
 from graspd.daemon.doctor.surroundings import can_finding
+from graspd.drivers.joints import JointStreamDriver
 from graspd.drivers.twins import spi as spi_twin
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -42,6 +43,7 @@ from tests.daemon.doctor.emulated import (
 )
 from tests.daemon.processes import start, wait_for
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
+from tests.kit.crowd import crowded
 from tests.ports import free_port
 
 
@@ -356,3 +358,18 @@ def test_the_table_of_electrodes_is_shown_with_all_only_and_fits(
     assert len(lines) == 25
     assert max(map(len, lines)) <= 80
     assert [line.split()[0] for line in lines[1:]] == [str(number) for number in range(1, 25)]
+
+
+def test_the_doctor_listens_above_descriptor_1024(tmp_path: Path, healthy: str) -> None:
+    with crowded():
+        assert look(tmp_path, healthy) == []
+
+
+def test_a_sender_that_only_from_refuses_is_named() -> None:
+    driver = JointStreamDriver("udp://127.0.0.1:0", only_from="127.0.0.2")
+    with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.sendto(b'{"joints": {"FFJ3": 0.1}}', ("127.0.0.1", driver.port or 0))
+        driver.read_ready()
+        (told,) = doctor.examine(driver, None, 1.0)
+    assert (told.level, told.cause) == (Level.ERROR, Cause.FOREIGN_SENDER)
+    assert "datagrams of 127.0.0.1 are refused by only_from" in told.what

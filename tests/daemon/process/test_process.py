@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import printable, progress
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit import inside
+from tests.kit.crowd import SELECT_MAX, crowded
 from tests.kit.scenes import demo_scene
 
 ROOT = Path(__file__).parents[3]
@@ -253,3 +255,11 @@ def test_what_is_being_done_is_shown_on_a_terminal_only(monkeypatch: pytest.Monk
         progress("half\nway")
         progress("")
         assert stderr.getvalue() == expected
+
+
+def test_a_signal_is_waited_for_above_descriptor_1024() -> None:
+    with crowded(), StopSignal() as stop:
+        assert stop.fileno() >= SELECT_MAX
+        assert not stop.wait(0.0)
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.wait(100.0)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 import time
 
 import pytest
 from msgspec import structs
 
 from graspd.daemon.judge.reasons import ADVICE, Decision, FingerState, Reason
+from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.watch.snapshot import FingerMotion, Snapshot, Tone
-from graspd.daemon.watch.terminal import STYLES
+from graspd.daemon.watch.terminal import STYLES, Keyboard
 from tests.daemon.watch.watch_fakes import (
     ENDPOINT,
     MS,
@@ -21,6 +24,7 @@ from tests.daemon.watch.watch_fakes import (
     verdict,
     whole_hand,
 )
+from tests.kit.crowd import SELECT_MAX, crowded
 
 
 def a_full_hand(decision: Decision = Decision.SLIP, hand: str = "right") -> Snapshot:
@@ -179,3 +183,19 @@ def test_several_hands_all_show_their_verdicts() -> None:
     assert "tab shows the next hand" in first[2]
     second = text_of(hands, 100, chosen=1)
     assert [line.split()[0] for line in second[:2]] == ["left", "right"]
+
+
+def test_keys_are_read_above_descriptor_1024(monkeypatch: pytest.MonkeyPatch) -> None:
+    with crowded(), StopSignal() as stop:
+        near, far = os.openpty()
+        with open(far, closefd=True) as terminal:
+            monkeypatch.setattr(sys, "stdin", terminal)
+            keyboard = Keyboard(stop)
+            with keyboard.unbuffered():
+                assert terminal.fileno() >= SELECT_MAX
+                os.write(near, b"\t\t ")
+                assert not keyboard.wait()
+                assert (keyboard.tabs, keyboard.spaces) == (2, 1)
+                os.write(near, b"q")
+                assert keyboard.wait()
+        os.close(near)

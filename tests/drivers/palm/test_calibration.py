@@ -252,6 +252,41 @@ def test_the_coupled_table_agrees_with_an_independent_interpolation() -> None:
     assert inside > 150
 
 
+GRID = [
+    (1000.0 + 500 * i, 1000.0 + 500 * j, 15.0 * i + 3 * ((i + j) % 2), 15.0 * j - 10)
+    for i, j in itertools.product(range(3), repeat=2)
+]
+"""Raw pairs on a square grid, as of a jig; each square has two ways to be cut."""
+
+
+def test_a_square_grid_agrees_with_an_independent_interpolation() -> None:
+    """The reference cuts squares in the plane that the table's documentation names."""
+    interpolate = pytest.importorskip("scipy.interpolate", reason="scipy is not installed")
+    rows, sheared = np.array(GRID), np.array([[1.0, 1e-5], [0.0, 1.00001618]])
+    reference = interpolate.LinearNDInterpolator(rows[:, :2] @ sheared, rows[:, 2:])
+    table = CoupledTable(GRID)
+    for pair in np.random.default_rng(8).uniform(1000, 2000, (300, 2)):
+        expected = reference(*(pair @ sheared))
+        assert np.degrees(table.angles_rad(*pair)) == pytest.approx(expected, abs=1e-9)
+
+
+@given(order=st.permutations(GRID), turn=st.sampled_from([(500, 0), (400, 300), (350, 350)]))
+def test_angles_are_continuous_on_a_square_grid(
+    order: list[tuple[float, ...]], turn: tuple[float, float]
+) -> None:
+    """Half a count moves an angle by at most half the steepest slope between neighbours."""
+    (along, across), centre = turn, 1500.0
+    rows = []
+    for first, second, *angles in order:
+        i, j = (first - centre) / 500, (second - centre) / 500
+        raws = centre + along * i - across * j, centre + across * i + along * j
+        rows.append((*raws, *angles))
+    table = CoupledTable(rows)
+    for offset in (-300.0, 100.0):
+        steps = np.array([table.angles_rad(1500 + offset, b) for b in np.arange(1200, 1800, 0.5)])
+        assert np.degrees(np.abs(np.diff(steps, axis=0))).max() < 0.5 * 0.06
+
+
 @pytest.mark.parametrize(
     ("joint", "rows", "reason"),
     [

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd.drivers.base import ElectrodeFault
+from graspd.drivers.base import ElectrodeFault, Reading
 from graspd.drivers.palm.packet import PalmPacket
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.faults import LinkFaults
+from tests.drivers.one_sweep import tactile
 from tests.drivers.palm.palm_stream import (
     FINGERS,
     MS,
@@ -289,3 +290,41 @@ def test_swapped_packets_find_their_place_or_are_counted_as_late() -> None:
     assert counters.reordered_packets + counters.late_packets == swapped > 100
     assert counters.lost_packets == counters.late_packets  # swapped over the end of a round
     assert counters.conflicting_packets == counters.duplicate_packets == 0
+
+
+@pytest.mark.parametrize("copies", [1, 2])
+def test_a_palm_whose_words_stand_still_is_read(copies: int) -> None:
+    """Each round of such a palm equals the one before, and is not its copy."""
+    stream, steady = PalmStream(FINGERS), packets(1)
+    for outage_ns in (0, 300 * MS):
+        stream.interrupt()
+        readings: list[Reading] = []
+        for cycle, packet in enumerate(steady * 10):
+            for _ in range(copies):
+                readings += stream.receive(packet.to_bytes(), outage_ns + cycle * MS) or ()
+        assert len(readings) == 10
+        assert not any(reading.faults.any() for reading in tactile(readings))
+    assert stream.counters.duplicate_packets == 2 * 10 * ROUND * (copies - 1)
+    assert stream.counters.unsynchronised_packets == 0
+
+
+def test_a_palm_that_stands_still_may_lose_packets() -> None:
+    steady: list[PalmPacket | None] = [*packets(1) * 10]
+    lost = {ROUND - 1, *range(4 * ROUND - 2, 4 * ROUND + 3), 5 * ROUND + 3}
+    played = play_packets([None if at in lost else packet for at, packet in enumerate(steady)])
+    assert (played.counters.lost_packets, played.counters.duplicate_packets) == (len(lost), 0)
+    assert len(played.sound()) == 10 - len({at // ROUND for at in lost})
+
+
+def test_a_late_copy_in_its_round_begins_no_round() -> None:
+    """A copy 8 to 12 ms late is 6 to 2 packets ahead of the last."""
+    for late_ms in range(1, 13):
+        stream = PalmStream(FINGERS)
+        data = [packet.to_bytes() for packet in packets(2)]
+        readings: list[Reading] = []
+        for cycle in range(2 * ROUND + late_ms):
+            for at in (cycle, cycle - late_ms):
+                is_in_round = at == cycle or at // ROUND == cycle // ROUND
+                if 0 <= at < len(data) and is_in_round:
+                    readings += stream.receive(data[at], cycle * MS) or ()
+        assert [reading.seq for reading in readings] == [0, 1], late_ms

@@ -22,7 +22,12 @@ class Port:
         self.reads: list[int] = []
         self.written = b""
         self.failure: Exception | None = None
+        self.refusal: Exception | None = None
         self.discarded = self.closed = False
+
+    def open(self) -> None:
+        if self.refusal is not None:
+            raise self.refusal
 
     def read(self, most: int) -> bytes:
         self.reads.append(most)
@@ -142,6 +147,20 @@ def test_why_a_port_cannot_be_opened_is_one_short_line(
     monkeypatch.setattr("graspd.drivers.spi.driver.serial.serial_for_url", refuse)
     with pytest.raises(kind, match=told):
         SerialLine("port", 9600).open()
+
+
+def test_a_descriptor_too_high_for_pyserial_is_a_link_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    port = Port()
+    line = opened(monkeypatch, port)
+    port.failure = port.refusal = ValueError("filedescriptor out of range in select()")
+    with pytest.raises(LinkError, match="the device went away"):
+        line.read()
+    with pytest.raises(LinkError, match="the device went away"):
+        line.write(b"abc")
+    with pytest.raises(LinkError, match="port: filedescriptor out of range"):
+        line.open()
 
 
 def test_who_taps_a_line_gets_all_that_comes_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,47 @@
+"""Serial ports without `select`, which fails for descriptors of 1024 and more.
+
+The module's name makes it pyserial's handler of `polled://PATH`.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import serial
+
+from graspd.drivers.link import is_ready
+
+SCHEME = "polled://"
+
+serial.protocol_handler_packages.append(__package__)
+
+
+class PolledSerial(serial.Serial):
+    """A terminal that is read and written without waiting."""
+
+    def read(self, size: int = 1, /) -> bytes:
+        """Return the bytes that have arrived, at most `size`. Raises `OSError` after a hang-up."""
+        try:
+            data = os.read(self.fileno(), size)
+            # A terminal that was hung up is always ready and has nothing.
+            if data or not is_ready(self.fileno()) or (data := os.read(self.fileno(), size)):
+                return data
+        except BlockingIOError:
+            return b""
+        raise serial.SerialException(errno.EIO, os.strerror(errno.EIO))
+
+    def write(self, data: bytes, /) -> int:  # type: ignore[override]
+        """Write all bytes. Raises `SerialTimeoutException` if there is no room, else `OSError`."""
+        try:
+            written = os.write(self.fileno(), data)
+        except BlockingIOError:
+            written = 0
+        if written < len(data):
+            raise serial.SerialTimeoutException("the port has no room")
+        return written
+
+
+def serial_class_for_url(url: str) -> tuple[str, type[PolledSerial]]:
+    """Return the path in a URL, and the class that opens it."""
+    return url.removeprefix(SCHEME), PolledSerial

@@ -1,0 +1,173 @@
+"""Each driver works again after a loss while 2,000 descriptors are open."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import pty
+import socket
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from graspd.drivers.base import Driver, Reading
+from graspd.drivers.can.driver import CanBridgeDriver
+from graspd.drivers.joints import JointStreamDriver
+from graspd.drivers.palm.stream import PalmDriver
+from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
+from graspd.drivers.spi.driver import SpiBridgeDriver
+from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
+from graspd.drivers.twins.datagrams import JointTwin, PalmTwin
+from graspd.drivers.twins.spi import SpiTwin
+from tests.drivers.can.can_standin import SocketBus, channel, contact, stand_in, sweep_of_frames
+from tests.drivers.palm.palm_stream import rows
+from tests.kit.crowd import SELECT_MAX, crowded
+from tests.kit.waiting import wait_until
+from tests.ports import can_id, multicast_group
+
+FINGERS = ("ff", "mf", "th")
+LOOPBACK = "udp://127.0.0.1:0"
+
+
+class Bench(NamedTuple):
+    """An open driver, a sender of a little data, and ways to unplug the device and plug it in."""
+
+    driver: Driver
+    send: Callable[[], object]
+    unplug: Callable[[], object]
+    plug: Callable[[], object]
+    waits: bool = True
+    """False if the driver has no descriptor."""
+
+
+@contextlib.contextmanager
+def spi(folder: Path) -> Iterator[Bench]:
+    with (
+        SpiTwin(folder / "port", itertools.cycle(contact(50))) as twin,
+        SpiBridgeDriver(str(folder / "port"), FINGERS) as driver,
+    ):
+        yield Bench(driver, lambda: twin.run_once(0.001), twin.unplug, twin.plug)
+
+
+@contextlib.contextmanager
+def slcan(folder: Path) -> Iterator[Bench]:
+    path, ends = folder / "adapter", list[int]()
+
+    def unplug() -> None:
+        while ends:
+            os.close(ends.pop())
+
+    def plug() -> None:
+        ends.extend(pty.openpty())
+        tty.setraw(ends[1])
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(ends[1]))
+
+    def send() -> None:
+        for frame in sweep_of_frames(0):
+            line = f"t{frame.arbitration_id:03X}7{frame.data.hex().upper()}\r"
+            os.write(ends[0], line.encode())
+
+    plug()
+    with CanBridgeDriver("slcan", str(path), arbitration_id=SAMPLE_ID, sequence="electrodes") as it:
+        yield Bench(it, send, unplug, plug)
+    unplug()
+
+
+@contextlib.contextmanager
+def multicast(_: Path) -> Iterator[Bench]:
+    group = multicast_group()
+    where, number = ("udp_multicast", group), can_id(group)
+    options = {"format": "syntouch", "arbitration_id": number, "sequence": "electrodes"}
+    twin = CanTwin(*where, itertools.cycle(contact(50)), **options)  # type: ignore[arg-type]
+    with twin, CanBridgeDriver(*where, **options) as driver:  # type: ignore[arg-type]
+        yield Bench(driver, twin.send_sweep, driver.close, driver.open)
+
+
+@contextlib.contextmanager
+def virtual(_: Path) -> Iterator[Bench]:
+    where, counts = channel(), itertools.cycle(contact(50))
+    driver = CanBridgeDriver("virtual", where, arbitration_id=SAMPLE_ID, sequence="electrodes")
+    with driver, CanTwin("virtual", where, counts, sequence="electrodes") as twin:
+        yield Bench(driver, twin.send_sweep, driver.close, driver.open, waits=False)
+
+
+@contextlib.contextmanager
+def socketcan(_: Path) -> Iterator[Bench]:
+    """A pair of Unix sockets stands in for the CAN socket."""
+    with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
+        buses: list[SocketBus] = []
+
+        def bus() -> SocketBus:
+            buses.append(stack.enter_context(SocketBus()))
+            return buses[-1]
+
+        def send() -> None:
+            for frame in sweep_of_frames(0):
+                buses[-1].send(frame)
+
+        stand_in(patch, bus)
+        driver = CanBridgeDriver("socketcan", "lo", arbitration_id=SAMPLE_ID, sequence="electrodes")
+        with driver:
+            yield Bench(driver, send, driver.close, driver.open)
+
+
+@contextlib.contextmanager
+def palm(_: Path) -> Iterator[Bench]:
+    with PalmDriver(LOOPBACK, FINGERS) as driver, socket.socket(type=socket.SOCK_DGRAM) as near:
+        packets = itertools.cycle(packet.to_bytes() for packet in PalmTwin(rows(20)).packets())
+        yield Bench(driver, lambda: send_to(near, driver.port, packets), driver.close, driver.open)
+
+
+@contextlib.contextmanager
+def joints(_: Path) -> Iterator[Bench]:
+    with JointStreamDriver(LOOPBACK) as driver, socket.socket(type=socket.SOCK_DGRAM) as near:
+        messages = (data for cycle in JointTwin().cycles() for data in cycle)
+        yield Bench(driver, lambda: send_to(near, driver.port, messages), driver.close, driver.open)
+
+
+@contextlib.contextmanager
+def table(_: Path) -> Iterator[Bench]:
+    with ReplayDriver([DEMO_TABLE], FINGERS, speed=None) as driver:
+        yield Bench(driver, lambda: None, driver.close, driver.open, waits=False)
+
+
+def send_to(near: socket.socket, port: int | None, datagrams: Iterator[bytes]) -> None:
+    """Send one round of the palm, or 14 messages."""
+    assert port is not None
+    for data in itertools.islice(datagrams, 14):
+        near.sendto(data, ("127.0.0.1", port))
+
+
+BENCHES = [spi, slcan, multicast, virtual, socketcan, palm, joints, table]
+
+
+@pytest.mark.parametrize("bench", BENCHES, ids=lambda bench: bench.__name__)
+def test_a_driver_reads_again_above_descriptor_1024(
+    bench: Callable[[Path], contextlib.AbstractContextManager[Bench]], tmp_path: Path
+) -> None:
+    with bench(tmp_path) as (driver, send, unplug, plug, waits):
+        descriptors: list[int] = []
+
+        def reads() -> Sequence[Reading]:
+            send()
+            for _ in range(2):
+                if (descriptor := driver.fileno()) is not None:
+                    descriptors.append(descriptor)
+                if readings := driver.read_ready():
+                    return readings
+            return ()
+
+        wait_until(reads)
+        assert max(descriptors, default=0) < SELECT_MAX
+        unplug()
+        while driver.fileno() is not None:
+            driver.read_ready()
+        with crowded():
+            plug()
+            wait_until(lambda: reads() and (not waits or max(descriptors) >= SELECT_MAX))
+            driver.close()
