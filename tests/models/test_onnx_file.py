@@ -13,7 +13,7 @@ import pytest
 from graspd.models import onnx_file, zoo
 from graspd.models.contract import ModelError
 
-onnx = pytest.importorskip("onnx", reason="needs the train extra")
+onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
 DecodeError = pytest.importorskip("google.protobuf.message").DecodeError
 text_format = pytest.importorskip("google.protobuf.text_format")
 DAMAGED = 20_000

@@ -84,7 +84,7 @@ def test_what_it_finds_is_said_in_one_line(tmp_path: Path) -> None:
 def test_one_that_takes_too_long_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("onnx", reason="needs the train extra")
+    pytest.importorskip("onnx", reason="needs the extra `train`")
     path = hostile.giant(tmp_path)
     monkeypatch.setattr(trial, "TRIAL_S", 3.0)
     began_s = time.monotonic()
@@ -94,7 +94,7 @@ def test_one_that_takes_too_long_is_refused(
 
 
 def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
-    pytest.importorskip("onnx", reason="needs the train extra")
+    pytest.importorskip("onnx", reason="needs the extra `train`")
     path = hostile.giant(tmp_path, side=20_000)
     with pytest.raises(ModelError, match=r"Failed to allocate|no answer within|takes more than"):
         trial.load(path)
@@ -103,7 +103,7 @@ def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
 def test_what_is_not_the_model_alone_is_refused_without_being_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("onnx", reason="needs the train extra")
+    pytest.importorskip("onnx", reason="needs the extra `train`")
     path = hostile.external(tmp_path)
     monkeypatch.chdir(tmp_path)
     for load in (trial.load, TactileModel):

@@ -25,7 +25,7 @@ from tests.daemon.processes import TIMEOUT_S, graspd, start
 from tests.kit.messages import GOLDEN
 from tests.ports import free_port
 
-pytest.importorskip("foxglove", reason="extra foxglove")
+pytest.importorskip("foxglove", reason="needs the extra `foxglove`")
 
 
 class ViewerClient:
