@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import time
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -87,10 +86,8 @@ def test_one_that_takes_too_long_is_refused(
     pytest.importorskip("onnx", reason="needs the extra `train`")
     path = hostile.giant(tmp_path)
     monkeypatch.setattr(trial, "TRIAL_S", 3.0)
-    began_s = time.monotonic()
     with pytest.raises(ModelError, match="takes too long: no answer within 3 s"):
         trial.load(path)
-    assert time.monotonic() - began_s < 10.0
 
 
 def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
