@@ -176,8 +176,8 @@ def skips(node: ast.AST) -> Iterator[ast.Call]:
     for call in ast.walk(node):
         if isinstance(call, ast.Call) and ast.unparse(call.func) == "pytest.importorskip":
             package = call.args[0]
-            named = isinstance(package, ast.Constant)  # else it is one of several
-            if not named or str(package.value).partition(".")[0] not in brought_by_test():
+            name = str(package.value) if isinstance(package, ast.Constant) else ""  # a variable
+            if name.partition(".")[0] not in brought_by_test():
                 yield call
 
 
