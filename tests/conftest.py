@@ -64,7 +64,8 @@ def data_dir() -> Path | None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Options of `graspd report stability`, which runs `tests/stability`."""
+    """Options of `.ci/run`, and of `graspd report stability`, which runs `tests/stability`."""
+    parser.addoption("--left", metavar="FILE", help="leave out what passed by this `pytest -rap`")
     parser.addoption("--model", action="append", default=[], help="a model to compare (all)")
     parser.addoption("--data", type=Path, help="folder of the real grasps")
     parser.addoption("--rows", choices=("markdown", "json"), help="print what was measured")
@@ -91,8 +92,11 @@ def what_is_there_is_kept() -> None:
     gc.freeze()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """What takes long is begun first; all else stays in its order."""
+    if said := config.getoption("left"):
+        passed = set(Path(said).read_text().splitlines())
+        items[:] = [item for item in items if f"PASSED {item.nodeid}" not in passed]
     rank = {ROOT / "tests" / name: at for at, name in enumerate(BEGUN_FIRST)}
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
 

@@ -34,7 +34,7 @@ SIGNALS = "daemon/process/signals.py"
 """Entered in each round, for no reading."""
 JUDGED_ENOUGH = 20
 """Judged readings after which the daemon is stopped."""
-SECONDS_MAX = 60.0
+SECONDS_MAX = 200.0
 """When it is stopped at the latest, s."""
 SCENE = """
 [tactile]

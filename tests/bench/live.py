@@ -32,7 +32,7 @@ from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, synthetic_grasps
 from graspd.drivers.twins.spi import SpiTwin
 from tests.kit.messages import decode_verdict
 
-PATIENCE_S = 30.0
+PATIENCE_S = 100.0
 """Longest wait for what must come, s."""
 STOP_S = 5.0
 """Longest wait for a process that was told to stop, s."""

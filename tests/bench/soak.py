@@ -40,6 +40,7 @@ from tests.bench.live import (
     usage,
 )
 from tests.bench.soak_judge import Found, Heard, judge
+from tests.daemon.processes import before_others
 
 SAMPLE_S = 0.5
 IDLE_S = 0.05
@@ -232,7 +233,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     end_children_at_sigterm()
-    rows = judge(soak(Plan(given.seconds, given.rate, given.seed)))
+    with before_others():
+        rows = judge(soak(Plan(given.seconds, given.rate, given.seed)))
     head = ("", "found", "at most")
     lines = markdown_table(head, [row.cells() for row in rows], right=head[1:])
     sys.stdout.write("\n".join(lines) + "\n")

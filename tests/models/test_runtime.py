@@ -70,7 +70,7 @@ def test_a_path_that_no_file_can_have_is_refused() -> None:
 def test_a_model_that_contradicts_its_contract_is_refused(
     tmp_path: Path, stated: str, wrongly: str, says: str
 ) -> None:
-    onnx = pytest.importorskip("onnx", reason="needs the train extra")
+    onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
     model = onnx.load(CNN1)
     entry = model.metadata_props[0]
     assert stated in entry.value
@@ -81,7 +81,7 @@ def test_a_model_that_contradicts_its_contract_is_refused(
 
 
 def test_a_model_of_another_input_or_without_a_contract_is_refused(tmp_path: Path) -> None:
-    onnx = pytest.importorskip("onnx", reason="needs the train extra")
+    onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
     model, path = onnx.load(CNN1), tmp_path / "model.onnx"
     renamed = onnx.compose.add_prefix(model, "another_")
     onnx.save(renamed, path)

@@ -42,7 +42,7 @@ def probability(images: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def plain_forward(path: Path, images: NDArray[np.float32]) -> NDArray[np.float64]:
     """CNN1 by its definition in float64, from nothing of the file but its six weight arrays."""
-    onnx = pytest.importorskip("onnx", reason="the train extra is not installed")
+    onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
     arrays = [onnx.numpy_helper.to_array(item) for item in onnx.load(path).graph.initializer]
     weights = {item.shape: item.astype(np.float64) for item in arrays if item.dtype == np.float32}
     assert set(weights) == {(32, 3, 3, 3), (32,), (1024, 2880), (1024,), (2, 1024), (2,)}

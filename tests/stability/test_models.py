@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-pytest.importorskip("onnx", reason="the reference needs onnx, of the extra `train`")
+pytest.importorskip("onnx", reason="needs the extra `train`")
 
 from graspd.daemon.judge.network import Examined, Network
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("onnx", reason="the networks are made with onnx, of the extra `train`")
-pytest.importorskip("torch", reason="the networks are made with torch, of the extra `train`")
+pytest.importorskip("onnx", reason="needs the extra `train`")
+pytest.importorskip("torch", reason="needs the extra `train`")
 
 import onnx
 import torch

@@ -20,6 +20,7 @@ from graspd.daemon.process.text import markdown_table
 from tests.bench.attacks import doors, files, hands, rings, standing, who
 from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import end_children_at_sigterm
+from tests.daemon.processes import before_others
 
 ATTACKS: Final[dict[str, Callable[[Plan], Outcome]]] = {
     "second-palm": hands.second_palm,
@@ -80,4 +81,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     end_children_at_sigterm()
-    sys.exit(main())
+    with before_others():
+        code = main()
+    sys.exit(code)

@@ -210,7 +210,7 @@ def test_what_a_driver_cannot_use_is_one_line(
 
 def loop_scene(folder: Path) -> Path:
     """The scene to try the whole loop with, and all that it makes, in this folder."""
-    pytest.importorskip("mcap", reason="the record extra is not installed")
+    pytest.importorskip("mcap", reason="needs the extra `record`")
     text = (DEPLOY / "clients/loop.toml").read_text().replace("/tmp/graspd-", f"{folder}/")
     scene = folder / "loop.toml"
     scene.write_text(text.replace("../../drivers/recordings/demo", str(DEMO_TABLE.parent)))

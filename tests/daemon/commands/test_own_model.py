@@ -17,7 +17,7 @@ def test_a_table_becomes_a_model_that_a_scene_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for package in ("torch", "rich"):
-        pytest.importorskip(package, reason="the train extra is not installed")
+        pytest.importorskip(package, reason="needs the extra `train`")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "monday.csv", table("monday", 60, 1))

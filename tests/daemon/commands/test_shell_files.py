@@ -10,8 +10,8 @@ import sys
 
 import pytest
 
-pytest.importorskip("shtab", reason="of the extra `test`")
-pytest.importorskip("argparse_manpage", reason="of the extra `test`")
+pytest.importorskip("shtab", reason="needs the extra `test`")
+pytest.importorskip("argparse_manpage", reason="needs the extra `test`")
 
 from graspd.models import zoo
 from tests.daemon.commands.shell_files import FOLDER, files

@@ -10,8 +10,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("matplotlib")
+pytest.importorskip("torch", reason="needs the extra `train`")
+pytest.importorskip("matplotlib", reason="needs the extra `report`")
 
 from matplotlib.figure import Figure
 from matplotlib.text import Text

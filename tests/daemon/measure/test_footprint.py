@@ -1,4 +1,4 @@
-"""What a scene does not need is not there: modules, memory, threads, descriptors, start."""
+"""What a scene does not need is not there: modules, memory, threads, descriptors."""
 
 from __future__ import annotations
 
@@ -75,9 +75,6 @@ DRIVER = {"demo": "replay", "two-fingers": "spi"}
 MEMORY_MIB = {"demo": 126, "spi": 126, "can": 132, "palm": 126, "two-fingers": 126}
 """Resident; measured 82 to 88 MiB with numpy 2.4, onnxruntime 1.31 and pydantic 2.13, and other
 versions may take half as much again."""
-START_CPU_S = {"demo": 0.9, "spi": 0.9, "can": 1.1, "palm": 0.9, "two-fingers": 0.9}
-"""CPU time from the start of the process to the first reading judged, loading the model included;
-measured 0.34 to 0.52 s. Wall time is not held: the machine may be busy."""
 
 STANDARD = 3
 """Descriptors of standard input, output and error."""
@@ -134,7 +131,6 @@ def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measur
     commands = [name for name in cost["modules"] if name.startswith("graspd.daemon.commands.")]
     assert commands == ["graspd.daemon.commands.run"]
     assert cost["start"]["rss_kib"] < MEMORY_MIB[scene.stem] * 1024
-    assert cost["start"]["cpu_ms"] < START_CPU_S[scene.stem] * 1e3
     assert cost["start"]["threads"] == 1 + ZMQ_THREADS
     assert cost["start"]["descriptors"] == STANDARD + SIGNALS + SOCKET + FILE
     socket = next(part for part in cost["parts"] if part["name"] == "sockets")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("onnx", reason="the report needs onnx, of the extra `train`")
-pytest.importorskip("torch", reason="the report needs torch, of the extra `train`")
+pytest.importorskip("onnx", reason="needs the extra `train`")
+pytest.importorskip("torch", reason="needs the extra `train`")
 
 from graspd.daemon.measure import stability
 from tests.kit.inside import graspd

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("matplotlib")
+pytest.importorskip("torch", reason="needs the extra `train`")
+pytest.importorskip("matplotlib", reason="needs the extra `report`")
 
 from graspd.daemon.measure import streams as module
 from graspd.daemon.measure import worth

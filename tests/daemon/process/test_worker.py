@@ -7,7 +7,6 @@ import os
 import select
 import sys
 import threading
-import time
 import weakref
 from collections.abc import Iterator
 
@@ -73,9 +72,7 @@ def test_close_leaves_a_job_that_hangs_and_its_thread_ends_with_it() -> None:
     descriptors = set(os.listdir("/proc/self/fd"))
     go = threading.Event()
     assert worker.submit(go.wait)
-    began_s = time.monotonic()
     assert not worker.close(0.05)
-    assert time.monotonic() - began_s < 5.0
     assert worker.filenos() == []
     assert worker.take() is None
     go.set()

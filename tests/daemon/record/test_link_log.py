@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import can
+import numpy as np
 import pytest
 
 from graspd.daemon.record.mcap import header_of
-from graspd.drivers.base import TactileReading
+from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.recordings.can_log import CanLog
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from tests.bench.live import Subscriber
 from tests.daemon.commands.test_hardware_commands import GROUP, SCENES, filled, twin
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import compared, files, messages
 from tests.ports import can_id
 
 FAULTS = ("--drop", "0.0005", "--bit-flip", "0.0005", "--seed", "5")
+READINGS = 600
+"""That are recorded; two grasps are among them."""
 
 
 def scene(kind: str, folder: Path) -> Path:
@@ -38,11 +40,16 @@ def record(kind: str, folder: Path) -> tuple[Path, Path]:
     """The recording of a twin that plays the demo grasps under faults, and the link log."""
     with start("run", scene(kind, folder)) as daemon:
         wait_for(folder / "graspd")
-        with twin(kind, folder, "--recording", str(DEMO_RECORDING), *FAULTS) as hardware:
-            try:
-                hardware.wait(9.0)  # three grasps, when it is not busy
-            except subprocess.TimeoutExpired:
-                hardware.send_signal(signal.SIGTERM)
+        with (
+            twin(kind, folder, "--recording", str(DEMO_RECORDING), *FAULTS) as hardware,
+            Subscriber(f"ipc://{folder}/graspd") as subscriber,
+        ):
+            seen: set[int] = set()
+            while len(seen) < READINGS and hardware.poll() is None:
+                verdict = subscriber.verdict(TIMEOUT_S)
+                assert verdict is not None
+                seen.add(verdict.t_mono_ns)
+            hardware.terminate()
             hardware.communicate(timeout=TIMEOUT_S)
         daemon.terminate()
         _, said = daemon.communicate(timeout=TIMEOUT_S)
@@ -58,36 +65,49 @@ def of_can(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return record("can", tmp_path_factory.mktemp("can"))
 
 
-def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given(
-    tmp_path: Path,
-) -> None:
-    for attempt in range(3):
-        folder = tmp_path / str(attempt)
-        folder.mkdir()
-        recording, log = record("spi", folder)
-        kept = messages(recording)
-        # A machine that stalls leaves readings out, which the log has.
-        if not any(content["skipped_readings"] for what, content in kept if what == "status"):
-            break
+def played_again(folder: Path, log: Path) -> list[dict[str, Any]]:
+    """What a replay of a link log says of each reading."""
+    result = graspd("replay", "--json", log, "--scene", folder / "scene.toml")
+    assert result.returncode == 0, result.stderr
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+def pairs(folder: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Record a bridge: the verdict of a replay and the one that was given, of each reading.
+
+    They end where a computer that stood still left readings out, which the log has, or was late.
+    """
+    recording, log = record("spi", folder)
     assert log.suffix == ".serial"
+    kept = messages(recording)
     times = {content["t_mono_ns"] for what, content in kept if what == "tactile"}
     before: dict[int, dict[str, Any]] = {}
+    whole = 0
     for what, content in kept:
         if what == "verdict" and content["t_mono_ns"] in times:
             before.setdefault(content["t_mono_ns"], content)
-    result = graspd("replay", "--json", log, "--scene", folder / "scene.toml")
-    assert result.returncode == 0, result.stderr
-    now = [json.loads(line) for line in result.stdout.splitlines()]
-    assert len(before) > 400
-    # Ages are those of the file's own times: what a busy machine was late with is not there, and
-    # whether it was called stable before its lift, which `risk` counts.
-    prompt = [
-        (compared(new) | {"risk": None}, compared(old) | {"risk": None})
-        for new, old in zip(now, before.values(), strict=True)
-        if "stale" not in new["reasons"] + old["reasons"]
-    ]
-    assert len(prompt) > 0.9 * len(before)
-    for new, old in prompt:
+        elif what == "status":
+            if content["skipped_readings"]:
+                break
+            whole = len(before)
+    both = list(zip(played_again(folder, log), before.values(), strict=False))[:whole]
+    late = ("stale" in new["reasons"] + old["reasons"] for new, old in both)
+    return both[: next((at for at, is_late in enumerate(late) if is_late), whole)]
+
+
+def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given(
+    tmp_path: Path,
+) -> None:
+    found: list[tuple[dict[str, Any], dict[str, Any]]] = []
+    for attempt in range(5):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        if len(found := pairs(folder)) > 400:
+            break
+    assert len(found) > 400
+    # Whether it was called stable before its lift, which `risk` counts, is a matter of time.
+    for new, old in ((compared(new), compared(old)) for new, old in found):
+        new["risk"] = old["risk"] = None
         # The bridge's clock is known by other pings: times differ by microseconds, and what is told
         # of motion, to two places, may be rounded otherwise.
         for name, much in (("still_ms", 0.1), ("motion", 0.011), ("motion_limits", 0.011)):
@@ -110,14 +130,17 @@ def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_wer
                 decoded[reading.made_ns // 1000] = reading
                 readings += 1
     known = [content for what, content in messages(recording) if what == "tactile"]
-    assert len(known) > 400
+    # A machine that is too busy to look at the bus for 100 ms takes it for silent, and cuts sweeps.
+    whole = [
+        each for each in known if not np.any(np.array(each["faults"]) & ElectrodeFault.MISSING)
+    ]
+    assert len(whole) > 100
     same = 0
-    for content in known:
+    for content in whole:
         found = decoded.get((content["t_mono_ns"] + offset_ns) // 1000)
         if found is not None and found.counts.ravel().tolist() == content["counts"]:
             same += found.faults.ravel().tolist() == content["faults"]
-    # A machine that is too busy to look at the bus for 100 ms takes it for silent, and cuts sweeps.
-    assert same > 0.95 * len(known)
+    assert same > 0.95 * len(whole)
     result = graspd("replay", "--json", log, "--scene", log.parents[1] / "scene.toml")
     assert result.returncode == 0, result.stderr
     assert len(result.stdout.splitlines()) == readings
@@ -131,4 +154,5 @@ def test_candump_text_is_what_other_programs_read(of_can: tuple[Path, Path]) -> 
     assert len(frames) > 5000
     assert {frame.arbitration_id for frame in frames} == {can_id(GROUP)}
     stamps = [frame.timestamp for frame in frames]
-    assert 5.0 < stamps[-1] - stamps[0] < 20.0
+    assert stamps == sorted(stamps)
+    assert stamps[-1] <= log.stat().st_mtime  # of the wall clock

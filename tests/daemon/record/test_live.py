@@ -25,14 +25,14 @@ from tests.daemon.processes import TIMEOUT_S, graspd, start
 from tests.kit.messages import GOLDEN
 from tests.ports import free_port
 
-pytest.importorskip("foxglove", reason="extra foxglove")
+pytest.importorskip("foxglove", reason="needs the extra `foxglove`")
 
 
 class ViewerClient:
     """A WebSocket client (RFC 6455) that speaks the protocol of Foxglove's viewers."""
 
     def __init__(self, port: int) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout=20)
+        self._socket = socket.create_connection(("127.0.0.1", port), timeout=100)
         key = base64.b64encode(os.urandom(16)).decode()
         lines = ["GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket"]
         lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Key: {key}"]

@@ -212,9 +212,22 @@ class Browser:
             self.complaints.append(details["entry"]["text"])
 
 
-def see(browser: Browser, tone: str) -> None:
-    """Wait until the page of the first hand has a tone."""
-    browser.wait_for(f"{BANNER}.dataset.tone == '{tone}'")
+def see(browser: Browser, tone: str, *more: str) -> None:
+    """Wait until the page of the first hand has a tone, and whatever else is true at that time.
+
+    Scripts that are asked one after the other may see silence: a busy computer stands still.
+    """
+    browser.wait_for(" && ".join([f"{BANNER}.dataset.tone == '{tone}'", *(f"({m})" for m in more)]))
+
+
+def says(element: str, part: str) -> str:
+    """Return a script: does the first element of a class have this text in it?"""
+    return f"document.querySelector('.{element}').innerText.includes({json.dumps(part)})"
+
+
+def reads(element: str, whole: str) -> str:
+    """Return a script: has the first element of a class this text and no other?"""
+    return f"document.querySelector('.{element}').innerText == {json.dumps(whole)}"
 
 
 def text(browser: Browser, element: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from typing import Literal
@@ -16,6 +17,8 @@ from tests.daemon.watch.browser import (
     CHROMIUM,
     Browser,
     Page,
+    reads,
+    says,
     see,
     serving_hands,
     show,
@@ -35,8 +38,9 @@ CARD = "rgb(23, 27, 34)"
 """What is behind the letters in the dark where nothing is promised."""
 
 
-def background(browser: Browser) -> object:
-    return browser.value(f"getComputedStyle({BANNER}).backgroundColor")
+def is_of(colour: str) -> str:
+    """Return a script: is the banner of this colour?"""
+    return f"getComputedStyle({BANNER}).backgroundColor == '{colour}'"
 
 
 @pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (390, "dark")])
@@ -50,22 +54,26 @@ def test_the_page_shows_verdict_images_and_advice(
     assert re.fullmatch(r"\d\d:\d\d:\d\d", first)
     for decision, share in ((Decision.STABLE, "25 %"), (Decision.SLIP, "75 %")):
         talker.decision = decision
-        see(browser, decision.value)
-        assert text(browser, "verdict") == decision.value.upper()
-        assert share in text(browser, "p")
-        assert background(browser) == COLOURS[theme][decision.value]
-    browser.wait_for("document.querySelectorAll('figure canvas').length == 2")
-    assert text(browser, "who") == "graspd right"
-    assert "FFJ3\n28.6°" in text(browser, "joints")
-    assert "ff_7 electrode-dead: " in text(browser, "health")
-    assert "latency p50, p99\t250 us, 500 us" in text(browser, "timing")
-    # Nothing is wider than the window, and the images are drawn: not all of one colour.
-    assert browser.value("document.documentElement.scrollWidth <= innerWidth")
-    colours = browser.value(
+        see(
+            browser,
+            decision.value,
+            reads("verdict", decision.value.upper()),
+            says("p", share),
+            is_of(COLOURS[theme][decision.value]),
+        )
+    see(
+        browser,
+        "slip",
+        "document.querySelectorAll('figure canvas').length == 2",
+        reads("who", "graspd right"),
+        says("joints", "FFJ3\n28.6°"),
+        says("health", "ff_7 electrode-dead: "),
+        says("timing", "latency p50, p99\t250 us, 500 us"),
+        # Nothing is wider than the window, and the images are drawn: not all of one colour.
+        "document.documentElement.scrollWidth <= innerWidth",
         "(c => new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
-        "(document.querySelector('figure canvas'))"
+        "(document.querySelector('figure canvas')) > 8",
     )
-    assert colours > 8
     browser.wait_for(f"document.querySelector('.clock').innerText > '{first}'")
 
 
@@ -104,93 +112,102 @@ def test_a_stable_that_lifts_have_not_earned_is_hollow(
     talker.decision = Decision.STABLE
     browser.look(1280, 800, "dark")
     browser.go(page.address)
-    see(browser, "leans")
-    assert text(browser, "verdict") == "LEANS TO STABLE"
-    assert browser.value("document.title") == "leans to stable - graspd"
-    assert background(browser) == CARD
-    assert (
-        text(browser, "evidence")
-        == "slip probability by the network alone 30 %, no outcome told yet"
+    see(
+        browser,
+        "leans",
+        reads("verdict", "LEANS TO STABLE"),
+        "document.title == 'leans to stable - graspd'",
+        is_of(CARD),
+        reads("evidence", "slip probability by the network alone 30 %, no outcome told yet"),
+        says("p", "slip probability 44 %"),
+        "!document.querySelector('.why').innerText.startsWith('lift')",
     )
-    assert "slip probability 44 %" in text(browser, "p")
-    assert not text(browser, "why").startswith("lift")
     talker.more = {}
-    see(browser, "stable")
-    assert "rests on 57 lifts; of 41 `stable` ones 2 slipped" in text(browser, "evidence")
-    assert background(browser) == COLOURS["dark"]["stable"]
+    see(
+        browser,
+        "stable",
+        says("evidence", "rests on 57 lifts; of 41 `stable` ones 2 slipped"),
+        is_of(COLOURS["dark"]["stable"]),
+    )
 
 
 def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    def bars() -> list[list[object]]:
-        told = browser.value(
-            "[...document.querySelectorAll('.moves')].map(bar => [bar.dataset.motion,"
-            " bar.style.getPropertyValue('--share'), bar.hidden, bar.nextSibling.innerText])"
-        )
-        assert isinstance(told, list)
-        return told
+    def bars(*wanted: list[object]) -> str:
+        """Return a script: are these the bars? Each has motion, share and text; or the text."""
+        parts = ["bar.nextSibling.innerText"]
+        if wanted and len(wanted[0]) > 1:
+            parts = ["bar.dataset.motion", "bar.style.getPropertyValue('--share')", *parts]
+        found = f"[...document.querySelectorAll('.moves')].map(bar => [{', '.join(parts)}])"
+        return f"JSON.stringify({found}) == JSON.stringify({json.dumps(wanted)})"
 
+    shown = "[...document.querySelectorAll('.moves')].every(bar => !bar.hidden)"
     show(browser, page, talker, Decision.STABLE)
-    assert text(browser, "still") == "-"
-    assert browser.value("[...document.querySelectorAll('.moves')].every(bar => bar.hidden)")
+    hidden = "[...document.querySelectorAll('.moves')].every(bar => bar.hidden)"
+    see(browser, "stable", reads("still", "-"), hidden)
     limits = {"motion_limits": {"ff": 1.25, "th": 1.0}}
     talker.more = {"still_ms": 130.5, "motion": {"ff": 1.0, "th": None}, **limits}
-    browser.wait_for("document.querySelector('.still').innerText == '130 ms, may slide'")
-    assert bars() == [
-        ["still", "40%", False, "moves 1.0 / 1.3 \u03c3"],  # by hand: half of 1 / 1.25
-        ["unknown", "0%", False, "motion unknown"],
-    ]
+    see(
+        browser,
+        "stable",
+        reads("still", "130 ms, may slide"),
+        shown,
+        bars(
+            ["still", "40%", "moves 1.0 / 1.3 \u03c3"],  # by hand: half of 1 / 1.25
+            ["unknown", "0%", "motion unknown"],
+        ),
+    )
     talker.more |= {"still_ms": 0.0, "motion": {"ff": 2.0, "th": 9.0}}
-    browser.wait_for("document.querySelector('.still').innerText == '0 ms'")
-    assert bars() == [
-        ["moving", "80%", False, "moves 2.0 / 1.3 \u03c3"],
-        ["moving", "100%", False, "moves 9.0 / 1.0 \u03c3"],
-    ]
+    see(
+        browser,
+        "stable",
+        reads("still", "0 ms"),
+        shown,
+        bars(
+            ["moving", "80%", "moves 2.0 / 1.3 \u03c3"],
+            ["moving", "100%", "moves 9.0 / 1.0 \u03c3"],
+        ),
+    )
     talker.more |= {"fingers": {"ff": "slide", "th": None}}
-    browser.wait_for("document.querySelector('.moves').nextSibling.innerText[0] == 's'")
-    assert [words for *_, words in bars()] == ["slide 2.0 / 1.3 \u03c3", "moves 9.0 / 1.0 \u03c3"]
+    see(browser, "stable", bars(["slide 2.0 / 1.3 \u03c3"], ["moves 9.0 / 1.0 \u03c3"]))
     talker.more |= {"motion": {"ff": None, "th": 0.5}, "fingers": {"ff": "free", "th": "touch"}}
-    browser.wait_for("document.querySelector('.moves').nextSibling.innerText == 'free'")
-    assert [words for *_, words in bars()] == ["free", "touch 0.5 / 1.0 \u03c3"]
+    see(browser, "stable", bars(["free"], ["touch 0.5 / 1.0 \u03c3"]))
     talker.decision = None
-    see(browser, "silent")
-    assert text(browser, "still") == "-"
-    assert bars() == []
+    see(browser, "silent", reads("still", "-"), bars())
 
 
 def test_the_last_verdict_stays_until_the_next_grasp_and_then_in_the_list(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     show(browser, page, talker, Decision.STABLE)
-    assert text(browser, "was") == ""
+    see(browser, "stable", reads("was", ""))
     talker.decision = Decision.UNKNOWN
-    see(browser, "waiting")
-    assert text(browser, "was") == "past: stable, slip probability 25 %"
-    assert ", past; lift: not told" in text(browser, "judged")
+    past = reads("was", "past: stable, slip probability 25 %")
+    see(browser, "waiting", past, says("judged", ", past; lift: not told"))
     talker.more = {"grasp": 8}
     browser.wait_for("document.querySelector('.was').innerText == ''")
     talker.more = {"grasp": 8, "supervised": True}
     talker.decision = Decision.SLIP
-    see(browser, "slip")
-    assert text(browser, "grasps").split("\n") == [
+    grasps = [
         "8\t✕slip\tslip probability 75 %\tnot told, supervised",
         "7\t●stable\tslip probability 25 %\tnot told",
     ]
-    assert "slips of `stable`\t2 of 41 lifts, at most 9.5" in text(browser, "learning")
+    learning = says("learning", "slips of `stable`\t2 of 41 lifts, at most 9.5")
+    see(browser, "slip", reads("grasps", "\n".join(grasps)), learning)
 
 
 def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
+    began_s = int(time.time())
     show(browser, page, talker, Decision.STABLE)
-    browser.wait_for("document.querySelector('.timing').innerText.includes('250 us')")
     figure = "getComputedStyle(document.querySelector('.timing td'))"
-    assert text(browser, "old") == ""
-    assert browser.value(f"{figure}.fontStyle") == "normal"
+    plain = f"{figure}.fontStyle == 'normal'"
+    see(browser, "stable", says("timing", "250 us"), reads("old", ""), plain)
     talker.decision = None
     see(browser, "silent")
-    died = time.time()
+    silent_s = int(time.time())
     assert text(browser, "verdict") == "UNKNOWN"
     assert "silent: no message for " in text(browser, "why")
     assert browser.value(f"{figure}.fontStyle") == "italic"
@@ -200,7 +217,8 @@ def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
     assert text(browser, "judged") == "-"
     said = re.fullmatch(r"figures are of (\d\d:\d\d:\d\d), the last message", text(browser, "old"))
     assert said
-    assert said[1] in {time.strftime("%H:%M:%S", time.localtime(died - ago)) for ago in range(5)}
+    times_s = range(began_s, silent_s + 1)
+    assert said[1] in {time.strftime("%H:%M:%S", time.localtime(t_s)) for t_s in times_s}
     talker.decision = Decision.SLIP
     see(browser, "slip")
     page.stop()
@@ -215,18 +233,14 @@ def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
 def test_the_timeline_is_there_again_on_a_page_that_is_reloaded(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
+    slipped = "/slip [1-9]/.test(document.querySelector('.timeline').ariaLabel)"
     show(browser, page, talker, Decision.SLIP)
-    time.sleep(1.0)  # of which two seconds of the clock are seen, or one
+    see(browser, "slip", slipped)  # a second of it is over
     talker.decision = Decision.STABLE
     see(browser, "stable")
     browser.go("about:blank")
     browser.go(page.address)
-    see(browser, "stable")
-    slips = re.search(
-        r"slip (\d+) s", browser.value("document.querySelector('.timeline').ariaLabel")
-    )
-    assert slips
-    assert int(slips[1]) >= 1
+    see(browser, "stable", slipped)
     # It is drawn: below the first lane's name and the minutes there is something of its colour.
     assert browser.value(
         "(c => { const all = c.getContext('2d').getImageData(0, 0, c.width, 12).data; let n = 0;"
@@ -338,8 +352,8 @@ def test_a_page_in_the_background_shows_no_verdict(
     for hidden, tone in (("true", "silent"), ("false", "stable")):
         hide(browser, hidden)
         browser.value("document.dispatchEvent(new Event('visibilitychange'))")
-        see(browser, tone)
-        assert browser.value("document.title") == f"{text(browser, 'verdict').lower()} - graspd"
+        word = "document.querySelector('.verdict').innerText.toLowerCase()"
+        see(browser, tone, f"document.title == {word} + ' - graspd'")
 
 
 def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:

@@ -36,12 +36,13 @@ LOOPBACK = "lo"
 class SocketBus:
     """What python-can's `socketcan` bus is to the driver: something with a raw socket.
 
-    The socket is one end of a pair of Unix datagram sockets, stamped like a CAN socket.
+    The socket is one end of a pair of Unix datagram sockets.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, stamped: bool = False) -> None:
+        """`stamped`: like a CAN socket. Else no pause of a busy computer is between two frames."""
         self.socket, self.far_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamped)
         self.far_end.setblocking(False)
 
     def __enter__(self) -> Self:

@@ -238,7 +238,7 @@ def test_a_coupled_table_is_cut_where_its_points_are_near_each_other() -> None:
 
 
 def test_the_coupled_table_agrees_with_an_independent_interpolation() -> None:
-    interpolate = pytest.importorskip("scipy.interpolate", reason="scipy is not installed")
+    interpolate = pytest.importorskip("scipy.interpolate", reason="needs the extra `test`")
     raws = np.random.default_rng(5).uniform(500, 3500, (25, 2))
     angles = np.random.default_rng(6).uniform(-15, 40, (25, 2))
     rows = [(float(a), float(b), float(c), float(d)) for (a, b), (c, d) in zip(raws, angles)]  # noqa: B905

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.training.commands import evaluation
 from graspd.models.training.commands.evaluation import grid_of
 from graspd.models.training.data.datasets import read_all
@@ -159,7 +161,7 @@ def test_data_without_a_later_session_have_no_session_protocol(data: Path, tmp_p
 def test_no_cluster_is_exit_code_1_and_says_so(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("distributed", reason="no extra: cluster")
+    pytest.importorskip("distributed", reason="needs the extra `cluster`")
     monkeypatch.setattr(jobs, "CONNECT_TIMEOUT_S", 1)
     options = "--data", data, "--out", tmp_path, "--dask", "tcp://127.0.0.1:9"
     done = graspd("evaluate", "svm", "--quick", *options)

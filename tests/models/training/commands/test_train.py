@@ -12,6 +12,8 @@ from subprocess import CompletedProcess
 import numpy as np
 import pytest
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.contract import Dataset, SessionInput
 from graspd.models.runtime import TactileModel
 from graspd.models.training.data.datasets import Grasps

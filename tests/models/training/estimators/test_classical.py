@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.inputs import VectorBuilder
 from graspd.models.training.estimators.classical import fit_classical
 from graspd.models.training.estimators.configs import (

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.training.evaluating.broken import KINDS, NUMBERS, broken_study
 from graspd.models.training.systems.registry import SYSTEMS
 from tests.models.training.samples import sessions

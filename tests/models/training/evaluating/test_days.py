@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.network import Plausibility
 from graspd.models.contract import SessionInput, Sharpness

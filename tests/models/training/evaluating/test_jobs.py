@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from sklearn.neural_network import MLPClassifier
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.contract import VectorInput
 from graspd.models.inputs import SessionBuilder, raw_features
 from graspd.models.training.estimators.configs import MlpConfig, SvmConfig

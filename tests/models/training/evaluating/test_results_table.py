@@ -12,6 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from sklearn.metrics import log_loss
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.training.data.protocols import EvalProtocol, splits
 from graspd.models.training.evaluating.jobs import Job, JobResult
 from graspd.models.training.evaluating.metrics import fit_temperature
@@ -248,7 +250,7 @@ def test_every_row_has_as_many_cells_as_its_header() -> None:
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Plots of two protocols. Matplotlib keeps fonts open for the life of the process."""
-    pytest.importorskip("matplotlib", reason="no extra: report")
+    pytest.importorskip("matplotlib", reason="needs the extra `report`")
     from graspd.models.training.evaluating import plots
 
     session = summary_of("svm-session", "session", 0.2)

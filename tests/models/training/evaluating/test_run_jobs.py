@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.contract import VectorInput
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.estimators.configs import ForestConfig
@@ -73,7 +75,7 @@ def test_an_interrupted_sweep_goes_on_and_runs_nothing_twice(
 
 
 def test_a_cluster_may_lose_a_worker_and_then_its_scheduler(tmp_path: Path) -> None:
-    pytest.importorskip("distributed", reason="no extra: cluster")
+    pytest.importorskip("distributed", reason="needs the extra `cluster`")
     wanted, more = some_jobs(8, trees=40), some_jobs(8, trees=30)
     found: dict[Job, JobResult] = {}
     with cluster(tmp_path) as (address, scheduler, workers):

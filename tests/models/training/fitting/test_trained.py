@@ -9,6 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import rotate
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models.contract import VectorInput
 from graspd.models.inputs import SessionBuilder, builder, raw_features
 from graspd.models.tactile_image import TactileImager

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 import onnx
 import onnxruntime as ort
-import pytest
 from numpy.typing import NDArray
 
 from graspd.models.contract import (

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("torch", reason="needs the extra `train`")
+
 from graspd.models import zoo
 from graspd.models.contract import VectorInput
 from graspd.models.runtime import TactileModel
