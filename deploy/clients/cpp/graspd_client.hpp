@@ -46,6 +46,7 @@ using Nanoseconds = std::int64_t;
 constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not understood
 constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
 constexpr double REAL_MAX = 1e12;                              // as a time, thirty years in ms
+constexpr double WAIT_MAX_S = 1e9;                             // of a call: thirty years
 // A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 constexpr std::size_t MESSAGE_MAX_BYTES = 1 << 16;
 // Of lists and objects in a message, and so its depth; a verdict has ten.
@@ -1036,7 +1037,7 @@ private:
     }
 
     static Nanoseconds duration_ns(double seconds) {
-        if (!(seconds >= 0.0 && seconds <= 1e9))
+        if (!(seconds >= 0.0 && seconds <= WAIT_MAX_S))
             throw std::invalid_argument("a time must be 0 s or more, and finite");
         return std::llrint(seconds * 1e9);
     }
