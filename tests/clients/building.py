@@ -99,12 +99,12 @@ def cpp_lifts(lift_gate: Path, *words: object) -> bool:
     return result.returncode == 0
 
 
-def compiled_probe() -> Path:
-    """The probe that tells what the header's rules say."""
+def compiled_probe(name: str = "probe") -> Path:
+    """The probe that tells what the header's rules say, or another program beside it."""
     skip_unless_it_can_be_compiled()
     warnings = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    source = Path(__file__).parent / "probe.cpp"
+    source = Path(__file__).parent / f"{name}.cpp"
     words: Words = [
         "g++",
         "-std=c++17",
@@ -116,7 +116,7 @@ def compiled_probe() -> Path:
         "-lzmq",
         "-o",
     ]
-    return kept(lambda folder: [*words, folder / "probe"], "probe")
+    return kept(lambda folder: [*words, folder / name], name)
 
 
 class Probe:

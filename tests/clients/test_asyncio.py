@@ -7,6 +7,7 @@ import inspect
 from pathlib import Path
 
 import pytest
+from zmq.asyncio import Poller
 
 from deploy.clients.python.graspd_client import AsyncClient, Client, Decision
 from tests.clients.test_both_ask import DEADLINE_S, PATIENT_MS, false_daemon, of, told
@@ -52,6 +53,26 @@ def test_without_a_daemon_it_is_no_in_time(tmp_path: Path) -> None:
             assert await graspd.wait_for_grasp(SHORT_S) is None
 
     asyncio.run(asks())
+
+
+def test_it_waits_without_looking_again_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[float] = []
+    poll = Poller.poll
+
+    def noted(poller: Poller, timeout: float = -1) -> object:
+        looks.append(timeout)
+        return poll(poller, timeout)
+
+    async def waits() -> None:
+        async with made(tmp_path) as graspd:
+            await graspd.verdict(0.3)
+            await graspd.wait_for_grasp(0.3)
+
+    monkeypatch.setattr(Poller, "poll", noted)
+    asyncio.run(waits())
+    assert len(looks) < 10, "one for each call, and for what the clocks round off"
 
 
 def test_other_tasks_go_on_while_it_waits(tmp_path: Path) -> None:

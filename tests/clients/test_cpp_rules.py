@@ -89,13 +89,14 @@ def test_both_clients_count_age_by_a_clock_that_was_told(
 ) -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     probe.tell("new", MAX_AGE_NS, 0)
+    now_ns = START_NS
     for seq, (delay_ms, asking_ms, compares) in enumerate(steps):
         sent_ns = START_NS + seq * 300 * MS
-        now_ns = sent_ns + delay_ms * MS
+        empty_ns, now_ns = now_ns, sent_ns + delay_ms * MS
         if compares:
             newest.compare_clocks(sent_ns - asking_ms * MS, sent_ns + 77_000 * MS)
             probe.tell("clock", sent_ns - asking_ms * MS, sent_ns + 77_000 * MS)
         message = frames(verdict(seq, sent_ns + 77_000 * MS))
-        newest.take(message, now_ns, now_ns)
-        probe.tell("take", now_ns, now_ns, *map(as_hex, message))
+        newest.take(message, empty_ns, now_ns)
+        probe.tell("take", empty_ns, now_ns, *map(as_hex, message))
         assert probe.ask("at", now_ns) == said(newest, now_ns)

@@ -217,6 +217,24 @@ def test_a_clock_that_was_told_makes_up_for_any_drift() -> None:
         assert seq < 1 or newest.at(now_ns)
 
 
+@pytest.mark.parametrize("first", ["clock", "message"])
+@pytest.mark.parametrize("between_ms", [50, 150, 700])
+def test_with_a_clock_that_was_told_rare_looks_age_nothing(first: str, between_ms: int) -> None:
+    """Messages wait to be read: the queue was last empty at the look before."""
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    now_ns, ahead_ns = START_NS, START_NS - OFFSET_NS
+    if first == "message":
+        newest.take(frames(verdict(0, now_ns - ahead_ns - MS)), now_ns, now_ns)
+    newest.compare_clocks(now_ns - MS, now_ns - MS - ahead_ns)
+    for seq in range(1, 20):
+        empty_ns, now_ns = now_ns, now_ns + between_ms * MS
+        sent = verdict(seq, now_ns - ahead_ns - 2 * MS, silence_ms=100.0)
+        newest.take(frames(sent), empty_ns, now_ns)
+        said = newest.at(now_ns)
+        assert said
+        assert said.age_ms == pytest.approx(2.0 + 1e-3 * between_ms * seq, abs=0.1)
+
+
 def test_what_is_forgotten_comes_back_only_with_a_newer_message() -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     for seq in range(3):

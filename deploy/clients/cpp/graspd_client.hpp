@@ -24,6 +24,7 @@
 #include <iostream>
 #include <iterator>
 #include <map>
+#include <memory>
 #include <optional>
 #include <random>
 #include <set>
@@ -32,6 +33,8 @@
 #include <string_view>
 #include <utility>
 #include <vector>
+
+#include <unistd.h>
 
 #include <nlohmann/json.hpp>
 #include <zmq_addon.hpp>
@@ -43,6 +46,7 @@ using Nanoseconds = std::int64_t;
 constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not understood
 constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
 constexpr double REAL_MAX = 1e12;                              // as a time, thirty years in ms
+constexpr double WAIT_MAX_S = 1e9;                             // of a call: thirty years
 // A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 constexpr std::size_t MESSAGE_MAX_BYTES = 1 << 16;
 // Of lists and objects in a message, and so its depth; a verdict has ten.
@@ -169,7 +173,8 @@ struct SlideAnswer {
 
 // Whether graspd has taken how a lift ended. True in an `if` exactly when it has.
 struct OutcomeAnswer {
-    std::string why;  // why not: the daemon's words, or `no-answer`, `malformed` or `version`
+    // Why not: the daemon's words, or `no-answer`, `malformed`, `version` or `other-process`.
+    std::string why;
 
     explicit operator bool() const { return why.empty(); }
 };
@@ -593,11 +598,11 @@ private:
                 former_.push_back(*boot_id_);
                 if (former_.size() > FORMER_MAX) former_.pop_front();
                 ++counts.restarts;
+                best_.reset();
+                bound_.reset();
             }
             boot_id_ = found.boot_id;
             seq_ = *found.seq;
-            best_.reset();
-            bound_.reset();
             return true;
         }
         if (*found.seq <= seq_) return ++counts.repeats, false;
@@ -616,8 +621,8 @@ private:
     // None for the first: it may have been kept for those who come late.
     std::optional<Nanoseconds> by_arrival(Nanoseconds published_ns, Nanoseconds empty_ns,
                                           Nanoseconds now_ns) {
-        if (bound_)
-            return std::min({empty_ns, published_ns + at_least(*bound_, now_ns), now_ns});
+        if (bound_)  // no earlier, however long it then waited to be read
+            return std::min(published_ns + at_least(*bound_, now_ns), now_ns);
         const std::pair here{now_ns - published_ns, now_ns};
         if (!best_) {
             best_ = here;
@@ -651,16 +656,28 @@ private:
     std::optional<std::pair<Nanoseconds, Nanoseconds>> bound_;
 };
 
+// What a call of ZeroMQ returns; a signal interrupts any of them before it has done anything.
+template <typename Call>
+auto uninterrupted(const Call& call) {
+    while (true) {
+        try {
+            return call();
+        } catch (const zmq::error_t& error) {
+            if (error.num() != EINTR) throw;
+        }
+    }
+}
+
 // The next message, if one waits.
 inline bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames) {
     frames.clear();
-    try {
-        return zmq::recv_multipart(socket, std::back_inserter(frames), zmq::recv_flags::dontwait)
-            .has_value();
-    } catch (const zmq::error_t& error) {
-        if (error.num() != EINTR) throw;  // a signal; there will be another look
-        return false;
-    }
+    do {
+        zmq::message_t frame;
+        if (!uninterrupted([&] { return socket.recv(frame, zmq::recv_flags::dontwait); }))
+            return false;
+        frames.push_back(std::move(frame));
+    } while (frames.back().more());
+    return true;
 }
 
 // Something that is said to the daemon, on a socket of its own, until it has answered.
@@ -700,7 +717,8 @@ public:
     void ask(Call& call, const std::string& question) {
         if (!call.socket)
             call.socket = connected(zmq::socket_type::dealer, options_.ask_endpoint);
-        call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait);
+        uninterrupted(
+            [&] { return call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait); });
     }
 
     // Connect anew, and forget what waits.
@@ -711,24 +729,27 @@ public:
 
 private:
     zmq::socket_t connected(zmq::socket_type kind, const std::string& endpoint) {
-        zmq::socket_t made(context_, kind);
-        made.set(zmq::sockopt::linger, 0);
-        made.set(zmq::sockopt::rcvhwm, QUEUE_MAX);
-        made.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(MESSAGE_MAX_BYTES));
+        auto made = uninterrupted([&] { return zmq::socket_t(context_, kind); });
+        const auto set = [&made](auto option, const auto& value) {
+            uninterrupted([&] { made.set(option, value); });
+        };
+        set(zmq::sockopt::linger, 0);
+        set(zmq::sockopt::rcvhwm, QUEUE_MAX);
+        set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(MESSAGE_MAX_BYTES));
         if (options_.keys) {
-            made.set(zmq::sockopt::curve_serverkey, options_.keys->server_key);
-            made.set(zmq::sockopt::curve_publickey, options_.keys->public_key);
-            made.set(zmq::sockopt::curve_secretkey, options_.keys->secret_key);
+            set(zmq::sockopt::curve_serverkey, options_.keys->server_key);
+            set(zmq::sockopt::curve_publickey, options_.keys->public_key);
+            set(zmq::sockopt::curve_secretkey, options_.keys->secret_key);
         }
         if (endpoint.rfind("tcp://", 0) == 0) {
-            made.set(zmq::sockopt::heartbeat_ivl, HEARTBEAT_MS);
-            made.set(zmq::sockopt::heartbeat_timeout, HEARTBEAT_TIMEOUT_MS);
+            set(zmq::sockopt::heartbeat_ivl, HEARTBEAT_MS);
+            set(zmq::sockopt::heartbeat_timeout, HEARTBEAT_TIMEOUT_MS);
         }
         if (kind == zmq::socket_type::sub)
-            made.set(zmq::sockopt::subscribe, "verdict." + options_.hand);
+            set(zmq::sockopt::subscribe, "verdict." + options_.hand);
         else  // graspd knows the client by the name, and each connection by the number after it
-            made.set(zmq::sockopt::routing_id, name_ + std::to_string(++calls_));
-        made.connect(endpoint);
+            set(zmq::sockopt::routing_id, name_ + std::to_string(++calls_));
+        uninterrupted([&] { made.connect(endpoint); });
         return made;
     }
 
@@ -750,6 +771,17 @@ public:
     Call asking, telling, timing;  // closed before the context
 };
 
+// Deletes what it made, but not in a forked process: ZeroMQ's thread is the parent's alone.
+struct Owner {
+    pid_t pid = getpid();
+
+    bool is_here() const { return getpid() == pid; }
+
+    void operator()(Link* link) const {
+        if (is_here()) delete link;
+    }
+};
+
 // Whether the message that is the answer is still to come.
 inline bool is_behind(const Verdict& newest, const Verdict& answer) {
     return newest.boot_id != answer.boot_id || !newest.seq || *newest.seq < *answer.seq;
@@ -764,7 +796,9 @@ public:
           still_ms_(still_ms) {}
     Question(const Question&) = delete;
     Question& operator=(const Question&) = delete;
-    ~Question() { link_.asking.hang_up(); }
+    ~Question() {
+        if (asks_) link_.asking.hang_up();
+    }
 
     // Whether a verdict lets the hand lift.
     bool permits(const Verdict& said) const { return said || (supervised_ && said.supervised); }
@@ -838,7 +872,7 @@ public:
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
                   options.same_computer.value_or(detail::is_same_computer(options.endpoint)),
                   probability(options.max_p_slip)),
-          link_(options), max_age_ns_(age_ns(options.max_age_ms)),
+          link_(new detail::Link(options)), max_age_ns_(age_ns(options.max_age_ms)),
           asks_(!options.ask_endpoint.empty()),
           compares_clocks_(asks_ && !options.same_computer.value_or(
                                         detail::is_same_computer(options.endpoint))),
@@ -875,7 +909,7 @@ public:
             throw std::invalid_argument("still_ms must be 0 or more, and finite");
         const Nanoseconds began_ns = detail::now_ns();
         const Nanoseconds due_ns = began_ns + duration_ns(deadline_s);
-        detail::Question question(newest_, link_, asks_, supervised, still_ms);
+        detail::Question question(newest_, *link_, asks_ && is_here(), supervised, still_ms);
         Verdict decided = question.decided(verdict());
         while (!question.is_over(decided) && wait(due_ns)) {
             decided = question.decided(verdict());
@@ -908,7 +942,7 @@ public:
                 returned_ = detail::key(said);
                 return said;
             }
-        } while (detail::now_ns() < due_ns);
+        } while (is_here() && detail::now_ns() < due_ns);
         return std::nullopt;
     }
 
@@ -949,7 +983,7 @@ public:
                                                   touched.begin(), touched.end()))
                 sure_ns = now_ns - std::llrint(newest.age_ms.value_or(0.0) * 1e6);
             const bool is_old = now_ns - sure_ns > max_age_ns_;
-            const bool ends = !sliding.empty() || lost || is_old;
+            const bool ends = !sliding.empty() || lost || is_old || !is_here();
             if (ends || !wait(due_ns))
                 return {newest, static_cast<double>(now_ns - began_ns) / 1e9, sliding,
                         !touched.empty() && !ends};
@@ -968,8 +1002,9 @@ public:
         const std::string telling = detail::telling(lifted_on, how, object_name);
         if (!asks_) throw std::invalid_argument("an outcome needs an ask_endpoint");
         const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
-        link_.telling.hang_up();
-        link_.ask(link_.telling, telling);
+        if (!is_here()) return OutcomeAnswer{"other-process"};
+        link_->telling.hang_up();
+        link_->ask(link_->telling, telling);
         told_.reset();
         telling_ = detail::key(lifted_on);
         newest_.end(telling_);
@@ -979,8 +1014,12 @@ public:
     }
 
 private:
+    // Whether this is the process that made the client, and not a fork of it.
+    bool is_here() const { return link_.get_deleter().is_here(); }
+
     // The newest verdict; waits for a new message until then at most.
     Verdict next_verdict(Nanoseconds due_ns) {
+        if (!is_here()) return Verdict{}.unknown({"other-process"});
         while (!drain() && wait(due_ns)) {}
         if (behind_) return Verdict{}.unknown({"behind"});
         return newest_.at(detail::now_ns());
@@ -998,7 +1037,7 @@ private:
     }
 
     static Nanoseconds duration_ns(double seconds) {
-        if (!(seconds >= 0.0 && seconds <= 1e9))
+        if (!(seconds >= 0.0 && seconds <= WAIT_MAX_S))
             throw std::invalid_argument("a time must be 0 s or more, and finite");
         return std::llrint(seconds * 1e9);
     }
@@ -1024,9 +1063,9 @@ private:
 
     // Take in the answer to an outcome, if it is there.
     void hear() {
-        const auto payload = link_.telling.answer();
+        const auto payload = link_->telling.answer();
         if (!payload) return;
-        link_.telling.hang_up();
+        link_->telling.hang_up();
         told_ = detail::taken(*payload);
         newest_.counts.malformed += !told_;
         if (!told_) told_ = OutcomeAnswer{"malformed"};
@@ -1037,7 +1076,7 @@ private:
     void compare_clocks() {
         if (!compares_clocks_) return;
         const Nanoseconds now_ns = detail::now_ns();
-        const auto payload = clock_asked_ns_ ? link_.timing.answer() : std::nullopt;
+        const auto payload = clock_asked_ns_ ? link_->timing.answer() : std::nullopt;
         if (payload) {
             const auto told_ns = detail::told_clock(*payload);
             if (told_ns) {
@@ -1049,10 +1088,10 @@ private:
         }
         if (now_ns < clock_due_ns_) return;
         // A late answer must not be taken for one to this question.
-        if (clock_asked_ns_) link_.timing.hang_up();
+        if (clock_asked_ns_) link_->timing.hang_up();
         clock_asked_ns_ = now_ns;
         clock_due_ns_ = now_ns + CLOCK_RETRY_NS;
-        link_.ask(link_.timing, "clock");
+        link_->ask(link_->timing, "clock");
     }
 
     // Read all that waits, without waiting; whether there was anything new.
@@ -1065,7 +1104,7 @@ private:
         newest_.passed.clear();
         for (int taken = 0; behind_ && taken < QUEUE_MAX; ++taken) {
             const Nanoseconds before_ns = detail::now_ns();
-            if (link_.receive(frames_)) {
+            if (link_->receive(frames_)) {
                 std::vector<std::string_view> views;
                 for (const zmq::message_t& frame : frames_) views.push_back(frame.to_string_view());
                 heard_ns_ = detail::now_ns();
@@ -1098,8 +1137,8 @@ private:
     }
 
     void connect_anew() {
-        link_.renew();
-        link_.timing.hang_up();
+        link_->renew();
+        link_->timing.hang_up();
         clock_asked_ns_.reset();
         clock_due_ns_ = 0;
         empty_ns_ = heard_ns_ = detail::now_ns();
@@ -1108,13 +1147,13 @@ private:
     // Wait for a message, but not for long; false when it is time to end.
     bool wait(Nanoseconds due_ns) {
         const Nanoseconds left_ns = due_ns - detail::now_ns();
-        if (left_ns <= 0) return false;
-        link_.wait(std::min<std::int64_t>(left_ns / 1'000'000, SLICE_MS));
+        if (left_ns <= 0 || !is_here()) return false;
+        link_->wait(std::min<std::int64_t>(left_ns / 1'000'000, SLICE_MS));
         return true;
     }
 
     detail::Newest newest_;
-    detail::Link link_;
+    std::unique_ptr<detail::Link, detail::Owner> link_;
     Nanoseconds max_age_ns_;
     bool asks_, compares_clocks_;
     std::optional<Nanoseconds> clock_asked_ns_;

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import re
 import time
@@ -49,7 +48,8 @@ __all__ = [
 
 VERSION = 1  # of the messages; what has another is not understood
 INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
-REAL_MAX = 1e12  # of a message: as a time, thirty years in ms
+REAL_MAX = 1e12  # of a message or an age: as a time, thirty years in ms
+WAIT_MAX_S = 1e9  # of a call: thirty years
 # A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 MESSAGE_MAX_BYTES = 1 << 16
 OPENINGS_MAX = 100  # of lists and objects in a message, and so its depth; a verdict has ten
@@ -62,7 +62,8 @@ QUIET_NS, QUIET_MAX_NS = 1_000_000_000, 10_000_000_000
 # The computer has slept if its clocks have moved apart by more. A sleep takes seconds, the
 # scheduler a moment between two looks at the clocks.
 SLEPT_NS = 50_000_000
-# Longest wait in one piece: so well is it known when a message came from another computer.
+# Longest wait in one piece while the clock of another computer is not known: so well is it known
+# when a message came.
 SLICE_MS = 10
 # What a message may come from the future by before the clocks are taken for different ones.
 CLOCK_SLACK_NS = 1_000_000
@@ -218,7 +219,7 @@ class OutcomeAnswer:
     """Whether graspd has taken how a lift ended. True in an `if` exactly when it has."""
 
     why: str = ""
-    """Why not: the daemon's words, or `no-answer`, `malformed`, `version` or `closed`."""
+    """Why not: the daemon's words, or one of those in deploy/clients/README.md."""
 
     def __bool__(self) -> bool:
         return not self.why
@@ -292,6 +293,7 @@ class _Hand:
         self._max_age_ns = round(max_age_ms * 1e6)
         self._asks = ask_endpoint is not None
         self._closed = self._behind = False
+        self._pid = os.getpid()
         self._lifts: dict[tuple[str, int], bool] = {}
         """Grasps whose lift was allowed, the oldest first, and whether graspd has the outcome."""
         self._last = self._telling = "", 0
@@ -322,9 +324,19 @@ class _Hand:
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)
 
+    @property
+    def _unusable(self) -> str:
+        """Why the sockets cannot be used, `closed` or `other-process`; empty if they can.
+
+        After a fork, ZeroMQ's thread is the parent's alone.
+        """
+        if os.getpid() != self._pid:
+            return "other-process"
+        return "closed" if self._closed else ""
+
     def _verdict(self, due_ns: int) -> Waits[Verdict]:
-        if self._closed:
-            return Verdict(Decision.UNKNOWN, ("closed",))
+        if self._unusable:
+            return Verdict(Decision.UNKNOWN, (self._unusable,))
         while not self._drain() and (yield from self._wait(due_ns)):
             pass
         if self._behind:
@@ -338,7 +350,7 @@ class _Hand:
             raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms!r}")
         began_ns = time.monotonic_ns()
         due_ns = _due_ns("deadline_s", deadline_s)
-        asking = self._link.asking if self._asks and not self._closed else None
+        asking = self._link.asking if self._asks and not self._unusable else None
         question = _Question(self._newest, asking, supervised is True, still_ms)
         try:
             decided = question.decided((yield from self._verdict(0)))
@@ -347,7 +359,8 @@ class _Hand:
                 if time.monotonic_ns() > due_ns and question.permits(decided):
                     decided = decided.unknown("late")
         finally:
-            self._link.asking.hang_up()
+            if not self._unusable:
+                self._link.asking.hang_up()
         decided = question.at_the_end(decided)
         waited_s = (time.monotonic_ns() - began_ns) / 1e9
         answer = LiftAnswer(decided, waited_s, supervised is True and decided.supervised)
@@ -364,7 +377,7 @@ class _Hand:
             if is_judged and not said.early and _key(said) != self._returned:
                 self._returned = _key(said)
                 return said
-            if self._closed or time.monotonic_ns() >= due_ns:
+            if self._unusable or time.monotonic_ns() >= due_ns:
                 return None
 
     def _wait_for_slide(self, timeout_s: float) -> Waits[SlideAnswer]:
@@ -388,8 +401,8 @@ class _Hand:
             if touched and touched.issubset(touching):
                 sure_ns = now_ns - round((newest.age_ms or 0.0) * 1e6)
             is_old = now_ns - sure_ns > self._max_age_ns
-            ends = bool(sliding or lost or is_old or self._closed)
-            if ends or not (yield from self._wait(due_ns)):
+            ends = bool(sliding or lost or is_old or self._unusable)
+            if ends or not (yield from self._wait(due_ns, sure_ns + self._max_age_ns + 1)):
                 waited_s = (now_ns - began_ns) / 1e9
                 return SlideAnswer(newest, waited_s, sliding, held=bool(touched) and not ends)
 
@@ -400,8 +413,8 @@ class _Hand:
         if not self._asks:
             raise ValueError("an outcome needs an ask_endpoint")
         due_ns = _due_ns("wait_s", wait_s)
-        if self._closed:
-            return OutcomeAnswer("closed")
+        if self._unusable:
+            return OutcomeAnswer(self._unusable)
         self._link.telling.hang_up()
         self._link.telling.ask(telling)
         self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
@@ -413,7 +426,7 @@ class _Hand:
 
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on."""
-        if not self._closed:
+        if not self._unusable:
             self._closed = True
             self._link.close()
             self._allow(("", 0))
@@ -503,12 +516,18 @@ class _Hand:
         self._clock_asked_ns, self._clock_due_ns = None, 0
         self._empty_ns = self._heard_ns = time.monotonic_ns()
 
-    def _wait(self, due_ns: int) -> Waits[bool]:
-        """Wait for a message, but not for long; False when it is time to end."""
-        left_ns = due_ns - time.monotonic_ns()
-        if left_ns <= 0 or self._closed:
+    def _wait(self, due_ns: int, look_ns: int | None = None) -> Waits[bool]:
+        """Wait for a message, or until another look is due; False when it is time to end."""
+        now_ns = time.monotonic_ns()
+        if now_ns >= due_ns or self._unusable:
             return False
-        yield min(left_ns // 1_000_000, SLICE_MS)
+        if self._newest.needs_arrival:
+            look_ns = now_ns + SLICE_MS * 1_000_000
+        quiet_ns = self._heard_ns + max(self._quiet_ns, self._newest.silence_ns) + 1
+        wake_ns = min(due_ns, quiet_ns, due_ns if look_ns is None else look_ns)
+        if self._compares_clocks:
+            wake_ns = min(wake_ns, self._clock_due_ns)
+        yield max(wake_ns - now_ns, 0) // 1_000_000
         return True
 
 
@@ -701,6 +720,11 @@ class Newest:
         """For how long no message may come; 0 without one."""
         return 0 if self._message is None else self._message.silence_ns
 
+    @property
+    def needs_arrival(self) -> bool:
+        """Whether the age of a message rests on the time when it came."""
+        return not self._same_computer and self._bound is None
+
     def forget(self, why: str) -> None:
         """Forget the message and the clocks' difference, but not what repeats are."""
         self._message, self._why = None, why
@@ -801,8 +825,8 @@ class Newest:
             if self._boot_id is not None:
                 self._former.append(self._boot_id)
                 self.counts.restarts += 1
+                self._best = self._bound = None
             self._boot_id, self._seq = boot_id, seq
-            self._best = self._bound = None
             return True
         if seq <= self._seq:
             self.counts.repeats += 1
@@ -822,8 +846,8 @@ class Newest:
         None for the first: it may have been kept for those who come late.
         """
         difference_ns = now_ns - published_ns
-        if self._bound is not None:
-            return min(empty_ns, published_ns + self._at_least(self._bound, now_ns), now_ns)
+        if self._bound is not None:  # no earlier, however long it then waited to be read
+            return min(published_ns + self._at_least(self._bound, now_ns), now_ns)
         if self._best is None:
             self._best, self._least_ns = (difference_ns, now_ns), difference_ns
             return None
@@ -938,7 +962,7 @@ class _Link:
     @property
     def sockets(self) -> list[zmq.Socket[bytes]]:
         """Those on which a message or an answer may come."""
-        sockets = (self._socket, self.asking.socket, self.telling.socket)
+        sockets = (self._socket, self.asking.socket, self.telling.socket, self.timing.socket)
         return [each for each in sockets if each is not None]
 
     def wait(self, timeout_ms: int) -> None:
@@ -1005,16 +1029,16 @@ def is_same_computer(endpoint: str) -> bool:
 
 def _due_ns(name: str, seconds: float) -> int:
     """Return the time when a wait of `seconds` ends, ns. Raises `ValueError`."""
-    if not _is_amount(seconds):
+    if not _is_amount(seconds, WAIT_MAX_S):
         raise ValueError(f"{name} must be 0 or more and finite, not {seconds!r}")
     return time.monotonic_ns() + round(seconds * 1e9)
 
 
-def _is_amount(value: object) -> bool:
-    """Whether it is a number, 0 or more and finite."""
+def _is_amount(value: object, most: float = REAL_MAX) -> bool:
+    """Whether it is a number from 0 to `most`."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return False
-    return 0.0 <= float(value) < math.inf
+    return not value < 0 and bool(value <= most)
 
 
 def _slept_ns() -> int:
