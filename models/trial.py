@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import sys
 from collections import deque
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from graspd.models import zoo
-from graspd.models.contract import ModelError
+from graspd.models.contract import ModelError, SeenCounts
 from graspd.models.runtime import ModelFile, TactileModel, check_operators, read
 
 TRIAL_S = 10.0
@@ -22,6 +26,9 @@ A start or reload of the daemon waits for it.
 """
 MEMORY_MAX_BYTES = 640 << 20
 """Most memory of the trial's process, bytes; the service has a gigabyte."""
+VARIED = 20
+"""Number of readings of the trial, of each kind."""
+COUNT_MAX = 4095
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
 """Option of prctl(2): a signal for this process when its parent ends."""
@@ -37,7 +44,7 @@ def load(path: Path, file: ModelFile | None = None) -> TactileModel:
     `file`: its content, if it was read before.
     """
     file = read(path) if file is None else file
-    if file.sha256 not in passed and not zoo.ships(path, file.sha256):
+    if not zoo.ships(path, file.sha256) and file.sha256 not in passed:
         _try(path, file.data)
         passed.append(file.sha256)
     return TactileModel(path, file)
@@ -71,6 +78,15 @@ def _try(path: Path, content: bytes) -> None:
         )
 
 
+def _varied(seen: SeenCounts) -> Iterator[NDArray[np.int64]]:
+    """Yield counts (fingers, 24): the ends, any that a sensor may have, any like the training's."""
+    draw, shape = np.random.default_rng(0), np.shape(seen.low)
+    yield from (np.zeros(shape, np.int64), np.full(shape, COUNT_MAX))
+    for _ in range(VARIED):
+        yield draw.integers(0, COUNT_MAX, shape, endpoint=True)
+        yield draw.integers(seen.low, seen.high, endpoint=True)
+
+
 def main() -> None:
     """Try the model on stdin, in its own process; print why it is refused."""
     import ctypes
@@ -84,7 +100,10 @@ def main() -> None:
     path, file = Path(sys.argv[1]), ModelFile(sys.stdin.buffer.read())
     try:
         check_operators(path, file.data)
-        TactileModel(path, file)
+        model = TactileModel(path, file)
+        for counts in _varied(model.contract.seen):
+            model.inputs.build(counts, model.input)
+            model.run()
     except ModelError as error:
         sys.stdout.write(str(error))
         sys.exit(REFUSED)

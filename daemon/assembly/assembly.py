@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.process.files import write_atomically
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import (
     CanTactile,
@@ -52,6 +53,19 @@ def model_path(scene: Scene) -> Path:
 def load_model(scene: Scene) -> TactileModel:
     """Load the scene's model and run it once. Raises `ModelError`."""
     return trial.load(model_path(scene))
+
+
+def keep_digest(model: TactileModel) -> Iterator[str]:
+    """Write a card beside an own model without one: a later change of the model is refused.
+
+    Yield a warning if that is impossible.
+    """
+    about = model.path.with_suffix(".json")
+    if not zoo.ships(model.path, model.sha256) and not about.exists():
+        try:
+            write_atomically(about, json.dumps(own.card(model.path)).encode(), mode=0o644)
+        except OSError as error:
+            yield f"{about}: cannot keep the model's digest, to notice a change: {error.strerror}"
 
 
 def build_pipeline(

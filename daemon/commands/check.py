@@ -90,7 +90,7 @@ def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footpri
         "scene": str(path),
         "in": _what_is_in(wanted, model, limits, period_ns),
         "left_out": _what_is_left_out(wanted, model, limits),
-        "warnings": _warnings(wanted),
+        "warnings": [*_warnings(wanted), *assembly.keep_digest(model)],
     }
     cost_lines: Iterable[str] = ()
     if args.cost:

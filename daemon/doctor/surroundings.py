@@ -46,7 +46,7 @@ def model_finding(wanted: Scene) -> Finding:
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
     except ModelError as problem:
-        advice = "choose a model that fits the hand: graspd models"
+        advice = "choose another model that fits the hand: graspd models"
         return Finding(Level.ERROR, str(problem), Cause.MODEL_MISFIT, advice)
     return fine(f"model {model.contract.name} ({model.sha256[:12]}) fits the hand")
 

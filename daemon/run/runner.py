@@ -40,6 +40,8 @@ def prepare(path: Path) -> Parts:
     """Read a scene and load its model; with `[realtime]` rehearse. Raises as `Parts.of`."""
     loaded = scene.load(path)
     parts = Parts.of(loaded, assembly.load_model(loaded))
+    for warning in assembly.keep_digest(parts.model):
+        log.warning("%s", warning)
     if loaded.realtime is not None:
         from graspd.daemon.run.rehearsal import rehearse  # only where a scene wants realtime
 

@@ -1,50 +1,37 @@
-"""A lab with grasps of its own: table, training, the model by its name in a scene, verdicts."""
+"""A change of a user's own model is noticed, from the first time that a scene names it."""
 
 from __future__ import annotations
 
 import json
-import shlex
+import shutil
 from pathlib import Path
 
 import pytest
 
-from graspd.models.runtime import read
+from graspd.models import zoo
 from tests.daemon.processes import graspd
-from tests.models.training.samples import table, write
+from tests.kit.scenes import demo_scene
 
 
-def test_a_table_becomes_a_model_that_a_scene_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for package in ("torch", "rich"):
-        pytest.importorskip(package, reason="the train extra is not installed")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "monday.csv", table("monday", 60, 1))
+def flip(path: Path) -> None:
+    """Flip a bit of a weight."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 4] ^= 0x40
+    path.write_bytes(content)
 
-    trained = graspd("train", "svm", "--own", "monday.csv", "--folds", 2, "--only", "cv")
-    assert trained.returncode == 0, trained.stderr
-    *warnings, last = trained.stderr.splitlines()
-    assert any("not calibrated by the session" in line for line in warnings)
-    command = last.removeprefix("graspd train: for a scene: graspd ")
-    assert command == "models add runs/svm-monday/svm-monday.onnx --name svm-monday"
 
-    added = graspd(*shlex.split(command), "--user")
-    assert added.returncode == 0, added.stderr
-    assert added.stdout.endswith('in a scene, below [model]: name = "svm-monday"\n')
-    scene = tmp_path / "right.toml"
-    scene.write_text(
-        '[tactile]\ndriver = "replay"\nrecordings = ["monday.csv"]\n[model]\nname = "svm-monday"\n'
-    )
-    checked = graspd("check", scene)
-    assert checked.returncode == 0, checked.stderr
-    sha256 = read(tmp_path / "runs" / "svm-monday" / "svm-monday.onnx").sha256
-    assert f"svm-monday ({sha256[:12]})" in checked.stdout
-
-    replayed = graspd("replay", "monday.csv", "--model", "svm-monday", "--json")
-    assert replayed.returncode == 0, replayed.stderr
-    verdicts = [json.loads(line) for line in replayed.stdout.splitlines()]
-    assert len(verdicts) == 60
-    assert {verdict["model_sha"] for verdict in verdicts} == {sha256[:12]}
-    assert {"stable", "slip"} <= {verdict["verdict"] for verdict in verdicts}
-    assert "svm-monday (own)" in graspd("models").stdout
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_change_of_an_own_model_is_refused(command: str, tmp_path: Path) -> None:
+    model = Path(shutil.copy(zoo.find("mlp"), tmp_path / "mine.onnx"))
+    scene = demo_scene(tmp_path, sections=f'[model]\npath = "{model}"')
+    first = graspd(command, scene)
+    assert first.returncode == 0, first.stderr
+    kept = json.loads(model.with_suffix(".json").read_text())
+    assert kept["file"]["sha256"] == zoo.card("mlp")["file"]["sha256"]
+    flip(model)
+    for again in (("check", scene), ("run", scene), ("models", model)):
+        refused = graspd(*again)
+        assert refused.returncode == 2
+        assert "mine.json: is the card of another file than mine.onnx" in refused.stderr
+    model.with_suffix(".json").unlink()
+    assert graspd("check", scene).returncode == 0
