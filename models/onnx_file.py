@@ -124,7 +124,7 @@ class _Reader:
             if field_number == 1:
                 name = _text(value)
             elif field_number in (3, 8):
-                values += _integers(value)
+                values += [value] if isinstance(value, int) else []  # no exporter packs them
             elif field_number in (5, 10):
                 self._read_tensor(value)
             elif field_number in (6, 11):
@@ -265,17 +265,6 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
                 break  # other readers would keep 64 bits
             return value, at + place + 1
     raise _broken("a number without an end")
-
-
-def _integers(value: memoryview | int) -> list[int]:
-    """Return the integers of a field: one, or as many as its bytes have."""
-    if isinstance(value, int):
-        return [value]
-    values, at = list[int](), 0
-    while at < len(value):
-        number, at = _varint(value, at)
-        values.append(number)
-    return values
 
 
 def _text(value: memoryview | int) -> str:

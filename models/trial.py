@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspd.models import zoo
-from graspd.models.contract import ModelError, SeenCounts
+from graspd.models.contract import ModelError
 from graspd.models.runtime import ModelFile, TactileModel, check_operators, read
 
 TRIAL_S = 10.0
@@ -27,7 +25,7 @@ A start or reload of the daemon waits for it.
 MEMORY_MAX_BYTES = 640 << 20
 """Most memory of the trial's process, bytes; the service has a gigabyte."""
 VARIED = 20
-"""Number of readings of the trial, of each kind."""
+"""Number of readings of the trial of any counts, and of those like the training's."""
 COUNT_MAX = 4095
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
@@ -78,15 +76,6 @@ def _try(path: Path, content: bytes) -> None:
         )
 
 
-def _varied(seen: SeenCounts) -> Iterator[NDArray[np.int64]]:
-    """Yield counts (fingers, 24): the ends, any that a sensor may have, any like the training's."""
-    draw, shape = np.random.default_rng(0), np.shape(seen.low)
-    yield from (np.zeros(shape, np.int64), np.full(shape, COUNT_MAX))
-    for _ in range(VARIED):
-        yield draw.integers(0, COUNT_MAX, shape, endpoint=True)
-        yield draw.integers(seen.low, seen.high, endpoint=True)
-
-
 def main() -> None:
     """Try the model on stdin, in its own process; print why it is refused."""
     import ctypes
@@ -101,9 +90,12 @@ def main() -> None:
     try:
         check_operators(path, file.data)
         model = TactileModel(path, file)
-        for counts in _varied(model.contract.seen):
-            model.inputs.build(counts, model.input)
-            model.run()
+        seen, draw = model.contract.seen, np.random.default_rng(0)
+        for low, high in ((0, COUNT_MAX), (seen.low, seen.high)):
+            shape = (VARIED, *np.shape(seen.low))
+            for counts in draw.integers(low, high, shape, endpoint=True):
+                model.inputs.build(counts, model.input)
+                model.run()
     except ModelError as error:
         sys.stdout.write(str(error))
         sys.exit(REFUSED)

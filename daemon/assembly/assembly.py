@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -210,6 +211,14 @@ def joint_limits(scene: Scene) -> JointLimits | None:
     )
 
 
+def refuse_absent_processors(scene: Scene) -> None:
+    """Raise `SceneError` if this computer lacks a processor of `[realtime]`."""
+    number = os.sysconf("SC_NPROCESSORS_CONF")
+    for cpu in (scene.realtime and scene.realtime.cpus) or ():
+        if cpu >= number:
+            raise SceneError(f"realtime.cpus: no processor {cpu}: there are 0 to {number - 1}")
+
+
 def build_drivers(scene: Scene) -> list[Driver]:
     """Make the drivers, not open yet, the tactile one first. Raises `SceneError`."""
     with _section("tactile"):
@@ -284,6 +293,8 @@ def _palm(scene: Scene, options: PalmTactile) -> Driver:
         from graspd.drivers.palm.stream import PalmDriver
 
         return PalmDriver(options.source, only_from=options.only_from, **common)
+    if "://" in options.source:
+        raise ValueError(f"source {options.source} is neither udp:// nor a file")
     from graspd.drivers.recordings.palm_file import PalmFile
 
     return PalmFile(Path(options.source), **common)

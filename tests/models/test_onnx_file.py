@@ -221,30 +221,6 @@ def test_trees_take_the_models_input_alone() -> None:
         onnx_file.check(with_trees(trees(given="y")))
 
 
-def piece(number: int, content: bytes) -> bytes:
-    """A field of bytes in front of less than 16384."""
-    size = len(content)
-    return bytes([number << 3 | 2, size & 0x7F | 0x80, size >> 7]) + content
-
-
-@pytest.mark.parametrize("false", [TREES["nodes_falsenodeids"], [2, 0, 2, 0, 0, 2, 0, 0]])
-def test_packed_numbers_of_trees_are_read_too(false: list[int]) -> None:
-    """Readers take lists of numbers in either form."""
-    model, node = small(), trees()
-    (place,) = (i for i, each in enumerate(node.attribute) if each.name == "nodes_falsenodeids")
-    del node.attribute[place], model.graph.node[2]
-    packed = piece(1, b"nodes_falsenodeids") + piece(8, bytes(false)) + b"\xa0\x01\x07"
-    content = model.SerializeToString()
-    content += piece(7, piece(1, node.SerializeToString() + piece(5, packed)))
-    read = onnx.load_model_from_string(content).graph.node[-1].attribute[-1]
-    assert onnx.helper.get_attribute_value(read) == false
-    if false == TREES["nodes_falsenodeids"]:
-        onnx_file.check(content)
-        return
-    with pytest.raises(ModelError, match="with a cycle"):
-        onnx_file.check(content)
-
-
 def test_a_second_piece_of_the_graph_is_looked_at_too() -> None:
     """Readers of this format put the pieces of a message together."""
     model, more = small(), onnx.ModelProto()
