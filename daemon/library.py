@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -52,6 +53,8 @@ class GraspModel:
         self._electrodes = Electrodes(contract.seen)
         self._plausibility = Plausibility(self.fingers, self._electrodes)
         self._network = Network(model, Limits.slip_threshold)
+        self._turn = threading.Lock()
+        """Held while the network judges: its input and output are buffers."""
 
     def predict_proba(
         self,
@@ -61,9 +64,9 @@ class GraspModel:
     ) -> NDArray[np.float64]:
         """Return the probabilities of `classes`, shape (n, 2), for each of n held grasps.
 
-        `counts`: shape (n, fingers, 24), or a table with columns such as `ff_biotac_1`. NaN is an
-        electrode that is known to be broken, as is one at 0 or 4095. A row is NaN if the daemon
-        would refuse to judge it.
+        `counts`: shape (n, fingers, 24), or a table with columns such as `ff_biotac_1`. NaN, or a
+        masked value, is an electrode that is known to be broken, as is one at 0 or 4095. A row is
+        NaN if the daemon would refuse to judge it. Threads may share a model.
 
         `session`, for models that need one: grasps of the same sensors on the same day, like
         `counts` and without outcomes, or the file of a session that a daemon has kept.
@@ -84,8 +87,9 @@ class GraspModel:
         """Return what the network says, and the counts that a session may take in."""
         counts = np.where(np.isnan(values), 0.0, values).astype(np.uint16)
         broken = at_rail(counts)  # as is a NaN, which is 0 there
-        examined = self._plausibility.examine(counts, broken if broken.any() else None, now)
-        return self._network.judge(examined, now), examined.grasp
+        with self._turn:
+            examined = self._plausibility.examine(counts, broken if broken.any() else None, now)
+            return self._network.judge(examined, now), examined.grasp
 
     def _calibration(
         self, session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None
@@ -119,7 +123,9 @@ class GraspModel:
     def _counts(self, given: ArrayLike | pd.DataFrame) -> NDArray[np.float64]:
         """Return counts of shape (n, fingers, 24). Raises `ValueError`."""
         values = _of_table(given, self.fingers) if hasattr(given, "columns") else given
-        counts = np.asarray(values, dtype=np.float64)
+        if np.asarray(values).dtype.kind in "cmM":
+            raise ValueError(f"counts are of type {np.asarray(values).dtype}, not numbers")
+        counts: NDArray[np.float64] = np.ma.array(values, dtype=np.float64).filled(np.nan)
         fingers = len(self.fingers)
         if counts.ndim != 3 or counts.shape[1:] != (fingers, ELECTRODES):
             raise ValueError(
@@ -195,5 +201,9 @@ def _of_table(table: Any, fingers: Sequence[str]) -> NDArray[np.float64]:  # noq
     missing = [name for name in names if name not in table.columns]
     if missing:
         raise ValueError(f"the table has no column {missing[0]}")
+    columns = list(table.columns)
+    twice = [name for name in names if columns.count(name) > 1]
+    if twice:
+        raise ValueError(f"the table has the column {twice[0]} more than once")
     values = np.asarray(table[names].to_numpy(dtype=np.float64, na_value=np.nan))
     return values.reshape(-1, len(fingers), ELECTRODES)

@@ -6,8 +6,10 @@ ever. Files are Protocol Buffers; the numbers of the fields are those of onnx.pr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from graspd.models.contract import ModelError
 
@@ -20,46 +22,31 @@ VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 """Wire types of fields; the other two, groups, are out of use."""
 
 _OF_ONNX = """
-    Abs Add And ArgMax ArgMin AveragePool BatchNormalization Cast CastLike Ceil Celu Clip Concat
-    Constant ConstantOfShape Conv ConvInteger ConvTranspose Cos Cosh CumSum DepthToSpace
-    DequantizeLinear Div Dropout DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand EyeLike
-    Flatten Floor GRU Gather GatherElements GatherND Gelu Gemm GlobalAveragePool GlobalLpPool
-    GlobalMaxPool Greater GreaterOrEqual GroupNormalization HardSigmoid HardSwish Hardmax Identity
-    InstanceNormalization IsInf IsNaN LRN LSTM LayerNormalization LeakyRelu Less LessOrEqual Log
-    LogSoftmax LpNormalization LpPool MatMul MatMulInteger Max MaxPool Mean
-    MeanVarianceNormalization Min Mish Mod Mul Neg Not Or PRelu Pad Pow QLinearConv QLinearMatMul
-    QuantizeLinear RMSNormalization RNN Range Reciprocal ReduceL1 ReduceL2 ReduceLogSum
-    ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape
-    Resize Round ScatterElements ScatterND Selu Shape Shrink Sigmoid Sign Sin Sinh Size Slice
-    Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Swish Tan Tanh ThresholdedRelu
-    Tile TopK Transpose Trilu Unsqueeze Upsample Where Xor
+    Add Cast Clip Concat Conv Div Exp Gather Gemm Log MatMul MaxPool Mul ReduceSumSquare Relu
+    Reshape Slice Softmax Sub Sum Transpose
     """
-_OF_ML = """
-    ArrayFeatureExtractor Binarizer Imputer LinearClassifier LinearRegressor Normalizer
-    SVMClassifier SVMRegressor Scaler TreeEnsemble TreeEnsembleClassifier TreeEnsembleRegressor
-    """
+TREES = frozenset({"TreeEnsembleClassifier", "TreeEnsembleRegressor"})
 OPERATORS = {
     "": frozenset(_OF_ONNX.split()),
     "ai.onnx": frozenset(_OF_ONNX.split()),
-    "ai.onnx.ml": frozenset(_OF_ML.split()),
+    "ai.onnx.ml": TREES,
 }
 """Operators that a model may use, by domain; the first two domains are one.
 
-They exclude loops, branches, chance, sequences and texts. They also exclude operators whose result
-has a size that depends on its values.
+They are those of the models that `graspd train` makes. Each ends, whatever the counts, and the size
+of its result does not depend on values: of `SHAPED` and `TREES` that is checked.
 """
-_SHAPED = """
-    ConstantOfShape Expand Pad Range Reshape Resize Slice Split Squeeze Tile TopK Unsqueeze Upsample
-    ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd
-    ReduceSum ReduceSumSquare
-    """
-SHAPED = frozenset(_SHAPED.split())
+SHAPED = frozenset({"ReduceSumSquare", "Reshape", "Slice"})
 """Operators whose further inputs give the size of the result.
 
 These inputs must be constants of the model, so that each run takes as long as the first.
 """
-ALL_INPUTS = frozenset({"ConstantOfShape", "Range"})
-"""Operators of `SHAPED` whose first input also gives the size."""
+TEXTS = {"LEAF": 0, "BRANCH_LEQ": 1}
+"""Numbers of the texts that an attribute may have, the kinds of a tree's nodes; 2: another."""
+LEAF, BRANCH = TEXTS.values()
+VALUES = frozenset(range(2, 12))
+"""Fields of an attribute that are its values, each of another kind."""
+NODE_LISTS = ("treeids", "nodeids", "modes", "featureids", "truenodeids", "falsenodeids")
 
 
 @dataclass(slots=True)
@@ -68,6 +55,8 @@ class _Node:
     domain: str = ""
     inputs: list[str] = field(default_factory=list)
     outputs: list[str] = field(default_factory=list)
+    attributes: dict[str, list[int]] = field(default_factory=dict)
+    """Values by name: integers, numbers of `TEXTS`, and 0 for each float."""
 
 
 def check(content: bytes) -> None:
@@ -84,6 +73,8 @@ class _Reader:
         self._nodes: list[_Node] = []
         self._fixed: set[str] = set()
         """Names of values that are constants of the model."""
+        self._widths: dict[str, int] = {}
+        """Last dimension of the model's inputs, by name."""
 
     def check(self) -> None:
         # A message may come in several pieces, so each field with that number is checked.
@@ -101,6 +92,10 @@ class _Reader:
                 self._nodes.append(self._read_node(value))
             elif field_number == 5:
                 self._fixed.add(self._read_tensor(value))
+            elif field_number == 11:
+                names, sizes = self._at(value, 1), self._at(value, 2, 1, 2, 1, 1)
+                if names and sizes and isinstance(sizes[-1], int):
+                    self._widths[_text(names[-1])] = sizes[-1]
             elif field_number == 15:
                 raise ModelError("has sparse weights")
 
@@ -114,19 +109,35 @@ class _Reader:
             elif field_number == 4:
                 result.operator = _text(value)
             elif field_number == 5:
-                self._read_attribute(value)
+                name, values = self._read_attribute(value)
+                if name in result.attributes:
+                    raise _broken(f"{name} twice")
+                result.attributes[name] = values
             elif field_number == 7:
                 result.domain = _text(value)
         return result
 
-    def _read_attribute(self, attribute: memoryview | int) -> None:
+    def _read_attribute(self, attribute: memoryview | int) -> tuple[str, list[int]]:
+        name, values, kinds = "", list[int](), set[int]()
         for field_number, value in self._fields(attribute):
-            if field_number in (5, 10):
+            kinds |= {field_number} & VALUES
+            if field_number == 1:
+                name = _text(value)
+            elif field_number in (3, 8):
+                values += [value] if isinstance(value, int) else []  # no exporter packs them
+            elif field_number in (5, 10):
                 self._read_tensor(value)
             elif field_number in (6, 11):
                 raise ModelError("has a loop or branch: a graph within its graph")
+            elif field_number == 7 and not isinstance(value, int):
+                values += bytes(len(value) // 4)
+            elif field_number == 9:
+                values.append(TEXTS.get(_text(value), len(TEXTS)))
             elif field_number in (22, 23):
                 raise ModelError("has sparse weights")
+        if len(kinds) > 1:
+            raise _broken(f"{name} of two kinds")
+        return name, values
 
     def _read_tensor(self, tensor: memoryview | int) -> str:
         """Check a tensor; return its name."""
@@ -144,10 +155,20 @@ class _Reader:
             raise ModelError(f"has an operator {operator!r} of another domain, {node.domain!r}")
         if operator not in OPERATORS[node.domain]:
             raise ModelError(f"has an operator that no model may use: {operator!r}")
-        if operator in SHAPED and not all(fixed if operator in ALL_INPUTS else fixed[1:]):
+        if operator in SHAPED and not all(fixed[1:]):
             raise ModelError(f"has a {operator} whose size depends on the counts")
-        if operator in ("Shape", "Size") or all(fixed):
+        if operator in TREES:
+            width = self._widths.get(node.inputs[0], 0) if node.inputs else 0
+            _check_trees(defaultdict(list, node.attributes), width)
+        if all(fixed):
             self._fixed.update(node.outputs)
+
+    def _at(self, message: memoryview | int, *path: int) -> list[Any]:
+        """Return the values of the fields that these field numbers lead to."""
+        found = [value for number, value in self._fields(message) if number == path[0]]
+        if len(path) == 1:
+            return found
+        return [value for inner in found for value in self._at(inner, *path[1:])]
 
     def _fields(self, message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
         """Yield number and value of each field: an integer, or bytes.
@@ -181,6 +202,56 @@ class _Reader:
             at += size
 
 
+def _check_trees(lists: Mapping[str, list[int]], width: int) -> None:
+    """Raise `ModelError` unless each node is reached once, from the first of its tree.
+
+    `lists`: attributes of the operator. `width`: number of values that the trees read.
+    """
+    kind = "target" if lists["target_ids"] else "class"
+    for prefix, names in (("nodes", NODE_LISTS), (kind, ("treeids", "nodeids", "ids"))):
+        lengths = {len(lists[f"{prefix}_{name}"]) for name in names}
+        lengths |= {len(each) for name, each in lists.items() if name.startswith(f"{prefix}_")}
+        if len(lengths) != 1:
+            raise ModelError(f"has trees whose lists {prefix}_* differ in length")
+    trees, ids, modes = (lists[f"nodes_{name}"] for name in NODE_LISTS[:3])
+    places = {each: place for place, each in enumerate(zip(trees, ids, strict=True))}
+    roots = [place for place, tree in enumerate(trees) if not place or trees[place - 1] != tree]
+    if len(places) != len(trees) or len(roots) != len(set(trees)):
+        raise ModelError("has trees that list a node twice")
+    if len(_reached(lists, places, roots, range(width))) != len(trees):
+        raise ModelError("has a tree with nodes that its root does not reach")
+    numbers = range(len(lists["classlabels_int64s"]) or (lists["n_targets"] or [1])[-1])
+    leaves = zip(lists[f"{kind}_treeids"], lists[f"{kind}_nodeids"], strict=True)
+    kinds = {modes[places[leaf]] if leaf in places else BRANCH for leaf in leaves}
+    if kinds - {LEAF} or any(each not in numbers for each in lists[f"{kind}_ids"]):
+        raise ModelError("has trees with a result that is not one of a leaf")
+
+
+def _reached(
+    lists: Mapping[str, list[int]],
+    places: Mapping[tuple[int, int], int],
+    roots: list[int],
+    width: range,
+) -> set[int]:
+    """Return the places of the nodes below the roots. Raises `ModelError` if paths meet."""
+    trees, _, modes, features, *children = (lists[f"nodes_{name}"] for name in NODE_LISTS)
+    reached = set[int]()
+    while roots:
+        place = roots.pop()
+        if place in reached:
+            raise ModelError("has a tree with a cycle: a node is reached twice")
+        reached.add(place)
+        if modes[place] == LEAF:
+            continue
+        if modes[place] != BRANCH or features[place] not in width:
+            raise ModelError("has a tree with a node that does not compare an input")
+        for child in children:
+            if (trees[place], child[place]) not in places:
+                raise ModelError("has a tree that leads to a node which it lacks")
+            roots.append(places[trees[place], child[place]])
+    return reached
+
+
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
     """Return the variable-length integer at `at`, and the place after it."""
     value = 0
@@ -190,6 +261,8 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
         byte = message[at + place]
         value |= (byte & 0x7F) << 7 * place
         if byte < 0x80:
+            if value >> 64:
+                break  # other readers would keep 64 bits
             return value, at + place + 1
     raise _broken("a number without an end")
 

@@ -11,6 +11,8 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import ModelFile, TactileModel, check_operators, read
@@ -22,6 +24,9 @@ A start or reload of the daemon waits for it.
 """
 MEMORY_MAX_BYTES = 640 << 20
 """Most memory of the trial's process, bytes; the service has a gigabyte."""
+VARIED = 20
+"""Number of readings of the trial of any counts, and of those like the training's."""
+COUNT_MAX = 4095
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
 """Option of prctl(2): a signal for this process when its parent ends."""
@@ -37,7 +42,7 @@ def load(path: Path, file: ModelFile | None = None) -> TactileModel:
     `file`: its content, if it was read before.
     """
     file = read(path) if file is None else file
-    if file.sha256 not in passed and not zoo.ships(path, file.sha256):
+    if not zoo.ships(path, file.sha256) and file.sha256 not in passed:
         _try(path, file.data)
         passed.append(file.sha256)
     return TactileModel(path, file)
@@ -84,7 +89,13 @@ def main() -> None:
     path, file = Path(sys.argv[1]), ModelFile(sys.stdin.buffer.read())
     try:
         check_operators(path, file.data)
-        TactileModel(path, file)
+        model = TactileModel(path, file)
+        seen, draw = model.contract.seen, np.random.default_rng(0)
+        for low, high in ((0, COUNT_MAX), (seen.low, seen.high)):
+            shape = (VARIED, *np.shape(seen.low))
+            for counts in draw.integers(low, high, shape, endpoint=True):
+                model.inputs.build(counts, model.input)
+                model.run()
     except ModelError as error:
         sys.stdout.write(str(error))
         sys.exit(REFUSED)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.process.files import write_atomically
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import (
     CanTactile,
@@ -52,6 +54,19 @@ def model_path(scene: Scene) -> Path:
 def load_model(scene: Scene) -> TactileModel:
     """Load the scene's model and run it once. Raises `ModelError`."""
     return trial.load(model_path(scene))
+
+
+def keep_digest(model: TactileModel) -> Iterator[str]:
+    """Write a card beside an own model without one: a later change of the model is refused.
+
+    Yield a warning if that is impossible.
+    """
+    about = model.path.with_suffix(".json")
+    if not zoo.ships(model.path, model.sha256) and not about.exists():
+        try:
+            write_atomically(about, json.dumps(own.card(model.path)).encode(), mode=0o644)
+        except OSError as error:
+            yield f"{about}: cannot keep the model's digest, to notice a change: {error.strerror}"
 
 
 def build_pipeline(
@@ -196,6 +211,14 @@ def joint_limits(scene: Scene) -> JointLimits | None:
     )
 
 
+def refuse_absent_processors(scene: Scene) -> None:
+    """Raise `SceneError` if this computer lacks a processor of `[realtime]`."""
+    number = os.sysconf("SC_NPROCESSORS_CONF")
+    for cpu in (scene.realtime and scene.realtime.cpus) or ():
+        if cpu >= number:
+            raise SceneError(f"realtime.cpus: no processor {cpu}: there are 0 to {number - 1}")
+
+
 def build_drivers(scene: Scene) -> list[Driver]:
     """Make the drivers, not open yet, the tactile one first. Raises `SceneError`."""
     with _section("tactile"):
@@ -270,6 +293,8 @@ def _palm(scene: Scene, options: PalmTactile) -> Driver:
         from graspd.drivers.palm.stream import PalmDriver
 
         return PalmDriver(options.source, only_from=options.only_from, **common)
+    if "://" in options.source:
+        raise ValueError(f"source {options.source} is neither udp:// nor a file")
     from graspd.drivers.recordings.palm_file import PalmFile
 
     return PalmFile(Path(options.source), **common)

@@ -50,6 +50,7 @@ class Parts:
     @classmethod
     def of(cls, scene: Scene, model: TactileModel) -> Parts:
         """Make the parts. Raises `SceneError`, `ModelError` or `RecordingError`."""
+        assembly.refuse_absent_processors(scene)
         pipeline = assembly.build_pipeline(scene, model, learns=scene.session.learn)
         return cls(scene, model, pipeline, assembly.build_drivers(scene))
 

@@ -16,6 +16,8 @@ from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.commands.models import f1_percent
 from graspd.daemon.doctor.computer import NETWORK
+from graspd.daemon.doctor.finding import Level
+from graspd.daemon.doctor.surroundings import socket_findings
 from graspd.daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
 from graspd.daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
 from graspd.daemon.process.text import (
@@ -77,10 +79,14 @@ def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footpri
     try:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
+        assembly.refuse_absent_processors(wanted)
         assembly.build_pipeline(wanted, model)
         limits = assembly.hand_limits(wanted)
         period_ns = _try_drivers(wanted)
         _try_keys(wanted)
+        for finding in socket_findings(wanted):
+            if finding.level is Level.ERROR:
+                raise scene.SceneError(finding.what)
         if wanted.record is not None:
             assembly.require_mcap("[record]")
     except (scene.SceneError, ModelError, DriverError) as error:
@@ -90,7 +96,7 @@ def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footpri
         "scene": str(path),
         "in": _what_is_in(wanted, model, limits, period_ns),
         "left_out": _what_is_left_out(wanted, model, limits),
-        "warnings": _warnings(wanted),
+        "warnings": [*_warnings(wanted), *assembly.keep_digest(model)],
     }
     cost_lines: Iterable[str] = ()
     if args.cost:

@@ -96,11 +96,11 @@ def run(args: argparse.Namespace) -> int:
 def _show(args: argparse.Namespace) -> int:
     if args.what is None:
         added = own.added()
-        contents = {name: zoo.card(name) for name in zoo.names()}
-        cards = {name: _parsed(content) for name, content in contents.items()}
-        for name, path in added.items():
+        contents: dict[str, Any] = {}
+        cards: dict[str, _ShownCard] = {}
+        for name, path in {**{name: zoo.find(name) for name in zoo.names()}, **added}.items():
             try:
-                content = zoo.read_card(path.with_suffix(".json"))
+                content = _card_of(path)
                 cards[name] = _parsed(content)
             except ModelError as error:
                 complain(error)
@@ -120,9 +120,15 @@ def _show(args: argparse.Namespace) -> int:
 def _content_of(what: str) -> dict[str, Any]:
     """Return the card of a name or a file, as it is."""
     if what in zoo.names():
-        return zoo.card(what)
+        return _card_of(zoo.find(what))
     is_file = what.endswith(".onnx") or os.sep in what
     return own.card(Path(what) if is_file else own.find(what))
+
+
+def _card_of(path: Path) -> dict[str, Any]:
+    """Return the card beside a model. Raises `ModelError` if it is of another file."""
+    zoo.ships(path, read(path).sha256)
+    return zoo.read_card(path.with_suffix(".json"))
 
 
 class _Size(msgspec.Struct):

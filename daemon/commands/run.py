@@ -28,7 +28,6 @@ DESCRIPTORS = 65_536
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", type=Path, help="scene file (TOML)")
-    parser.add_argument("--print", action="store_true", help="print every verdict, and a summary")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,12 +38,7 @@ def run(args: argparse.Namespace) -> int:
         with ExitStack() as stack:
             on_terminal = sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
             stop = stack.enter_context(StopSignal(reloads=not on_terminal))
-            printer = None
-            if args.print:
-                from graspd.daemon.run.summary import Printer
-
-                printer = Printer(as_json=False)
-            Runner(args.scene, stop, printer=printer, manager=_manager(stack)).run()
+            Runner(args.scene, stop, manager=_manager(stack)).run()
     except RecordingError:
         raise
     except PublishError as error:

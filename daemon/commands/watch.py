@@ -147,7 +147,7 @@ def where_to_look(endpoint: str, scene_path: Path | None = None) -> tuple[str, s
 
 def _terminal(hands: list[HandFeed]) -> int:
     if not sys.stdout.isatty():
-        raise UsageError("watch draws on a terminal; see --web, or `graspd run --print` for a pipe")
+        raise UsageError("watch draws on a terminal; see --web")
     try:
         from graspd.daemon.watch.terminal import can_draw, show
     except ModuleNotFoundError as error:

@@ -22,6 +22,8 @@ from graspd.models.contract import ModelError
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
 """Default bit rates of the boards in deploy/can/PROTOCOL.md, bit/s."""
+SERVICE_FOLDER = Path("/run/graspd")
+"""Folder of sockets that the service makes when it starts."""
 NOT_HEARD = frozenset(
     {Cause.INTERFACE_MISSING, Cause.INTERFACE_DOWN, Cause.LINK_DOWN, Cause.SILENT, Cause.BITRATE}
 )
@@ -46,7 +48,7 @@ def model_finding(wanted: Scene) -> Finding:
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
     except ModelError as problem:
-        advice = "choose a model that fits the hand: graspd models"
+        advice = "choose another model that fits the hand: graspd models"
         return Finding(Level.ERROR, str(problem), Cause.MODEL_MISFIT, advice)
     return fine(f"model {model.contract.name} ({model.sha256[:12]}) fits the hand")
 
@@ -170,7 +172,8 @@ def _of_socket(name: str, path: Path) -> Iterator[Finding]:
     if not folder.is_dir():
         what = f"{name}: there is no folder {folder}"
         advice = f"the service makes it; without: sudo install -d -o $USER {folder}"
-        yield Finding(Level.WARNING, what, Cause.SOCKET_FOLDER, advice)
+        level = Level.WARNING if folder == SERVICE_FOLDER else Level.ERROR
+        yield Finding(level, what, Cause.SOCKET_FOLDER, advice)
         return
     holders = computer.file_holders(f"{path}.lock")
     if holders:

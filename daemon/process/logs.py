@@ -49,24 +49,29 @@ class JournalFormatter(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Filter that passes a burst of each kind of message, then one per window."""
+    """Filter that passes a burst of each kind of message, then one per window.
+
+    A window in which nothing was held back gives the burst back.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._clock = clock
-        self._kinds: dict[str, tuple[float, int]] = {}
-        """Start of the window, s, and number of messages in it, by kind."""
+        self._kinds: dict[str, tuple[float, int, int]] = {}
+        """Start of the window, s, number of messages in it, and limit, by kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return True to pass a message; the first of a window gives the number held back."""
         now_s, kind = self._clock(), f"{record.name} {record.msg}"
         if kind not in self._kinds and len(self._kinds) >= KINDS_MAX:
             return True
-        start_s, count = self._kinds.get(kind, (now_s, 0))
+        start_s, count, limit = self._kinds.get(kind, (now_s, 0, BURST))
         if now_s - start_s >= WINDOW_S:
-            held_back, start_s, count = max(count - BURST, 0), now_s, 0
+            held_back = max(count - limit, 0)
+            limit = 1 if held_back and now_s - start_s < 2 * WINDOW_S else BURST
+            start_s, count = now_s, 0
             if held_back:
                 record.msg = f"{record.getMessage()} (and {held_back} more like it before)"
                 record.args = None
-        self._kinds[kind] = (start_s, count + 1)
-        return count < BURST
+        self._kinds[kind] = (start_s, count + 1, limit)
+        return count < limit

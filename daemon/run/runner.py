@@ -27,7 +27,6 @@ from graspd.models.contract import ModelError
 if TYPE_CHECKING:
     from graspd.daemon.run.realtime import RealtimeMode
     from graspd.daemon.run.replaying import Controller
-    from graspd.daemon.run.summary import Printer
     from graspd.daemon.run.systemd import Systemd
 
 log = logging.getLogger("graspd")
@@ -40,6 +39,8 @@ def prepare(path: Path) -> Parts:
     """Read a scene and load its model; with `[realtime]` rehearse. Raises as `Parts.of`."""
     loaded = scene.load(path)
     parts = Parts.of(loaded, assembly.load_model(loaded))
+    for warning in assembly.keep_digest(parts.model):
+        log.warning("%s", warning)
     if loaded.realtime is not None:
         from graspd.daemon.run.rehearsal import rehearse  # only where a scene wants realtime
 
@@ -99,18 +100,10 @@ class RunLog(Companion):
 class Runner:
     """Runs a scene file; SIGHUP reloads it."""
 
-    def __init__(
-        self,
-        path: Path,
-        stop: StopSignal,
-        *,
-        printer: Printer | None = None,
-        manager: Systemd | None = None,
-    ) -> None:
+    def __init__(self, path: Path, stop: StopSignal, *, manager: Systemd | None = None) -> None:
         """`manager`: the service manager, if it started this process."""
         self._path = path
         self._stop = stop
-        self._printer = printer
         self._manager = manager
         self._sockets: Sockets | None = None
         began = (lambda: None) if manager is None else manager.reloading
@@ -140,8 +133,6 @@ class Runner:
                 self._sockets.close()
             if self._latest is not None:
                 self._log.write(cause)
-        if self._printer is not None and self._latest is not None:
-            self._printer.summary(self._latest.pipeline.trust)
 
     def _run(self, parts: Parts) -> None:
         woken = False
@@ -203,10 +194,9 @@ class Runner:
             realtime = enter_realtime(running, stack)
             around.record()
             controller = _controller(running)
-            self._note_training(parts)
             companions = [
                 *(self._reload, self._manager, self._log, *around.companions),
-                *(self._printer, realtime, controller),
+                *(realtime, controller),
             ]
             loop = Loop(
                 parts.drivers,
@@ -230,15 +220,6 @@ class Runner:
             while ended is Ended.RELOAD and (following := self._taken()) is None:
                 ended = loop.run()
             return ended, following
-
-    def _note_training(self, parts: Parts) -> None:
-        """Have the summary say which recordings the model was trained on."""
-        played = parts.scene.tactile
-        if self._printer is None or not isinstance(played, ReplayTactile):
-            return
-        from graspd.daemon.run.replaying import trained_on  # only where recordings are scored
-
-        self._printer.result.trained_on = trained_on(played.recordings, parts.model)
 
     def _take_over(self, parts: Parts, *, keeps_session: bool) -> None:
         """Note that these parts run now; log what those before knew and these do not."""

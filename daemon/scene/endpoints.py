@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 
 IPC_PATH_MAX_BYTES = 107
@@ -38,10 +39,28 @@ def is_private(endpoint: str) -> bool:
     return scheme == "ipc" or _ip_address(address.rpartition(":")[0]).is_loopback
 
 
+def clash(first: str, second: str) -> bool:
+    """Return True if two checked endpoints cannot both be bound, however they are written.
+
+    An `ipc://` endpoint also takes its path with `.lock`.
+    """
+    (scheme, _, one), (other_scheme, _, other) = first.partition("://"), second.partition("://")
+    if scheme != other_scheme:
+        return False
+    if scheme == "ipc":
+        one, other = os.path.realpath(one), os.path.realpath(other)
+        return one in (other, f"{other}.lock") or other == f"{one}.lock"
+    (host, _, port), (other_host, _, other_port) = one.rpartition(":"), other.rpartition(":")
+    addresses = {_ip_address(host), _ip_address(other_host)}
+    shared = len(addresses) == 1 or any(address.is_unspecified for address in addresses)
+    return int(port) == int(other_port) and shared
+
+
 def _ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     try:
         if host.startswith("[") and host.endswith("]"):
-            return ipaddress.IPv6Address(host[1:-1])
+            address = ipaddress.IPv6Address(host[1:-1])
+            return address.ipv4_mapped or address
         return ipaddress.IPv4Address(host)
     except ValueError:
         raise ValueError(f"needs an IP address, 127.0.0.1 or [::1], not '{host}'") from None

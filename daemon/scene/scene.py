@@ -31,7 +31,7 @@ from graspd.daemon.scene.drivers import (
     Tactile,
     unit,
 )
-from graspd.daemon.scene.endpoints import check_endpoint, is_private
+from graspd.daemon.scene.endpoints import check_endpoint, clash, is_private
 from graspd.drivers import toml
 from graspd.models.contract import Finger
 
@@ -210,14 +210,15 @@ class Ask(Section):
     """Group of an `ipc://` socket's file; without it that of `[publish]`."""
 
 
+Processor = Annotated[int, Field(ge=0, le=8191), unit()]
+
+
 class Realtime(Section):
     """`[realtime]`: run with realtime priority."""
 
     priority: Annotated[int, Field(ge=1, le=98), unit()] | None = 50
     """Priority of SCHED_FIFO; below that of the hand's own controller."""
-    cpus: (
-        Annotated[tuple[Annotated[int, unit()], ...], Field(min_length=1, strict=False)] | None
-    ) = None
+    cpus: Annotated[tuple[Processor, ...], Field(min_length=1, strict=False)] | None = None
     """Processors to run on, from 0; without it all."""
     lock_memory: bool = True
     """True: lock used memory, so that no reading waits for a disk."""
@@ -304,9 +305,10 @@ class Scene(Section):
             "publish.endpoint": self.publish.endpoint,
             "ask.endpoint": None if self.ask is None else self.ask.endpoint,
         }
-        given = [endpoint for endpoint in endpoints.values() if endpoint is not None]
-        if len(set(given)) != len(given):
-            raise ValueError("publish.endpoint and ask.endpoint must differ")
+        if self.ask_endpoint is not None and clash(self.endpoint, self.ask_endpoint):
+            raise ValueError(
+                f"publish.endpoint {self.endpoint} and ask.endpoint {self.ask_endpoint} must differ"
+            )
         for key, endpoint in endpoints.items():
             if endpoint is not None and self.curve is None and not is_private(endpoint):
                 raise ValueError(
@@ -362,7 +364,7 @@ class Scene(Section):
 def load(path: Path) -> Scene:
     """Read and check a scene file. Raises `SceneError`."""
     try:
-        text = read_regular(path, SCENE_MAX_BYTES).decode()
+        text = read_regular(path, SCENE_MAX_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene: {error.strerror}") from error
     except UnicodeDecodeError as error:

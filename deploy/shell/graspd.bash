@@ -11,7 +11,7 @@ _shtab_graspd_keys_subparsers=(make list)
 _shtab_graspd_report_subparsers=(error-vs-time stability worth)
 _shtab_graspd_subparsers=(run replay watch scene check doctor twin data schema models session export-grasps keys train evaluate report completion manual)
 
-_shtab_graspd_run_option_strings=(-h --help --print)
+_shtab_graspd_run_option_strings=(-h --help)
 _shtab_graspd_replay_option_strings=(-h --help --scene --model --speed --rate --loop --strict --session --outcomes --only-lifted --max-slip-when-stable --warm-up --explore --min-confidence --gate --publish --wait --json --verbose)
 _shtab_graspd_watch_option_strings=(-h --help --connect --keys --server-key --web --foxglove --port)
 _shtab_graspd_scene_option_strings=(-h --help --example --schema --page)
@@ -171,7 +171,6 @@ _shtab_graspd_pos_0_choices=(run replay watch scene check doctor twin data schem
 
 _shtab_graspd_run__h_nargs=0
 _shtab_graspd_run___help_nargs=0
-_shtab_graspd_run___print_nargs=0
 _shtab_graspd_replay_pos_0_nargs='*'
 _shtab_graspd_replay__h_nargs=0
 _shtab_graspd_replay___help_nargs=0

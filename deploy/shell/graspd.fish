@@ -60,7 +60,6 @@ complete -c graspd -n _shtab_graspd_using -s h -l help -d 'show this help messag
 complete -c graspd -n _shtab_graspd_using -l version -d 'tell versions and leave'
 complete -c graspd -n '_shtab_graspd_using; and test $_shtab_graspd_npos -eq 0' -a run -d 'Run the daemon on a scene.'
 complete -c graspd -n '_shtab_graspd_using run' -s h -l help -d 'show this help message and exit'
-complete -c graspd -n '_shtab_graspd_using run' -l print -d 'print every verdict, and a summary'
 complete -c graspd -n '_shtab_graspd_using run; and test $_shtab_graspd_npos -eq 0' -ka "(__fish_complete_path (commandline -ct))" -d 'scene file (TOML)'
 complete -c graspd -n '_shtab_graspd_using; and test $_shtab_graspd_npos -eq 0' -a replay -d 'Judge recordings and print the verdicts.'
 complete -c graspd -n '_shtab_graspd_using replay' -s h -l help -d 'show this help message and exit'

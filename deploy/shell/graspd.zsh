@@ -264,7 +264,6 @@ _shtab_graspd_report_worth_defaults_added=0
 
 _shtab_graspd_run_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "--print[print every verdict, and a summary]"
   ":scene file (TOML):_files"
 )
 

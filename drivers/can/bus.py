@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import socket
 import stat
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from typing import Any, Final
 
 import can
@@ -56,15 +56,38 @@ _OPTIONS: Final[dict[str, dict[str, Any]]] = {
     "virtual": {"rx_queue_size": 16384},
 }
 
-_PACKAGES: Final = {"serial": "pyserial"}
-_MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module is)? not installed")
+_EXTRAS: Final[dict[str, tuple[str, str]]] = {
+    **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "serial")),
+    "udp_multicast": ("msgpack", "multicast"),
+    "gs_usb": ("gs_usb", "gs-usb"),
+    "canalystii": ("canalystii", "canalystii"),
+    "cantact": ("cantact", "cantact"),
+    "neovi": ("ics", "neovi"),
+}
+"""Module that an interface needs, and the extra of python-can that brings it."""
+_WINDOWS: Final = ("etas", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector")
+_UNUSABLE: Final = {
+    "socketcand": "needs host and port, which a scene cannot give",
+    **dict.fromkeys(_WINDOWS, "is for Windows alone"),
+}
+
+
+def refuse_unusable(interface: str) -> None:
+    """Raise `ValueError` for an interface that can never be opened on this computer."""
+    if interface not in can.VALID_INTERFACES:
+        common = "socketcan, slcan, udp_multicast, virtual"
+        why = f"python-can has no interface {interface!r}; it has {common} and others"
+    elif interface in _UNUSABLE:
+        why = f"python-can's interface {interface!r} {_UNUSABLE[interface]}"
+    elif interface in _EXTRAS and find_spec(_EXTRAS[interface][0]) is None:
+        why = _what_is_missing(interface)
+    else:
+        return
+    raise ValueError(f"interface: {why}")
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
     """Open a bus of python-can. Raises `LinkError`; `DriverError` if no retry can succeed."""
-    if interface not in can.VALID_INTERFACES:
-        common = "socketcan, slcan, udp_multicast, virtual"
-        raise DriverError(f"python-can has no interface {interface!r}; it has {common} and others")
     where = f"cannot open {interface} {channel}"
     if interface == "socketcan":
         try:
@@ -83,14 +106,12 @@ def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.Bu
         raise LinkError.from_errno(error, f"{where}: {error}") from error
 
 
-def _what_is_missing(interface: str, error: Exception) -> str:
-    missing = _MISSING_MODULE.search(str(error))
-    if missing is None:
+def _what_is_missing(interface: str, error: Exception | None = None) -> str:
+    if interface not in _EXTRAS:
         return f"python-can's interface {interface!r} does not work here: {error}"
-    name = missing[1] or missing[2]
-    name = _PACKAGES.get(name, name)
     return (
-        f"python-can's interface {interface!r} needs the package {name}: run {installer()} {name}"
+        f"python-can's interface {interface!r} needs more packages: run {installer()} "
+        f"'python-can[{_EXTRAS[interface][1]}]'"
     )
 
 
@@ -100,7 +121,11 @@ def bus_options(
     bitrate: int | None = None,
     data_bitrate: int | None = None,
 ) -> dict[str, Any]:
-    """Return arguments of python-can's bus. Raises `ValueError` for rates it would ignore."""
+    """Return arguments of python-can's bus.
+
+    Raises `ValueError` for rates it would ignore, and for an interface that cannot be used.
+    """
+    refuse_unusable(interface)
     if interface == "socketcan" and (bitrate is not None or data_bitrate is not None):
         raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
     wants_fd = frame_format is CanFormat.SWEEP_FD

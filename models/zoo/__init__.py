@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
@@ -53,13 +54,24 @@ def read_card(path: Path) -> dict[str, Any]:
 
 
 def ships(path: Path, sha256: str) -> bool:
-    """Return True if the card of a zoo model at `path` states this digest (hexadecimal)."""
-    if path.resolve().parent != ZOO.resolve():
-        return False
-    try:
-        return bool(read_card(path.with_suffix(".json"))["file"].get("sha256") == sha256)
-    except ModelError:
-        return False
+    """Return True for a model of the zoo, False for another file.
+
+    Raises `ModelError` if the file has a card, as all of the zoo have, and this digest
+    (hexadecimal) is not the card's.
+    """
+    real = path.resolve()  # the card may be beside a link or beside its target
+    is_ours = real.parent == ZOO.resolve()
+    for about in {path.with_suffix(".json"), real.with_suffix(".json")}:
+        is_required = is_ours and about.stem == real.stem
+        if not is_required and not os.path.exists(about):
+            continue
+        if read_card(about)["file"].get("sha256") != sha256:
+            advice = "install graspd again" if is_ours else f"if it is right, remove {about.name}"
+            raise ModelError(
+                f"{about}: is the card of another file than {path.name}, which was changed or "
+                f"damaged: {advice}"
+            )
+    return is_ours
 
 
 def find(name: str) -> Path:

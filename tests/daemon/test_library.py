@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +129,63 @@ def test_what_is_no_count_is_refused(counts: NDArray[np.float64], value: float) 
     wrong[1, 2, 3] = value
     with pytest.raises(ValueError, match=r"whole numbers in 0\.\.4095"):
         graspd.load("mlp").predict_proba(wrong)
+
+
+@pytest.mark.parametrize("name", ["small-session", "cnn1"])
+def test_threads_share_a_model(name: str, counts: NDArray[np.float64]) -> None:
+    model = graspd.load(name)
+    session = counts[:60] if name == "small-session" else None
+    expected = model.predict_proba(counts, session=session)
+    orders = [np.arange(len(counts))[:: 1 if k % 2 else -1] for k in range(12)]
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(4) as threads:
+            judge = functools.partial(model.predict_proba, session=session)
+            given = list(threads.map(judge, [counts[order] for order in orders]))
+    finally:
+        sys.setswitchinterval(before)
+    assert np.isfinite(expected).sum() > 100
+    for order, got in zip(orders, given, strict=True):
+        np.testing.assert_array_equal(got, expected[order])
+
+
+@pytest.mark.parametrize("name", ["small-session", "cnn1", "svm"])
+@pytest.mark.parametrize("value", [np.nan, 0.0, 4095.0])
+@pytest.mark.filterwarnings("ignore:small-session does not know the sensors")
+def test_a_dead_hand_has_no_probability(
+    counts: NDArray[np.float64], name: str, value: float
+) -> None:
+    model = graspd.load(name)
+    session = None if name != "small-session" else np.full((30, 3, 24), value)
+    given = np.concatenate([np.full((1, 3, 24), value), counts[:1]])
+    assert np.isnan(model.predict_proba(given, session=session)[0]).all()
+
+
+def test_a_masked_count_is_as_a_nan(counts: NDArray[np.float64]) -> None:
+    model = graspd.load("mlp")
+    given = np.ma.array(counts.astype(np.uint16), mask=np.zeros(counts.shape, np.bool_))
+    given[:5, 0, :], given[5:10, 1, 7] = np.ma.masked, np.ma.masked
+    plain = counts.copy()
+    plain[:5, 0, :], plain[5:10, 1, 7] = np.nan, np.nan
+    expected = model.predict_proba(plain)
+    assert np.isnan(expected[:5]).all()
+    for each in (given, list(given)):
+        np.testing.assert_array_equal(model.predict_proba(each), expected)
+
+
+def test_a_column_twice_is_refused(counts: NDArray[np.float64]) -> None:
+    pd = pytest.importorskip("pandas", reason="needs the extra pandas")
+    table = graspd.read_grasps(DEMO_DAY)
+    twice = pd.concat([table, table[["mf_biotac_3"]]], axis=1)
+    with pytest.raises(ValueError, match="the column mf_biotac_3 more than once"):
+        graspd.load("mlp").predict_proba(twice)
+
+
+@pytest.mark.parametrize("kind", ["complex128", "datetime64[s]"])
+def test_values_of_other_kinds_are_refused(counts: NDArray[np.float64], kind: str) -> None:
+    with pytest.raises(ValueError, match="not numbers"):
+        graspd.load("mlp").predict_proba(counts.astype(kind))
 
 
 def test_counts_of_another_shape_are_refused(counts: NDArray[np.float64]) -> None:

@@ -23,25 +23,78 @@ def small() -> Any:  # noqa: ANN401 - onnx has no types
     """A model of some kinds of nodes, small enough that damage hits what matters."""
     helper = onnx.helper
     nodes = [
-        helper.make_node("Shape", ["x"], ["shape"]),
         helper.make_node("Reshape", ["x", "shape"], ["y"]),
         helper.make_node("Gemm", ["y", "w"], ["z"], alpha=1.0),
-        helper.make_node(
-            "Constant", [], ["c"], value=onnx.numpy_helper.from_array(np.ones(2), "v")
-        ),
-        helper.make_node("Scaler", ["z"], ["s"], domain="ai.onnx.ml", offset=[0.0], scale=[1.0]),
+        trees(),
+        helper.make_node("Sum", ["z", "margin"], ["s"]),
         helper.make_node("Softmax", ["s"], ["probability"], axis=1),
     ]
     weights = onnx.numpy_helper.from_array(np.ones((3, 2), np.float32), "w")
+    shape = onnx.numpy_helper.from_array(np.array([-1, 3]), "shape")
     graph = helper.make_graph(
         nodes,
         "g",
         [helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 3])],
         [helper.make_tensor_value_info("probability", onnx.TensorProto.FLOAT, ["N", 2])],
-        [weights],
+        [weights, shape],
     )
     imports = [helper.make_opsetid("", 18), helper.make_opsetid("ai.onnx.ml", 3)]
     return helper.make_model(graph, opset_imports=imports)
+
+
+TREES: dict[str, list[Any]] = {
+    "nodes_treeids": [0, 0, 0, 0, 0, 1, 1, 1],
+    "nodes_nodeids": [0, 1, 2, 3, 4, 0, 1, 2],
+    "nodes_modes": [*["BRANCH_LEQ", "LEAF"] * 2, "LEAF", "BRANCH_LEQ", "LEAF", "LEAF"],
+    "nodes_featureids": [0, 0, 2, 0, 0, 1, 0, 0],
+    "nodes_values": [1.0, 0.0, 2.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+    "nodes_truenodeids": [1, 0, 3, 0, 0, 1, 0, 0],
+    "nodes_falsenodeids": [2, 0, 4, 0, 0, 2, 0, 0],
+    "target_treeids": [0, 0, 0, 1, 1],
+    "target_nodeids": [1, 3, 4, 1, 2],
+    "target_ids": [0, 0, 0, 0, 0],
+    "target_weights": [1.0, 2.0, 3.0, 4.0, 5.0],
+}
+"""Two trees: 0 asks twice, 1 once."""
+
+
+def trees(changed: dict[str, list[Any]] | None = None, given: str = "x") -> Any:  # noqa: ANN401
+    return onnx.helper.make_node(
+        "TreeEnsembleRegressor",
+        [given],
+        ["margin"],
+        domain="ai.onnx.ml",
+        n_targets=1,
+        **{**TREES, **(changed or {})},
+    )
+
+
+def with_trees(node: Any) -> bytes:  # noqa: ANN401
+    model = small()
+    model.graph.node[2].CopyFrom(node)
+    content: bytes = model.SerializeToString()
+    return content
+
+
+def leaves(tree: Any) -> int:  # noqa: ANN401
+    """Number of leaves below the first node, or more than there are nodes if paths meet."""
+    values = {each.name: list(each.ints) or list(each.strings) for each in tree.attribute}
+    keys = list(zip(values["nodes_treeids"], values["nodes_nodeids"], strict=True))
+    number = 0
+    for first in dict.fromkeys(values["nodes_treeids"]):
+        paths = [keys[values["nodes_treeids"].index(first)]]
+        for step in range(len(keys) + 1):
+            places = [keys.index(each) for each in paths]
+            inner = [place for place in places if values["nodes_modes"][place] != b"LEAF"]
+            number += len(places) - len(inner)
+            if (step == len(keys) and inner) or len(places) > len(keys):
+                return len(keys) + 1
+            paths = [
+                (first, values[f"nodes_{answer}nodeids"][place])
+                for place in inner
+                for answer in ("true", "false")
+            ]
+    return number
 
 
 def tensors(graph: Any) -> Iterator[Any]:  # noqa: ANN401
@@ -68,14 +121,30 @@ def is_sound(model: Any) -> bool:  # noqa: ANN401
         all(node.op_type in onnx_file.OPERATORS.get(node.domain, ()) for node in graph.node)
         and not any(each.external_data or each.data_location for each in tensors(graph))
         and not (inner or graph.sparse_initializer or model.functions or model.training_info)
+        and all(leaves(node) <= 5 for node in graph.node if node.op_type in onnx_file.TREES)
     )
 
 
 @pytest.mark.parametrize("name", zoo.names())
 def test_the_zoo_may_be_used(name: str) -> None:
-    content = zoo.find(name).read_bytes()
-    onnx_file.check(content)
-    assert is_sound(onnx.load_model_from_string(content))
+    onnx_file.check(zoo.find(name).read_bytes())
+
+
+def test_operators_are_those_of_zoo_and_training() -> None:
+    """The zoo has no network with pooling, no blend and no boosting; training has."""
+    pytest.importorskip("torch", reason="needs the train extra")
+    from graspd.models.training.fitting.trained import fit
+    from graspd.models.training.systems.registry import SYSTEMS, with_recipes
+
+    models = [onnx.load(zoo.find(name)) for name in zoo.names()]
+    draw = np.random.default_rng(SEED)
+    for name, shape in (("cnn2", (12, 11, 3)), ("blend-electrodes", (72,)), ("hgb-session", (78,))):
+        inputs = draw.normal(size=(60, *shape)).astype(np.float32)
+        system = with_recipes(SYSTEMS[name], epochs=1)
+        models.append(fit(system, inputs, draw.random(60) < 0.5, seed=0).to_onnx(1.0, "x"))
+    used = {(node.domain, node.op_type) for model in models for node in model.graph.node}
+    allowed = {(domain, name) for domain, names in onnx_file.OPERATORS.items() for name in names}
+    assert used == {each for each in allowed if each[0] != "ai.onnx"}  # another name of ""
 
 
 def test_a_small_model_may_be_used() -> None:
@@ -101,6 +170,14 @@ def test_a_small_model_may_be_used() -> None:
         ("} functions { name: 'Gemm'", "functions or training"),
         ("} training_info { algorithm { name: 'a' }", "functions or training"),
         ("node { op_type: 'Reshape' input: 'x' input: 'z' }", "size depends on the counts"),
+        ("node { op_type: 'If' }", "no model may use: 'If'"),
+        ("node { op_type: 'Einsum' }", "no model may use: 'Einsum'"),
+        (
+            "node { op_type: 'TreeEnsemble' domain: 'ai.onnx.ml' }",
+            "no model may use: 'TreeEnsemble'",
+        ),
+        ("node { attribute { name: 'a' i: 1 f: 1 } }", "a of two kinds"),
+        ("node { attribute { name: 'a' i: 1 } attribute { name: 'a' i: 2 } }", "a twice"),
     ],
 )
 def test_what_may_not_be_is_named(more: str, says: str) -> None:
@@ -110,12 +187,45 @@ def test_what_may_not_be_is_named(more: str, says: str) -> None:
         onnx_file.check(model.SerializeToString())
 
 
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"nodes_truenodeids": [1, 0, 0, 0, 0, 1, 0, 0]}, "with a cycle"),
+        ({"nodes_falsenodeids": [2, 0, 2, 0, 0, 2, 0, 0]}, "with a cycle"),
+        ({"nodes_falsenodeids": [2, 0, 1, 0, 0, 2, 0, 0]}, "with a cycle"),
+        ({"nodes_falsenodeids": [2, 0, 5, 0, 0, 2, 0, 0]}, "a node which it lacks"),
+        ({"nodes_falsenodeids": [-1, 0, 4, 0, 0, 2, 0, 0]}, "a node which it lacks"),
+        ({"nodes_featureids": [0, 0, 3, 0, 0, 1, 0, 0]}, "does not compare an input"),
+        ({"nodes_featureids": [0, 0, -1, 0, 0, 1, 0, 0]}, "does not compare an input"),
+        ({"nodes_modes": ["BRANCH_EQ", *TREES["nodes_modes"][1:]]}, "does not compare an input"),
+        ({"nodes_modes": ["LEAF", *TREES["nodes_modes"][1:]]}, "does not reach"),
+        ({"nodes_nodeids": [0, 1, 2, 3, 3, 0, 1, 2]}, "list a node twice"),
+        ({"nodes_treeids": [0, 0, 0, 1, 0, 1, 1, 1]}, "list a node twice"),
+        ({"nodes_treeids": [0, 0, 0, 0, 0, 1, 1]}, "differ in length"),
+        ({"nodes_values": [1.0]}, "differ in length"),
+        ({"target_weights": [1.0]}, "differ in length"),
+        ({"target_nodeids": [0, 3, 4, 1, 2]}, "not one of a leaf"),
+        ({"target_nodeids": [9, 3, 4, 1, 2]}, "not one of a leaf"),
+        ({"target_ids": [0, 0, 0, 0, 1]}, "not one of a leaf"),
+    ],
+)
+def test_trees_are_checked_as_trees(changed: dict[str, list[Any]], says: str) -> None:
+    with pytest.raises(ModelError, match=says):
+        onnx_file.check(with_trees(trees(changed)))
+
+
+def test_trees_take_the_models_input_alone() -> None:
+    """Another value may be narrower than the features that they read."""
+    with pytest.raises(ModelError, match="does not compare an input"):
+        onnx_file.check(with_trees(trees(given="y")))
+
+
 def test_a_second_piece_of_the_graph_is_looked_at_too() -> None:
     """Readers of this format put the pieces of a message together."""
     model, more = small(), onnx.ModelProto()
     more.graph.node.add().op_type = "Scan"
     content = model.SerializeToString() + more.SerializeToString()
-    assert len(onnx.load_model_from_string(content).graph.node) == 7
+    assert len(onnx.load_model_from_string(content).graph.node) == 6
     with pytest.raises(ModelError, match="'Scan'"):
         onnx_file.check(content)
 
@@ -131,7 +241,10 @@ def test_a_location_of_more_bits_than_there_are_is_one() -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"\x3a\x05\x0a", b"\x3a", b"\x3b", b"\x00\x00", b"\xff" * 20, b"\x38\xff", b"\x3d\x01"],
+    [
+        *(b"\x3a\x05\x0a", b"\x3a", b"\x3b", b"\x00\x00", b"\xff" * 20, b"\x38\xff", b"\x3d\x01"),
+        b"\x08" + b"\xff" * 9 + b"\x02",
+    ],
 )
 def test_what_is_no_message_is_said(content: bytes) -> None:
     with pytest.raises(ModelError, match="not a usable ONNX model"):

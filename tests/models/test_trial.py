@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,21 +57,70 @@ def test_a_model_that_is_not_is_tried_once(tmp_path: Path, processes: list[str])
     assert len(processes) == 2
 
 
-def test_a_model_of_the_zoo_that_was_changed_is_not_known(
-    tmp_path: Path, processes: list[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("load", [trial.load, TactileModel])
+def test_a_damaged_model_of_the_zoo_is_refused(
+    load: Callable[[Path], TactileModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    path, card = (Path(shutil.copy(zoo.ZOO / f"mlp.{kind}", tmp_path)) for kind in ("onnx", "json"))
+    link = tmp_path / "link.onnx"
+    link.symlink_to(path)
     monkeypatch.setattr(zoo, "ZOO", tmp_path)
-    path = tmp_path / "mlp.onnx"
-    shutil.copy(ROOT_ZOO / "mlp.json", tmp_path)
-    path.write_bytes((ROOT_ZOO / "mlp.onnx").read_bytes())
-    trial.load(path)
-    assert processes == []
-    path.write_bytes(path.read_bytes() + b"\x10\x0a")
-    trial.load(path)
-    assert processes == [str(path)]
+    assert load(path).run() == load(link).run()
+    path.write_bytes(damaged(path.read_bytes()))
+    for name in (path, link):
+        with pytest.raises(ModelError, match=r"mlp\.json: is the card of another .*install graspd"):
+            load(name)
+    card.unlink()
+    with pytest.raises(ModelError, match=r"mlp\.json: cannot read the card"):
+        load(path)
 
 
-ROOT_ZOO = zoo.ZOO
+@pytest.mark.parametrize("load", [trial.load, TactileModel])
+def test_a_damaged_model_is_refused_by_its_card(
+    load: Callable[[Path], TactileModel], tmp_path: Path
+) -> None:
+    path, card = copy(tmp_path), tmp_path / "mine.json"
+    shutil.copy(zoo.ZOO / "mlp.json", card)
+    assert load(path).contract.name == "mlp"
+    path.write_bytes(damaged(path.read_bytes()))
+    with pytest.raises(ModelError, match=r"mine\.json: is the card of another .*remove mine.json"):
+        load(path)
+    card.unlink()
+    assert load(path).contract.name == "mlp"  # nothing knows better
+
+
+def damaged(content: bytes) -> bytes:
+    """With one bit of a weight flipped."""
+    place = len(content) // 4
+    return content[:place] + bytes([content[place] ^ 0x40]) + content[place + 1 :]
+
+
+def test_a_tree_with_a_cycle_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("onnx", reason="needs the train extra")
+    path = hostile.cyclic(tmp_path)
+    for load in (trial.load, TactileModel):
+        with pytest.raises(ModelError, match="has a tree with a cycle"):
+            load(path)
+
+
+SPY = """
+import sys
+from graspd.models import runtime, trial
+run, seen = runtime.TactileModel.run, set()
+def noted(model):
+    seen.add(model.input.tobytes())
+    return run(model)
+runtime.TactileModel.run = noted
+trial.main()
+sys.stdout.write(str(len(seen)))
+"""
+
+
+def test_the_trial_runs_varied_counts(tmp_path: Path) -> None:
+    path = copy(tmp_path, "small-electrodes")
+    command = [sys.executable, "-c", SPY, str(path)]
+    done = subprocess.run(command, input=path.read_bytes(), stdout=subprocess.PIPE, check=True)
+    assert int(done.stdout) > 20
 
 
 def test_what_it_finds_is_said_in_one_line(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "version": "--version",
     "option-first": "--json check demo.toml",
     "wrong-option": "check demo.toml --jsn",
-    "run": "run demo.toml --print",
+    "run": "run demo.toml",
     "run-absent": "run absent.toml",
     "run-wrong-key": "run wrong.toml",
     "run-wrong-recording": "run not-there.toml",

@@ -169,16 +169,22 @@ def accuracy_at(probability: Floats, slipped: Bools, coverage: float) -> float:
     return float(accuracy[max(1, round(coverage * len(accuracy))) - 1])
 
 
-def reject_threshold(probability: Floats, slipped: Bools, wanted: float) -> ConfidenceStep | None:
-    """Return the lowest confidence from which verdicts reach the accuracy `wanted`.
+def reject_threshold(
+    probability: Floats, slipped: Bools, wanted: float, repeats: int = 1
+) -> ConfidenceStep | None:
+    """Return the lowest confidence from which verdicts surely reach the accuracy `wanted`.
 
+    Surely: the lower end of the 95 % interval reaches it. With many confidences to choose from, the
+    accuracy itself reaches it somewhere by chance. `repeats`: number of verdicts on each grasp.
     None: no confidence reaches it with `FEWEST_JUDGED` verdicts.
     """
     least = FEWEST_JUDGED / len(slipped)
+    grasps = len(slipped) / repeats
     reached = (
         point
         for point in reversed(_points(probability, slipped))
-        if point.coverage >= least and point.accuracy >= wanted
+        if point.coverage >= least
+        and wilson(point.accuracy, max(1, round(point.coverage * grasps))).low >= wanted
     )
     return next(reached, None)
 

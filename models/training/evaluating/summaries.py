@@ -277,7 +277,8 @@ def _variant(name: str, seeds: Sequence[Sequence[JobResult]], grasps: Grasps) ->
         curve=metrics.coverage_curve(probability, slipped),
         coverages={f"{c:g}": metrics.accuracy_at(probability, slipped, c) for c in COVERAGES},
         thresholds={
-            f"{a:g}": metrics.reject_threshold(probability, slipped, a) for a in WANTED_ACCURACIES
+            f"{a:g}": metrics.reject_threshold(probability, slipped, a, len(seeds))
+            for a in WANTED_ACCURACIES
         },
         bins=metrics.reliability_bins(probability, slipped),
         ages=[by_age(group, groups == group) for group in np.unique(groups)],

@@ -127,7 +127,6 @@ def test_what_is_mistyped_is_answered_with_the_nearest(arguments: list[str], mea
         ("models add A --name X", "models add --name X A"),
         ("evaluate svm cnn1 --jobs 2", "evaluate svm --jobs 2 cnn1"),
         ("report stability svm mlp --quick", "report stability svm --quick mlp"),
-        ("run A --print", "run --print A"),
     ],
 )
 def test_options_and_files_come_in_any_order(files_first: str, mixed: str) -> None:

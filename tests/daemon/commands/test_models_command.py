@@ -158,14 +158,15 @@ def test_a_name_that_cannot_be_is_refused(
 
 def test_what_the_daemon_would_refuse_is_not_added(home: Path, trained: Path) -> None:
     add = ("add", trained, "--name", "mine", "--user")
-    whole = trained.read_bytes()
+    whole, card = trained.read_bytes(), trained.with_suffix(".json").read_text()
+    trained.with_suffix(".json").unlink()
     trained.write_bytes(whole[:-100])
     refused("not a usable ONNX model", *add)
+    trained.with_suffix(".json").write_text(card)
     shutil.copy(zoo.find("svm"), trained)
     refused("mine.json: is the card of another file than mine.onnx", *add)
     trained.write_bytes(whole)
-    card = json.loads(trained.with_suffix(".json").read_text())
-    trained.with_suffix(".json").write_text(json.dumps({**card, "weak_points": 3}))
+    trained.with_suffix(".json").write_text(json.dumps({**json.loads(card), "weak_points": 3}))
     refused("a card is wrong: Expected `array`", *add)
     assert not home.exists()
 

@@ -14,7 +14,7 @@ from graspd.daemon.session.file import SessionFile, kept_now
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.models.session_statistics import SessionState
 from tests.kit.inside import graspd
-from tests.kit.scenes import demo_scene, session_scene, written
+from tests.kit.scenes import demo_scene, session_scene
 
 
 @pytest.fixture
@@ -55,14 +55,6 @@ def test_check_says_that_the_file_of_a_session_that_is_not_kept_is_not_read(
     assert checked.returncode == 0, checked.stderr
     assert ("not kept and its file not read" in checked.stdout) is (keep is not True)
     assert (f"kept in {tmp_path}/kept.json" in checked.stdout) is (keep is True)
-
-
-def test_a_run_on_grasps_of_the_training_says_so(tmp_path: Path, bts3_dir: Path) -> None:
-    played = f'driver = "replay"\npace = "fast"\nrecordings = ["{bts3_dir}/palm_side.csv"]\n'
-    text = f'[tactile]\n{played}[model]\nname = "mlp"\n[publish]\nendpoint = "ipc://{tmp_path}/v"\n'
-    result = graspd("run", written(tmp_path, text), "--print")
-    assert result.returncode == 0, result.stderr
-    assert "the model was trained on palm_side.csv" in result.stdout
 
 
 @pytest.mark.parametrize("section", ["", '[session]\nkeep = false\nfile = "kept.json"\n'])

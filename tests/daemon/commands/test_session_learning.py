@@ -6,13 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from graspd.daemon import scene as scenes
 from graspd.daemon.assembly import assembly
 from graspd.daemon.session.file import SessionFile, former_of, kept_now, load
-from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.trust import Trust, TrustState, decode
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
@@ -115,22 +113,6 @@ def test_seeding_where_nothing_learns_keeps_what_was_learned(tmp_path: Path) -> 
     assert learned.learner.outcomes > 0
     off = session_scene(tmp_path, sections="[learn]\nenabled = false\n")
     assert seed(off, unlabelled_demo(tmp_path)) == learned
-
-
-def test_a_run_that_prints_ends_with_what_outcomes_have_taught(tmp_path: Path) -> None:
-    path = session_scene(tmp_path, "mlp", "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n")
-    played = f'driver = "replay"\npace = "fast"\nrecordings = ["{DEMO_TABLE}"]'
-    text = path.read_text().replace('driver = "spi"\nport = "/nowhere"', played)
-    path.write_text(f'{text}[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n')
-    trust, grasp = live_trust(path), GraspId("0" * 32, 1)
-    trust.note(grasp, trust.judge(grasp, 0.01, -5.0, np.zeros(0)), stable=True)
-    trust.outcome(grasp, slipped=True)
-    with SessionFile(tmp_path / "right.json") as file:
-        file.save(kept_now(None, FINGERS, {}, trust.state()))
-    result = graspd("run", path, "--print")
-    assert result.returncode == 0, result.stderr
-    assert "\nlearned from 1 outcomes\n" in result.stdout
-    assert "\nrisk: of 1 lifts of `stable` 1 slipped, allowed are 10 % and " in result.stdout
 
 
 def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:

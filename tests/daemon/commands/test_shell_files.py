@@ -22,7 +22,6 @@ LINES = {
     "graspd twin spi --st": {"--stuck-clock"},
     "graspd replay --gate ": {"settled", "every"},
     "graspd replay --model ": set(zoo.names()),
-    "graspd run --p": {"--print"},
     "graspd check README": {"README.md"},
 }
 """What is typed, and what is offered for its last word."""

@@ -76,7 +76,23 @@ def test_a_burst_passes_and_the_rest_of_the_window_is_counted() -> None:
     late = record(logging.WARNING, "lost %d", 99)
     assert limit.filter(late)
     assert late.getMessage() == "lost 99 (and 7 more like it before)"
-    assert limit.filter(record(logging.WARNING, "lost %d", 100))
+    assert not limit.filter(record(logging.WARNING, "lost %d", 100))
+
+
+def test_a_lasting_fault_logs_once_a_window() -> None:
+    now_s = 0.0
+    limit = RateLimit(lambda: now_s)
+
+    def passed(number: int) -> int:
+        return sum(limit.filter(record(logging.WARNING, "lost")) for _ in range(number))
+
+    windows = []
+    for number in (100, 100, 100, 1, BURST, 100):
+        windows.append(passed(number))
+        now_s += WINDOW_S
+    assert windows == [BURST, 1, 1, 1, BURST, BURST]
+    now_s += WINDOW_S
+    assert passed(100) == BURST  # after a silence it is another fault
 
 
 def test_a_message_with_a_percent_sign_survives_being_counted() -> None:

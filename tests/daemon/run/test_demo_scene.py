@@ -6,12 +6,14 @@ import csv
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import PublishedVerdict
 from graspd.daemon.publish.messages import Verdict
-from graspd.daemon.run.runner import Runner
-from graspd.daemon.run.summary import Printer
+from graspd.daemon.run import runner
+from graspd.daemon.run.runner import RunLog
 from graspd.daemon.watch.figures import doubt
 from graspd.drivers.recordings.csv_player import SHOW_RECORDING
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
@@ -21,18 +23,20 @@ LOOPS = 2
 """Times that the recording is played: less than two minutes."""
 
 
-class Heard(Printer):
-    """Keeps the verdicts in place of printing them."""
+class Heard(RunLog):
+    """Keeps the verdicts in place of counting them."""
 
-    def __init__(self, *, as_json: bool) -> None:
-        super().__init__(as_json=as_json)
+    def __init__(self) -> None:
+        super().__init__()
         self.verdicts: list[Verdict] = []
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         self.verdicts.append(published.verdict)
 
 
-def test_the_demo_turns_solid_green_within_two_minutes(tmp_path: Path) -> None:
+def test_the_demo_turns_solid_green_within_two_minutes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recordings = ", ".join([f'"{SHOW_RECORDING}"'] * LOOPS)
     text = SCENE.read_text()
     for former, instead in (
@@ -44,9 +48,10 @@ def test_the_demo_turns_solid_green_within_two_minutes(tmp_path: Path) -> None:
         text = text.replace(former, instead)
     scene = tmp_path / "scene.toml"
     scene.write_text(text + "[gate]\nmax_age_ms = 10000\n")
-    heard = Heard(as_json=True)
+    heard = Heard()
+    monkeypatch.setattr(runner, "RunLog", lambda: heard)
     with StopSignal() as stop:
-        Runner(scene, stop, printer=heard).run()
+        runner.Runner(scene, stop).run()
     verdicts = heard.verdicts
     with SHOW_RECORDING.open(newline="") as file:
         rows = list(csv.DictReader(file))

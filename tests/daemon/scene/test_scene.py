@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from pydantic import BaseModel
 
-from graspd.daemon.scene import Scene, SceneError, load
+from graspd.daemon.scene import Scene, SceneError, load, parse
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.endpoints import check_endpoint
 from graspd.daemon.scene.scene import SCENE_MAX_BYTES
@@ -266,3 +266,46 @@ def test_every_section_of_the_scene_forbids_unknown_keys() -> None:
     for section in sections:
         assert section.model_config["extra"] == "forbid"
         assert section.model_config["frozen"] is True
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "clash"),
+    [
+        ("ipc:///run/graspd/right.ipc", None, False),
+        (None, "ipc:///run/graspd/right.ipc", True),
+        (None, "ipc:///run/graspd/../graspd//right.ipc", True),
+        ("ipc://{}/a", "ipc://{}//a", True),
+        ("ipc://{}/a", "ipc://{}/./a", True),
+        ("ipc://{}/a", "ipc://{}/link/a", True),
+        ("ipc://{}/a", "ipc://{}/a.lock", True),
+        ("ipc://{}/a.lock", "ipc://{}/a", True),
+        ("ipc://{}/a", "ipc://{}/b", False),
+        ("tcp://127.0.0.1:5555", "tcp://127.0.0.1:05555", True),
+        ("tcp://127.0.0.1:5555", "tcp://[::ffff:127.0.0.1]:5555", True),
+        ("tcp://127.0.0.1:5555", "tcp://127.0.0.1:5556", False),
+        ("tcp://127.0.0.1:5555", "tcp://[::1]:5555", False),
+        ("tcp://0.0.0.0:5555", "tcp://127.0.0.1:5555", True),
+        ("tcp://[::]:5555", "tcp://127.0.0.1:5555", True),
+        ("tcp://127.0.0.1:5555", "ipc://{}/a", False),
+    ],
+)
+def test_equal_endpoints_are_refused_however_written(
+    first: str | None, second: str | None, clash: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "link").symlink_to(tmp_path)
+    sections: dict[str, Any] = {"tactile": {"driver": "spi", "port": "/nowhere"}, "ask": {}}
+    sections["curve"] = {"secret_key": "own.key_secret", "clients": "clients"}
+    for name, endpoint in (("publish", first), ("ask", second)):
+        if endpoint is not None:
+            sections[name] = {"endpoint": endpoint.format(tmp_path)}
+    if not clash:
+        parse(sections, tmp_path / "s.toml")
+        return
+    with pytest.raises(SceneError, match=r"publish\.endpoint .* and ask\.endpoint .* must"):
+        parse(sections, tmp_path / "s.toml")
+
+
+def test_a_byte_order_mark_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_bytes(b'\xef\xbb\xbf[tactile]\ndriver = "can"\n')
+    assert load(path).tactile.driver == "can"

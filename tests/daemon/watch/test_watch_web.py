@@ -7,13 +7,12 @@ import json
 import re
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 
 import pytest
 
-from graspd.daemon.watch.web import ADDRESS, CONNECTIONS_MAX, Server, load_page
+from graspd.daemon.watch.web import ADDRESS, PAGES_MAX, Server, load_page
 from tests.daemon.watch.browser import serving
-from tests.kit.waiting import wait_until
 
 
 @pytest.fixture
@@ -186,20 +185,15 @@ def test_a_browser_that_does_not_read_misses_snapshots_and_holds_up_nobody(serve
         assert seen < 1900  # what the sockets of both sides hold, 8 MB would be all
 
 
-def test_connections_are_limited_and_a_place_becomes_free_again(server: Server) -> None:
+def test_open_pages_do_not_hold_the_page(server: Server) -> None:
     with ExitStack() as stack:
-        for _ in range(CONNECTIONS_MAX):
-            opened(server, stack)
-        late = stack.enter_context(socket.create_connection((ADDRESS, server.server_port), 10))
-        assert has_ended(late)
-
-    def is_served() -> bool:
-        server.newest.put(b"{}")  # pages whose browser has gone notice it
-        with suppress(OSError, http.client.HTTPException):
-            return ask(server)[0] == 200
-        return False
-
-    wait_until(is_served)
+        pages = [opened(server, stack) for _ in range(PAGES_MAX)]
+        assert ask(server)[0] == 200
+        newest = opened(server, stack)
+        with pages[0].makefile("rb") as oldest:
+            assert oldest.read() is not None  # it ends: the oldest gives way
+        server.newest.put(b'{"a": 1}')
+        assert next(events(pages[1])) == next(events(newest)) == {"a": 1}
 
 
 @pytest.mark.parametrize("begin", [b"", b"GET / HTTP/1.0\r\nHost: localhost\r\nX: "])

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 
 from graspd.models.training.evaluating.metrics import (
     accuracy_at,
@@ -122,9 +123,27 @@ def test_a_threshold_rejects_as_little_as_the_wanted_accuracy_allows() -> None:
     assert found.coverage == pytest.approx(judged.mean())
     assert found.accuracy >= 0.9
     lower = [c for c in confidence if c < found.confidence]
-    assert all(right[confidence >= c].mean() < 0.9 for c in lower[:200])
+    for c in lower[:200]:
+        several = right[confidence >= c]
+        interval = stats.binomtest(int(several.sum()), len(several)).proportion_ci(method="wilson")
+        assert interval.low < 0.9
     # Confidences are uniform in 0.5..1, so 0.9 on average means judging from 0.8 on.
-    assert found.confidence == pytest.approx(0.8, abs=0.05)
+    assert found.confidence == pytest.approx(0.83, abs=0.05)
+    again = reject_threshold(np.tile(probability, 5), np.tile(slipped, 5), 0.9, repeats=5)
+    assert again is not None
+    assert again.confidence == found.confidence
+
+
+def test_confidences_that_say_nothing_set_no_threshold() -> None:
+    """Of verdicts that are right in 92 of 100 cases, however sure, none are in 95 of 100."""
+    random = np.random.default_rng(0)
+    found = 0
+    for _ in range(200):
+        confidence, says_slip = random.uniform(0.5, 1.0, 1000), random.random(1000) < 0.5
+        right = random.random(1000) < 0.92
+        probability = np.where(says_slip, confidence, 1.0 - confidence)
+        found += reject_threshold(probability, says_slip == right, 0.95) is not None
+    assert found <= 10
 
 
 def test_a_few_lucky_verdicts_set_no_threshold() -> None:
