@@ -109,6 +109,8 @@ class RecordedRun(Source):
                 pipeline.skip()
             case Topic.ANNOUNCED if self._same_grasps:
                 pipeline.lifts.announce()
+            case Topic.TAKEN_BACK if self._same_grasps:
+                pipeline.lifts.take_back(None)
             case Exchanged():
                 try:
                     pipeline.sensors_exchanged(event.session, event.learned)

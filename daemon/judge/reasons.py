@@ -55,6 +55,7 @@ class Reason(StrEnum):
     UNPROVEN = "unproven"
     RISK_EXCEEDED = "risk-exceeded"
     OUTCOME_TOLD = "outcome-told"
+    NOT_KEPT = "not-kept"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
 
@@ -91,6 +92,7 @@ ADVICE: dict[Reason, str] = {
     Reason.RISK_EXCEEDED: "more `stable` lifts slipped than [risk] can make good: find out why, "
     "then `graspd session reset`",
     Reason.OUTCOME_TOLD: "the outcome of its lift is known: release the object, then grasp again",
+    Reason.NOT_KEPT: "the lift cannot be noted on the disk: is it full, slow or read-only?",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
 }

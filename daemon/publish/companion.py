@@ -33,6 +33,8 @@ class LoopEvent(Enum):
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
     """A controller asked whether it may lift, and the answer was `stable`."""
+    TAKEN_BACK = "taken-back"
+    """No lift follows the last announcement."""
 
 
 class PublishedVerdict(NamedTuple):
@@ -48,6 +50,8 @@ class PublishedVerdict(NamedTuple):
     """True if this verdict answers the controllers that asked."""
     grasp: GraspId
     lifts: LiftBook
+    keep: Callable[[Answer], None] = at_once
+    """Calls its argument once all until now is on the disk."""
 
 
 class Requests(Protocol):
@@ -55,6 +59,9 @@ class Requests(Protocol):
 
     def ask(self) -> None:
         """Ask for a verdict, by which a controller decides whether to lift."""
+
+    def silence(self) -> None:
+        """Publish that no reading has come."""
 
     def outcome(self, report: Report, answer: Answer) -> None:
         """Tell the outcome of a lift; `answer` is called with None once it is on the disk.

@@ -114,7 +114,10 @@ class Proxy(threading.Thread):
 
 
 class Courier(Proxy):
-    """Carries questions of the peers to the loop, a few at a time, and all answers back."""
+    """Carries questions of the peers to the loop, a few at a time, and all answers back.
+
+    Behind the routing id it puts a frame of its own with the sender's credential.
+    """
 
     def _copy(self) -> None:
         poller = zmq.Poller()
@@ -137,13 +140,25 @@ class Courier(Proxy):
         """Carry one, cut at `FRAMES_MAX`; False if there is none or no room."""
         if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
             return False
-        frames = [self._front.recv()]
+        first = self._front.recv(copy=False)
+        frames = [first.bytes, self._credential(first)]
         while self._front.getsockopt(zmq.RCVMORE):
             frame = self._front.recv()
-            if len(frames) < FRAMES_MAX:
+            if len(frames) <= FRAMES_MAX:
                 frames.append(frame)
         self._back.send_multipart(frames)
         return True
+
+    def _credential(self, frame: zmq.Frame) -> bytes:
+        """Return `user <uid>` by the kernel, `key <Z85>` by the handshake, or nothing."""
+        with suppress(zmq.ZMQError):  # libzmq knows nothing of the sender
+            if self.endpoint.startswith("ipc://"):
+                _, *numbers = str(frame.get("Peer-Address")).rsplit(":", 3)  # uid, gid, pid
+                return b"user %d" % int(numbers[0]) if len(numbers) == 3 else b""
+            # Without keys a peer may send any `User-Id`.
+            if self._front.getsockopt(zmq.MECHANISM) == zmq.CURVE:
+                return b"key %b" % str(frame.get("User-Id")).encode()
+        return b""
 
 
 class Lookout(threading.Thread):

@@ -7,6 +7,7 @@ import errno
 import fcntl
 import grp
 import os
+import pwd
 import socket
 import stat
 from contextlib import ExitStack
@@ -90,6 +91,14 @@ class Listener:
         with contextlib.suppress(OSError):
             self._lock_path.unlink()
         os.close(lock)
+
+
+def user_id(name: str) -> int:
+    """Return the number of a user, by name or number. Raises `PublishError`."""
+    try:
+        return int(name) if name.isdecimal() else pwd.getpwnam(name).pw_uid
+    except KeyError:
+        raise PublishError(f"there is no user {name}") from None
 
 
 def _group_id(name: str) -> int:

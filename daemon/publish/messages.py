@@ -10,6 +10,7 @@ from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from graspd.daemon.judge.reasons import Decision, FingerState, GateCause, GateState, Reason
 from graspd.daemon.trust.lift_book import OutcomeStatus
@@ -268,6 +269,15 @@ MESSAGES: Final[dict[str, type[Message]]] = {
 
 encode = msgspec.json.Encoder().encode
 """JSON payload of a message."""
+
+
+def withheld(verdict: Verdict, reason: Reason) -> bytes:
+    """Return the JSON of a verdict that is `unknown` for this reason, and no leave to lift."""
+    unsure = replace(verdict, verdict=Decision.UNKNOWN, verdict_code=0, reasons=[reason])
+    without = replace(unsure, p_slip=None, p_slip_model=None, valid=False, judged=False)
+    return encode(replace(without, supervised=False, early=False))
+
+
 decode_outcome = msgspec.json.Decoder(OutcomeMessage).decode
 """Decode the payload of an outcome. Raises `msgspec.DecodeError`."""
 

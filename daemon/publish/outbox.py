@@ -214,7 +214,7 @@ class Outbox:
             **self._head("outcome"),
             t_mono_ns=self._clock(),
             grasp=grasp,
-            outcome=report.outcome,
+            outcome="slip" if report.outcome == "slip" else "stable",
             object=report.object_name,
             grasp_boot_id=None if boot_id == self.boot_id else boot_id,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -10,30 +11,33 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from graspd.daemon.publish.companion import REPEATED, Requests
+from msgspec.structs import replace
+
+from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.publish.companion import REPEATED, PublishedVerdict, Requests
 from graspd.daemon.publish.door import Frames
-from graspd.daemon.publish.messages import OBJECT_PATTERN
-from graspd.daemon.trust.lift_book import GraspId, Report
+from graspd.daemon.publish.messages import OBJECT_PATTERN, encode, withheld
+from graspd.daemon.trust.lift_book import NAME_BYTES, GraspId, LiftBook, Peer, Report
+
+log = logging.getLogger("graspd")
 
 JUDGE, LIFT = b"judge", b"lift"
 """Texts that ask for a verdict. `lift` also reserves the grasp's outcome for the peer."""
+NOT_LIFTING = b"not-lifting"
+"""Text that takes back the last `lift` of this connection, answered or not."""
 CLOCK = b"clock"
 """Text that asks for the daemon's monotonic time, to compare with a remote client's clock."""
 OUTCOME = b"outcome"
 WAITING_MAX: Final = 256
-"""Most questions that wait, one of each peer. A newer one replaces the oldest."""
+"""Most questions that wait, one of each connection. A newer one replaces the oldest."""
 _REPORT = re.compile(
-    rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
+    rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip|not-lifted)(?: (%b))?"
+    % OBJECT_PATTERN.encode()
 )
-MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
-
-Peer = bytes
-"""Routing id of a connection."""
-NAME_BYTES: Final = 16
-"""Bytes at the start of a routing id that stay the same when a client reconnects."""
+MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip|not-lifted> [<object>]"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Question:
     """A question that waits for an answer."""
 
@@ -43,37 +47,59 @@ class Question:
     """Time of the latest answer, monotonic ns."""
     lifts: bool
     """True for `lift`, False for `judge`."""
+    offer: tuple[GraspId, Decision] | None = None
+    """Grasp that the peer may lift, and its verdict, before that is answered."""
+    kept: bool | None = None
+    """True once the offer is on the disk, False if it cannot be."""
+
+    def keep(self, offer: tuple[GraspId, Decision], problem: str | None) -> None:
+        """Note that an offer is on the disk, or why it cannot be."""
+        if offer == self.offer:
+            self.kept = problem is None
 
 
 class Questions:
     """Takes questions and outcomes of peers, and answers them."""
 
-    def __init__(self, send: Callable[[Sequence[bytes]], bool], patience_ns: int) -> None:
+    def __init__(
+        self,
+        send: Callable[[Sequence[bytes]], bool],
+        patience_ns: int,
+        tells: Callable[[bytes], bool] | None = None,
+    ) -> None:
         """`send`: sends an answer's frames; returns False if it drops them.
 
-        `patience_ns`: longest time that a question waits for a better verdict, ns.
+        `patience_ns`: longest time until a question is answered, ns. `tells`: whether a credential
+        may lift and tell; None: that of the first peer that lifts.
         """
         self.counters: Counter[str] = Counter()
         """Questions and outcomes by what became of them; `dropped` counts answers."""
         self._send = send
         self._patience_ns = patience_ns
+        self._tells = tells
         self.waiting: dict[Peer, Question] = {}
-        """Questions without an answer, by the peer's routing id; the oldest first."""
+        """Questions without an answer; the oldest first."""
+        self._last: PublishedVerdict | None = None
 
     def take(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> None:
-        """Take messages of peers that arrived by `now_ns`; pass them on to `requests`."""
+        """Take messages of peers that arrived by `now_ns`; pass them on to `requests`.
+
+        A message is a routing id, a credential, maybe the delimiter of a REQ socket, and a text.
+        """
         asked = 0
-        for peer, *envelope, text in messages:
-            well_formed = envelope in ([], [b""])
+        for routing_id, credential, *delimiter, text in messages:
+            peer = Peer(routing_id, credential or routing_id[:NAME_BYTES])
+            envelope, well_formed = [routing_id, *delimiter], delimiter in ([], [b""])
             if well_formed and text.partition(b" ")[0] == OUTCOME:
-                self._take_outcome([peer, *envelope], text, requests)
+                self._take_outcome(envelope, peer, text, requests)
             elif well_formed and text in (JUDGE, LIFT):
-                due_ns = now_ns + self._patience_ns
-                self._wait(peer, Question([peer, *envelope], due_ns, text == LIFT))
+                self._wait(peer, Question(envelope, now_ns + self._patience_ns, text == LIFT))
                 asked += 1
+            elif well_formed and text == NOT_LIFTING:
+                self._take_back(envelope, peer, requests)
             elif well_formed and text == CLOCK:
                 # `now_ns` is later than the question: an age by it is never too small.
-                self._answer([peer, *envelope], b'{"v":1,"t_mono_ns":%d}' % now_ns)
+                self._answer(envelope, b'{"v":1,"t_mono_ns":%d}' % now_ns)
                 self.counters["clocks"] += 1
             else:
                 self.counters["malformed"] += 1
@@ -82,23 +108,47 @@ class Questions:
             requests.ask()
 
     def _wait(self, peer: Peer, question: Question) -> None:
-        if self.waiting.pop(peer, None) is not None:
+        if peer in self.waiting:
+            self._withdraw(peer, self.waiting.pop(peer))
             self.counters["given_up"] += 1
         elif len(self.waiting) >= WAITING_MAX:
-            del self.waiting[next(iter(self.waiting))]
-            self.counters["given_up"] += 1
+            self._give_up(next(iter(self.waiting)), Reason.NOT_ASKED)
         self.waiting[peer] = question
 
-    def _take_outcome(self, envelope: Frames, text: bytes, requests: Requests) -> None:
+    def _give_up(self, peer: Peer, reason: Reason) -> None:
+        """Answer a question with `unknown`."""
+        question = self.waiting.pop(peer)
+        self._withdraw(peer, question)
+        self.counters["given_up"] += 1
+        if self._last is not None:
+            self._answer(question.envelope, withheld(self._last.verdict, reason))
+
+    def _withdraw(self, peer: Peer, question: Question) -> None:
+        """Take back an offer that is not answered."""
+        offer, question.offer, question.kept = question.offer, None, None
+        lifts = None if self._last is None else self._last.lifts
+        if lifts is not None and offer is not None and lifts.offered(peer) == offer[0]:
+            lifts.take_back(offer[0])
+
+    def _take_back(self, envelope: Frames, peer: Peer, requests: Requests) -> None:
+        answer = partial(self._answer_outcome, envelope)
+        self.waiting.pop(peer, None)
+        grasp = None if self._last is None else self._last.lifts.offered(peer)
+        if grasp is None:
+            answer(None)
+        else:
+            requests.outcome(Report(grasp, "not-lifted", peer=peer), answer)
+
+    def _take_outcome(self, envelope: Frames, peer: Peer, text: bytes, requests: Requests) -> None:
         told = _REPORT.fullmatch(text)
         if told is None:
             self._answer_outcome(envelope, MALFORMED)
             return
         report = Report(
             grasp=GraspId(told[1].decode(), int(told[2])),
-            outcome="slip" if told[3] == b"slip" else "stable",
+            outcome=told[3].decode(),
             object_name=None if told[4] is None else told[4].decode(),
-            peer=envelope[0][:NAME_BYTES],
+            peer=peer,
         )
         requests.outcome(report, partial(self._answer_outcome, envelope))
 
@@ -115,18 +165,67 @@ class Questions:
     def _answer(self, envelope: Frames, payload: bytes) -> None:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
-    def answer(self, payload: bytes, now_ns: int | None = None) -> list[Peer]:
-        """Answer with this verdict; return the peers that asked to lift.
+    @property
+    def due_ns(self) -> int | None:
+        """Latest time of the next answer, monotonic ns; None: no question waits."""
+        return next((question.due_ns for question in self.waiting.values()), None)
 
-        `now_ns`: answer only questions that are due by then; None: answer all.
+    def expire(self, now_ns: int, requests: Requests) -> None:
+        """Answer `unknown` to questions that are due, though no reading has come."""
+        due = [peer for peer, question in self.waiting.items() if question.due_ns <= now_ns]
+        if due and self._last is None:
+            requests.silence()
+        for peer in due:
+            if peer in self.waiting:
+                reason = Reason.NOT_KEPT if self.waiting[peer].offer else Reason.STALE
+                self._give_up(peer, reason)
+
+    def answer(self, published: PublishedVerdict, now_ns: int | None = None) -> None:
+        """Answer with this verdict.
+
+        `now_ns`: answer only questions that are due by then, or wait for the disk; None: all.
         """
-        lifters = []
+        self._last = published
         for peer, question in list(self.waiting.items()):
-            if now_ns is not None and question.due_ns > now_ns:
-                break
-            del self.waiting[peer]
-            self.counters["answered"] += 1
-            self._answer(question.envelope, payload)
-            if question.lifts:
-                lifters.append(peer[:NAME_BYTES])
-        return lifters
+            if now_ns is None or question.offer or question.due_ns <= now_ns:
+                payload = self._payload(peer, question, published)
+                if payload is not None:
+                    del self.waiting[peer]
+                    self.counters["answered"] += 1
+                    self._answer(question.envelope, payload)
+
+    def _payload(self, peer: Peer, question: Question, published: PublishedVerdict) -> bytes | None:
+        """Return the answer to a question; None: its offer is not on the disk yet."""
+        verdict, lifts = published.verdict, published.lifts
+        is_stable = verdict.verdict is Decision.STABLE
+        is_offer = question.lifts and (is_stable or verdict.supervised)
+        offer = (published.grasp, verdict.verdict) if is_offer else None
+        if offer != question.offer:
+            self._withdraw(peer, question)
+        if offer is None:
+            return published.payload
+        is_new = question.offer is None
+        if is_new and not (self._may_lift(peer, lifts) and lifts.claim(published.grasp, peer)):
+            looked_at = replace(verdict, supervised=False, early=False)
+            return encode(looked_at) if verdict.supervised else published.payload
+        if is_stable:
+            lifts.announce()
+        if is_new:
+            question.offer = offer
+            published.keep(partial(question.keep, offer))
+        if question.kept is False:
+            self._withdraw(peer, question)
+            return withheld(verdict, Reason.NOT_KEPT)
+        return published.payload if question.kept else None
+
+    def _may_lift(self, peer: Peer, lifts: LiftBook) -> bool:
+        if self._tells is not None:
+            tells = self._tells(peer.credential)
+        else:
+            tells = lifts.lifter is None or lifts.lifter.credential == peer.credential
+        if tells and len(peer.routing_id) >= NAME_BYTES:
+            return True
+        if not self.counters["not_theirs"]:
+            log.warning("%r asks `lift` and may not: [ask] tell, deploy/wire/README.md", peer)
+        self.counters["not_theirs"] += 1
+        return False

@@ -10,10 +10,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
 from graspd.daemon.publish.door import Admission, Door
-from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.listener import Listener, PublishError, user_id
 from graspd.daemon.publish.messages import Status
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Curve
@@ -73,7 +72,18 @@ class Sockets(Companion):
             self._listeners.append(ask)
             from graspd.daemon.publish.questions import Questions  # only where peers may ask
 
-            self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6))
+            tells = None if wanted.ask is None or wanted.ask.tell is None else self._tells(wanted)
+            self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6), tells)
+
+    def _tells(self, wanted: Scene) -> Callable[[bytes], bool]:
+        """Return whether the scene lets a credential lift and tell."""
+        names = () if wanted.ask is None else wanted.ask.tell or ()
+        if (wanted.ask_endpoint or "").startswith("ipc://"):
+            return {b"user %d" % user_id(name) for name in names}.__contains__
+        return lambda credential: (
+            self._admission is not None
+            and self._admission.admitted.get(credential.removeprefix(b"key ")) in names
+        )
 
     def _open(self) -> None:
         self._door = Door(
@@ -117,22 +127,20 @@ class Sockets(Companion):
     def filenos(self) -> list[int]:
         return self._filenos
 
+    def due_ns(self) -> int | None:
+        return None if self.questions is None else self.questions.due_ns
+
     def before_wait(self, requests: Requests) -> None:
         if self.questions is not None and self._door is not None:
             messages = self._door.receive()
             if messages:
                 self.questions.take(messages, self._clock(), requests)
+            self.questions.expire(self._clock(), requests)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         """Answer the questions with an answer; with another verdict only those that are due."""
-        if self.questions is None or not self.questions.waiting:
-            return
-        now_ns = None if published.is_answer else self._clock()
-        lifters = self.questions.answer(published.payload, now_ns)
-        for peer in lifters if published.grasp.grasp else ():
-            published.lifts.claim(published.grasp, peer)
-        if lifters and published.verdict.verdict is Decision.STABLE:
-            published.lifts.announce()
+        if self.questions is not None:
+            self.questions.answer(published, None if published.is_answer else self._clock())
 
     def on_status(self, status: Status) -> None:
         """Check the sockets and the list of keys. Raises `PublishError`, which ends the daemon."""
@@ -206,7 +214,8 @@ def _log_refused(clients: Clients) -> None:
 
 def plan(wanted: Scene) -> object:
     """Return the parts of a scene that its sockets depend on."""
-    asked = (wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group, wanted.gate.request_ms)
+    rights = wanted.ask_file_mode, wanted.ask_group, None if wanted.ask is None else wanted.ask.tell
+    asked = wanted.ask_endpoint, rights, wanted.gate.request_ms
     own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
     return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
 

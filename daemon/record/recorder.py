@@ -142,9 +142,9 @@ class Recorder(Companion):
             self._put(self._names[Topic.JUDGED], making)
 
     def on_event(self, event: LoopEvent) -> None:
-        """Record an event; of equal events in a row only the first."""
+        """Record an event; of equal ones in a row only the first, but each `TAKEN_BACK`."""
         topic = self._names[Topic(event.value)]
-        if topic != self._last_topic:
+        if topic != self._last_topic or event is LoopEvent.TAKEN_BACK:
             self._put(topic, EVENT)
 
     def on_status(self, status: Status) -> None:

@@ -114,6 +114,8 @@ class Topic(StrEnum):
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
     """A controller asked if it may lift, and the answer was `stable`."""
+    TAKEN_BACK = "taken-back"
+    """No lift follows the last announcement."""
     # Made from these for viewers:
     IMAGE = "image"
     LOG = "log"
@@ -127,11 +129,12 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
     "exchanged": Exchanged,
     "skipped": Event,
     "announced": Event,
+    "taken-back": Event,
     "image": RawImage,
     "log": Log,
 }
 """Type of the messages by the first part of their topic."""
-EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED)
+EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED, Topic.TAKEN_BACK)
 EVENT: Final = b"{}"
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode

@@ -30,7 +30,7 @@ from graspd.daemon.run.reload import Reload
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus, Report
 from graspd.drivers.base import Driver, JointReading, Reading, TactileReading
 
-NOT_YOURS: Final = "not yours: another peer asks whether it may lift here"
+NOT_YOURS: Final = "not yours: another peer may lift here, or this one has too short a routing id"
 UNKNOWN_START: Final = "unknown boot_id: of a start whose grasps are not known any more"
 """Why an outcome is refused, besides `REFUSALS`."""
 REFUSALS: Final = {
@@ -106,6 +106,7 @@ class Loop:
         self._max_age_ns = timing.max_age_ns
         self._keep = keep
 
+        pipeline.lifts.on_announced = self._announced
         self._companions = companions
         self._before_wait = hooks(companions, Companion.before_wait)
         drivers_due_ns = (driver.due_ns for driver in drivers)
@@ -300,16 +301,15 @@ class Loop:
         verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
         is_answer = is_answer or verdict.judged or not self._pipeline.on_request
         grasp = GraspId(self._pipeline.boot_id, verdict.grasp)
-        published = PublishedVerdict(
-            judgement, verdict, payload, reading, is_answer, grasp, self._pipeline.lifts
-        )
-        announced = published.lifts.announced
+        about = grasp, self._pipeline.lifts, self._keep
+        published = PublishedVerdict(judgement, verdict, payload, reading, is_answer, *about)
         for on_verdict in self._on_verdict:
             on_verdict(published)
-        if published.lifts.announced != announced:
-            for on_event in self._on_event:
-                on_event(LoopEvent.ANNOUNCED)
         return verdict
+
+    def _announced(self, announced: bool) -> None:
+        for on_event in self._on_event:
+            on_event(LoopEvent.ANNOUNCED if announced else LoopEvent.TAKEN_BACK)
 
     @property
     def _silence_ns(self) -> int:
@@ -342,6 +342,10 @@ class Loop:
         for on_event in self._on_event:
             on_event(LoopEvent.ASKED)
 
+    def silence(self) -> None:
+        """Publish that no reading has come."""
+        self._report_silence(self._clock())
+
     def outcome(self, report: Report, answer: Answer) -> None:
         """Learn, publish and save the outcome of a judged grasp's lift; then call `answer`."""
         lifts, grasp = self._pipeline.lifts, report.grasp
@@ -349,6 +353,9 @@ class Loop:
             grasp = GraspId(self._pipeline.boot_id, grasp.grasp)
         if not lifts.may_report(grasp, report.peer):
             answer(NOT_YOURS)
+            return
+        if report.outcome == "not-lifted" and lifts.take_back(grasp):
+            self._keep(answer)
             return
         status = self._pipeline.outcome(grasp, slipped=report.outcome == "slip")
         if status in REFUSALS:

@@ -204,10 +204,13 @@ class Ask(Section):
     """Without it `ipc:///run/graspd/<hand>.ask.ipc`. `tcp://` needs `[curve]`, except on
     loopback."""
     file_mode: FileMode | None = None
-    """Mode of an `ipc://` socket's file; users who may write may ask, and tell outcomes. Without it
-    that of `[publish]`, for owner and group only."""
+    """Mode of an `ipc://` socket's file; users who may write may ask. Without it that of
+    `[publish]`, for owner and group only."""
     group: Name | None = None
     """Group of an `ipc://` socket's file; without it that of `[publish]`."""
+    tell: Annotated[tuple[Name, ...], Field(strict=False)] | None = None
+    """Users, on `tcp://` names of `.key` files, that may lift and tell outcomes. Without it the
+    user or key of the first peer that may lift. They are trusted with the truth."""
 
 
 Processor = Annotated[int, Field(ge=0, le=8191), unit()]
@@ -315,6 +318,9 @@ class Scene(Section):
                     f"{key} {endpoint} is not a loopback address; anyone could listen: [curve] "
                     "says who may"
                 )
+        is_named = (self.ask_endpoint or "").startswith("ipc://") or self.curve is not None
+        if self.ask is not None and self.ask.tell is not None and not is_named:
+            raise ValueError("ask.tell needs an ipc:// socket, or [curve]: who connects is unknown")
 
     @property
     def endpoint(self) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from enum import StrEnum
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -13,6 +14,8 @@ from graspd.daemon.trust.learner import INPUT_MAX, vector
 
 LIFTS_MAX: Final = 256
 """Grasps in the book: those of an hour and more. Outcomes of older ones are refused."""
+NAME_BYTES: Final = 16
+"""Bytes at the start of a routing id that stay the same when a client reconnects."""
 NOT_ASSESSED: Final = b""
 """Stands for the features of a grasp that nothing can be learned from: the model refused it, or
 the scene has no learner and no risk."""
@@ -27,15 +30,29 @@ class GraspId(NamedTuple):
     """Its number since that start."""
 
 
+class Peer(NamedTuple):
+    """Connection of a program that asks and tells."""
+
+    routing_id: bytes
+    credential: bytes
+    """User or key, which a peer cannot choose; where there is neither, its name."""
+
+    @property
+    def name(self) -> tuple[bytes, bytes]:
+        """The part that stays the same when it reconnects."""
+        return self.routing_id[:NAME_BYTES], self.credential
+
+
 class Report(NamedTuple):
     """How a lift ended, as a peer tells it."""
 
     grasp: GraspId
-    outcome: Literal["stable", "slip"]
+    outcome: str
+    """`stable`, `slip` or `not-lifted`."""
     object_name: str | None = None
     """Name of the lifted object; None: not told."""
-    peer: bytes | None = None
-    """Name of the peer; None: the daemon itself, when it replays a recording."""
+    peer: Peer | None = None
+    """None: the daemon itself, when it replays a recording."""
 
 
 class OutcomeStatus(StrEnum):
@@ -66,6 +83,8 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """None until the outcome is told."""
     announced: bool = False
     """True once a `lift` question was answered `stable`."""
+    owner: Peer | None = None
+    """Peer that was answered first that it may lift the grasp."""
 
     @property
     def is_outstanding(self) -> bool:
@@ -91,16 +110,18 @@ class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class LiftBook:
     """The last `LIFTS_MAX` judged grasps, and who may report how their lifts ended.
 
-    A peer that asks for a lift owns the grasp that it was answered about; it alone reports the
-    outcome. Owners are not kept between two starts: until a peer asks again, any peer may report.
+    A peer owns a grasp once it was answered that it may lift it, and reports the outcome. Once it
+    has ended, another peer of its credential that may lift reports for it.
     """
 
     def __init__(self) -> None:
         """Start empty."""
         self._lifts: dict[GraspId, Lift] = {}
         """Oldest first."""
-        self._owners: dict[GraspId, bytes] = {}
-        """Name of the peer that asked to lift a grasp; the oldest first, at most `LIFTS_MAX`."""
+        self.lifter: Peer | None = None
+        """Peer that was answered last, since the start, that it may lift a grasp."""
+        self.on_announced: Callable[[bool], None] = lambda _announced: None
+        """Called with True after an announcement, with False after it was taken back."""
         self._unkept: set[GraspId] = set()
         """Grasps whose outcome was taken and is not on the disk yet."""
         self.told: Counter[OutcomeStatus] = Counter()
@@ -142,8 +163,8 @@ class LiftBook:
             if lift.slipped is not None or not (first_stable or first_assessed):
                 return False
             stable = stable or lift.stable
-        announced = lift is not None and lift.announced
-        self._lifts[grasp] = Lift(grasp, stable, features, announced=announced)
+        former = lift or Lift(grasp, stable, features)
+        self._lifts[grasp] = replace(former, stable=stable, features=features)
         is_abandoned = False
         if len(self._lifts) > LIFTS_MAX:
             oldest = self._lifts.pop(next(iter(self._lifts)))
@@ -153,11 +174,17 @@ class LiftBook:
         self._count()
         return is_abandoned
 
-    def claim(self, grasp: GraspId, owner: bytes) -> None:
-        """Give a grasp to the peer that asked to lift it, unless another one owns it already."""
-        self._owners.setdefault(grasp, owner)
-        if len(self._owners) > LIFTS_MAX:
-            del self._owners[next(iter(self._owners))]
+    def claim(self, grasp: GraspId, peer: Peer) -> bool:
+        """Give a grasp to a peer that may lift it; False if it is another's, or its lift over."""
+        lift = self._lifts.get(grasp)
+        if lift is None or lift.slipped is not None:
+            return False
+        if lift.owner is not None and lift.owner.credential != peer.credential:
+            return False
+        if lift.owner is None or not lift.announced:
+            self._lifts[grasp] = replace(lift, owner=peer)
+        self.lifter = peer
+        return True
 
     def announce(self) -> None:
         """Note that a `lift` question about the newest grasp was answered `stable`."""
@@ -167,6 +194,28 @@ class LiftBook:
         self._lifts[lift.id] = replace(lift, announced=True)
         self.announced += 1
         self._count()
+        self.on_announced(True)
+
+    def take_back(self, grasp: GraspId | None) -> bool:
+        """Note that no lift of a grasp follows; None: of the one announced last.
+
+        False, and nothing changes, if the outcome is known, or the grasp is not.
+        """
+        awaited = (lift.id for lift in reversed(self._lifts.values()) if lift.is_awaited)
+        lift = self._lifts.get(grasp or next(awaited, GraspId("", 0)))
+        if lift is not None and lift.is_awaited:
+            self._lifts[lift.id] = replace(lift, announced=False)
+            self.announced -= 1
+            self._count()
+            self.on_announced(False)
+        return lift is not None and lift.slipped is None
+
+    def offered(self, peer: Peer) -> GraspId | None:
+        """Return the last grasp that this connection may lift, if its outcome is out."""
+        for lift in reversed(self._lifts.values()):
+            if lift.owner == peer and lift.slipped is None:
+                return lift.id
+        return None
 
     def withdraw(self) -> None:
         """Take back all announcements: another risk is set, which counts from the start."""
@@ -174,18 +223,16 @@ class LiftBook:
         self.announced = 0
         self._count()
 
-    def may_report(self, grasp: GraspId, peer: bytes | None) -> bool:
+    def may_report(self, grasp: GraspId, peer: Peer | None) -> bool:
         """True if this peer may tell the outcome: the owner of the grasp, or the daemon itself.
 
-        For a grasp without an owner: any peer that owns another one, or any peer at all while
-        there is no owner.
+        The last peer that may lift reports for other owners of its credential, and grasps of none.
         """
-        if peer is None:
+        lift = self._lifts.get(grasp)
+        if peer is None or lift is None or (lift.owner and lift.owner.name == peer.name):
             return True
-        owner = self._owners.get(grasp)
-        if owner is not None:
-            return owner == peer
-        return not self._owners or peer in self._owners.values()
+        is_heir = lift.owner is None or lift.owner.credential == peer.credential
+        return is_heir and self.lifter is not None and self.lifter.name == peer.name
 
     def tell(self, grasp: GraspId, *, slipped: bool) -> tuple[OutcomeStatus, Lift | None]:
         """Enter an outcome; return what became of it, and the entry as it was before."""
@@ -205,8 +252,8 @@ class LiftBook:
         return status, lift
 
     def follow(self, former: LiftBook) -> None:
-        """Take over the owners of the book before a reload: their connections are the same."""
-        self._owners = dict(former._owners)
+        """Take over who may lift from the book before a reload or a sleep."""
+        self.lifter = former.lifter
 
     def is_kept(self, grasp: GraspId) -> bool:
         """True unless an outcome of the grasp was taken and is not on the disk yet."""

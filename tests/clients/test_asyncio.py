@@ -11,6 +11,7 @@ from zmq.asyncio import Poller
 
 from deploy.clients.python.graspd_client import AsyncClient, Client, Decision
 from tests.clients.test_both_ask import DEADLINE_S, PATIENT_MS, false_daemon, of, told
+from tests.kit.waiting import wait_until
 
 PATIENT_S = PATIENT_MS / 1e3
 SHORT_S = 0.05
@@ -101,5 +102,6 @@ def test_a_call_meanwhile_is_refused_and_a_cancelled_one_ends(tmp_path: Path) ->
                 await waiting
             assert not await graspd.may_i_lift(SHORT_S)
 
-    with false_daemon(tmp_path, of("unknown")):
+    with false_daemon(tmp_path, of("unknown")) as heard:
         asyncio.run(overlaps())
+        wait_until(lambda: heard.count(b"not-lifting") == 2)

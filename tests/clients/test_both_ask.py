@@ -17,6 +17,7 @@ import zmq
 from deploy.clients.python.graspd_client import Client, Decision, Outcome, OutcomeAnswer, Verdict
 from tests.clients.building import Probe, asked, cpp_lifts
 from tests.clients.messages import TEACHES, TOPIC, verdict
+from tests.kit.waiting import wait_until
 from tests.threads import at_work
 
 PERIOD_MS = 5
@@ -43,14 +44,23 @@ def of(outcome: str) -> Answer:
 @contextmanager
 def false_daemon(
     folder: Path, answer: Answer, outcome: str = "stable", **more: object
-) -> Iterator[None]:
-    """Publishes that verdict all the time, with what is `more`, and answers so."""
-    with at_work(partial(_serve, folder, answer, outcome, more)):
-        yield
+) -> Iterator[list[bytes]]:
+    """Publishes that verdict all the time, with what is `more`, and answers so.
+
+    Gives what it is asked and told.
+    """
+    heard: list[bytes] = []
+    with at_work(partial(_serve, folder, answer, outcome, more, heard)):
+        yield heard
 
 
 def _serve(
-    folder: Path, answer: Answer, outcome: str, more: dict[str, Any], stop: threading.Event
+    folder: Path,
+    answer: Answer,
+    outcome: str,
+    more: dict[str, Any],
+    heard: list[bytes],
+    stop: threading.Event,
 ) -> None:
     with (
         zmq.Context() as context,
@@ -69,7 +79,8 @@ def _serve(
             seq += 1
             if questions.poll(PERIOD_MS):
                 who, *question = questions.recv_multipart()
-                told_of = question[0].startswith(b"outcome ")
+                heard.extend(question)
+                told_of = question[0].startswith((b"outcome ", b"not-lifting"))
                 assert told_of or question == [b"lift"]
                 questions.send_multipart([who, *(TAKEN_FRAMES if told_of else answer(message))])
 
@@ -232,6 +243,42 @@ def test_where_nobody_answers_a_restless_hand_is_not_all_that_is_told(
     assert (bool(answer), list(answer.verdict.reasons)) == (False, expected)
     assert result.returncode == 1
     assert [word for word in result.stdout.split() if word in (*reasons, "no-answer")] == expected
+
+
+@pytest.mark.parametrize(
+    ("answer", "outcome", "may"),
+    [(told(), "stable", True), (told(), "unknown", False), (told(grasp=2), "stable", False)],
+    ids=["yes", "no", "of another grasp"],
+)
+def test_a_no_takes_the_lift_back(
+    lift_gate: Path, tmp_path: Path, answer: Answer, outcome: str, may: bool
+) -> None:
+    """In C++ too: each client says so once for each connection that asked."""
+    places = [f"ipc://{tmp_path}/out", "30.0" if may else str(DEADLINE_S), f"ipc://{tmp_path}/ask"]
+    with false_daemon(tmp_path, answer, outcome) as heard:
+        with Client(places[0], ask_endpoint=places[2]) as graspd:
+            assert bool(graspd.may_i_lift(float(places[1]))) is may
+        if not may:
+            wait_until(lambda: b"not-lifting" in heard)
+    with false_daemon(tmp_path, answer, outcome) as heard_of_cpp:
+        assert cpp_lifts(lift_gate, *places) is may
+        if not may:
+            wait_until(lambda: b"not-lifting" in heard_of_cpp)
+    for each in (heard, heard_of_cpp):
+        assert (each[0], b"not-lifting" in each) == (b"lift", not may)
+
+
+def test_a_yes_that_no_lift_follows_is_told(tmp_path: Path) -> None:
+    places = [f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask"]
+    with (
+        false_daemon(tmp_path, told()) as heard,
+        Client(places[0], ask_endpoint=places[1]) as graspd,
+    ):
+        verdict = graspd.may_i_lift(30.0).verdict
+        assert graspd.tell(verdict, Outcome.NOT_LIFTED, wait_s=30.0)
+        assert heard[-1].endswith(b" 1 not-lifted")
+        assert graspd.may_i_lift(30.0), "it is offered again"
+        assert graspd.unreported == 0
 
 
 BOOT = "0f0e0d0c0b0a09080706050403020100"

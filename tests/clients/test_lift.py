@@ -50,7 +50,7 @@ class Call:
         self.due = None
         return self.answered[-1]
 
-    def hang_up(self) -> None:
+    def hang_up(self, *, lifts: bool = True) -> None:
         self.due = None
 
 

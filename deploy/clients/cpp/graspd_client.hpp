@@ -77,6 +77,10 @@ constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
 constexpr std::size_t NAME_BYTES = 16;   // of a client's name
 constexpr std::size_t LIFTS_MAX = 256;  // that are remembered: as many as graspd takes outcomes of
 constexpr std::int64_t WARN_EVERY = 10;  // lifts whose outcome was never told
+// Longest wait at the end until graspd has heard that no lift follows, and most connections that
+// say so at a time.
+constexpr int TAKE_BACK_MS = 200;
+constexpr std::size_t LEAVING_MAX = 4;
 
 // What graspd decided about a grasp; the numbers are those of `verdict_code`.
 enum class Decision { unknown = 0, stable = 1, slip = 2 };
@@ -97,7 +101,7 @@ inline const char* name(FingerState state) {
 }
 
 // How a lift ended.
-enum class Outcome { held, slipped };
+enum class Outcome { held, slipped, not_lifted };
 
 // What lifts of `stable` verdicts came to: of `lifts` that were told, so many `slips`.
 struct Risk {
@@ -445,7 +449,9 @@ inline std::string telling(const Verdict& lifted_on, Outcome how, const std::str
     if (lifted_on.boot_id.empty() || lifted_on.grasp.value_or(0) == 0)
         throw std::invalid_argument("nothing was lifted on a verdict that is of no grasp");
     const auto told = "outcome " + lifted_on.boot_id + ' ' + std::to_string(*lifted_on.grasp) +
-                      (how == Outcome::held ? " stable" : " slip");
+                      (how == Outcome::held      ? " stable"
+                       : how == Outcome::slipped ? " slip"
+                                                 : " not-lifted");
     if (object_name.empty()) return told;
     const auto fits = [&object_name](const char& c) {
         const bool plain = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') ||
@@ -496,6 +502,7 @@ public:
     // What each finger felt by the messages of the last look.
     std::set<std::pair<std::string, FingerState>> passed;
     Counts counts;
+    bool may_be_announced = false;  // the lift that the last answer was about
 
     // For how long no message may come; 0 without one.
     Nanoseconds silence_ns() const { return message_ ? message_->silence_ns : 0; }
@@ -568,7 +575,10 @@ public:
 
     // An answer; none if it is not understood.
     std::optional<Verdict> answered(std::string_view payload) {
-        if (auto found = read(payload, max_p_slip_).first) return if_open(found->verdict);
+        auto found = read(payload, max_p_slip_).first;
+        may_be_announced = !found || found->verdict.decision == Decision::stable ||
+                           found->verdict.reasons == std::vector<std::string>{"p-slip"};
+        if (found) return if_open(found->verdict);
         ++counts.malformed;
         return std::nullopt;
     }
@@ -721,6 +731,18 @@ public:
             [&] { return call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait); });
     }
 
+    // Say that no lift follows what was asked, and hang up.
+    void take_back(Call& call) {
+        if (!call.socket) return;
+        call.socket.set(zmq::sockopt::linger, TAKE_BACK_MS);
+        call.socket.send(zmq::str_buffer("not-lifting"), zmq::send_flags::dontwait);
+        leaving_.push_back(std::move(call.socket));
+        call.hang_up();
+        if (leaving_.size() <= LEAVING_MAX) return;
+        leaving_.front().set(zmq::sockopt::linger, 0);
+        leaving_.pop_front();
+    }
+
     // Connect anew, and forget what waits.
     void renew() {
         socket_.close();
@@ -766,6 +788,7 @@ private:
     std::string name_ = random_name();
     std::uint64_t calls_ = 0;
     zmq::socket_t socket_;
+    std::deque<zmq::socket_t> leaving_;  // whose last message is being sent
 
 public:
     Call asking, telling, timing;  // closed before the context
@@ -797,7 +820,12 @@ public:
     Question(const Question&) = delete;
     Question& operator=(const Question&) = delete;
     ~Question() {
-        if (asks_) link_.asking.hang_up();
+        if (!asks_) return;
+        try {
+            if (!lifts_) link_.take_back(link_.asking);
+        } catch (const zmq::error_t&) {  // it cannot be said; a person settles the lift
+        }
+        link_.asking.hang_up();
     }
 
     // Whether a verdict lets the hand lift.
@@ -816,6 +844,7 @@ public:
             asked_ = false;
             heard_ = true;
             answer_ = newest_.answered(*payload);
+            may_be_announced_ = newest_.may_be_announced;
             if (answer_) answer_ = if_still(*std::move(answer_));
             const bool permitted = answer_ && permits(*answer_);
             if (answer_ && answer_->decision == Decision::slip && !permitted) return *answer_;
@@ -828,6 +857,8 @@ public:
             answer_.reset();
         }
         if (!asked_ && !answer_) {
+            if (may_be_announced_) link_.take_back(link_.asking);
+            may_be_announced_ = false;
             link_.ask(link_.asking, "lift");
             asked_ = true;
         }
@@ -837,7 +868,8 @@ public:
     }
 
     // What was decided; if it is no lift on a message, also that nobody has answered.
-    Verdict at_the_end(Verdict said) const {
+    Verdict at_the_end(Verdict said) {
+        lifts_ = permits(said);
         auto& why = said.reasons;
         if (asks_ && !heard_ && said.seq && !is_over(said) &&
             std::find(why.begin(), why.end(), "no-answer") == why.end())
@@ -857,6 +889,7 @@ private:
     Newest& newest_;
     Link& link_;
     bool asks_, supervised_, asked_ = false, heard_ = false;
+    bool may_be_announced_ = false, lifts_ = false;
     std::optional<double> still_ms_;
     std::optional<Verdict> answer_;  // that is to be confirmed
 };
@@ -991,6 +1024,7 @@ public:
     }
 
     // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
+    // Tell `Outcome::not_lifted` if no lift followed a yes: else graspd waits for an outcome.
     //
     // Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
     // comes later is taken in by later calls; without one, tell it again. Throws
@@ -1007,7 +1041,7 @@ public:
         link_->ask(link_->telling, telling);
         told_.reset();
         telling_ = detail::key(lifted_on);
-        newest_.end(telling_);
+        if (how != Outcome::not_lifted) newest_.end(telling_);
         drain();
         while (!told_ && wait(due_ns)) drain();
         return told_.value_or(OutcomeAnswer{"no-answer"});

@@ -80,6 +80,9 @@ NAME_BYTES = 16  # of a client's name, which routing ids begin with: random, the
 OBJECT_MAX = 64  # characters of an object's name
 LIFTS_MAX = 256  # that are remembered: as many as graspd takes outcomes of
 WARN_EVERY = 10  # lifts whose outcome was never told
+# Longest wait at closing until graspd has heard that no lift follows, and most connections that
+# say so at a time.
+TAKE_BACK_MS, LEAVING_MAX = 200, 4
 
 # The only reasons of a grasp that may be lifted under supervision: [risk] alone is against it.
 _WITHHELD = {"unproven", "low-confidence"}
@@ -121,6 +124,7 @@ class Outcome(Enum):
 
     HELD = "stable"
     SLIPPED = "slip"
+    NOT_LIFTED = "not-lifted"
 
     @classmethod
     def _missing_(cls, value: object) -> Outcome | None:
@@ -352,15 +356,17 @@ class _Hand:
         due_ns = _due_ns("deadline_s", deadline_s)
         asking = self._link.asking if self._asks and not self._unusable else None
         question = _Question(self._newest, asking, supervised is True, still_ms)
+        allowed = False
         try:
             decided = question.decided((yield from self._verdict(0)))
             while not question.is_over(decided) and (yield from self._wait(due_ns)):
                 decided = question.decided((yield from self._verdict(0)))
                 if time.monotonic_ns() > due_ns and question.permits(decided):
                     decided = decided.unknown("late")
+            allowed = question.permits(decided)
         finally:
             if not self._unusable:
-                self._link.asking.hang_up()
+                self._link.asking.hang_up(lifts=allowed)
         decided = question.at_the_end(decided)
         waited_s = (time.monotonic_ns() - began_ns) / 1e9
         answer = LiftAnswer(decided, waited_s, supervised is True and decided.supervised)
@@ -418,7 +424,8 @@ class _Hand:
         self._link.telling.hang_up()
         self._link.telling.ask(telling)
         self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
-        self._newest.end(self._telling)
+        if Outcome(how) is not Outcome.NOT_LIFTED:
+            self._newest.end(self._telling)
         self._drain()
         while self._telling[1] and (yield from self._wait(due_ns)):
             self._drain()
@@ -587,6 +594,7 @@ class Client(_Hand):
     ) -> OutcomeAnswer:
         """Tell how the lift ended that was made on a verdict, and what was lifted.
 
+        Tell `Outcome.NOT_LIFTED` if no lift followed a yes: else graspd waits for an outcome.
         Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
         comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
         without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` or a time that
@@ -873,7 +881,7 @@ class _Question:
     ) -> None:
         self._newest, self._asking, self._supervised = newest, asking, supervised
         self._still_ms = still_ms
-        self._asked = self._heard = False
+        self._asked = self._heard = self._may_be_announced = False
         self._answer: Verdict | None = None
         """Answer that the newest message must confirm."""
 
@@ -894,6 +902,7 @@ class _Question:
         if payload is not None:
             self._asked, self._heard = False, True
             answer = self._newest.read(payload)
+            self._may_be_announced = isinstance(answer, str) or _was_stable(answer.verdict)
             said = Verdict(Decision.UNKNOWN)
             if not isinstance(answer, str):
                 said = self._if_still(self._newest.if_open(answer.verdict))
@@ -909,8 +918,10 @@ class _Question:
                 return newest
             self._answer = None
         if not self._asked and self._answer is None:
+            if self._may_be_announced:
+                self._asking.hang_up(lifts=False)
             self._asking.ask(b"lift")
-            self._asked = True
+            self._asked, self._may_be_announced = True, False
         if newest.decision == Decision.UNKNOWN and not self.permits(newest):
             return newest
         return newest.unknown(*(newest.reasons or ("no-answer",)))
@@ -933,6 +944,11 @@ class _Question:
         return said if still and not is_early else said.unknown("not-still")
 
 
+def _was_stable(said: Verdict) -> bool:
+    """Whether the daemon said `stable`, even if `p_slip` is too high."""
+    return said.decision == Decision.STABLE or said.reasons == ("p-slip",)
+
+
 def _reaches(newest: Verdict, answer: Verdict) -> bool:
     """Whether the message that is the answer is no longer to come."""
     return newest.boot_id == answer.boot_id and (newest.seq or 0) >= (answer.seq or 0)
@@ -945,6 +961,7 @@ class _Link:
         self._endpoint, self._topic, self._keys = endpoint, topic, keys
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._name, self._calls = b"g" + os.urandom(NAME_BYTES - 1), 0
+        self._leaving: deque[zmq.Socket[bytes]] = deque()
         self.asking, self.telling, self.timing = (_Call(self, ask or "") for _ in range(3))
         try:
             self._socket = self.connected(zmq.SUB, endpoint)
@@ -974,7 +991,15 @@ class _Link:
         self._socket.close(0)
         self._socket = self.connected(zmq.SUB, self._endpoint)
 
+    def leave(self, socket: zmq.Socket[bytes]) -> None:
+        """Keep a socket open while its last message is sent."""
+        self._leaving.append(socket)
+        if len(self._leaving) > LEAVING_MAX:
+            self._leaving.popleft().close(0)
+
     def close(self) -> None:
+        while self._leaving:
+            self._leaving.popleft().close()
         self._context.destroy(0)
 
     def connected(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
@@ -1015,11 +1040,20 @@ class _Call:
             return None
         return None if self.socket is None else frames[0] if len(frames) == 1 else b""
 
-    def hang_up(self) -> None:
-        """An answer that is late must not be taken for one to the next question."""
-        if self.socket is not None:
-            self.socket.close(0)
-            self.socket = None
+    def hang_up(self, *, lifts: bool = True) -> None:
+        """An answer that is late must not be taken for one to the next question.
+
+        Unless the hand `lifts`, the daemon is told to await no outcome of what was asked.
+        """
+        leaving, self.socket = self.socket, None
+        if leaving is None:
+            return
+        if lifts:
+            leaving.close(0)
+        else:
+            leaving.linger = TAKE_BACK_MS
+            leaving.send(b"not-lifting", zmq.NOBLOCK)
+            self._link.leave(leaving)
 
 
 def is_same_computer(endpoint: str) -> bool:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import random
 import resource
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -89,19 +92,22 @@ class Hand:
 
 
 @contextlib.contextmanager
-def hand(folder: Path, *, curve: bool = False, publish: str = "") -> Iterator[Hand]:
-    """A daemon at rest: on Unix sockets, or with keys on TCP; `publish` as of `running`."""
-    endpoint, ask = f"ipc://{folder}/v", f"ipc://{folder}/ask"
+def hand(folder: Path, *, curve: bool = False, publish: str = "", ask: str = "") -> Iterator[Hand]:
+    """A daemon at rest: on Unix sockets, or with keys on TCP; `publish` as of `running`.
+
+    `ask`: more keys of `[ask]`.
+    """
+    endpoint, questions = f"ipc://{folder}/v", f"ipc://{folder}/ask"
     section, keys = "", None
     if curve:
         make(folder, "daemon")
         make(folder / "clients", "friend")
         section, keys = '[curve]\nsecret_key = "daemon.key_secret"\nclients = "clients"\n', folder
-        endpoint, ask = (f"tcp://127.0.0.1:{port}" for port in (free_port(), free_port()))
+        endpoint, questions = (f"tcp://127.0.0.1:{port}" for port in (free_port(), free_port()))
     sections = (
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[gate]\nmode = "every"\nrequest_ms = {PATIENCE_MS}.0\n[model]\nname = "cnn1"\n'
-        f'[ask]\nendpoint = "{ask}"\n{section}'
+        f'[ask]\nendpoint = "{questions}"\n{ask}{section}'
     )
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -111,7 +117,7 @@ def hand(folder: Path, *, curve: bool = False, publish: str = "") -> Iterator[Ha
             raise TimeoutError("the daemon says nothing")
         for _ in range(100):
             friend.take(1.0)
-        yield Hand(process, endpoint, ask, friend, memory_mib(process.pid))
+        yield Hand(process, endpoint, questions, friend, memory_mib(process.pid))
 
 
 def connect(endpoint: str) -> socket.socket:
@@ -247,43 +253,116 @@ def _keep_rules(door: Connect, first: bytes, then: bytes, stop: threading.Event)
                     pass
 
 
+NAMES = b"the-controller-1", b"another-program1"
+"""Routing ids of the controller, and of another program of its user."""
+NOBODY = 65534
+"""User and group of nobody (Debian)."""
+AS_NOBODY = """
+import os, socket, sys
+made = socket.socket(socket.AF_UNIX)
+os.setgroups([])
+os.setgid(int(sys.argv[2]))
+os.setuid(int(sys.argv[2]))
+made.connect(sys.argv[1])
+made.settimeout(60)
+def frame():
+    flags = made.recv(1)[0]
+    size = int.from_bytes(made.recv(8 if flags & 2 else 1, socket.MSG_WAITALL), "big")
+    return made.recv(size, socket.MSG_WAITALL)
+made.sendall(bytes.fromhex(sys.argv[3]))
+made.recv(64, socket.MSG_WAITALL)
+made.sendall(bytes.fromhex(sys.argv[4]))
+frame()
+made.settimeout(2)
+for line in sys.stdin:
+    text = line.strip().encode()
+    made.sendall(bytes([0, len(text)]) + text)
+    try:
+        print(frame().decode(), flush=True)
+    except OSError:
+        print("{}", flush=True)
+"""
+"""Speaks ZeroMQ as another user: sends each line, and prints the answer."""
+Tells = Callable[[str], str]
+"""Says something to the daemon; returns the answer, `{}` for none."""
+
+
+@contextlib.contextmanager
+def as_nobody(endpoint: str, name: bytes) -> Iterator[Tells]:
+    """A peer of the user nobody with this routing id. Only root can make one."""
+    identity = b"\x08Identity" + len(name).to_bytes(4, "big") + name
+    body = READY_DEALER[2:] + identity
+    ready = (GREETING.hex(), (b"\x04" + bytes([len(body)]) + body).hex())
+    path = endpoint.removeprefix("ipc://")
+    command = [sys.executable, "-I", "-c", AS_NOBODY, path, str(NOBODY), *ready]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, bufsize=1) as liar:
+        if liar.stdin is None or liar.stdout is None:
+            raise OSError("no pipe to the liar")
+        says, hears = liar.stdin, liar.stdout
+
+        def tell(text: str) -> str:
+            says.write(text + "\n")
+            return hears.readline()
+
+        yield tell
+        says.close()
+
+
 def forged(plan: Plan) -> Outcome:
-    """Outcomes told by somebody else, of grasps that the controller asked about, before and after
-    it, and of others; and a word of its own that it takes back."""
+    """Outcomes told by others: another user, also with the controller's routing id, and one that
+    asks first; another program of its user; one without a routing id of its own. Of grasps that the
+    controller asked about, before and after it, and of others; and a word that it takes back."""
     forged_well = lies = told_well = tried = 0
-
-    def tell(who: zmq.Socket[bytes], boot_id: str, grasp: int, outcome: str) -> bool:
-        who.send(f"outcome {boot_id} {grasp} {outcome}".encode())
-        return bool(who.poll(2000)) and bool(json.loads(who.recv())["ok"])
-
+    plan.folder.chmod(0o755)
     with (
-        hand(plan.folder) as daemon,
+        hand(plan.folder, ask='file_mode = "0666"\n') as daemon,
         zmq.Context() as context,
-        context.socket(zmq.DEALER) as controller,
-        context.socket(zmq.DEALER) as liar,
+        contextlib.ExitStack() as stack,
     ):
-        for who in (controller, liar):
-            who.linger = 0
-            who.connect(daemon.ask)
+
+        def peer(name: bytes | None = None) -> Tells:
+            made = stack.enter_context(context.socket(zmq.DEALER))
+            made.linger = 0
+            if name is not None:
+                made.routing_id = name
+            made.connect(daemon.ask)
+
+            def tell(text: str) -> str:
+                made.send(text.encode())
+                return made.recv().decode() if made.poll(2000) else "{}"
+
+            return tell
+
+        controller = peer(NAMES[0] + b"1")
+        liars = [peer(NAMES[1]), peer(b"short"), peer()]
+        if not os.geteuid():
+            strangers = (as_nobody(daemon.ask, name) for name in (NAMES[0], NAMES[1] + b"2"))
+            liars.extend(stack.enter_context(stranger) for stranger in strangers)
+        while json.loads(controller("lift")).get("verdict") != "stable":
+            pass  # from then on its user alone may lift
         for _ in plan.rounds():
             for _ in range(QUESTIONS):
-                liar.send(b"judge")  # a dashboard that looks takes nothing over
-                if liar.poll(2000):
-                    liar.recv()
-                controller.send(b"lift")
-                if not controller.poll(2000):
-                    continue
-                answer = json.loads(controller.recv())
-                if not answer["judged"]:
+                for liar in liars[1:]:
+                    liar("lift")  # asks first, and looks
+                answer = json.loads(controller("lift"))
+                if not answer.get("judged"):
                     continue
                 tried += 1
-                names = answer["boot_id"], answer["grasp"]
-                forged_well += tell(liar, *names, "slip")
-                told_well += tell(controller, *names, "stable")
-                forged_well += tell(liar, *names, "slip")
-                forged_well += tell(controller, *names, "slip")
-                forged_well += tell(liar, answer["boot_id"], answer["grasp"] - 1, "slip")
-                lies += 4
+                right, wrong, before = (
+                    f"outcome {answer['boot_id']} {grasp} {outcome}"
+                    for grasp, outcome in (
+                        (answer["grasp"], "stable"),
+                        (answer["grasp"], "slip"),
+                        (answer["grasp"] - 1, "slip"),
+                    )
+                )
+                told = [liar(wrong) for liar in liars]
+                told_well += json.loads(controller(right)).get("ok", False)
+                told += [liar(lie) for liar in liars for lie in (wrong, before)]
+                told.append(controller(wrong))
+                forged_well += sum(json.loads(each).get("ok", False) for each in told)
+                lies += len(told)
         well = forged_well == 0 and told_well == tried > 0
         said = f"{forged_well} of {lies} forged, {told_well} of {tried} true ones taken, "
         return daemon.outcome(lies + tried, well, said)

@@ -8,20 +8,44 @@ from pathlib import Path
 from typing import Self
 
 import zmq
+from msgspec.structs import replace
 
 from graspd.daemon import scene
-from graspd.daemon.publish.companion import Answer
+from graspd.daemon.judge.network import Opinion
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.judge.reasons import Moment
+from graspd.daemon.publish.companion import Answer, PublishedVerdict, at_once
 from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.sockets import Sockets
-from graspd.daemon.trust.lift_book import Report
+from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
+from tests.kit.messages import GOLDEN, decode_verdict
 from tests.ports import free_port
 
 WAIT_MS = 100_000
 QUIET_S = 0.3
 
 Keys = tuple[bytes, bytes]
+
+
+USER = b"user 1000"
+"""A credential, as of `ipc://`."""
+
+
+def published(
+    payload: bytes = b"{}",
+    name: str = "stable",
+    lifts: LiftBook | None = None,
+    keep: Callable[[Answer], None] = at_once,
+    grasp: int = 7,
+    **changes: object,
+) -> PublishedVerdict:
+    """The golden verdict of that name, with changes, on a grasp of the book."""
+    verdict = replace(decode_verdict((GOLDEN / f"verdict_{name}.json").read_bytes()), **changes)
+    judgement = Judgement(0, verdict.verdict, (), 0.1, Moment(grasp), Opinion(0.1, ()))
+    about = GraspId("0" * 32, grasp), LiftBook() if lifts is None else lifts, keep
+    return PublishedVerdict(judgement, verdict, payload, None, True, *about)
 
 
 class Publisher:
@@ -64,6 +88,9 @@ class Asked:
 
     def ask(self) -> None:
         self.times += 1
+
+    def silence(self) -> None:
+        raise AssertionError("a verdict was published")
 
     def outcome(self, report: Report, answer: Answer) -> None:
         self.outcomes.append(report)

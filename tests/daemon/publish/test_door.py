@@ -21,6 +21,7 @@ from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message
 from tests.ports import free_port
 
 SCHEMES = ("ipc", "tcp", "ip6")
+ME = b"user %d" % os.getuid()
 
 
 @pytest.fixture
@@ -165,7 +166,7 @@ def test_a_question_comes_with_its_routing_id_and_gets_its_answer(
     asker = peers.connect(kind, endpoint, name=b"controller")
     asker.send(b"judge")
     delimiter = [b""] if kind == zmq.REQ else []
-    assert receive(door, 1) == [[b"controller", *delimiter, b"judge"]]
+    assert receive(door, 1) == [[b"controller", ME, *delimiter, b"judge"]]
     assert door.answer([b"controller", *delimiter, b"{}"])
     assert asker.recv_multipart() == [b"{}"]
 
@@ -177,7 +178,7 @@ def test_a_client_that_reconnects_takes_its_routing_id_along(
     for number in range(2):
         asker = peers.connect(zmq.DEALER, endpoint, name=b"controller")
         asker.send(b"judge")
-        assert receive(door, 1) == [[b"controller", b"judge"]]
+        assert receive(door, 1) == [[b"controller", ME, b"judge"]]
         door.answer([b"controller", b"%d" % number])
         assert asker.recv() == b"%d" % number
 
@@ -188,8 +189,8 @@ def test_a_message_of_many_frames_is_cut(asked: tuple[Door, str], peers: Peers) 
     asker.send_multipart([b"x"] * 1000)
     asker.send(b"judge")
     long, question = receive(door, 2)
-    assert long == [b"controller", b"x", b"x", b"x"]
-    assert question == [b"controller", b"judge"]
+    assert long == [b"controller", ME, b"x", b"x", b"x"]
+    assert question == [b"controller", ME, b"judge"]
 
 
 def test_a_flood_of_questions_is_read_a_few_a_round(asked: tuple[Door, str], peers: Peers) -> None:
@@ -210,4 +211,4 @@ def test_a_peer_that_sends_too_much_is_disconnected_and_others_are_not(
     loud, polite = (peers.connect(zmq.DEALER, endpoint, name=name) for name in (b"loud", b"polite"))
     loud.send(b"x" * 100_000)
     polite.send(b"judge")
-    assert receive(door, 1) == [[b"polite", b"judge"]]
+    assert receive(door, 1) == [[b"polite", ME, b"judge"]]

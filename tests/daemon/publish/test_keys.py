@@ -17,7 +17,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from graspd.daemon.publish import door as doors
 from graspd.daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
 from graspd.daemon.publish.listener import PublishError
-from tests.daemon.publish.doors import QUIET_S, Asked, KeyedDoor
+from tests.daemon.publish.doors import QUIET_S, Asked, KeyedDoor, published
 from tests.kit.inside import graspd
 from tests.kit.messages import GOLDEN_STATUS
 from tests.kit.scenes import demo_scene
@@ -46,7 +46,7 @@ def test_a_key_on_the_list_hears_messages_and_may_ask(
         return requests.times
 
     wait_until(has_come)
-    questions.answer(b"{}")
+    questions.answer(published())
     assert asker.poll(int(PATIENCE_S * 1e3))
     assert asker.recv() == b"{}"
     assert caplog.text.count("admitted a peer with the key of controller") == 2

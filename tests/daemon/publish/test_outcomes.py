@@ -15,8 +15,9 @@ from graspd.daemon.publish.companion import REPEATED, Answer
 from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.publish.questions import Questions
-from graspd.daemon.trust.lift_book import GraspId, Report
+from graspd.daemon.trust.lift_book import GraspId, Peer, Report
 from tests.daemon.fakes import FINGERS, Clock
+from tests.daemon.publish.doors import USER
 from tests.daemon.publish.doors import Asked as Requests
 from tests.kit.loops import SentMessages
 
@@ -57,7 +58,7 @@ def test_an_outcome_of_a_grasp_that_an_earlier_start_judged_says_which() -> None
         assert (message.boot_id, message.grasp, message.grasp_boot_id) == (BOOT, 3, judged_by)
 
 
-TELLER, OTHER = b"teller", b"other"
+TELLER = b"teller"
 
 
 class Asked:
@@ -74,7 +75,7 @@ class Asked:
     def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
         """Tell an outcome, which is no question."""
         requests = requests or Requests(takes_the_seventh)
-        self.questions.take([[peer, *frames]], 0, requests)
+        self.questions.take([[peer, USER, *frames]], 0, requests)
         assert requests.times == 0
         answer: dict[str, Any] = json.loads(self.sent[-1][-1])
         assert self.sent[-1] == (peer, *frames[:-1], self.sent[-1][-1])
@@ -109,7 +110,7 @@ def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(asked: Asked) -> N
     waiting: list[Answer] = []
     requests.waiting = waiting
     texts = [f"outcome {BOOT} {grasp} slip".encode() for grasp in (7, 8, 7)]
-    messages = [[TELLER, text] for text in texts]
+    messages = [[TELLER, USER, text] for text in texts]
     asked.questions.take(messages, 0, requests)
     assert [json.loads(frames[-1]) for frames in asked.sent] == [
         {"v": 1, "ok": False, "why": "no such"}
@@ -130,28 +131,6 @@ def test_a_repeated_outcome_is_answered_as_taken_and_repeated(asked: Asked) -> N
     assert asked.questions.counters["outcomes"] == 1
 
 
-def test_only_peers_that_ask_lift_are_named_by_the_answer(asked: Asked) -> None:
-    messages = [[OTHER, b"judge"], [TELLER, b"lift"], [b"third", b"lift"]]
-    asked.questions.take(messages, 0, Requests())
-    assert asked.questions.answer(b"{}") == [TELLER, b"third"]
-    assert asked.questions.answer(b"{}") == []
-
-
-def test_a_question_that_is_replaced_asks_for_no_lift(asked: Asked) -> None:
-    messages = [[OTHER, b"lift"], [OTHER, b"judge"], [TELLER, b"lift"]]
-    asked.questions.take(messages, 0, Requests())
-    assert asked.questions.answer(b"{}") == [TELLER]
-
-
-def test_connections_of_one_client_are_one_peer(asked: Asked) -> None:
-    """By the first 16 bytes of their routing ids."""
-    name, requests = bytes(range(1, 17)), Requests()
-    asked.questions.take([[name + b"1", b"lift"]], 0, Requests())
-    assert asked.questions.answer(b"{}") == [name]
-    asked.tell(name + b"2", SLIP, requests=requests)
-    assert requests.outcomes == [Report(GraspId(BOOT, 7), "slip", None, name)]
-
-
 NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", "a=1", "a|b", "~")
 """What a spreadsheet or a shell takes for more than a name."""
 
@@ -162,7 +141,7 @@ def test_the_object_arrives_as_it_was_told(asked: Asked, name: str | None) -> No
     text = f"outcome {BOOT} 7 slip" + (f" {name}" if name else "")
     answer = asked.tell(TELLER, text.encode(), requests=requests)
     assert answer == {"v": 1, "ok": True}
-    assert requests.outcomes == [Report(GraspId(BOOT, 7), "slip", name, TELLER)]
+    assert requests.outcomes == [Report(GraspId(BOOT, 7), "slip", name, Peer(TELLER, USER))]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.questions import WAITING_MAX, Questions
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
-from tests.daemon.publish.doors import Asked, Peers
+from tests.daemon.publish.doors import USER, Asked, Peers, published
 from tests.kit.messages import decode_verdict
 from tests.kit.waiting import wait_until
 
@@ -40,7 +40,7 @@ def test_the_daemons_clock_is_told_at_once_and_judges_nothing(
     questions: Questions, sent: list[Frames]
 ) -> None:
     requests = Asked()
-    questions.take([[b"asker", b"clock"]], 1_234_567_890_123, requests)
+    questions.take([[b"asker", USER, b"clock"]], 1_234_567_890_123, requests)
     assert sent == [[b"asker", b'{"v":1,"t_mono_ns":1234567890123}']]
     assert (requests.times, questions.counters["clocks"], questions.waiting) == (0, 1, {})
 
@@ -51,13 +51,14 @@ def test_a_question_gets_one_answer(
     questions: Questions, sent: list[Frames], delimiter: list[bytes], text: bytes
 ) -> None:
     requests = Asked()
-    questions.take([[b"asker", *delimiter, text]], 0, requests)
+    questions.take([[b"asker", USER, *delimiter, text]], 0, requests)
     assert (requests.times, len(questions.waiting)) == (1, 1)
-    questions.answer(b"{}")
-    questions.answer(b"{}")
+    questions.answer(published(b"{}"))
+    questions.answer(published(b"{}"))
     assert sent == [[b"asker", *delimiter, b"{}"]]
     assert len(questions.waiting) == 0
-    assert questions.counters == {"asked": 1, "answered": 1, "dropped": 0}
+    short_id = {"not_theirs": 1} if text == b"lift" else {}
+    assert questions.counters == {"asked": 1, "answered": 1, "dropped": 0} | short_id
 
 
 @pytest.mark.parametrize(
@@ -77,10 +78,10 @@ def test_what_is_no_question_is_counted_and_not_answered(
     questions: Questions, sent: list[Frames], frames: list[bytes]
 ) -> None:
     requests = Asked()
-    questions.take([[b"asker", *frames]], 0, requests)
+    questions.take([[b"asker", USER, *frames]], 0, requests)
     assert requests.times == 0
-    questions.take([[b"asker", b"judge"]], 0, requests)
-    questions.answer(b"{}")
+    questions.take([[b"asker", USER, b"judge"]], 0, requests)
+    questions.answer(published(b"{}"))
     assert sent == [[b"asker", b"{}"]]
     assert questions.counters["malformed"] == 1
 
@@ -89,10 +90,10 @@ def test_a_flood_of_questions_is_bounded_and_each_peers_newest_is_answered(
     questions: Questions, sent: list[Frames]
 ) -> None:
     for _ in range(5):
-        questions.take([[b"%d" % peer, b"judge"] for peer in range(10)], 0, Asked())
+        questions.take([[b"%d" % peer, USER, b"judge"] for peer in range(10)], 0, Asked())
     assert len(questions.waiting) == 10
     assert questions.counters["given_up"] == 40
-    questions.answer(b"{}")
+    questions.answer(published(b"{}"))
     assert sent == [[b"%d" % peer, b"{}"] for peer in range(10)]
 
 
@@ -100,29 +101,29 @@ def test_the_oldest_question_makes_place_for_a_newer_one(
     questions: Questions, sent: list[Frames]
 ) -> None:
     for peer in range(WAITING_MAX + 20):
-        questions.take([[b"%d" % peer, b"judge"]], 0, Asked())
+        questions.take([[b"%d" % peer, USER, b"judge"]], 0, Asked())
     assert len(questions.waiting) == WAITING_MAX
-    questions.answer(b"{}")
+    questions.answer(published(b"{}"))
     assert sent[0] == [b"20", b"{}"]
 
 
 def test_when_time_is_up_only_the_peers_that_waited_that_long_are_answered(
     questions: Questions, sent: list[Frames]
 ) -> None:
-    questions.take([[b"first", b"judge"]], 0, Asked())
-    questions.take([[b"second", b"judge"]], 500, Asked())
-    questions.answer(b"early", PATIENCE_NS - 1)
+    questions.take([[b"first", USER, b"judge"]], 0, Asked())
+    questions.take([[b"second", USER, b"judge"]], 500, Asked())
+    questions.answer(published(b"early"), PATIENCE_NS - 1)
     assert len(questions.waiting) == 2
-    questions.answer(b"late", PATIENCE_NS)
+    questions.answer(published(b"late"), PATIENCE_NS)
     assert len(questions.waiting) == 1
-    questions.answer(b"judged")
+    questions.answer(published(b"judged"))
     assert sent == [[b"first", b"late"], [b"second", b"judged"]]
 
 
 def test_an_answer_that_is_dropped_is_counted() -> None:
     questions = Questions(lambda _frames: False, PATIENCE_NS)
-    questions.take([[b"asker", b"judge"]], 0, Asked())
-    questions.answer(b"{}")
+    questions.take([[b"asker", USER, b"judge"]], 0, Asked())
+    questions.answer(published(b"{}"))
     assert questions.counters["dropped"] == 1
 
 

@@ -14,17 +14,12 @@ import pytest
 import zmq
 
 from graspd.daemon import scene
-from graspd.daemon.judge.network import Opinion
-from graspd.daemon.judge.pipeline import Judgement
-from graspd.daemon.judge.reasons import Decision, Moment
-from graspd.daemon.publish.companion import PublishedVerdict
 from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets, plan
-from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook
+from graspd.daemon.trust.lift_book import GraspId
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import Asked, Peers
+from tests.daemon.publish.doors import USER, Asked, Peers, published
 from tests.kit.inside import graspd
-from tests.kit.messages import GOLDEN, GOLDEN_VERDICT, decode_verdict
 from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S, wait_until
 
@@ -85,47 +80,11 @@ def test_questions_and_outcomes_reach_the_loop_and_are_answered(
         assert report[:3] == (GraspId("0" * 32, 7), "slip", None)
         assert asker.recv() == b'{"v":1,"ok":true}'
         assert sockets.questions is not None
-        sockets.questions.answer(b"{}")
+        sockets.questions.answer(published())
         assert asker.recv() == b"{}"
         counters = sockets.counters
     assert counters["publish"] == {"dropped": 0}
     assert (counters["ask"]["asked"], counters["ask"]["outcomes"]) == (1, 1)
-
-
-@pytest.mark.parametrize("number", [0, 7])
-def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
-    tmp_path: Path, number: int
-) -> None:
-    """Number 0: before the first touch there is no grasp."""
-    lifts, grasp = LiftBook(), GraspId("0" * 32, number)
-    with Sockets(wanted(tmp_path)) as sockets:
-        assert sockets.questions is not None
-        sockets.questions.take([[b"dashboard", b"judge"], [b"controller", b"lift"]], 0, Asked())
-        judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(number), Opinion(0.1, ()))
-        sockets.on_verdict(
-            PublishedVerdict(judgement, GOLDEN_VERDICT, b"{}", None, True, grasp, lifts)
-        )
-        assert len(sockets.questions.waiting) == 0
-    assert lifts.may_report(grasp, b"controller")
-    assert lifts.may_report(grasp, b"dashboard") == (number == 0)
-
-
-@pytest.mark.parametrize(
-    ("question", "answer", "announced"),
-    [(b"lift", "stable", 1), (b"lift", "slip", 0), (b"judge", "stable", 0)],
-)
-def test_only_a_lift_question_that_is_answered_stable_announces_a_lift(
-    tmp_path: Path, question: bytes, answer: str, announced: int
-) -> None:
-    lifts, grasp = LiftBook(), GraspId("0" * 32, 7)
-    lifts.note(grasp, NOT_ASSESSED, stable=True)
-    with Sockets(wanted(tmp_path)) as sockets:
-        assert sockets.questions is not None
-        sockets.questions.take([[b"peer", question], [b"other", question]], 0, Asked())
-        verdict = decode_verdict((GOLDEN / f"verdict_{answer}.json").read_bytes())
-        judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(7), Opinion(0.1, ()))
-        sockets.on_verdict(PublishedVerdict(judgement, verdict, b"{}", None, True, grasp, lifts))
-    assert (lifts.announced, lifts.awaited) == (announced, announced)
 
 
 def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers: Peers) -> None:
@@ -151,11 +110,11 @@ def test_a_daemon_whose_proxy_ends_ends_with_an_error(
 def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:
     sockets = Sockets(wanted(tmp_path))
     assert sockets.questions is not None
-    sockets.questions.take([[b"asker", b"judge"]], 0, Asked())
+    sockets.questions.take([[b"asker", USER, b"judge"]], 0, Asked())
     sockets.close()
     sockets.close()
     sockets.send(b"verdict.right", b"{}")
-    sockets.questions.answer(b"{}")
+    sockets.questions.answer(published())
     counters = sockets.counters
     assert (counters["publish"]["dropped"], counters["ask"]["dropped"]) == (1, 1)
     assert list(tmp_path.iterdir()) == []
@@ -243,7 +202,7 @@ def test_hostile_messages_do_no_harm(tmp_path: Path, peers: Peers, door: str, ki
                 pass
             if sent % 20 == 0:
                 sockets.before_wait(requests)
-                questions.answer(b"{}")
+                questions.answer(published())
         friend = peers.subscribe(f"ipc://{tmp_path}/v", "verdict.")
         asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")
         asker.send(b"judge")
@@ -251,7 +210,7 @@ def test_hostile_messages_do_no_harm(tmp_path: Path, peers: Peers, door: str, ki
         def served() -> bool:
             sockets.send(b"verdict.right", b"{}")
             sockets.before_wait(requests)
-            questions.answer(b"{}")
+            questions.answer(published())
             return bool(friend.poll(0) and asker.poll(0))
 
         wait_until(served)

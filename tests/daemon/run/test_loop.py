@@ -298,12 +298,10 @@ def test_a_companion_asks_and_tells_and_hears_what_comes_of_it() -> None:
 BOOT = "b" * 32
 
 
-def told(
-    bench: LoopBench, outcome: Literal["stable", "slip"], peer: bytes = b"controller"
-) -> list[str | None]:
+def told(bench: LoopBench, outcome: Literal["stable", "slip"]) -> list[str | None]:
     """What the answers to an outcome of the first grasp are, as they come."""
     answers: list[str | None] = []
-    bench.loop.outcome(Report(GraspId(BOOT, 1), outcome, None, peer), answers.append)
+    bench.loop.outcome(Report(GraspId(BOOT, 1), outcome), answers.append)
     return answers
 
 

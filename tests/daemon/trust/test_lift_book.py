@@ -4,35 +4,86 @@ from __future__ import annotations
 
 import pytest
 
-from graspd.daemon.trust.lift_book import LIFTS_MAX, NOT_ASSESSED, LiftBook, OutcomeStatus
+from graspd.daemon.trust.lift_book import LIFTS_MAX, NOT_ASSESSED, LiftBook, OutcomeStatus, Peer
 from tests.daemon.trust.grasps import named
 
-CONTROLLER, DASHBOARD = b"controller", b"dashboard"
+ROBOT, STRANGER = b"user 1000", b"user 1001"
+CONTROLLER = Peer(b"controller-16byte1", ROBOT)
+RESTARTED = Peer(b"another-16-bytes1", ROBOT)
+FORGER = Peer(CONTROLLER.routing_id, STRANGER)
 
 
-def test_only_its_first_owner_reports_a_grasp_that_was_claimed() -> None:
+def book(*grasps: int) -> LiftBook:
+    """One in which these grasps were called `stable`."""
     lifts = LiftBook()
+    for grasp in grasps:
+        lifts.note(named(grasp), bytes(8), stable=True)
+    return lifts
+
+
+def test_the_owner_alone_reports_a_grasp() -> None:
+    lifts = book(1)
+    assert lifts.claim(named(1), CONTROLLER)
+    assert lifts.may_report(named(1), CONTROLLER._replace(routing_id=b"controller-16byte2"))
+    assert not lifts.may_report(named(1), FORGER)
+    assert not lifts.may_report(named(1), RESTARTED)
+
+
+def test_another_user_cannot_claim_an_owned_grasp() -> None:
+    lifts = book(1)
+    assert lifts.claim(named(1), CONTROLLER)
+    assert not lifts.claim(named(1), FORGER)
+    assert lifts.lifter == CONTROLLER
+
+
+def test_a_restarted_controller_reports_for_the_former_one() -> None:
+    lifts = book(1, 2)
     lifts.claim(named(1), CONTROLLER)
-    lifts.claim(named(1), DASHBOARD)
+    assert lifts.claim(named(2), RESTARTED)
+    assert lifts.may_report(named(1), RESTARTED)
     assert lifts.may_report(named(1), CONTROLLER)
-    assert not lifts.may_report(named(1), DASHBOARD)
+    assert not lifts.may_report(named(2), CONTROLLER)
 
 
-def test_a_grasp_that_nothing_claimed_is_reported_by_those_that_own_others() -> None:
-    lifts = LiftBook()
-    assert lifts.may_report(named(1), DASHBOARD), "there is no owner at all"
+def test_only_the_last_lifter_reports_grasps_without_an_owner() -> None:
+    lifts = book(1, 2)
+    assert not lifts.may_report(named(1), CONTROLLER)
     lifts.claim(named(2), CONTROLLER)
     assert lifts.may_report(named(1), CONTROLLER)
-    assert not lifts.may_report(named(1), DASHBOARD)
+    assert not lifts.may_report(named(1), FORGER)
 
 
-def test_as_many_owners_are_remembered_as_grasps() -> None:
-    lifts = LiftBook()
-    lifts.claim(named(0), DASHBOARD)
-    for grasp in range(1, LIFTS_MAX + 1):
-        lifts.claim(named(grasp), CONTROLLER)
-    assert not lifts.may_report(named(LIFTS_MAX + 1), DASHBOARD), "its only claim was the oldest"
-    assert lifts.may_report(named(1), CONTROLLER)
+def test_a_told_or_unknown_grasp_has_no_new_owner() -> None:
+    lifts = book(1)
+    lifts.tell(named(1), slipped=False)
+    assert not lifts.claim(named(1), CONTROLLER)
+    assert not lifts.claim(named(2), CONTROLLER)
+
+
+def test_owners_are_kept_between_two_starts() -> None:
+    lifts, later = book(1), LiftBook()
+    lifts.claim(named(1), CONTROLLER)
+    later.restore(lifts.state(), 1)
+    assert later.may_report(named(1), CONTROLLER)
+    assert not later.may_report(named(1), FORGER)
+    assert not later.may_report(named(1), RESTARTED)
+
+
+def test_a_lift_that_is_taken_back_is_not_awaited() -> None:
+    lifts, heard = book(1), list[bool]()
+    lifts.on_announced = heard.append
+    lifts.claim(named(1), CONTROLLER)
+    assert lifts.offered(CONTROLLER) == named(1)
+    assert lifts.offered(FORGER) is None
+    lifts.announce()
+    assert lifts.take_back(named(1))
+    assert (lifts.announced, lifts.awaited, heard) == (0, 0, [True, False])
+    lifts.announce()
+    assert lifts.take_back(None)
+    assert lifts.take_back(named(1)), "there is nothing to take back"
+    lifts.tell(named(1), slipped=True)
+    assert not lifts.take_back(named(1))
+    assert heard == [True, False] * 2
 
 
 @pytest.mark.parametrize("stable", [True, False])
@@ -68,16 +119,14 @@ def test_an_outcome_is_kept_once_the_disk_has_it() -> None:
     assert lifts.is_kept(named(1))
 
 
-def test_a_restored_outcome_is_kept_and_its_owner_is_not() -> None:
+def test_a_restored_outcome_is_kept() -> None:
     lifts = LiftBook()
     lifts.note(named(1), bytes(8), stable=True)
-    lifts.claim(named(1), CONTROLLER)
     lifts.tell(named(1), slipped=False)
     other = LiftBook()
     other.restore(lifts.state(), 1)
     assert other.is_told(named(1))
     assert other.is_kept(named(1))
-    assert other.may_report(named(1), DASHBOARD)
     assert other.tell(named(1), slipped=False)[0] is OutcomeStatus.REPEATED
     assert other.tell(named(1), slipped=True)[0] is OutcomeStatus.CONTRADICTS
 

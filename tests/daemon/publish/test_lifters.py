@@ -1,0 +1,450 @@
+"""Who may lift and tell: an answered `lift` on the disk, of one user or key; all else looks."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from graspd.daemon import scene
+from graspd.daemon.publish.companion import Answer
+from graspd.daemon.publish.door import Door, Frames
+from graspd.daemon.publish.keys import load_pair, make
+from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.questions import WAITING_MAX, Questions
+from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.daemon.publish.doors import WAIT_MS, Asked, KeyedDoor, Peers, published
+from tests.kit.waiting import wait_until
+from tests.ports import free_port
+
+ROBOT, STRANGER = b"user 1000", b"user 1001"
+NAME, OTHER = b"controller-16byt", b"another-16-bytes"
+SEVENTH = GraspId("0" * 32, 7)
+S = 1_000_000_000
+
+
+class Book(Asked):
+    """The loop's part: the book of lifts, with grasp 7 called `stable`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lifts = LiftBook()
+        self.lifts.note(SEVENTH, bytes(8), stable=True)
+        self.disk: list[Answer] = []
+        self.silences = 0
+
+    def silence(self) -> None:
+        self.silences += 1
+
+    def outcome(self, report: Report, answer: Answer) -> None:
+        if not self.lifts.may_report(report.grasp, report.peer):
+            answer("not yours")
+        elif report.outcome == "not-lifted":
+            answer(None if self.lifts.take_back(report.grasp) else "contradicts")
+        else:
+            self.lifts.tell(report.grasp, slipped=report.outcome == "slip")
+            answer(None)
+
+
+class Bench:
+    """Questions of peers, what they are answered, and verdicts."""
+
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401
+        self.sent: list[Frames] = []
+        self.book = Book()
+        self.questions = Questions(self._send, S, **options)
+
+    def _send(self, frames: Any) -> bool:  # noqa: ANN401
+        self.sent.append([*frames])
+        return True
+
+    def say(self, text: bytes, who: bytes = NAME, user: bytes = ROBOT, now_ns: int = 0) -> Any:  # noqa: ANN401
+        """Return the answer if there is one at once."""
+        known = len(self.sent)
+        self.questions.take([[who, user, text]], now_ns, self.book)
+        return json.loads(self.sent[-1][-1]) if len(self.sent) > known else None
+
+    def verdict(self, name: str = "stable", now_ns: int | None = None, **more: Any) -> None:  # noqa: ANN401
+        payload = f'{{"said":"{name}"}}'.encode()
+        self.questions.answer(published(payload, name, self.book.lifts, **more), now_ns)
+
+    @property
+    def answers(self) -> list[Any]:
+        return [json.loads(frames[-1]) for frames in self.sent]
+
+    @property
+    def announced(self) -> tuple[int, int]:
+        return self.book.lifts.announced, self.book.lifts.awaited
+
+    def tells(self, who: bytes = NAME, user: bytes = ROBOT) -> bool:
+        ok: bool = self.say(b"outcome " + b"0" * 32 + b" 7 slip", who, user)["ok"]
+        return ok
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def lifted(bench: Bench, who: bytes = NAME, user: bytes = ROBOT) -> None:
+    bench.say(b"lift", who, user)
+    bench.verdict()
+
+
+@pytest.mark.parametrize("name", ["unknown", "slip"])
+def test_asking_alone_owns_nothing(bench: Bench, name: str) -> None:
+    bench.say(b"lift")
+    bench.verdict(name, supervised=False)
+    assert bench.answers == [{"said": name}]
+    assert not bench.tells()
+
+
+def test_the_first_user_that_may_lift_stays_the_only_one(bench: Bench) -> None:
+    lifted(bench)
+    lifted(bench, OTHER, STRANGER)
+    assert len(bench.answers) == 2
+    assert bench.announced == (1, 1)
+    assert [bench.tells(who, STRANGER) for who in (OTHER, NAME)] == [False, False]
+    assert bench.tells()
+
+
+def test_a_user_that_only_looks_does_not_take_the_place(bench: Bench) -> None:
+    bench.say(b"judge", OTHER, STRANGER)
+    bench.verdict()
+    bench.say(b"lift", OTHER, STRANGER)
+    bench.verdict("unknown", supervised=False)
+    lifted(bench)
+    assert bench.announced == (1, 1)
+    assert bench.tells()
+
+
+def test_the_scene_says_who_may_lift() -> None:
+    bench = Bench(tells={ROBOT}.__contains__)
+    lifted(bench, OTHER, STRANGER)
+    assert bench.announced == (0, 0)
+    assert not bench.tells(OTHER, STRANGER)
+    lifted(bench)
+    assert bench.announced == (1, 1)
+    assert bench.tells()
+
+
+@pytest.mark.parametrize("size", [1, 5, 15])
+def test_a_short_routing_id_owns_nothing(bench: Bench, size: int) -> None:
+    lifted(bench, NAME[:size])
+    assert (len(bench.answers), bench.announced) == (1, (0, 0))
+    assert not bench.tells(NAME[:size])
+
+
+def test_a_supervised_lift_is_offered_to_lifters_alone(bench: Bench) -> None:
+    for who, user in ((NAME, ROBOT), (OTHER, STRANGER)):
+        bench.say(b"lift", who, user)
+        bench.verdict("unknown", supervised=True, reasons=["unproven"])
+    assert bench.answers[0] == {"said": "unknown"}
+    assert bench.answers[1]["supervised"] is False
+    assert bench.announced == (0, 0)
+    assert bench.tells()
+
+
+def test_a_lift_is_on_the_disk_before_the_answer(bench: Bench) -> None:
+    bench.say(b"lift")
+    bench.verdict(keep=bench.book.disk.append)
+    assert (bench.sent, bench.announced) == ([], (1, 1))
+    bench.verdict(now_ns=0)
+    bench.book.disk[0](None)
+    assert bench.sent == []
+    bench.verdict(now_ns=0)
+    assert (bench.answers, len(bench.book.disk)) == ([{"said": "stable"}], 1)
+
+
+def test_a_lift_that_cannot_be_kept_is_unknown(bench: Bench) -> None:
+    bench.say(b"lift")
+    bench.verdict(keep=lambda answer: answer("not kept: full"))
+    (answer,) = bench.answers
+    assert (answer["verdict"], answer["reasons"], answer["p_slip"]) == (
+        "unknown",
+        ["not-kept"],
+        None,
+    )
+    assert bench.announced == (0, 0)
+
+
+@pytest.mark.parametrize("name", ["unknown", "slip"])
+def test_what_is_no_longer_stable_is_not_announced(bench: Bench, name: str) -> None:
+    bench.say(b"lift")
+    bench.verdict(keep=bench.book.disk.append)
+    bench.book.disk[0](None)
+    bench.verdict(name, now_ns=0, supervised=False)
+    assert (bench.answers, bench.announced) == ([{"said": name}], (0, 0))
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_a_word_takes_a_lift_back(bench: Bench, answered: bool) -> None:
+    bench.say(b"lift")
+    bench.verdict(keep=(lambda answer: answer(None)) if answered else bench.book.disk.append)
+    assert bench.announced == (1, 1)
+    assert bench.say(b"not-lifting") == {"v": 1, "ok": True}
+    assert bench.announced == (0, 0)
+    bench.verdict()
+    assert len(bench.sent) == 1 + answered
+
+
+def test_a_question_that_is_taken_back_is_not_answered(bench: Bench) -> None:
+    bench.say(b"lift")
+    bench.say(b"not-lifting")
+    bench.verdict()
+    assert (bench.answers, bench.announced) == ([{"v": 1, "ok": True}], (0, 0))
+
+
+@pytest.mark.parametrize(("who", "user"), [(NAME, STRANGER), (NAME + b"2", ROBOT), (OTHER, ROBOT)])
+def test_the_word_of_another_connection_takes_nothing_back(
+    bench: Bench, who: bytes, user: bytes
+) -> None:
+    lifted(bench)
+    bench.say(b"not-lifting", who, user)
+    assert bench.announced == (1, 1)
+
+
+def test_a_second_question_does_not_take_the_first_lift_back(bench: Bench) -> None:
+    """The hand may be lifting by the first answer."""
+    lifted(bench)
+    lifted(bench, NAME + b"2")
+    bench.say(b"not-lifting", NAME + b"2")
+    assert bench.announced == (1, 1)
+
+
+def test_an_owner_says_that_no_lift_followed(bench: Bench) -> None:
+    lifted(bench)
+    not_lifted = b"outcome " + b"0" * 32 + b" 7 not-lifted"
+    assert not bench.say(not_lifted, NAME, STRANGER)["ok"]
+    assert bench.announced == (1, 1)
+    assert bench.say(not_lifted, NAME + b"2")["ok"]
+    assert bench.announced == (0, 0)
+
+
+def test_five_questions_without_a_lift_leave_none_announced(bench: Bench) -> None:
+    for grasp in range(8, 13):
+        bench.book.lifts.note(GraspId("0" * 32, grasp), bytes(8), stable=True)
+        bench.say(b"lift")
+        bench.verdict(grasp=grasp)
+        bench.say(b"not-lifting")
+    assert bench.announced == (0, 0)
+
+
+def test_a_question_ends_in_time_without_a_reading(bench: Bench) -> None:
+    bench.verdict("slip")
+    bench.say(b"judge")
+    bench.questions.expire(S - 1, bench.book)
+    assert (bench.sent, bench.questions.due_ns) == ([], S)
+    bench.questions.expire(S, bench.book)
+    assert [(answer["verdict"], answer["reasons"]) for answer in bench.answers] == [
+        ("unknown", ["stale"])
+    ]
+    assert (bench.questions.due_ns, bench.book.silences) == (None, 0)
+
+
+def test_before_the_first_reading_silence_is_the_answer(bench: Bench) -> None:
+    bench.say(b"judge")
+    bench.questions.expire(S, bench.book)
+    assert bench.book.silences == 1
+
+
+def test_a_lift_that_waits_too_long_for_the_disk_ends_unknown(bench: Bench) -> None:
+    bench.say(b"lift")
+    bench.verdict(keep=bench.book.disk.append)
+    bench.questions.expire(S, bench.book)
+    assert [answer["reasons"] for answer in bench.answers] == [["not-kept"]]
+    assert bench.announced == (0, 0)
+    bench.book.disk[0](None)
+    bench.verdict()
+    assert len(bench.sent) == 1
+
+
+def test_a_question_that_makes_place_is_answered_unknown(bench: Bench) -> None:
+    bench.verdict("slip")
+    bench.say(b"lift")
+    for number in range(WAITING_MAX):
+        bench.say(b"judge", b"%016d" % number)
+    assert bench.sent[0][0] == NAME
+    assert (bench.answers[0]["verdict"], len(bench.sent)) == ("unknown", 1)
+
+
+# Credentials
+
+
+@pytest.fixture
+def door() -> Iterator[tuple[Door, str]]:
+    """A door that other users can reach, and its socket for questions."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        listeners = [Listener(f"ipc://{folder}/{name}", 0o666) for name in ("v", "ask")]
+        opened = Door(listeners)
+        yield opened, f"{folder}/ask"
+        assert opened.close()
+        for listener in listeners:
+            listener.close()
+
+
+def first_of(receive: Callable[[], list[Frames]]) -> Frames:
+    got: list[Frames] = []
+
+    def has_come() -> bool:
+        got.extend(receive())
+        return bool(got)
+
+    wait_until(has_come)
+    return got[0]
+
+
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
+CONNECTS_AS = """
+import os, socket, sys, time
+path, uid, hello = sys.argv[1], int(sys.argv[2]), bytes.fromhex(sys.argv[3])
+made = socket.socket(socket.AF_UNIX)
+os.setgroups([]); os.setgid(uid); os.setuid(uid)
+made.connect(path); made.settimeout(30); made.sendall(hello[:64])
+assert made.recv(64, socket.MSG_WAITALL); made.sendall(hello[64:])
+while made.recv(100): pass
+"""
+
+
+def hello(*properties: tuple[bytes, bytes]) -> bytes:
+    """A DEALER's handshake (RFC 23) with these properties, and a question."""
+    fields = b"\x05READY"
+    for name, value in ((b"Socket-Type", b"DEALER"), (b"Identity", NAME), *properties):
+        fields += bytes([len(name)]) + name + struct.pack(">I", len(value)) + value
+    return b"\x04" + bytes([len(fields)]) + fields + b"\x00\x04lift"
+
+
+@pytest.mark.parametrize("forged", [b"Peer-Address", b"User-Id"])
+def test_a_peer_cannot_name_its_own_user(door: tuple[Door, str], forged: bytes) -> None:
+    with socket.socket(socket.AF_UNIX) as rogue:
+        rogue.connect(door[1])
+        rogue.sendall(GREETING)
+        assert len(rogue.recv(64, socket.MSG_WAITALL)) == 64
+        rogue.sendall(hello((forged, b"localhost:4242:4242:1")))
+        assert first_of(door[0].receive) == [NAME, b"user %d" % os.getuid(), b"lift"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_another_user_with_the_same_routing_id_is_told_apart(
+    door: tuple[Door, str], peers: Peers
+) -> None:
+    peers.connect(zmq.DEALER, f"ipc://{door[1]}", name=NAME).send(b"lift")
+    assert first_of(door[0].receive) == [NAME, b"user 0", b"lift"]
+    command = [sys.executable, "-I", "-c", CONNECTS_AS, door[1], "65534"]
+    command.append((GREETING + hello()).hex())
+    with subprocess.Popen(command) as rogue:
+        assert first_of(door[0].receive) == [NAME, b"user 65534", b"lift"]
+        rogue.kill()
+
+
+def test_a_key_is_the_credential_on_tcp(tmp_path: Path) -> None:
+    opened = KeyedDoor(tmp_path)
+    lifts = LiftBook()
+    lifts.note(SEVENTH, bytes(8), stable=True)
+    try:
+        made = opened.connect(opened.known, zmq.DEALER)
+        made.send(b"lift")
+        requests, questions = Asked(), opened.sockets.questions
+        assert questions is not None
+
+        def has_come() -> bool:
+            opened.sockets.before_wait(requests)
+            return bool(requests.times)
+
+        wait_until(has_come)
+        ((peer, _),) = questions.waiting.items()
+    finally:
+        opened.close()
+    assert peer.credential == b"key " + opened.known[0]
+
+
+def wanted(folder: Path, tell: list[str], ask: str, curve: bool = False) -> scene.Scene:
+    text: dict[str, Any] = {
+        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        "publish": {"endpoint": f"ipc://{folder}/v"},
+        "ask": {"endpoint": ask, "tell": tell},
+    }
+    if curve:
+        text["curve"] = {"secret_key": "daemon.key_secret", "clients": "clients"}
+    return scene.parse(text, folder / "scene.toml")
+
+
+def test_tellers_are_users_or_keys_of_the_scene(tmp_path: Path) -> None:
+    make(tmp_path, "daemon")
+    public = load_pair(make(tmp_path / "clients", "controller")[1])[0]
+    for ask, curve, credentials in (
+        (f"ipc://{tmp_path}/ask", False, (b"user 12345", b"user 1", b"", b"key x")),
+        (
+            f"tcp://127.0.0.1:{free_port()}",
+            True,
+            (b"key " + public, b"", b"key " + b"0" * 40, b"user 0"),
+        ),
+    ):
+        tell = ["controller"] if curve else ["root", "12345"]
+        with Sockets(wanted(tmp_path, tell, ask, curve)) as sockets:
+            assert sockets.questions is not None
+            lifts, may = LiftBook(), []
+            lifts.note(SEVENTH, bytes(8), stable=True)
+            for credential in credentials:
+                peer = [[NAME, credential, b"lift"]]
+                sockets.questions.take(peer, 0, Asked())
+                before = lifts.lifter
+                sockets.on_verdict(published(lifts=lifts))
+                may.append(lifts.lifter != before)
+                lifts.lifter = None
+                lifts.note(SEVENTH, bytes(8), stable=True)
+        assert may == [credential == credentials[0] for credential in credentials]
+
+
+def test_a_teller_that_is_no_user_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PublishError, match="there is no user no-such-user"):
+        Sockets(wanted(tmp_path, ["no-such-user"], f"ipc://{tmp_path}/ask"))
+
+
+def test_tellers_cannot_be_checked_on_plain_tcp(tmp_path: Path) -> None:
+    with pytest.raises(scene.SceneError, match=r"ask\.tell needs an ipc:// socket"):
+        wanted(tmp_path, ["root"], "tcp://127.0.0.1:5555")
+
+
+def test_a_killed_daemon_takes_the_outcome_after_its_restart(tmp_path: Path, peers: Peers) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[tactile]\ndriver = "replay"\nloop = true\nspeed = 2.0\n'
+        f'recordings = ["{DEMO_RECORDING}"]\n[session]\nkeep = true\nfile = "s.json"\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n[ask]\nendpoint = "ipc://{tmp_path}/ask"\n'
+    )
+    asker = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask", name=NAME)
+    asker.rcvtimeo = WAIT_MS
+    with start("run", path) as daemon:
+        wait_for(tmp_path / "ask")
+        answer: dict[str, Any] = {}
+        while answer.get("verdict") != "stable":
+            asker.send(b"lift")
+            answer = json.loads(asker.recv())
+        daemon.send_signal(signal.SIGKILL)
+        daemon.communicate(timeout=TIMEOUT_S)
+    with start("run", path) as daemon:
+        told = f"outcome {answer['boot_id']} {answer['grasp']} slip".encode()
+        stranger = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask", name=OTHER)
+        taken = []
+        for peer in (stranger, asker):
+            peer.send(told)
+            taken.append(json.loads(peer.recv())["ok"])
+        daemon.terminate()
+        daemon.communicate(timeout=TIMEOUT_S)
+    assert taken == [False, True]
