@@ -149,7 +149,8 @@ class Runner:
             self._running = False
             try:
                 if woken:
-                    parts = Parts.of(parts.scene, parts.model)
+                    slept, parts = parts, Parts.of(parts.scene, parts.model)
+                    parts.pipeline.lifts.follow(slept.pipeline.lifts)
                 ended, following = self._work(parts)
             except Exception as error:
                 if self._running or (self._former is None and not (woken and _is_told(error))):
