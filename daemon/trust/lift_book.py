@@ -168,6 +168,14 @@ class LiftBook:
         self.announced += 1
         self._count()
 
+    def take_back(self, grasp: GraspId) -> None:
+        """Note that no lift follows an announcement."""
+        lift = self._lifts.get(grasp)
+        if lift is not None and lift.is_awaited:
+            self._lifts[grasp] = replace(lift, announced=False)
+            self.announced -= 1
+            self._count()
+
     def withdraw(self) -> None:
         """Take back all announcements: another risk is set, which counts from the start."""
         self._lifts = {grasp: replace(lift, announced=False) for grasp, lift in self._lifts.items()}
