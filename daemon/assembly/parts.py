@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import uuid
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
     from graspd.daemon.record.recorder import Recorder
     from graspd.daemon.session.file import SessionFile
     from graspd.drivers.recordings.player import LinkLogDriver
-
-log = logging.getLogger("graspd")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,17 +117,13 @@ class Assembly:
         return True
 
     def _session_file(self) -> SessionFile | None:
-        """Return the locked session file; None if no session is kept or it cannot be locked."""
+        """Return the session's file, not locked yet; None if no session is kept."""
         scene, pipeline = self._parts.scene, self._parts.pipeline
         if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
             return None
-        from graspd.daemon.session.file import SessionFile, SessionFileError
+        from graspd.daemon.session.file import SessionFile
 
-        try:
-            return SessionFile(scene.session_path)
-        except SessionFileError as error:
-            log.warning("%s; every start begins a new session", error)
-            return None
+        return SessionFile(scene.session_path)
 
     def record(self) -> None:
         """Record if the scene asks for it. Call after `keep_session`. Raises `SceneError`."""

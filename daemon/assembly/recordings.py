@@ -10,13 +10,14 @@ from typing import Any, Final
 
 from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.assembly.sources import Source
+from graspd.daemon.judge.calibration import Exchanged
 from graspd.daemon.judge.memory import recall
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.publish.messages import OutcomeMessage
 from graspd.daemon.record.mcap import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
-from graspd.daemon.record.topics import Exchanged, Topic
+from graspd.daemon.record.topics import Topic
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.daemon.trust.trust import FormatError, decode
@@ -113,7 +114,7 @@ class RecordedRun(Source):
                 pipeline.lifts.take_back(None)
             case Exchanged():
                 try:
-                    pipeline.sensors_exchanged(event.session, event.learned)
+                    pipeline.sensors_exchanged(event)
                 except ValueError:  # the recorded state is of another model
                     pipeline.sensors_exchanged()
             case OutcomeMessage() if self._same_grasps:

@@ -1,4 +1,4 @@
-"""`graspd session show|reset|seed SCENE`: calibration of the sensors, and what outcomes taught."""
+"""`graspd session show|reset|seed|settle SCENE`: calibration, and what outcomes taught."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
@@ -20,19 +21,18 @@ from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
 from graspd.daemon.run.replaying import trained_on
 from graspd.daemon.scene import drivers as scene_drivers
+from graspd.daemon.scene.scene import GateMode
 from graspd.daemon.session.file import (
     KeptSession,
     SessionFile,
     SessionFileError,
-    former_of,
     kept_now,
     load,
-    others,
-    read,
     restore_kept,
 )
+from graspd.daemon.session.keeper import is_of_unknown_sensors
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
-from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.daemon.trust.trust import Trust, TrustState, decode, encode
 from graspd.drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
@@ -47,12 +47,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for action, text in (
         ("show", "say how many grasps are known, of which sensors, and what outcomes have taught"),
         ("reset", "forget the session and what was learned: after a sensor was refilled"),
+        ("settle", "say how announced lifts ended whose outcome was never told"),
         ("seed", "start the session from recorded grasps; learn from those whose outcome is known"),
     ):
         command = actions.add_parser(action, help=text, description=f"{text[0].upper()}{text[1:]}.")
         command.add_argument("scene", type=Path, help="scene file (TOML)")
         if action == "show":
             command.add_argument("--json", action="store_true", help="one JSON object on stdout")
+        if action == "settle":
+            command.add_argument(
+                "lifts", nargs="*", metavar="LIFT", help="names of open lifts; without any: all"
+            )
+            outcomes = "held", "slipped", "not-lifted"
+            command.add_argument("--as", dest="told", choices=outcomes, help="how these ended")
         if action == "seed":
             command.add_argument(
                 "recordings",
@@ -78,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.action == "show":
         _show(wanted, model, as_json=args.json)
+    elif args.action == "settle":
+        _settle(wanted, model, args.lifts, args.told)
     elif args.action == "reset":
         with SessionFile(wanted.session_path) as file:
             result = "forgotten" if file.remove() else "no session was kept"
@@ -98,32 +107,30 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
     kept = load(path)
     calibrated = _is_calibrated(wanted, model, kept)
     if as_json:
-        session = None
-        if kept is not None:
-            session = {**msgspec.to_builtins(kept), "trust": _learned(kept)}
-        former = _former(path)
+        others = () if kept is None else kept.others
         document = {
             "file": str(path),
             "calibrated": calibrated,
-            "session": session,
-            "former_saved_at": None if former is None else former.saved_at,
-            "put_aside": [
-                {"serials": each.serials, "grasps": _grasps(each), "saved_at": each.saved_at}
-                for each in others(path).values()
-            ],
+            "session": None if kept is None else _document(kept),
+            "others": [_document(each) for each in others],
         }
         write_json(document)
     else:
         write_lines(*_lines(path, kept, model, calibrated))
 
 
+def _document(kept: KeptSession) -> dict[str, Any]:
+    return {**msgspec.to_builtins(replace(kept, others=())), "trust": _learned(kept)}
+
+
 def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession | None) -> bool:
     """Return True if a daemon that starts now is calibrated."""
-    session = assembly.build_pipeline(wanted, model).session
+    pipeline = assembly.build_pipeline(wanted, model)
+    session = pipeline.session
     if session is None:
         return False
     try:
-        if kept is not None:
+        if kept is not None and not (is_of_unknown_sensors(kept) and pipeline.read_rest):
             restore_kept(kept, wanted.hand.fingers, session)
     except SessionFileError as error:
         complain(f"{error}; a new session begins")
@@ -132,13 +139,6 @@ def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession |
 
 def _grasps(kept: KeptSession) -> int:
     return 0 if kept.statistics is None else kept.statistics.grasps
-
-
-def _former(path: Path) -> KeptSession | None:
-    """Return the save before the last one; None if it cannot be read."""
-    with contextlib.suppress(SessionFileError):
-        return read(former_of(path))
-    return None
 
 
 def _lines(
@@ -153,12 +153,9 @@ def _lines(
         state = f", {state} (from {given.calibrated_from:g} on)"
     yield f"{printable(str(path))}: {_grasps(kept)} grasps{state}"
     yield f"  saved    {_when(kept)}"
-    former = _former(path)
-    if former is not None and former != kept:
-        yield f"  before   {_when(former)}, {_grasps(former)} grasps"
-    for each in others(path).values():
-        names = ", ".join(f"{finger} {serial}" for finger, serial in each.serials.items())
-        yield f"  aside    {_when(each)}, {_grasps(each)} grasps of {printable(names)}"
+    for each in kept.others:
+        names = ", ".join(" ".join((name, each.serials.get(name, "?"))) for name in each.fingers)
+        yield f"  other    {_when(each)}, {_grasps(each)} grasps of {printable(names)}"
     for finger in kept.fingers:
         yield f"  {finger:8} sensor {printable(kept.serials.get(finger, 'of unknown serial'))}"
     learned = _learned(kept)
@@ -201,7 +198,8 @@ def _learned(kept: KeptSession) -> dict[str, Any] | None:
 
 def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
     """Judge the recordings as the daemon does, tell their outcomes, and keep the session."""
-    wanted = _on_recordings(wanted, recordings)
+    is_mcap = any(path.suffix == assembly.MCAP for path in recordings)
+    wanted = _on_recordings(wanted, recordings, "every" if is_mcap else None)
     pipeline = assembly.build_pipeline(wanted, model)
     session, trust = pipeline.session, pipeline.trust
     with SessionFile(wanted.session_path) as file:
@@ -218,10 +216,11 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
             _check(wanted, model, state)
         elif not outcomes:
             raise DriverError(f"of {readings} readings none is a grasp whose outcome is known")
-        learned = _learned_before(file) if trust is None else _taught(trust)
-        serials: dict[str, str] = {}  # not known before the daemon hears from the sensors
-        file.save(kept_now(state, wanted.hand.fingers, serials, learned))
-        file.remove_former()
+        rest = _rest(wanted, model, recordings)
+        learned = (
+            _learned_before(file) if trust is None else _taught(trust, proves=rest is not None)
+        )
+        file.save(kept_now(state, wanted.hand.fingers, {}, learned, rest))
     write_lines(
         f"{printable(str(wanted.session_path))}: {grasps} grasps of {readings} readings taken in, "
         f"each once for as long as it was held, {outcomes} outcomes learned"
@@ -240,6 +239,33 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
         )
 
 
+def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: str | None) -> None:
+    """Tell how open lifts ended, as their controller would have; show which are open."""
+    path, trust = wanted.session_path, assembly.build_pipeline(wanted, model).trust
+    with SessionFile(path) as file:
+        kept = file.load()
+        if trust is None or kept is None or kept.trust is None:
+            raise SessionFileError(f"{path}: no lifts are kept")
+        try:
+            trust.restore(decode(kept.trust))
+        except ValueError as error:
+            raise SessionFileError(f"{path}: what was learned {error}") from error
+        grasps = [lift.id for lift in trust.lifts.state().records if lift.is_awaited]
+        lifts = {f"{grasp.boot_id[:8]}-{grasp.grasp}": grasp for grasp in grasps}
+        if unknown := set(names) - lifts.keys():
+            raise SessionFileError(f"{', '.join(unknown)}: not open")
+        if told is None:
+            write_lines(f"{printable(str(path))}: {len(lifts)} lifts without outcome", *lifts)
+            return
+        for name in names or lifts:
+            if told == "not-lifted":
+                trust.lifts.take_back(lifts[name])
+            else:
+                trust.outcome(lifts[name], slipped=told == "slipped")
+        file.save(replace(kept, trust=encode(trust.state()), saved_at=time.time()))
+    write_lines(f"{printable(str(path))}: {len(names or lifts)} lifts {told}")
+
+
 def _learned_before(file: SessionFile) -> TrustState | None:
     """Return what was kept, for a scene that may learn again later."""
     try:
@@ -250,12 +276,28 @@ def _learned_before(file: SessionFile) -> TrustState | None:
         return None
 
 
-def _taught(trust: Trust) -> TrustState:
-    """Return what recorded outcomes have taught, also that the warm-up is over.
+def _taught(trust: Trust, *, proves: bool) -> TrustState:
+    """Return what recorded outcomes have taught; if it `proves`, that the warm-up is over.
     Their lifts were not made on a `stable` verdict: the bound of `[risk]` does not count them."""
     state = trust.state()
-    risk = msgspec.structs.replace(state.risk, lifts=0, slips=0)
-    return msgspec.structs.replace(state, risk=risk, lifts=LiftBook().state())
+    risk = replace(state.risk, lifts=0, slips=0, proven=state.risk.proven if proves else 0)
+    return replace(state, risk=risk, lifts=LiftBook().state())
+
+
+def _rest(
+    wanted: scene.Scene, model: TactileModel, recordings: list[Path]
+) -> tuple[float, ...] | None:
+    """Return where the recorded electrodes rest at the first tare; None: that is not recorded."""
+    played = _on_recordings(wanted, recordings, mode=None)
+    pipeline = assembly.build_pipeline(played, model, learns=False)
+    read_rest = pipeline.read_rest
+    for reading in () if read_rest is None else _played(played):
+        if isinstance(reading, TactileReading) and read_rest is not None:
+            pipeline.judge(reading)
+            rest = read_rest()
+            if rest.any(axis=1).all():
+                return tuple(rest.ravel().tolist())
+    return None
 
 
 def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> None:
@@ -273,12 +315,13 @@ def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> Non
         )
 
 
-def _on_recordings(wanted: scene.Scene, recordings: list[Path]) -> scene.Scene:
+def _on_recordings(
+    wanted: scene.Scene, recordings: list[Path], mode: GateMode | None
+) -> scene.Scene:
     """Return the scene with recordings in place of its sensors, and without `[risk]`."""
     replay = scene_drivers.ReplayTactile(
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
-    mode = "every" if assembly.is_mcap(replay) else None
     gate = wanted.gate.model_copy(
         update={"mode": mode, "sweeps": None, "max_age_ms": assembly.RECORDED_MAX_AGE_MS}
     )
@@ -308,7 +351,11 @@ def _readings(wanted: scene.Scene) -> Iterator[Reading]:
     tactile = wanted.tactile
     if isinstance(tactile, scene_drivers.ReplayTactile) and assembly.is_mcap(tactile):
         yield from _recorded_grasps(tactile.recordings, wanted.hand.fingers)
-        return
+    else:
+        yield from _played(wanted)
+
+
+def _played(wanted: scene.Scene) -> Iterator[Reading]:
     (driver,) = assembly.build_drivers(wanted)
     with contextlib.closing(driver):
         assembly.open_driver(driver)

@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.daemon.trust.learner import LearnerState
+from graspd.daemon.trust.risk import Count
 from graspd.drivers.base import COUNT_MAX
 from graspd.models.contract import SessionInput
 from graspd.models.inputs import raw_features
 from graspd.models.session_statistics import SessionState, SessionStatistics, is_odd
+
+
+class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
+    """An exchange of sensors, with what is known of those that are there now."""
+
+    session: SessionState | None = None
+    learned: LearnerState | None = None
+    proven: Count = 0
+    """Outcomes that count for their warm-up."""
+    tared: bool = False
+    """True if the tare that is known is theirs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

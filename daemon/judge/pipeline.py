@@ -30,11 +30,9 @@ from graspd.models.electrodes import Electrodes
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from graspd.daemon.judge.calibration import SessionCalibration
+    from graspd.daemon.judge.calibration import Exchanged, SessionCalibration
     from graspd.daemon.judge.hand import HandTracker
-    from graspd.daemon.trust.learner import LearnerState
     from graspd.daemon.trust.trust import Trust
-    from graspd.models.session_statistics import SessionState
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False):
@@ -139,7 +137,7 @@ class Pipeline:
         self.memory = PipelineMemory(np.zeros(electrodes.centre.shape))
         self._latest_ns = 0, 0
         """Times `t_ns` and `made_ns` of the last reading."""
-        self.on_exchange: Callable[[SessionState | None, LearnerState | None], None] | None = None
+        self.on_exchange: Callable[[Exchanged | None], None] | None = None
         """Called when the sensors were exchanged, with what was known of the new ones."""
 
     @property
@@ -165,26 +163,27 @@ class Pipeline:
         if self.hand is not None:
             self.hand.gate.ask()
 
-    def sensors_exchanged(
-        self, session: SessionState | None = None, learned: LearnerState | None = None
-    ) -> None:
-        """Forget session, tare and grasp: the sensors are others.
+    def sensors_exchanged(self, known: Exchanged | None = None) -> None:
+        """Forget session, grasp and maybe the tare: the sensors are others.
 
-        `session`, `learned`: what was known of them. Raises `ValueError` if of another model.
+        Go on from what is `known` of them. Raises `ValueError` if that is of another model.
         """
         self._forget_opinion()
         self.memory.is_to_learn = False
         self.memory.needs_session = True
         if self._session is not None:
             self._session.reset()
-            if session is not None:
-                self._session.restore(session)
+            if known is not None and known.session is not None:
+                self._session.restore(known.session)
         if self.trust is not None:
-            self.trust.sensors_exchanged(learned)
-        if self.hand is not None:
+            learned, proven = (None, 0) if known is None else (known.learned, known.proven)
+            self.trust.sensors_exchanged(learned, proven)
+        if self.hand is not None and known is not None and known.tared:
+            self.hand.restart()
+        elif self.hand is not None:
             self.hand.forget()
         if self.on_exchange is not None:
-            self.on_exchange(session, learned)
+            self.on_exchange(known)
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
         """Take in how the lift of a grasp has ended; takes 1 to 3 ms."""

@@ -23,10 +23,8 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     return content
 
 
-def write_atomically(
-    path: Path, content: bytes, mode: int = 0o600, *, former: Path | None = None
-) -> None:
-    """Replace the file at `path` in one step; keep the old one at `former`, if given.
+def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
+    """Replace the file at `path` in one step.
 
     Readers always see a whole file, also after a power cut. After an `OSError` it is the old one.
     """
@@ -38,9 +36,6 @@ def write_atomically(
             file.flush()
             os.fchmod(handle, mode)
             os.fsync(handle)
-        if former is not None:
-            with suppress(FileNotFoundError):
-                os.replace(path, former)
         os.replace(part, path)
     except OSError:
         with suppress(OSError):

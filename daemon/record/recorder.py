@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Final, cast
 import msgspec
 from msgspec.structs import replace
 
+from graspd.daemon.judge.calibration import Exchanged
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
 from graspd.daemon.record.mcap import McapWriter, RecordingFile, RecordingHeader
-from graspd.daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic, flat
+from graspd.daemon.record.topics import EVENT, Joints, Judged, Topic, flat
 from graspd.daemon.record.viewers import Viewer
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.base import JointReading, Reading
@@ -31,8 +32,6 @@ from graspd.drivers.base import JointReading, Reading
 if TYPE_CHECKING:
     from graspd.daemon.publish.messages import Status
     from graspd.daemon.record.link_log import Tap
-    from graspd.daemon.trust.learner import LearnerState
-    from graspd.models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 
@@ -153,8 +152,8 @@ class Recorder(Companion):
             self._wants_turn = False
             self._queue.append((self._clock(), NEXT_FILES, self._take_header()))
 
-    def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
-        self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
+    def exchanged(self, known: Exchanged | None) -> None:
+        self._put(self._names[Topic.EXCHANGED], lambda: known or Exchanged())
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
         if len(self._queue) >= QUEUE_MAX:

@@ -16,13 +16,12 @@ import msgspec
 import numpy as np
 from msgspec import inspect
 
+from graspd.daemon.judge.calibration import Exchanged
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.publish import messages
 from graspd.daemon.publish.messages import WIRE_VERSION, Count, Tactile
 from graspd.daemon.record.viewers import Log, RawImage
-from graspd.daemon.trust.learner import LearnerState
 from graspd.drivers.base import ELECTRODES, JOINTS, JointReading, TactileReading
-from graspd.models.session_statistics import SessionState
 
 JsonSchema = dict[str, Any]
 TABLE: Final = (
@@ -86,13 +85,6 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
 
 class Event(msgspec.Struct, frozen=True):
     """An event; its topic tells which."""
-
-
-class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An exchange of a sensor, with the state of the new one, if known."""
-
-    session: SessionState | None = None
-    learned: LearnerState | None = None
 
 
 class Topic(StrEnum):

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("graspd")
 
-MAX_BYTES: Final = 2 << 20
+MAX_BYTES: Final = 8 << 20
 """Largest file, bytes; a session has 7 kB, learning from outcomes up to 330 kB."""
-DIGITS: Final = 12
-"""Hexadecimal digits of the serial numbers' digest in a file name."""
+ASIDE: Final = "aside-"
+"""Begin of the ending of a file that is put aside; a hexadecimal digit follows."""
 OTHERS_MAX: Final = 4
-"""Most sessions of other sensors that are kept."""
+"""Most sessions of other fingers, models or sensors that are kept."""
 
 
 class SessionFileError(Exception):
@@ -52,6 +52,10 @@ class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of learning, from `graspd.daemon.trust.trust.encode`; None without learning."""
     rest: tuple[Annotated[float, msgspec.Meta(ge=0.0, le=COUNT_MAX)], ...] | None = None
     """Resting count of each electrode, finger by finger; 0: not known."""
+    model: str = ""
+    """Digest of the model that `trust` is of; empty: not known."""
+    others: Annotated[tuple[KeptSession, ...], msgspec.Meta(max_length=OTHERS_MAX)] = ()
+    """Sessions of other fingers, models or sensors, newest first; these have no others."""
 
 
 class SavedState(NamedTuple):
@@ -61,6 +65,7 @@ class SavedState(NamedTuple):
     statistics: SessionState | None = None
     trust: TrustState | None = None
     rest: tuple[float, ...] | None = None
+    others: tuple[KeptSession, ...] = ()
 
     @property
     def is_empty(self) -> bool:
@@ -81,14 +86,21 @@ class SessionFile:
     """One hand's file, locked while it is open."""
 
     def __init__(self, path: Path) -> None:
-        """Lock the file. Raises `SessionFileError` if it is in use or has no folder."""
+        """Nothing is locked yet: see `lock`."""
         self.path = path
-        self._newest_is_whole = False
-        """True if the file is complete; only then does it replace the former one."""
+        self._is_ours = False
+        """True if the file is as it was loaded or saved; any other is put aside, not replaced."""
+        self._lock: int | None = None
+
+    def lock(self) -> None:
+        """Lock the file, once. Raises `SessionFileError` if it is in use or has no folder."""
+        if self._lock is not None:
+            return
+        path = self.path
         lock = path.with_name(path.name + ".lock")
         try:
             flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-            self._lock: int | None = os.open(lock, flags, 0o644)
+            self._lock = os.open(lock, flags, 0o644)
         except OSError as error:
             raise SessionFileError(f"{path}: cannot keep the session: {error.strerror}") from error
         try:
@@ -98,10 +110,9 @@ class SessionFile:
             raise SessionFileError(
                 f"{path}: in use by another graspd, stop that one first"
             ) from error
-        for written in (glob.escape(path.name), _beside_any(path)):
-            for part in path.parent.glob(f"{written}.{'[0-9a-f]' * 8}"):
-                with suppress(OSError):  # left by a daemon that was killed while it wrote
-                    part.unlink()
+        for part in path.parent.glob(f"{glob.escape(path.name)}.{'[0-9a-f]' * 8}"):
+            with suppress(OSError):  # left by a daemon that was killed while it wrote
+                part.unlink()
 
     def close(self) -> None:
         """Unlock the file. May be called more than once."""
@@ -110,6 +121,7 @@ class SessionFile:
             os.close(lock)
 
     def __enter__(self) -> Self:
+        self.lock()
         return self
 
     def __exit__(self, *_details: object) -> None:
@@ -117,57 +129,36 @@ class SessionFile:
 
     def load(self) -> KeptSession | None:
         """Return the kept session: see the function `load`."""
-        self._newest_is_whole = False
-        newest = _newest_whole(self.path)
-        if newest is None:
-            return None
-        kept, path = newest
-        self._newest_is_whole = path == self.path
+        kept = load(self.path)
+        self._is_ours = self._lock is not None  # else another graspd may write it
         return kept
 
     def save(self, kept: KeptSession) -> None:
-        """Replace the file in one step; keep the former one. Raises `SessionFileError`."""
-        former = former_of(self.path) if self._newest_is_whole else None
-        self._newest_is_whole = False
-        _write(self.path, kept, former)
-        self._newest_is_whole = True
-
-    def put_aside(self, kept: KeptSession) -> None:
-        """Write the session of other sensors to a file of its own beside this one.
-
-        The newest `OTHERS_MAX` of these files are kept. Raises `SessionFileError`.
-        """
-        _write(_beside(self.path, kept.serials), kept, None)
-        newest = list(others(self.path))[:OTHERS_MAX]
-        for path in set(self.path.parent.glob(_beside_any(self.path))) - set(newest):
-            self._remove(path)
+        """Replace the file in one step. Raises `SessionFileError`."""
+        self.lock()
+        content = msgspec.json.encode(kept)
+        sealed = _Sealed(hashlib.sha256(content).hexdigest(), msgspec.Raw(content))
+        try:
+            if not self._is_ours:
+                with suppress(FileNotFoundError):
+                    os.replace(self.path, f"{self.path}.{ASIDE}{os.urandom(1).hex()[0]}")
+            self._is_ours = True
+            write_atomically(self.path, msgspec.json.encode(sealed) + b"\n")
+        except OSError as error:
+            raise SessionFileError(
+                f"{self.path}: cannot keep the session: {error.strerror}"
+            ) from error
 
     def remove(self) -> bool:
-        """Delete the session; return False if there was none. Raises `SessionFileError`."""
-        # The former file goes first: an interruption must not bring it back.
-        return bool(self.remove_former() + self._remove(self.path))
-
-    def remove_former(self) -> bool:
-        """Delete the former session and those of other sensors; return False if none was there.
-
-        Raises `SessionFileError`.
-        """
-        paths = [former_of(self.path), *self.path.parent.glob(_beside_any(self.path))]
-        return bool(sum([self._remove(path) for path in paths]))
-
-    def _remove(self, path: Path) -> bool:
+        """Delete all that was kept; return False if that is nothing. Raises `SessionFileError`."""
+        aside = self.path.parent.glob(f"{glob.escape(self.path.name)}.{ASIDE}?")
+        paths = [path for path in (*aside, self.path) if path.exists()]
         try:
-            path.unlink()
-        except FileNotFoundError:
-            return False
+            for path in paths:
+                path.unlink()
         except OSError as error:
-            raise SessionFileError(f"{path}: cannot remove: {error.strerror}") from error
-        return True
-
-
-def former_of(path: Path) -> Path:
-    """Return the path of the former session of `path`."""
-    return path.with_name(path.name + ".former")
+            raise SessionFileError(f"{self.path}: cannot remove: {error.strerror}") from error
+        return bool(paths)
 
 
 def kept_now(
@@ -176,75 +167,15 @@ def kept_now(
     serials: Mapping[str, str],
     trust: TrustState | None = None,
     rest: tuple[float, ...] | None = None,
+    others: tuple[KeptSession, ...] = (),
 ) -> KeptSession:
     """Return the content of a session file that is saved now; `KeptSession` has the meanings."""
-    learned = None if trust is None else encode(trust)
-    return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned, rest)
-
-
-def others(path: Path) -> dict[Path, KeptSession]:
-    """Return the sessions of other sensors beside `path`, newest first."""
-    sessions = {}
-    for each in path.parent.glob(_beside_any(path)):
-        try:
-            kept = read(each)
-        except SessionFileError as error:
-            log.warning("%s; it counts for nothing", error)
-            continue
-        if kept is not None:
-            sessions[each] = kept
-    newest = sorted(sessions, key=lambda each: sessions[each].saved_at, reverse=True)
-    return {each: sessions[each] for each in newest}
-
-
-def _beside(path: Path, serials: Mapping[str, str]) -> Path:
-    digest = hashlib.sha256(msgspec.json.encode(sorted(serials.items()))).hexdigest()
-    return path.with_name(f"{path.name}.of-{digest[:DIGITS]}")
-
-
-def _beside_any(path: Path) -> str:
-    """Return a pattern for files of other sensors; unfinished files do not match."""
-    return f"{glob.escape(path.name)}.of-{'[0-9a-f]' * DIGITS}"
-
-
-def _write(path: Path, kept: KeptSession, former: Path | None) -> None:
-    content = msgspec.json.encode(kept)
-    sealed = _Sealed(hashlib.sha256(content).hexdigest(), msgspec.Raw(content))
-    try:
-        write_atomically(path, msgspec.json.encode(sealed) + b"\n", former=former)
-    except OSError as error:
-        raise SessionFileError(f"{path}: cannot keep the session: {error.strerror}") from error
+    learned, model = (None, "") if trust is None else (encode(trust), trust.model)
+    now = time.time()
+    return KeptSession(tuple(fingers), dict(serials), now, statistics, learned, rest, model, others)
 
 
 def load(path: Path) -> KeptSession | None:
-    """Return the session at `path`, or the former one if that is damaged; None: no file.
-
-    Raises `SessionFileError` if both are damaged.
-    """
-    newest = _newest_whole(path)
-    return None if newest is None else newest[0]
-
-
-def _newest_whole(path: Path) -> tuple[KeptSession, Path] | None:
-    """Return the newest undamaged session, and its file. Raises `SessionFileError`."""
-    problem: SessionFileError | None = None
-    for each in (path, former_of(path)):
-        try:
-            kept = read(each)
-        except SessionFileError as error:
-            problem = problem or error
-            continue
-        if kept is not None:
-            if each != path:
-                why = problem or f"{path}: is not there"
-                log.warning("%s; what was kept before it goes on", why)
-            return kept, each
-    if problem is not None:
-        raise problem
-    return None
-
-
-def read(path: Path) -> KeptSession | None:
     """Return the session in a file; None: no file. Raises `SessionFileError`."""
     try:
         data = read_regular(path, MAX_BYTES)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
-from graspd.drivers.base import Driver, Reading
+from graspd.drivers.base import ELECTRODES, Driver, Reading
 
 if TYPE_CHECKING:
-    from graspd.daemon.session.file import SavedState
+    from graspd.daemon.session.file import KeptSession
+    from graspd.models.session_statistics import SessionState
 
 Rest = NDArray[np.float64]
 """Resting counts, shape (fingers, 24); 0: not known. They differ between sensors."""
@@ -30,6 +31,15 @@ It is the median over the electrodes, after subtracting the change that all shar
 tail of the published grasps it is 4 to 23 between the halves of a day, 80 to 154 for the first
 finger between two days, and 26 to 122 between the sensors of one hand. An untouched sensor
 changes by 1 in ten seconds.
+"""
+FIT_GRASPS: Final = 10
+"""Grasps by which a seeded session is compared with sensors that it does not know."""
+FIT_SPREADS: Final = 1.0
+"""Largest distance of their mean from the session's, in the session's spreads, if it fits.
+
+The distance is the root mean square over the electrodes of a finger, of the finger that is farthest
+off. Over ten grasps of a published day it is 0.2 to 0.8 (1 to 99 %) from that day's session, and
+from 1.6 on from that of another day.
 """
 KNOWN_MIN: Final = 12
 """Fewest electrodes of a finger with known rest both times."""
@@ -67,7 +77,6 @@ class SensorWatch(Companion):
                     "new sensor on %s: the hand must be seen open first", ", ".join(changed)
                 )
                 self._begin(self._with_serials(serials))
-                self._rest = None
             self._serials.update(serials)
         self._readings += 1
         if self._read_rest is None or self._readings % LOOK_EVERY:
@@ -84,36 +93,45 @@ class SensorWatch(Companion):
             self._is_first_tare = True
         if not all(tared):
             return
-        if self._rest is None:
-            self._rest = rest
-        elif has_drifted(self._rest, rest):
-            moved = moved_fingers(self._rest, rest)
-            former = self._with_rest(rest) if moved else None
-            # A later tare of a single finger may be of one that touches.
-            if moved and (self._is_first_tare or former is not None):
+        before, moved = self._rest, list[int]()
+        if before is not None and has_drifted(before, rest):
+            moved = moved_fingers(before, rest)
+        former = self._with_rest(rest, is_known=before is not None and not moved)
+        # A later tare of a single finger may be of one that touches.
+        if former is not None or (moved and self._is_first_tare):
+            if moved:
                 log.warning(UNTOLD, len(moved))
-                self._begin(former)
-                self._rest = rest
-            elif not moved:
-                self._rest = rest
+            self._begin(former, tared=former is not None)
+            self._rest = rest
+        elif before is None or (not moved and has_drifted(before, rest)):
+            self._rest = rest
         self._is_first_tare = False
 
-    def _with_serials(self, _serials: Mapping[str, str]) -> SavedState | None:
+    def _with_serials(self, _serials: Mapping[str, str]) -> KeptSession | None:
         """Return the session of the sensors with these serial numbers; None: not known."""
         return None
 
-    def _with_rest(self, _rest: Rest) -> SavedState | None:
-        """Return the session of the sensors that rest like this; None: not known."""
+    def _with_rest(self, _rest: Rest, *, is_known: bool) -> KeptSession | None:
+        """Return the session of sensors that rest like this; None: not known.
+
+        `is_known`: True if these are the sensors of the session that runs.
+        """
         return None
 
-    def _begin(self, _former: SavedState | None) -> None:
-        """Continue a former session, or begin a new one: the sensors are others."""
+    def _begin(self, _former: KeptSession | None, *, tared: bool = False) -> None:
+        """Continue a former session, whose sensors may be `tared`, or begin a new one."""
         self._sensors_exchanged()
+        self._rest = None
 
 
 def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Return the fingers whose serial number has changed."""
     return [finger for finger in now if before.get(finger, now[finger]) != now[finger]]
+
+
+def numbers(serials: Mapping[str, str]) -> dict[str, str]:
+    """Return the serial numbers among these, without what only names the sender of a link."""
+    return {finger: serial for finger, serial in serials.items() if "://" not in serial}
 
 
 def moved_fingers(before: Rest, now: Rest) -> list[int]:
@@ -127,6 +145,16 @@ def moved_fingers(before: Rest, now: Rest) -> list[int]:
         if np.median(np.abs(step - np.median(step))) > MOVED_COUNTS:
             moved.append(finger)
     return moved
+
+
+def fits(seeded: SessionState, seen: SessionState, fingers: int) -> bool:
+    """Return True if the grasps of a young session look like those of a seeded one."""
+    if len(seeded.mean) != len(seen.mean) or not seeded.weight:
+        return False
+    spread = np.sqrt(np.array(seeded.squares) / seeded.weight)
+    away = (np.array(seen.mean) - seeded.mean) / np.maximum(spread, 1.0)
+    counts = away[-fingers * ELECTRODES :].reshape(fingers, ELECTRODES)
+    return bool((np.mean(counts**2, axis=1) <= FIT_SPREADS**2).all())
 
 
 def has_drifted(before: Rest, now: Rest) -> bool:

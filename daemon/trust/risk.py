@@ -201,10 +201,13 @@ class Risk:
         if self.limits.max_slip_when_stable is not None:
             self.take(stable=True, slipped=True, proves=False)
 
-    def exchanged(self) -> None:
-        """Keep what slipped, not what was learned or saved up: a sensor was exchanged."""
+    def exchanged(self, proven: int = 0) -> None:
+        """Keep what slipped, not what was saved up: a sensor was exchanged.
+
+        `proven`: outcomes that are known of the sensors that are there now.
+        """
         self.budget = min(self.budget, BUDGET_START)
-        self.proven = 0
+        self.proven = proven
 
     def state(self) -> RiskState:
         """Return what `restore` needs."""

@@ -153,12 +153,15 @@ class Trust:
             awaited=self.lifts.awaited,
         )
 
-    def sensors_exchanged(self, learned: LearnerState | None = None) -> None:
-        """Learn from the start, or from `learned`. Raises `ValueError` for another model's."""
+    def sensors_exchanged(self, learned: LearnerState | None = None, proven: int = 0) -> None:
+        """Learn from the start, or from `learned`. Raises `ValueError` for another model's.
+
+        `proven`: outcomes that count for the warm-up.
+        """
         self.learner.reset()
         if learned is not None:
             self.learner.restore(learned)
-        self.risk.exchanged()
+        self.risk.exchanged(proven)
         self.lifts.exchanged()
 
     def state(self) -> TrustState:

@@ -50,8 +50,8 @@ function _shtab_graspd_using
   test "$_shtab_graspd_cmdpath" = "$argv"
 end
 
-set -g _shtab_graspd_commands run replay watch scene check doctor twin 'twin spi' 'twin can' 'twin palm' 'twin joints' data schema models session 'session show' 'session reset' 'session seed' export-grasps keys 'keys make' 'keys list' train evaluate report 'report error-vs-time' 'report stability' 'report worth' completion manual
-set -g _shtab_graspd_opts_with_value --arbitration-id --bit-flip --burst --card --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --format --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
+set -g _shtab_graspd_commands run replay watch scene check doctor twin 'twin spi' 'twin can' 'twin palm' 'twin joints' data schema models session 'session show' 'session reset' 'session settle' 'session seed' export-grasps keys 'keys make' 'keys list' train evaluate report 'report error-vs-time' 'report stability' 'report worth' completion manual
+set -g _shtab_graspd_opts_with_value --arbitration-id --as --bit-flip --burst --card --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --format --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
 
 complete -c graspd -e
 complete -c graspd -f
@@ -207,6 +207,11 @@ complete -c graspd -n '_shtab_graspd_using session show; and test $_shtab_graspd
 complete -c graspd -n '_shtab_graspd_using session; and test $_shtab_graspd_npos -eq 0' -a reset -d 'Forget the session and what was learned: after a sensor was refilled.'
 complete -c graspd -n '_shtab_graspd_using session reset' -s h -l help -d 'show this help message and exit'
 complete -c graspd -n '_shtab_graspd_using session reset; and test $_shtab_graspd_npos -eq 0' -ka "(__fish_complete_path (commandline -ct))" -d 'scene file (TOML)'
+complete -c graspd -n '_shtab_graspd_using session; and test $_shtab_graspd_npos -eq 0' -a settle -d 'Say how announced lifts ended whose outcome was never told.'
+complete -c graspd -n '_shtab_graspd_using session settle' -s h -l help -d 'show this help message and exit'
+complete -c graspd -n '_shtab_graspd_using session settle' -l as -xka "held slipped not-lifted" -d 'how these ended'
+complete -c graspd -n '_shtab_graspd_using session settle; and test $_shtab_graspd_npos -eq 0' -ka "(__fish_complete_path (commandline -ct))" -d 'scene file (TOML)'
+complete -c graspd -n '_shtab_graspd_using session settle; and test $_shtab_graspd_npos -ge 1' -ka "(__fish_complete_path (commandline -ct))" -d 'names of open lifts; without any: all'
 complete -c graspd -n '_shtab_graspd_using session; and test $_shtab_graspd_npos -eq 0' -a seed -d 'Start the session from recorded grasps; learn from those whose outcome is known.'
 complete -c graspd -n '_shtab_graspd_using session seed' -s h -l help -d 'show this help message and exit'
 complete -c graspd -n '_shtab_graspd_using session seed; and test $_shtab_graspd_npos -eq 0' -ka "(__fish_complete_path (commandline -ct))" -d 'scene file (TOML)'

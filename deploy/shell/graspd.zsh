@@ -53,6 +53,7 @@ _shtab_graspd_session_commands() {
   local _commands=(
     reset:'Forget the session and what was learned: after a sensor was refilled.'
     seed:'Start the session from recorded grasps; learn from those whose outcome is known.'
+    settle:'Say how announced lifts ended whose outcome was never told.'
     show:'Say how many grasps are known, of which sensors, and what outcomes have taught.'
   )
   _describe 'graspd session commands' _commands
@@ -311,6 +312,16 @@ _shtab_graspd_session_seed_options=(
 # guard to ensure default positional specs are added only once per session
 _shtab_graspd_session_seed_defaults_added=0
 
+_shtab_graspd_session_settle_options=(
+  "(- : *)"{-h,--help}"[show this help message and exit]"
+  "--as[how these ended]:told:(held slipped not-lifted)"
+  ":scene file (TOML):_files"
+  "(*)::names of open lifts\; without any\: all:_files"
+)
+
+# guard to ensure default positional specs are added only once per session
+_shtab_graspd_session_settle_defaults_added=0
+
 _shtab_graspd_session_show_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--json[one JSON object on stdout]"
@@ -562,6 +573,7 @@ _shtab_graspd_session() {
       case $line[1] in
         reset) _arguments -C -s $_shtab_graspd_session_reset_options ;;
         seed) _arguments -C -s $_shtab_graspd_session_seed_options ;;
+        settle) _arguments -C -s $_shtab_graspd_session_settle_options ;;
         show) _arguments -C -s $_shtab_graspd_session_show_options ;;
       esac
   esac

@@ -18,6 +18,7 @@ from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import build_recorder
 from graspd.daemon.assembly.recordings import RecordedRun
+from graspd.daemon.judge.calibration import Exchanged
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import GateCause
 from graspd.daemon.publish.companion import LoopEvent, PublishedVerdict
@@ -207,7 +208,8 @@ def test_exchanged_sensors_and_their_return_are_played_again(
         if reading.seq in (1250, 1500):
             assert daemon.pipeline.session is not None
             states.append(daemon.pipeline.session.state())
-            daemon.pipeline.sensors_exchanged(states[0] if reading.seq == 1500 else None)
+            known = Exchanged(states[0] if reading.seq == 1500 else None)
+            daemon.pipeline.sensors_exchanged(known)
         expected.append(daemon.judge(reading))
     daemon.recorder.close()
     assert states[0].grasps > 3 > states[1].grasps

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graspd.daemon.judge.calibration import Exchanged
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.publish.messages import State
 from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
-from graspd.daemon.record.topics import Exchanged, Topic, flat, schema_of, schemas, table
+from graspd.daemon.record.topics import Topic, flat, schema_of, schemas, table
 from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
 from graspd.daemon.trust.learner import LearnerState
 from graspd.drivers.base import JointReading, TactileReading
@@ -272,7 +273,7 @@ def test_questions_around_an_event_stay_around_it(tmp_path: Path, event: str) ->
     if event == "skipped":
         writing.on_event(LoopEvent.SKIPPED)
     else:
-        writing.exchanged(None, None)
+        writing.exchanged(None)
     writing.on_event(LoopEvent.ASKED)
     writing.send(b"tactile.right", tactile(0, *REST.tolist()))
     writing.close()
@@ -314,8 +315,9 @@ def test_an_older_recording_is_played_alike(tmp_path: Path) -> None:
 def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
     session = SessionState(weight=2.5, grasps=3, mean=(0.1, 1e-9), squares=(4.0, 0.0))
     learned = LearnerState(outcomes=4, mean=bytes(range(16)), covariance=b"\xff" * 32)
+    known = Exchanged(session, learned, proven=4)
     writing = recorder(tmp_path)
-    writing.exchanged(session, learned)
+    writing.exchanged(known)
     writing.close()
     (path,) = files(tmp_path)
     told: list[RecordedEvent] = []
@@ -324,4 +326,4 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
     with driver:
         while not driver.exhausted:
             driver.read_ready()
-    assert told == [Exchanged(session, learned)]
+    assert told == [known]

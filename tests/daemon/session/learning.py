@@ -8,19 +8,19 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.calibration import SessionCalibration
+from graspd.daemon.judge.calibration import Exchanged, SessionCalibration
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion, Requests
 from graspd.daemon.session.file import KeptSession, SessionFile
 from graspd.daemon.session.keeper import SessionKeeper
 from graspd.daemon.session.sensors import SensorWatch
-from graspd.daemon.trust.learner import LearnerState, sigmoid
+from graspd.daemon.trust.learner import sigmoid
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.risk import Permission, RiskLimits
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver
+from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.models.contract import Finger, SessionInput, Sharpness
-from graspd.models.session_statistics import SessionState
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
@@ -29,6 +29,14 @@ BOOT = "0123456789abcdef" * 2
 INPUTS = 78
 NOBODY = cast(Requests, None)
 """Of whom nothing is requested."""
+SHORT = Durations(
+    approach_s=(0.3, 0.3),
+    settle_s=(0.5, 0.6),
+    lift_s=(0.2, 0.2),
+    release_s=(0.2, 0.2),
+    rest_s=(0.4, 0.5),
+)
+"""Grasps of two seconds."""
 
 
 def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
@@ -105,16 +113,15 @@ class FakeJudge:
         """`hear`: called at each exchange."""
         self.session, self.trust, self.read_rest, self.hear = session, part, read_rest, hear
 
-    def sensors_exchanged(
-        self, known: SessionState | None = None, learned: LearnerState | None = None
-    ) -> None:
+    def sensors_exchanged(self, known: Exchanged | None = None) -> None:
         self.hear()
         if self.session is not None:
             self.session.reset()
-            if known is not None:
-                self.session.restore(known)
+            if known is not None and known.session is not None:
+                self.session.restore(known.session)
         if self.trust is not None:
-            self.trust.sensors_exchanged(learned)
+            learned, proven = (None, 0) if known is None else (known.learned, known.proven)
+            self.trust.sensors_exchanged(learned, proven)
 
 
 def session_keeper(

@@ -10,9 +10,11 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import pytest
 
+from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.session.file import SessionFile, kept_now, load
 from graspd.daemon.session.keeper import (
     BUSY,
@@ -28,6 +30,7 @@ from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
     NOBODY,
+    FakeJudge,
     calibration,
     judge,
     observe,
@@ -247,6 +250,110 @@ def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
     kept = load(file.path)
     assert kept is not None
     assert (kept.fingers, kept.statistics, kept.serials) == (FINGERS, None, {})
+
+
+def test_a_start_with_other_fingers_destroys_nothing(file: SessionFile) -> None:
+    session, part = calibration(), trust()
+    keeper = session_keeper(session, sensors(), file, part=part)
+    observe(session, 30)
+    for grasp in range(20):
+        judge(part, grasp)
+        tell(part, grasp)
+    keeper.save()
+    other = trust("of two fingers", inputs=52)
+    judged = cast(Pipeline, FakeJudge(None, other))
+    for grasp in range(5):
+        keeper = SessionKeeper(judged, ("ff", "th"), sensors(), file, Clock())
+        judge(other, grasp)
+        tell(other, grasp)
+        keeper.save()
+    again, back = calibration(), trust()
+    session_keeper(again, sensors(), file, part=back).save()
+    assert (again.state(), back.state()) == (session.state(), part.state())
+    third = trust("of two fingers", inputs=52)
+    SessionKeeper(cast(Pipeline, FakeJudge(None, third)), ("ff", "th"), sensors(), file, Clock())
+    assert third.state() == other.state()
+
+
+def test_a_start_with_another_model_destroys_no_ledger(file: SessionFile) -> None:
+    parts = trust("a"), trust("b")
+    for part in (*parts, *parts):
+        for _ in range(3):
+            restored = trust(part.state().model)
+            keeper = session_keeper(calibration(), sensors(), file, part=restored)
+            assert restored.state() == part.state()
+            for each in (part, restored):
+                grasp = each.risk.proven
+                judge(each, grasp)
+                tell(each, grasp)
+            keeper.save()
+    assert [part.risk.proven for part in parts] == [6, 6]
+
+
+def test_what_cannot_be_kept_at_the_start_is_said_and_kept_later(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As on a full or read-only disk, and in a folder that is gone."""
+    folder = tmp_path / "gone"
+    file, part, found = SessionFile(folder / "right.json"), trust(), list[str | None]()
+    keeper = session_keeper(None, sensors(), file, part=part)
+    judge(part, 1)
+    tell(part, 1)
+    keeper.keep(found.append)
+    go_round(keeper)
+    where = f"{folder}/right.json: cannot keep the session: No such file or directory"
+    assert found == [f"not kept: {where}"]
+    assert caplog.text.count(where) == 1
+    folder.mkdir()
+    keeper.keep(found.append)
+    go_round(keeper)
+    assert found[1:] == [None]
+    assert kept_trust(file) == part.state()
+    keeper.save()
+    file.close()
+
+
+def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path) -> None:
+    path, mine, theirs, found = tmp_path / "right.json", trust(), trust(), list[str | None]()
+    with SessionFile(path) as other:
+        file = SessionFile(path)
+        keeper = session_keeper(None, sensors(), file, part=mine)
+        judge(mine, 1)
+        tell(mine, 1)
+        keeper.keep(found.append)
+        go_round(keeper)
+        judge(theirs, 2)
+        other.save(kept_now(None, FINGERS, {}, theirs.state()))
+    keeper.keep(found.append)
+    go_round(keeper)
+    keeper.save()
+    file.close()
+    assert found == [f"not kept: {path}: in use by another graspd, stop that one first", None]
+    (aside,) = tmp_path.glob("right.json.aside-?")
+    kept = load(aside)
+    assert kept is not None
+    assert kept.trust is not None
+    assert decode(kept.trust) == theirs.state()
+    assert kept_trust(file) == mine.state()
+
+
+def test_announced_lifts_are_on_the_disk_when_that_is_answered(
+    file: SessionFile, keeper_of: KeeperOf
+) -> None:
+    part, announced = trust(), list[int]()
+    keeper = keeper_of(part)
+    while not part.lifts.outstanding:
+        judge(part, len(part.lifts.state().records))
+    part.lifts.announce()
+
+    def answer(_why: str | None) -> None:
+        kept = kept_trust(file)
+        assert kept is not None
+        announced.append(sum(lift.is_awaited for lift in kept.lifts.records))
+
+    keeper.keep(answer)
+    go_round(keeper)
+    assert announced == [1]
 
 
 def test_whoever_waits_is_answered_whatever_ends_the_writing(

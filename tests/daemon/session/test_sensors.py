@@ -19,11 +19,12 @@ from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.session.file import SessionFile, load, others
+from graspd.daemon.session.file import SessionFile, kept_now, load
 from graspd.daemon.session.keeper import SessionKeeper
-from graspd.daemon.session.sensors import LOOK_EVERY, moved_fingers
+from graspd.daemon.session.sensors import FIT_GRASPS, LOOK_EVERY, moved_fingers
+from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import TactileReading
-from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint
+from graspd.drivers.twins.grasps.grasp_script import EndPoint
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
 from graspd.models import zoo
@@ -31,21 +32,18 @@ from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, Clock, reading
 from tests.daemon.session.learning import (
     NOBODY,
+    SHORT,
     calibration,
+    judge,
     observe,
     read_once,
     sensor_watch,
     sensors,
     session_keeper,
+    tell,
+    trust,
 )
 
-SHORT = Durations(
-    approach_s=(0.3, 0.3),
-    settle_s=(0.5, 0.6),
-    lift_s=(0.2, 0.2),
-    release_s=(0.2, 0.2),
-    rest_s=(0.4, 0.5),
-)
 OUTAGE_NS = 2_000_000_000
 """Longer than the second after which tares are forgotten."""
 
@@ -237,11 +235,11 @@ def test_an_exchange_without_serial_numbers_ends_the_session(
     assert len(slips) == 20
     assert slips.count(Decision.STABLE) <= 2
     assert "taken for other sensors" in caplog.text
-    (former,) = others(tmp_path / "right.json").values()
-    assert former.statistics is not None
-    assert former.statistics.grasps >= 100
     kept = load(tmp_path / "right.json")
     assert kept is not None
+    (former,) = kept.others
+    assert former.statistics is not None
+    assert former.statistics.grasps >= 100
     assert kept.statistics is not None
     assert kept.statistics.grasps < 70
 
@@ -262,6 +260,130 @@ def test_a_hand_that_is_tared_while_it_holds_is_itself_again_once_it_opens(tmp_p
             grasps.append(session.grasps)
         keeper.save()
     assert grasps == [30, 30, 0, 30]
+
+
+def look(keeper: SessionKeeper, times: int = LOOK_EVERY) -> None:
+    """Tell a keeper of readings until it has looked at the rest."""
+    for _ in range(times):
+        keeper.on_reading(reading(0))
+
+
+PATTERN = np.full((3, 24), 2000.0)
+HELD = PATTERN - np.linspace(0.0, 400.0, 24)
+
+
+def taught() -> tuple[SessionCalibration, Trust]:
+    """A calibrated session, and twelve outcomes, all of which count for the warm-up."""
+    session, part = calibration(), trust()
+    observe(session, 30)
+    for grasp in range(12):
+        judge(part, grasp)
+        tell(part, grasp)
+    return session, part
+
+
+def test_a_hand_that_held_at_the_start_has_its_warm_up_back(tmp_path: Path) -> None:
+    now, (session, part) = [PATTERN], taught()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = session_keeper(session, sensors(), file, part=part, read_rest=lambda: now[0])
+        look(keeper)
+        keeper.save()
+        learned = part.learner.state()
+        again, later = calibration(), trust()
+        now[0] = HELD
+        keeper = session_keeper(again, sensors(), file, part=later, read_rest=lambda: now[0])
+        look(keeper)
+        assert (again.grasps, later.learner.outcomes, later.risk.proven) == (0, 0, 0)
+        keeper.save()
+        now[0] = PATTERN
+        look(keeper)
+        keeper.save()
+    assert (again.grasps, later.risk.proven) == (30, 12)
+    assert later.learner.state() == learned
+
+
+def test_a_relay_that_restarts_is_no_exchange(tmp_path: Path) -> None:
+    """Its sensors rest as before, whatever port it sends from."""
+    now, (session, part) = [PATTERN], taught()
+    driver = sensors(**dict.fromkeys(FINGERS, "udp://192.0.2.1:4001"))
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = session_keeper(session, driver, file, part=part, read_rest=lambda: now[0])
+        look(keeper)
+        driver.known = dict.fromkeys(FINGERS, "udp://192.0.2.1:4002")
+        now[0] = np.zeros((3, 24))
+        look(keeper)
+        assert session.grasps == 0  # nothing is judged before the hand was seen open
+        now[0] = PATTERN
+        look(keeper)
+        assert (session.grasps, part.learner.outcomes, part.risk.proven) == (30, 12, 12)
+        driver.known = dict.fromkeys(FINGERS, "udp://192.0.2.1:4003")
+        now[0] = np.zeros((3, 24))
+        look(keeper)
+        now[0] = HELD  # another hand
+        look(keeper)
+        keeper.save()
+    assert (session.grasps, part.learner.outcomes, part.risk.proven) == (0, 0, 0)
+
+
+def test_sensors_without_numbers_have_each_their_session(tmp_path: Path) -> None:
+    """Three hands in turn: the session of each is there when it is back."""
+    hands = [PATTERN, HELD, PATTERN - np.linspace(400.0, 0.0, 24)]
+    now, session = [hands[0]], calibration()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = session_keeper(session, sensors(), file, read_rest=lambda: now[0])
+        found = []
+        for number, rest in enumerate((*hands, *hands)):
+            for now[0] in (np.zeros((3, 24)), rest):
+                look(keeper)
+            found.append(session.grasps)
+            if number < 3:
+                observe(session, 20 + number, seed=number)
+        keeper.save()
+    assert found == [0, 0, 0, 20, 21, 22]
+
+
+def seed(robot: Robot, day: Day) -> None:
+    """Keep the session of recorded grasps that do not say of which sensors they are."""
+    robot.stop()
+    recorded = calibration_of(robot.pipeline)
+    day.teach(recorded, 300)
+    with SessionFile(robot.folder / "right.json") as file:
+        file.load()
+        file.save(kept_now(recorded.state(), FINGERS, {}))
+    robot.start()
+
+
+def calibration_of(pipeline: Pipeline) -> SessionCalibration:
+    if pipeline.session is None:
+        raise ValueError("a model without a session")
+    return pipeline.session
+
+
+@pytest.mark.parametrize("other", ["palm_down", "palm_side"])
+def test_a_seed_of_other_sensors_makes_no_slip_stable(
+    bts3_dir: Path, tmp_path: Path, other: str
+) -> None:
+    """Without the comparison 24 of 25 first slips were called stable."""
+    robot = Robot(tmp_path)
+    seed(robot, Day("palm_45", bts3_dir))
+    slips = first_slips(robot, Day(other, bts3_dir), 15, 40)
+    grasps = calibration_of(robot.pipeline).grasps
+    robot.stop()
+    assert len(slips) == 15
+    assert slips.count(Decision.STABLE) <= 2
+    assert grasps < 60  # its own only
+
+
+def test_a_seed_is_used_once_live_grasps_fit_it(bts3_dir: Path, tmp_path: Path) -> None:
+    robot, day = Robot(tmp_path), Day("palm_down", bts3_dir)
+    seed(robot, day)
+    calibrated = [known for _, _, known in robot.see(day.stream(0, 16))]
+    assert not any(calibrated[:FIT_GRASPS])
+    assert calibrated[-1]
+    assert calibration_of(robot.pipeline).grasps >= 300
+    robot.restart()  # it is that of these sensors from now on
+    assert all(known for _, _, known in robot.see(day.stream(20, 2)))
+    robot.stop()
 
 
 def test_a_finger_that_is_tared_alone_ends_nothing() -> None:

@@ -1,4 +1,4 @@
-"""The session's file: whole whenever it is cut off, damage found, the one before it at hand."""
+"""The session's file: whole whenever it is cut off, damage found and put aside."""
 
 from __future__ import annotations
 
@@ -17,10 +17,8 @@ from hypothesis import strategies as st
 from graspd.daemon.session.file import (
     SessionFile,
     SessionFileError,
-    former_of,
     kept_now,
     load,
-    read,
 )
 from graspd.daemon.trust.lift_book import LIFTS_MAX
 from graspd.daemon.trust.trust import decode
@@ -37,8 +35,8 @@ from tests.daemon.session.learning import (
 
 STEPS = ("open", "fchmod", "fsync", "replace")
 """Functions of `os` by which a file is written; a kill comes before or after a call of one."""
-CALLS = 7
-"""Of these in a save: open, fchmod and fsync of the part, two replacements, the folder's two."""
+CALLS = 6
+"""Of these in a save: open, fchmod and fsync of the part, the replacement, the folder's two."""
 
 
 class Killed(BaseException):
@@ -94,33 +92,30 @@ def test_a_kill_at_any_step_of_a_save_leaves_the_former_or_the_new_one(tmp_path:
             assert kept in (before, before + 1)
             save(file, 9)
             assert grasps_of(file.load()) == 9
-            assert sorted(each.name for each in tmp_path.glob(f"{path.name}*")) in (
-                [path.name, f"{path.name}.former", f"{path.name}.lock"],
-                [path.name, f"{path.name}.lock"],
-            )
+            names = sorted(each.name for each in tmp_path.glob(f"{path.name}*"))
+            assert names == [path.name, f"{path.name}.lock"]
     assert found == {0, 1}
-    with SessionFile(path) as file, killed(CALLS, after=False):
-        save(file, 1)  # there are no more calls
+    with SessionFile(path) as file:
+        file.load()
+        with killed(CALLS, after=False):
+            save(file, 1)  # there are no more calls
 
 
-Plan = list[tuple[int | None, bool, bool]]
-"""Of each life of a daemon: at which call its last save is killed, before or after, and whether the
-disk damages the newest file then."""
+Plan = list[tuple[int | None, bool]]
+"""Of each life of a daemon: at which call its last save is killed, before or after."""
 PLANS = st.lists(
-    st.tuples(st.none() | st.integers(0, CALLS - 1), st.booleans(), st.booleans()),
-    min_size=1,
-    max_size=8,
+    st.tuples(st.none() | st.integers(0, CALLS - 1), st.booleans()), min_size=1, max_size=8
 )
 
 
 @settings(max_examples=60)
 @given(PLANS)
-def test_whatever_is_killed_and_damaged_nothing_that_was_kept_twice_is_lost(
+def test_whenever_it_is_killed_nothing_that_was_kept_is_lost(
     tmp_path_factory: pytest.TempPathFactory, plan: Plan
 ) -> None:
     path = tmp_path_factory.mktemp("session") / "right.json"
     written, kept = 0, 0
-    for call, after, damaged in plan:
+    for call, after in plan:
         with SessionFile(path) as file:
             assert kept <= grasps_of(file.load()) <= written
             for _ in range(2):
@@ -131,9 +126,6 @@ def test_whatever_is_killed_and_damaged_nothing_that_was_kept_twice_is_lost(
                 written += 1
                 save(file, written)
                 kept = written
-        if damaged and path.exists():
-            path.write_bytes(path.read_bytes()[:-20])
-            kept = kept - 1  # the one before it is whole
     assert kept <= grasps_of(load(path)) <= written
 
 
@@ -170,12 +162,12 @@ def damage(data: bytes, choose: random.Random) -> bytes:
 def test_a_thousand_damaged_files_never_become_a_state_that_was_not_written(tmp_path: Path) -> None:
     path = tmp_path / "right.json"
     data = learned(path)
-    written, choose, refused = read(path), random.Random(16), 0
+    written, choose, refused = load(path), random.Random(16), 0
     for _ in range(1000):
         damaged = damage(data, choose)
         path.write_bytes(damaged)
         try:
-            assert read(path) == written, damaged
+            assert load(path) == written, damaged
         except SessionFileError:
             refused += 1
         else:
@@ -183,27 +175,39 @@ def test_a_thousand_damaged_files_never_become_a_state_that_was_not_written(tmp_
     assert refused > 990
 
 
-def test_what_was_kept_before_takes_the_place_of_what_is_damaged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+@pytest.mark.parametrize("spoil", ["cut", "flip", "empty", "nested"])
+def test_what_cannot_be_read_is_put_aside_never_replaced(tmp_path: Path, spoil: str) -> None:
     path = tmp_path / "right.json"
     with SessionFile(path) as file:
-        save(file, 1)
         save(file, 2)
-        assert grasps_of(file.load()) == 2
-        assert not caplog.text
-        path.write_bytes(path.read_bytes().replace(b'"grasps":2', b'"grasps":5'))
-        assert grasps_of(file.load()) == 1
-        assert caplog.text.count("its checksum is wrong; what was kept before it goes on") == 1
-        save(file, 3)  # the damaged one does not become the former one
-        assert grasps_of(read(former_of(path))) == 1
-        former_of(path).write_bytes(b"")
-        path.write_bytes(b"x")
+    data = path.read_bytes()
+    spoiled = {
+        "cut": data[:-9],
+        "flip": data.replace(b'"grasps":2', b'"grasps":5'),
+        "empty": b"",
+        "nested": b'{"version":2,"sha256":"a","kept":' + b"[" * 100_000,
+    }[spoil]
+    path.write_bytes(spoiled)
+    with SessionFile(path) as file:
         with pytest.raises(SessionFileError, match=r"right\.json: not a session"):
             file.load()
+        for grasps in (3, 4):
+            save(file, grasps)
+        (aside,) = tmp_path.glob("right.json.aside-?")
+        assert (aside.read_bytes(), grasps_of(file.load())) == (spoiled, 4)
         assert file.remove()
         assert not file.remove()
         assert file.load() is None
+    assert [each.name for each in tmp_path.iterdir()] == ["right.json.lock"]
+
+
+def test_what_was_put_aside_is_at_most_sixteen_files(tmp_path: Path) -> None:
+    path = tmp_path / "right.json"
+    for _ in range(60):
+        path.write_bytes(b"?")
+        with SessionFile(path) as file:
+            save(file, 1)
+    assert 8 < len(list(tmp_path.glob("right.json.aside-*"))) <= 16
 
 
 def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_path: Path) -> None:
@@ -217,14 +221,3 @@ def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_pat
     assert kept.trust is not None
     assert decode(kept.trust) == part.state()
     assert (tmp_path / "right.json").stat().st_size < 1 << 20
-
-
-def test_what_is_nested_too_deeply_gives_way_to_the_former_file(tmp_path: Path) -> None:
-    path = tmp_path / "right.json"
-    with SessionFile(path) as file:
-        for number in (20, 21):
-            session = calibration()
-            observe(session, number)
-            file.save(kept_now(session.state(), FINGERS, {}, None))
-    path.write_bytes(b'{"version":2,"sha256":"a","kept":' + b"[" * 100_000)
-    assert grasps_of(load(path)) == 20
