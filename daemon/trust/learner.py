@@ -18,11 +18,11 @@ from graspd.daemon.trust.residual import GRASPS_MAX, Matrix, Residual, Vector
 
 TEMPERATURE: Final = 2.0
 """Divisor of the model's margin; networks are too sure of another day's grasps."""
-SCALE: Final = 2.9
+SCALE: Final = 2.8
 """Factor of moderated log-odds, which are too timid on days, objects and poses that are new.
 
 With it, a tenth of the grasps with a `p_slip` of 0.1 slips. Fitted on the sessions of three
-quarters of the objects it is 2.87 to 2.90. The slope of outcomes on scaled log-odds is 1.00 on the
+quarters of the objects it is 2.75 to 2.79. The slope of outcomes on scaled log-odds is 1.00 on the
 others (`graspd report worth`, `worth` on the card of `small-session`).
 """
 MARGIN_MAX: Final = 30.0
@@ -39,9 +39,10 @@ MEAN_MAX: Final = 25.0
 """Largest mean of a weight, and of the residual in log-odds, whatever is told: 50 times the
 margin's standard deviation, 8 times the residual's."""
 
-TOLD_MAX: Final = 5.0
-"""Log-odds of its own grasp beyond which one outcome does not move the mean. Without it, one lift
-that held though the network was sure of a slip would turn unlike grasps `stable`."""
+MOVE_MAX, WEIGHTS_MOVE_MAX = 1.25, 0.5
+"""Standard deviations by which one outcome moves the mean log-odds of its own grasp at most, all of
+them and by the weights. The weights judge grasps that are unlike, of which one outcome says little:
+without these limits one false outcome turns slips of unlike grasps `stable`."""
 
 
 class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -128,11 +129,12 @@ class Learner:
         weight = p_slip * (1.0 - p_slip)
         gain = 1.0 / (1.0 + weight * variance)
         step = gain * (slipped - p_slip)
-        if slipped:
-            step = min(step, max(TOLD_MAX - log_odds, 0.0) / variance)
-        else:
-            step = max(step, min(-TOLD_MAX - log_odds, 0.0) / variance)
-        mean = np.clip(mean + step * seen, -MEAN_MAX, MEAN_MAX)
+        limit = MOVE_MAX / math.sqrt(variance)
+        step = min(max(step, -limit), limit)
+        move, weights = step * seen, slice(len(features))
+        spread = math.sqrt(float(features @ (covariance[weights, weights] @ features)))
+        move[weights] /= max(abs(step) * spread / WEIGHTS_MOVE_MAX, 1.0)
+        mean = np.clip(mean + move, -MEAN_MAX, MEAN_MAX)
         covariance = covariance - weight * gain * np.outer(seen, seen)
         covariance = (1.0 - DRIFT) * covariance + DRIFT * self._prior(residual)
         self._set(residual, mean, covariance)

@@ -19,7 +19,7 @@ SHARE_YOUNG: Final = 1.5
 """Probability of slip that may be called `stable` before an outcome, in units of the share that is
 set: with a full budget the surest grasps slip much less often than the threshold says."""
 SHARE_PROVEN: Final = 3.0
-"""The same once `PROVEN_FROM` outcomes are known: three sessions in four then keep to the target.
+"""The same once `PROVEN_FROM` outcomes are known: seven sessions in ten then keep to the target.
 From 3 to 5 both the good lifts that are kept and the sessions above the target rise;
 deploy/JUDGING.md has the curve."""
 PROVEN_FROM: Final = 40

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 Number = np.longdouble
 Exact = NDArray[np.longdouble]
 MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = Number("0.5"), Number("0.5"), Number("0.2")
-TEMPERATURE, SCALE, DRIFT = Number("2"), Number("2.9"), Number("0.002")
+TEMPERATURE, SCALE, DRIFT = Number("2"), Number("2.8"), Number("0.002")
+MOVE_MAX, WEIGHTS_MOVE_MAX = Number("1.25"), Number("0.5")
+"""Most that one outcome moves of its own grasp, all and by the weights, standard deviations."""
 SHARED, OWN, REACH = Number("9"), Number("0.009"), Number("0.5")
 """Variances of the residual, shared and a grasp's own, and how far it reaches."""
 PI = Number("3.14159265358979323846264338327950288")
@@ -48,11 +50,18 @@ class Reference:
     def learn(self, grasp: int, slipped: bool) -> None:
         h = self.features[grasp]
         p = 1 / (1 + np.exp(-(h @ self.mean)))
-        seen = self.covariance @ h
+        before, seen = self.covariance.copy(), self.covariance @ h
         # Kalman's gain, with the information p (1 - p) of an outcome as its inverse noise.
         gain = seen / (h @ seen + 1 / (p * (1 - p)))
         self.covariance -= np.outer(gain, seen)
-        self.mean += gain * (slipped - p) / (p * (1 - p))
+        move = gain * (slipped - p) / (p * (1 - p))
+        in_spreads = np.abs(h @ move) / np.sqrt(h @ seen)
+        move *= min(MOVE_MAX / in_spreads, 1)
+        here = np.ix_(self.weights, self.weights)
+        by_weights = h[self.weights] @ before[here] @ h[self.weights]
+        share = np.sqrt(by_weights / (h @ seen)) * min(in_spreads, MOVE_MAX)
+        move[self.weights] *= min(WEIGHTS_MOVE_MAX / share, 1)
+        self.mean += move
         self.covariance += self.drift * (self.prior - self.covariance)
 
     def keep(self, told: list[int]) -> None:
