@@ -57,6 +57,8 @@ class Reason(StrEnum):
     OUTCOME_TOLD = "outcome-told"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
+    HEARD_LATE = "heard-late"
+    """Only in `health`."""
 
 
 ADVICE: dict[Reason, str] = {
@@ -93,6 +95,7 @@ ADVICE: dict[Reason, str] = {
     Reason.OUTCOME_TOLD: "the outcome of its lift is known: release the object, then grasp again",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
+    Reason.HEARD_LATE: "subscribers receive messages late: check PC load; who floods the socket?",
 }
 
 

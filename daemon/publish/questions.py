@@ -11,8 +11,8 @@ from functools import partial
 from typing import Final
 
 from graspd.daemon.publish.companion import REPEATED, Requests
-from graspd.daemon.publish.door import Frames
 from graspd.daemon.publish.messages import OBJECT_PATTERN
+from graspd.daemon.publish.porter import Frames
 from graspd.daemon.trust.lift_book import GraspId, Report
 
 JUDGE, LIFT = b"judge", b"lift"
