@@ -42,6 +42,8 @@ from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 
 WAIT_MAX_S = 3600
+REPLAY_QUEUE = 1000
+"""`publish.high_water_mark`: a recording is not live, so a late message is as good."""
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
 DEMO_TITLE = "A day on which the sensors drift. All grasps are synthetic: no hand made them."
@@ -198,8 +200,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         around = Assembly(parts, stack)
         sockets = None
         if args.publish is not None:
-            waits = args.wait is not None
-            sockets = stack.enter_context(Sockets(parts.scene, awaits_subscriber=waits))
+            sockets = stack.enter_context(Sockets(parts.scene))
             around.add_sockets(sockets)
         around.open_drivers()
         if sockets is not None and args.wait is not None:
@@ -285,7 +286,8 @@ def _parts(args: argparse.Namespace, source: Source) -> Parts:
     chosen = {}
     if args.model is not None:
         chosen["path" if args.model.endswith(".onnx") else "name"] = args.model
-    wanted = source.scene({"endpoint": args.publish}, chosen, args.gate)
+    publish = {"endpoint": args.publish, "high_water_mark": REPLAY_QUEUE}
+    wanted = source.scene(publish, chosen, args.gate)
     learns = wanted.session.learn and args.session != OFF
     session = wanted.session.model_copy(update={"learn": learns})
     wanted = wanted.model_copy(update={"session": session})

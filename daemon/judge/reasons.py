@@ -58,6 +58,8 @@ class Reason(StrEnum):
     NOT_KEPT = "not-kept"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
+    HEARD_LATE = "heard-late"
+    """Only in `health`."""
 
 
 ADVICE: dict[Reason, str] = {
@@ -95,6 +97,7 @@ ADVICE: dict[Reason, str] = {
     Reason.NOT_KEPT: "the lift cannot be noted on the disk: is it full, slow or read-only?",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
+    Reason.HEARD_LATE: "subscribers receive messages late: check PC load; who floods the socket?",
 }
 
 

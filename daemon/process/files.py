@@ -9,6 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 
 
+class SceneError(Exception):
+    """The scene is missing or wrong; the text has one line per mistake, with its key."""
+
+
 def read_regular(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file, without waiting for the writer of a pipe.
 

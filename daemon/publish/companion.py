@@ -7,6 +7,7 @@ from enum import Enum
 from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar
 
 from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish.messages import Status, Verdict
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
 from graspd.drivers.base import Reading, TactileReading
@@ -108,6 +109,11 @@ class Companion:
     @property
     def counters(self) -> dict[str, dict[str, int]]:
         """Counts since the start, for the status: by part, then by name of the count."""
+        return {}
+
+    @property
+    def health(self) -> dict[str, Reason]:
+        """Parts that are not well, and why, for the status."""
         return {}
 
 

@@ -10,8 +10,7 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-from graspd.daemon.process.files import read_regular
-from graspd.daemon.scene import SceneError
+from graspd.daemon.process.files import SceneError, read_regular
 
 PUBLIC, SECRET = ".key", ".key_secret"
 """Endings of key files, as pyzmq and czmq have them."""
@@ -104,6 +103,25 @@ def load_clients(folder: Path) -> Clients:
         except KeysError as error:
             clients.refused.append(str(error))
     return clients
+
+
+def state(folder: Path) -> object:
+    """Return a value that changes when a file in the folder, or its rights, change."""
+    try:
+        with os.scandir(folder) as entries:
+            signatures = {entry.name: _signature(entry) for entry in entries}
+        about = os.stat(folder)
+    except OSError as error:
+        return error.errno
+    return signatures, about.st_ino, about.st_ctime_ns
+
+
+def _signature(entry: os.DirEntry[str]) -> object:
+    try:
+        about = entry.stat()
+    except OSError as error:  # a link that leads nowhere, for example
+        return error.errno
+    return about.st_ino, about.st_mtime_ns, about.st_ctime_ns, about.st_size
 
 
 def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:

@@ -25,10 +25,10 @@ class PublishError(Exception):
 
 
 class Listener:
-    """An endpoint, and the listening socket of an `ipc://` one.
+    """An endpoint, and its listening socket.
 
-    A file at its path is replaced only if it is a socket of a dead process. `PATH.lock` decides
-    which of two processes may do that. `close` removes both files.
+    A file at the path of an `ipc://` one is replaced only if it is a socket of a dead process.
+    `PATH.lock` decides which of two processes may do that. `close` removes both files.
     """
 
     def __init__(self, endpoint: str, mode: int | None = None, group: str | None = None) -> None:
@@ -42,6 +42,7 @@ class Listener:
         self._identity: tuple[int, int] | None = None
         self._lock: int | None = None
         if not endpoint.startswith("ipc://"):
+            self.socket = _listening(endpoint)
             return
         self._path = Path(endpoint.removeprefix("ipc://"))
         self._lock_path = Path(f"{self._path}.lock")
@@ -78,6 +79,12 @@ class Listener:
             os.chmod(path, self._mode)
         made.listen(BACKLOG)  # not before: no peer has connected while all could
 
+    def fileno(self) -> int:
+        """Return the descriptor of the listening socket. Raises `PublishError` after `close`."""
+        if self.socket is None:
+            raise PublishError(f"{self.endpoint}: closed")
+        return self.socket.fileno()
+
     def close(self) -> None:
         """Stop listening, and remove both files. May be called again."""
         if self.socket is not None:
@@ -99,6 +106,23 @@ def user_id(name: str) -> int:
         return int(name) if name.isdecimal() else pwd.getpwnam(name).pw_uid
     except KeyError:
         raise PublishError(f"there is no user {name}") from None
+
+
+def _listening(endpoint: str) -> socket.socket:
+    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    is_6 = "[" in host
+    family = socket.AF_INET6 if is_6 else socket.AF_INET
+    try:
+        made = socket.create_server(
+            (host.strip("[]"), int(port)), family=family, backlog=BACKLOG, dualstack_ipv6=is_6
+        )
+    except OSError as error:
+        refusal = PublishError(f"cannot bind {endpoint}: {os.strerror(error.errno or 0)}")
+        if error.errno == errno.EADDRINUSE:
+            refusal.taken = endpoint
+        raise refusal from error
+    made.setblocking(False)
+    return made
 
 
 def _group_id(name: str) -> int:

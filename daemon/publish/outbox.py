@@ -269,13 +269,18 @@ class Outbox:
         drivers: dict[str, dict[str, int]],
         pipeline: Pipeline,
         deadlines: Deadlines,
+        beside: dict[str, Reason],
         *,
         skipped_readings: int,
         overloaded: bool,
     ) -> Status:
-        """Send and return one status. `drivers`: counters of drivers and companions, by part."""
+        """Send and return one status.
+
+        `drivers`: counters of drivers and companions, by part. `beside`: parts of companions that
+        are not well.
+        """
         session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
-        health = pipeline.health()
+        health = pipeline.health() | beside
         if state is State.SILENT:
             health["link"] = Reason.STALE
         message = Status(

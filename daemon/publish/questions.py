@@ -15,8 +15,8 @@ from msgspec.structs import replace
 
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.companion import REPEATED, PublishedVerdict, Requests
-from graspd.daemon.publish.door import Frames
 from graspd.daemon.publish.messages import OBJECT_PATTERN, encode, withheld
+from graspd.daemon.publish.porter import Frames
 from graspd.daemon.trust.lift_book import NAME_BYTES, GraspId, LiftBook, Peer, Report
 
 log = logging.getLogger("graspd")

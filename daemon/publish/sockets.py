@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
-from graspd.daemon.publish.door import Admission, Door
-from graspd.daemon.publish.listener import Listener, PublishError, user_id
-from graspd.daemon.publish.messages import Status
+from graspd.daemon.publish.door import Door
+from graspd.daemon.publish.listener import Listener, user_id
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Curve
 
 if TYPE_CHECKING:
     from graspd.daemon.process.signals import StopSignal
-    from graspd.daemon.publish.keys import Clients
     from graspd.daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
@@ -30,35 +27,27 @@ TACTILE = b"tactile."
 class Sockets(Companion):
     """The sockets, open until `close`."""
 
-    def __init__(
-        self,
-        wanted: Scene,
-        clock: Callable[[], int] = time.monotonic_ns,
-        *,
-        awaits_subscriber: bool = False,
-    ) -> None:
+    def __init__(self, wanted: Scene, clock: Callable[[], int] = time.monotonic_ns) -> None:
         """`clock` gives monotonic ns. Raises `PublishError` or `KeysError`."""
         self.plan = plan(wanted)
         self.endpoint = wanted.endpoint
         self._clock = clock
-        self._awaits_subscriber = awaits_subscriber
-        self._high_water_mark = wanted.publish.high_water_mark
         self._counters = Counter(dropped=0)
         tactile_hz = wanted.publish.tactile_hz
         self._tactile_period_ns = round(1e9 / tactile_hz) if tactile_hz else None
         self._tactile_due_ns = 0
-        self._curve = wanted.curve
-        self._keys_seen: object = None
-        self._admission = None if wanted.curve is None else self._load_keys(wanted.curve)
+        keys = None if wanted.curve is None else _load_keys(wanted.curve)
         self._door: Door | None = None
-        """None after `close`, and while an endpoint cannot be had again."""
+        """None after `close`."""
         self.questions: Questions | None = None
         self._listeners: list[Listener] = []
         """Endpoint of the messages, then that of the questions, if peers may ask."""
         self._filenos: list[int] = []
         try:
             self._listen(wanted)
-            self._open()
+            self._door = Door(self._listeners, wanted.publish.high_water_mark, keys)
+            if self.questions is not None:
+                self._filenos = [self._door.fileno()]
         except BaseException:
             self.close()
             raise
@@ -80,28 +69,7 @@ class Sockets(Companion):
         names = () if wanted.ask is None else wanted.ask.tell or ()
         if (wanted.ask_endpoint or "").startswith("ipc://"):
             return {b"user %d" % user_id(name) for name in names}.__contains__
-        return lambda credential: (
-            self._admission is not None
-            and self._admission.admitted.get(credential.removeprefix(b"key ")) in names
-        )
-
-    def _open(self) -> None:
-        self._door = Door(
-            self._listeners,
-            self._high_water_mark,
-            self._admission,
-            awaits_subscriber=self._awaits_subscriber,
-        )
-        if self.questions is not None:
-            self._filenos = [self._door.fileno()]
-
-    def _load_keys(self, curve: Curve) -> Admission:
-        from graspd.daemon.publish import keys  # only where there are any
-
-        self._keys_seen = _state(curve.clients)
-        pair, clients = keys.load_own(curve.secret_key), keys.load_clients(curve.clients)
-        _log_refused(clients)
-        return Admission(*pair, clients.admitted)
+        return {b"key " + name.encode() for name in names}.__contains__
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Publish one message; count it if it is dropped."""
@@ -131,7 +99,10 @@ class Sockets(Companion):
         return None if self.questions is None else self.questions.due_ns
 
     def before_wait(self, requests: Requests) -> None:
-        if self.questions is not None and self._door is not None:
+        if self._door is None:
+            return
+        self._door.check()
+        if self.questions is not None:
             messages = self._door.receive()
             if messages:
                 self.questions.take(messages, self._clock(), requests)
@@ -142,12 +113,6 @@ class Sockets(Companion):
         if self.questions is not None:
             self.questions.answer(published, None if published.is_answer else self._clock())
 
-    def on_status(self, status: Status) -> None:
-        """Check the sockets and the list of keys. Raises `PublishError`, which ends the daemon."""
-        if self._door is not None:
-            self._door.check()
-        self.check_keys()
-
     @property
     def counters(self) -> dict[str, dict[str, int]]:
         counters = {"publish": dict(self._counters)}
@@ -155,47 +120,17 @@ class Sockets(Companion):
             counters["ask"] = dict(self.questions.counters)
         return counters
 
+    @property
+    def health(self) -> dict[str, Reason]:
+        late = self._door is not None and self._door.is_late
+        return {"publish": Reason.HEARD_LATE} if late else {}
+
     def wait_for_subscriber(self, timeout_s: float, stop: StopSignal | None = None) -> bool:
         return self._door is not None and self._door.wait_for_subscriber(timeout_s, stop)
 
-    def check_keys(self) -> None:
-        """Take the list of keys if it has changed; disconnect a peer whose key is removed.
-
-        A list that cannot be read, or that others may write, admits no peer. An endpoint that is
-        taken is tried again. Raises `PublishError` if peers stay connected.
-        """
-        if self._curve is None or self._admission is None:
-            return
-        now = _state(self._curve.clients)
-        if now != self._keys_seen:
-            self._keys_seen = now
-            self._take_keys(self._curve, self._admission)
-        if self._door is None:
-            try:
-                self._open()
-            except PublishError as error:
-                log.error("%s; no peer can connect", error)
-
-    def _take_keys(self, curve: Curve, admission: Admission) -> None:
-        from graspd.daemon.publish import keys
-
-        try:
-            clients = keys.load_clients(curve.clients)
-        except keys.KeysError as error:
-            clients = keys.Clients({}, [str(error)])
-        _log_refused(clients)
-        log.info("%d keys may connect", len(clients.admitted))
-        removed = admission.admitted.keys() - clients.admitted.keys()
-        admission.admitted = clients.admitted
-        if removed and self._door is not None:
-            # libzmq cannot disconnect a single peer. The others reconnect.
-            door, self._door, self._filenos = self._door, None, []
-            if not door.close():
-                raise PublishError(f"{self.endpoint}: cannot disconnect a peer with a removed key")
-
     def close(self) -> None:
         if self._door is not None and not self._door.close():
-            log.warning("%s: peers keep libzmq from closing", self.endpoint)
+            log.warning("%s: libzmq's process did not end and was killed", self.endpoint)
         self._door = None
         for listener in self._listeners:
             listener.close()
@@ -207,33 +142,21 @@ class Sockets(Companion):
         self.close()
 
 
-def _log_refused(clients: Clients) -> None:
-    for why in clients.refused:
-        log.error("%s; no key there may connect", why)
+def _load_keys(curve: Curve) -> tuple[str, str, str]:
+    from graspd.daemon.publish import keys  # only where there are any
+
+    public, secret = keys.load_own(curve.secret_key)
+    keys.load_clients(curve.clients)  # raises `KeysError` where it can be mended
+    return public.decode(), secret.decode(), str(curve.clients)
 
 
 def plan(wanted: Scene) -> object:
     """Return the parts of a scene that its sockets depend on."""
     rights = wanted.ask_file_mode, wanted.ask_group, None if wanted.ask is None else wanted.ask.tell
     asked = wanted.ask_endpoint, rights, wanted.gate.request_ms
-    own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
+    own_key = None
+    if wanted.curve is not None:
+        from graspd.daemon.publish import keys  # only where there are any
+
+        own_key = keys.state(wanted.curve.secret_key.parent)
     return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
-
-
-def _state(folder: Path) -> object:
-    """Return a value that changes when a file in the folder, or its rights, change."""
-    try:
-        with os.scandir(folder) as entries:
-            signatures = {entry.name: _signature(entry) for entry in entries}
-        about = os.stat(folder)
-    except OSError as error:
-        return error.errno
-    return signatures, about.st_ino, about.st_ctime_ns
-
-
-def _signature(entry: os.DirEntry[str]) -> object:
-    try:
-        about = entry.stat()
-    except OSError as error:  # a link that leads nowhere, for example
-        return error.errno
-    return about.st_ino, about.st_mtime_ns, about.st_ctime_ns, about.st_size

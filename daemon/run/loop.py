@@ -12,6 +12,7 @@ from functools import partial
 from typing import Final
 
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.sleep import Sleep
 from graspd.daemon.publish.companion import (
@@ -320,14 +321,17 @@ class Loop:
         now_ns = self._clock()
         elapsed_s = max(now_ns - self._status_at_ns, 1) / 1e9
         counters = {driver.name: driver.counters.as_dict() for driver in self._drivers}
+        health: dict[str, Reason] = {}
         for companion in self._companions:
             counters |= companion.counters
+            health |= companion.health
         status = self._outbox.status(
             self._state,
             self._readings_since_status / elapsed_s,
             counters,
             self._pipeline,
             self._deadlines,
+            health,
             skipped_readings=self._shedder.skipped_readings,
             overloaded=self._shedder.overloaded,
         )

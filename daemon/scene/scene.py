@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, JointLimits, Limits
-from graspd.daemon.process.files import read_regular
+from graspd.daemon.process.files import SceneError, read_regular
 from graspd.daemon.process.text import printable
 from graspd.daemon.scene.drivers import (
     CanTactile,
@@ -40,10 +40,6 @@ SCENE_MAX_BYTES = 128 << 10
 
 STATE_DIRECTORY = Path("/var/lib/graspd")
 """Folder for the state of a service (file-hierarchy(7))."""
-
-
-class SceneError(Exception):
-    """The scene is missing or wrong; the text has one line per mistake, with its key."""
 
 
 class Hand(Section):
@@ -176,7 +172,7 @@ class Publish(Section):
 
     endpoint: Endpoint | None = None
     """Without it `ipc:///run/graspd/<hand>.ipc`. `tcp://` needs `[curve]`, except on loopback."""
-    high_water_mark: Annotated[int, Field(ge=1, le=100_000), unit("messages")] = 1000
+    high_water_mark: Annotated[int, Field(ge=1, le=100_000), unit("messages")] = 10
     """Most messages that wait for a subscriber."""
     tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), unit("1/s")] = 25.0
     """Rate of readings on `tactile.<hand>`; 0: none; the sensor's rate or more: all."""

@@ -30,6 +30,7 @@ ATTACKS: Final[dict[str, Callable[[Plan], Outcome]]] = {
     "connections-curve": doors.connections,
     "noise-ipc": doors.noises,
     "flood": doors.flood,
+    "ping-hangup": doors.hang_ups,
     "scene-nested": files.nested_scenes,
     "sighup-storm": files.sighup_storm,
     "model-giant": files.giant_model,

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graspd.daemon import scene as scenes
 from graspd.daemon.assembly import assembly
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision
-from graspd.daemon.scene import scene as scenes
 from graspd.drivers.base import ElectrodeFault, JointReading, TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_DAY
 from graspd.models import zoo

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Self
 
+import pytest
 import zmq
 from msgspec.structs import replace
 
@@ -21,6 +26,7 @@ from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
 from tests.kit.messages import GOLDEN, decode_verdict
+from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
 WAIT_MS = 100_000
@@ -51,12 +57,10 @@ def published(
 class Publisher:
     """A door that only publishes."""
 
-    def __init__(self, endpoint: str, high_water_mark: int = 1000, *, awaits: bool = False) -> None:
+    def __init__(self, endpoint: str, high_water_mark: int = 1000) -> None:
         self._listener = Listener(endpoint)
         try:
-            self.door = Door(
-                [self._listener], high_water_mark=high_water_mark, awaits_subscriber=awaits
-            )
+            self.door = Door([self._listener], high_water_mark=high_water_mark)
         except BaseException:
             self._listener.close()
             raise
@@ -137,7 +141,11 @@ class Peers:
 class KeyedDoor:
     """A daemon's sockets with keys, and clients at it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._log = folder / "log"
+        self._stderr = self._log.open("a")
+        popen = partial(subprocess.Popen, stderr=self._stderr)
+        monkeypatch.setattr(subprocess, "Popen", popen)
         make(folder, "daemon")
         self.clients = folder / "clients"
         self.known = self.client("controller", folder / "theirs")
@@ -161,6 +169,7 @@ class KeyedDoor:
             each.close(linger=0)
         self.context.term()
         self.sockets.close()
+        self._stderr.close()
 
     def client(self, name: str, folder: Path) -> Keys:
         self.clients.mkdir(exist_ok=True)
@@ -170,8 +179,16 @@ class KeyedDoor:
         """Keys that the daemon has on its list from now on."""
         keys = self.client(name, folder)
         (folder / f"{name}.key").rename(self.clients / f"{name}.key")
-        self.sockets.check_keys()
+        self.knows(2)
         return keys
+
+    def said(self) -> str:
+        """The log of its process until now."""
+        return self._log.read_text()
+
+    def knows(self, number: int) -> None:
+        """Wait until this many keys may connect."""
+        wait_until(lambda: re.findall(r"(\d+) keys may", self.said())[-1:] == [str(number)])
 
     def is_deaf(self, subscriber: zmq.Socket[bytes]) -> None:
         """Nothing more comes there than what waits."""
@@ -196,6 +213,7 @@ class KeyedDoor:
     def hears(self, subscriber: zmq.Socket[bytes], patience_s: float) -> bool:
         deadline_s = time.monotonic() + patience_s
         while time.monotonic() < deadline_s:
+            self.sockets.before_wait(Asked())
             self.sockets.send(b"verdict.right", b"{}")
             if subscriber.poll(5):
                 subscriber.recv_multipart()
@@ -203,10 +221,21 @@ class KeyedDoor:
         return False
 
 
+def processes() -> list[int]:
+    """Processes that this one has started and not ended, such as those of doors."""
+    folder = Path(f"/proc/{os.getpid()}/task")
+    return [
+        int(number)
+        for thread in folder.iterdir()
+        for number in (thread / "children").read_text().split()
+    ]
+
+
 def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[bytes]:
     """Send until something arrives: the publisher does not learn of subscriptions."""
     deadline_s = time.monotonic() + WAIT_MS / 1e3
     while not subscriber.poll(10):
         assert time.monotonic() < deadline_s
+        publisher.door.check()
         publisher.send(b"verdict.right", b"first")
     return subscriber.recv_multipart()

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
 import socket
 import stat
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -15,9 +19,11 @@ import pytest
 import zmq
 
 from graspd.daemon.process.signals import StopSignal
-from graspd.daemon.publish.door import QUESTIONS_MAX, Door, Frames
+from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.listener import Listener, PublishError
-from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message
+from graspd.daemon.publish.porter import QUESTIONS_MAX, Frames, Plan
+from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message, processes
+from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
 SCHEMES = ("ipc", "tcp", "ip6")
@@ -68,7 +74,7 @@ def test_a_plain_subscriber_gets_two_frames_in_order(
     if scheme == "ip6" and not has_ipv6():
         pytest.skip("this computer has no IPv6")
     endpoint = endpoint_of(scheme, tmp_path)
-    with Publisher(endpoint, awaits=True) as publisher:
+    with Publisher(endpoint) as publisher:
         subscriber = peers.subscribe(endpoint, "verdict.")
         assert publisher.door.wait_for_subscriber(WAIT_MS / 1e3)
         publisher.send(b"status.right", b"not wanted")
@@ -80,7 +86,7 @@ def test_a_plain_subscriber_gets_two_frames_in_order(
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_wait_for_a_subscriber(tmp_path: Path, number: signal.Signals) -> None:
-    with StopSignal() as stop, Publisher(f"ipc://{tmp_path}/v", awaits=True) as publisher:
+    with StopSignal() as stop, Publisher(f"ipc://{tmp_path}/v") as publisher:
         timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
         timer.start()
         assert not publisher.door.wait_for_subscriber(3600.0, stop)
@@ -88,15 +94,15 @@ def test_a_signal_ends_the_wait_for_a_subscriber(tmp_path: Path, number: signal.
         assert stop.received is number
 
 
-def test_a_message_that_the_proxy_is_too_slow_for_is_dropped_and_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ended = threading.Event()
-    monkeypatch.setattr(zmq, "proxy", lambda _front, _back: ended.wait(WAIT_MS / 1e3))
+def test_messages_that_its_process_is_too_slow_for_are_dropped(tmp_path: Path) -> None:
     with Publisher(f"ipc://{tmp_path}/v", high_water_mark=5) as publisher:
-        sent = [publisher.send(b"verdict.right", b"{}") for _ in range(10)]
-        ended.set()
-    assert sent == [True] * 6 + [False] * 4  # five, and one at the proxy's end
+        (process,) = processes()
+        os.kill(process, signal.SIGSTOP)
+        sent = [publisher.send(b"verdict.right", bytes(10_000)) for _ in range(2000)]
+        os.kill(process, signal.SIGCONT)
+    # Five wait at each end, more in the kernel: 208 KiB (net.core.wmem_default).
+    assert 5 <= sum(sent) < 100
+    assert not all(sent)
 
 
 def test_a_subscriber_that_does_not_read_loses_messages_and_nothing_else(
@@ -212,3 +218,90 @@ def test_a_peer_that_sends_too_much_is_disconnected_and_others_are_not(
     loud.send(b"x" * 100_000)
     polite.send(b"judge")
     assert receive(door, 1) == [[b"polite", ME, b"judge"]]
+
+
+def test_peers_reconnect_after_the_end_of_its_process(tmp_path: Path, peers: Peers) -> None:
+    listeners = [Listener(f"ipc://{tmp_path}/{name}") for name in ("v", "ask")]
+    door = Door(listeners)
+    subscriber = peers.subscribe(listeners[0].endpoint)
+    asker = peers.connect(zmq.DEALER, listeners[1].endpoint)
+    for _ in range(2):
+        while subscriber.poll(0):
+            subscriber.recv_multipart()
+
+        def is_served() -> bool:
+            door.check()
+            door.send(b"verdict.right", b"{}")
+            asker.send(b"judge")
+            return bool(door.receive()) and bool(subscriber.poll(10))
+
+        wait_until(is_served)
+        (process,) = processes()
+        os.kill(process, signal.SIGKILL)
+    assert door.close()
+    for listener in listeners:
+        listener.close()
+
+
+def test_the_process_ends_with_the_daemon_and_leaves_no_file(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from graspd.daemon.publish.door import Door;"
+        "from graspd.daemon.publish.listener import Listener;"
+        "door = Door([Listener(sys.argv[1])]);"
+        "print(open(f'/proc/{os.getpid()}/task/{os.getpid()}/children').read(), flush=True);"
+        "os.kill(os.getpid(), 9)"
+    )
+    command = [sys.executable, "-c", code, f"ipc://{tmp_path}/v"]
+    killed = subprocess.run(
+        command, env=os.environ | {"TMPDIR": str(tmp_path)}, stdout=subprocess.PIPE, check=False
+    )
+    wait_until(lambda: not Path(f"/proc/{int(killed.stdout)}").exists())
+    assert {path.name for path in tmp_path.iterdir()} == {"v", "v.lock"}
+
+
+def test_connections_take_no_descriptor_of_the_daemon(tmp_path: Path) -> None:
+    with Publisher(f"ipc://{tmp_path}/v"), contextlib.ExitStack() as stack:
+        before = len(os.listdir("/proc/self/fd"))
+        (process,) = processes()
+        for _ in range(50):
+            peer = stack.enter_context(socket.socket(socket.AF_UNIX))
+            peer.connect(f"{tmp_path}/v")
+        wait_until(lambda: len(os.listdir(f"/proc/{process}/fd")) > 50)
+        assert len(os.listdir("/proc/self/fd")) == before + 50  # the other ends
+
+
+def test_the_door_says_when_its_own_subscriber_hears_late(tmp_path: Path) -> None:
+    with Publisher(f"ipc://{tmp_path}/v") as publisher:
+        door, (process,) = publisher.door, processes()
+
+        def is_late() -> bool:
+            door.check()
+            return door.is_late
+
+        assert not is_late()
+        os.kill(process, signal.SIGSTOP)
+        publisher.send(b"status.right", b"first")
+        assert not is_late()
+        wait_until(is_late)
+        os.kill(process, signal.SIGCONT)
+        publisher.send(b"status.right", b"second")
+        assert not door.is_late
+
+
+def test_its_process_ends_when_a_thread_of_it_has_ended(tmp_path: Path) -> None:
+    with contextlib.closing(Listener(f"ipc://{tmp_path}/v")) as listener:
+        plan = Plan(str(tmp_path), [listener.endpoint], [listener.fileno()], 10, [0], None)
+        code = "import zmq; from graspd.daemon.publish import porter;"
+        code += "zmq.proxy = lambda front, back: None; porter.main()"
+        with subprocess.Popen(
+            [sys.executable, "-c", code],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            pass_fds=[listener.fileno()],
+        ) as process:
+            assert process.stdin is not None
+            assert process.stderr is not None
+            process.stdin.write(json.dumps(plan).encode() + b"\n")
+            process.stdin.flush()
+            assert b"has ended" in process.stderr.readline()
+            assert process.wait() == 1

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import socket
 import stat
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import zmq
-from zmq.auth.thread import ThreadAuthenticator
 
-from graspd.daemon.publish import door as doors
+from graspd.daemon.publish import keys
 from graspd.daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
-from graspd.daemon.publish.listener import PublishError
-from tests.daemon.publish.doors import QUIET_S, Asked, KeyedDoor, published
+from graspd.daemon.publish.porter import LOOK_MS
+from tests.daemon.publish.doors import QUIET_S, Asked, KeyedDoor, processes, published
 from tests.kit.inside import graspd
 from tests.kit.messages import GOLDEN_STATUS
 from tests.kit.scenes import demo_scene
@@ -25,16 +24,13 @@ from tests.kit.waiting import PATIENCE_S, wait_until
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[KeyedDoor]:
-    door = KeyedDoor(tmp_path)
+def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[KeyedDoor]:
+    door = KeyedDoor(tmp_path, monkeypatch)
     yield door
     door.close()
 
 
-def test_a_key_on_the_list_hears_messages_and_may_ask(
-    door: KeyedDoor, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
+def test_a_key_on_the_list_hears_messages_and_may_ask(door: KeyedDoor) -> None:
     assert door.hears(door.connect(door.known), PATIENCE_S)
     asker = door.connect(door.known, zmq.REQ)
     asker.send(b"judge")
@@ -49,57 +45,51 @@ def test_a_key_on_the_list_hears_messages_and_may_ask(
     questions.answer(published())
     assert asker.poll(int(PATIENCE_S * 1e3))
     assert asker.recv() == b"{}"
-    assert caplog.text.count("admitted a peer with the key of controller") == 2
+    assert door.said().count("admitted a peer with the key of controller") == 2
 
 
 def test_a_key_that_is_not_on_the_list_is_turned_away_and_named(
-    door: KeyedDoor, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    door: KeyedDoor, tmp_path: Path
 ) -> None:
     keys = door.client("stranger", tmp_path / "elsewhere")
     assert not door.hears(door.connect(keys), QUIET_S)
-    assert f"turned away a peer: its key {keys[0].decode()} is not on the list" in caplog.text
+    assert f"turned away a peer: its key {keys[0].decode()} is not on the list" in door.said()
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
-def test_a_peer_without_a_key_is_warned_of(
-    door: KeyedDoor, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_peer_without_a_key_is_warned_of(door: KeyedDoor) -> None:
     for kind in (zmq.SUB, zmq.SUB, zmq.DEALER):
         assert not door.hears(door.connect(None, kind), QUIET_S)
     # A peer that sees what the daemon wants may hang up before it has said that it has no key.
     told = re.compile("turned away a peer: it (has no key|does not speak ZeroMQ with keys)")
-    wait_until(lambda: told.search(caplog.text))
+    wait_until(lambda: told.search(door.said()))
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
 def test_a_key_that_is_put_on_the_list_is_admitted_and_connections_stay(
-    door: KeyedDoor, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    door: KeyedDoor, tmp_path: Path
 ) -> None:
-    caplog.set_level(logging.INFO)
     friend = door.connect(door.known)
     assert door.hears(friend, PATIENCE_S)
     assert door.hears(door.connect(door.admitted("new", tmp_path / "new")), PATIENCE_S)
     assert door.hears(friend, PATIENCE_S)
-    assert caplog.text.count("the key of controller") == 1
+    assert door.said().count("the key of controller") == 1
 
 
-def test_a_removed_key_counts_whatever_lies_beside_it(
-    door: KeyedDoor, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_removed_key_counts_whatever_lies_beside_it(door: KeyedDoor, tmp_path: Path) -> None:
     friend = door.admitted("friend", tmp_path / "friends")
     (door.clients / "new.key").symlink_to("nowhere")
-    door.sockets.check_keys()
-    door.sockets.check_keys()
-    assert caplog.text.count("new.key: ") == 1
-    door.sockets.check_keys()
+    wait_until(lambda: "new.key: " in door.said())
     leaving, staying = door.connect(friend), door.connect(door.known)
     assert door.hears(leaving, PATIENCE_S)
     assert door.hears(staying, PATIENCE_S)
+    time.sleep(2 * LOOK_MS / 1e3)
+    assert door.said().count("new.key: ") == 1
     (door.clients / "friend.key").unlink()
-    door.sockets.check_keys()
+    door.knows(1)
     door.is_deaf(leaving)
-    door.is_deaf(door.connect(friend))
     assert door.hears(staying, PATIENCE_S)
+    door.is_deaf(door.connect(friend))
 
 
 def is_open_to_the_group(clients: Path) -> None:
@@ -117,13 +107,13 @@ def leads_over_a_folder_that_is_open(clients: Path) -> None:
 
 @pytest.mark.parametrize("spoil", [is_open_to_the_group, leads_over_a_folder_that_is_open])
 def test_a_folder_that_cannot_be_trusted_lets_nobody_in_until_it_can(
-    door: KeyedDoor, caplog: pytest.LogCaptureFixture, spoil: Callable[[Path], None]
+    door: KeyedDoor, spoil: Callable[[Path], None]
 ) -> None:
     former = door.connect(door.known)
     assert door.hears(former, PATIENCE_S)
     spoil(door.clients)
-    door.sockets.check_keys()
-    assert caplog.text.count("no key there may connect") == 1
+    door.knows(0)
+    assert "no key there may connect" in door.said()
     door.is_deaf(former)
     door.is_deaf(door.connect(door.known))
     with pytest.raises(KeysError):
@@ -132,7 +122,6 @@ def test_a_folder_that_cannot_be_trusted_lets_nobody_in_until_it_can(
         door.clients.unlink(missing_ok=True)
         door.clients.with_name("away").rename(door.clients)
     door.clients.chmod(0o755)
-    door.sockets.check_keys()
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
@@ -243,52 +232,25 @@ def test_a_folder_that_others_may_write_is_refused_before_anything_starts(
     assert f"{tmp_path}/keys: mode 0777; others may write it" in done.stderr
 
 
-def test_a_port_that_another_program_takes_meanwhile_is_tried_again(
-    door: KeyedDoor,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_port_stays_taken_while_peers_are_disconnected(door: KeyedDoor, tmp_path: Path) -> None:
     door.admitted("friend", tmp_path / "friends")
     (door.clients / "friend.key").unlink()
-    close = doors.Door.close
-    with socket.socket() as thief:
-        thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-
-        def close_and_steal(self: doors.Door) -> bool:
-            closed = close(self)
-            thief.bind(("127.0.0.1", door.port))
-            thief.listen()
-            return closed
-
-        with monkeypatch.context() as patched:
-            patched.setattr(doors.Door, "close", close_and_steal)
-            door.sockets.check_keys()
-        assert "no peer can connect" in caplog.text
-        door.sockets.send(b"verdict.right", b"{}")
-        assert door.sockets.filenos() == []
-        door.sockets.check_keys()
-    door.sockets.check_keys()
+    door.knows(1)
+    (process,) = processes()
+    wait_until(lambda: ") Z " in Path(f"/proc/{process}/stat").read_text())
+    with pytest.raises(OSError, match="in use"):
+        socket.create_server(("127.0.0.1", door.port))
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
-def test_peers_that_cannot_be_disconnected_end_the_daemon(
-    door: KeyedDoor, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_keys_are_never_read_by_the_loop(
+    door: KeyedDoor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A removed key must not go on hearing, even where a flood holds libzmq up."""
-    door.admitted("friend", tmp_path / "friends")
-    (door.clients / "friend.key").unlink()
-    close = doors.Door.close
-    monkeypatch.setattr(doors.Door, "close", lambda self: close(self) and False)
-    with pytest.raises(PublishError, match="cannot disconnect"):
-        door.sockets.check_keys()
-
-
-def test_an_authenticator_that_has_ended_ends_the_daemon(
-    door: KeyedDoor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patched:
-        patched.setattr(ThreadAuthenticator, "is_alive", lambda _self: False)
-        with pytest.raises(PublishError, match="authenticator has ended"):
-            door.sockets.on_status(GOLDEN_STATUS)
+    """A thousand keys take 60 ms, and a folder on the network may hang."""
+    read: list[str] = []
+    monkeypatch.setattr(keys, "load_clients", lambda _: read.append("list"))
+    monkeypatch.setattr(keys, "state", lambda _: read.append("state"))
+    new = door.admitted("new", tmp_path / "new")
     door.sockets.on_status(GOLDEN_STATUS)
+    assert door.hears(door.connect(new), PATIENCE_S)
+    assert read == []

@@ -19,9 +19,10 @@ import zmq
 
 from graspd.daemon import scene
 from graspd.daemon.publish.companion import Answer
-from graspd.daemon.publish.door import Door, Frames
+from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.porter import Frames
 from graspd.daemon.publish.questions import WAITING_MAX, Questions
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
@@ -352,8 +353,10 @@ def test_another_user_with_the_same_routing_id_is_told_apart(
         rogue.kill()
 
 
-def test_a_key_is_the_credential_on_tcp(tmp_path: Path) -> None:
-    opened = KeyedDoor(tmp_path)
+def test_the_name_of_a_key_is_the_credential_on_tcp(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = KeyedDoor(tmp_path, monkeypatch)
     lifts = LiftBook()
     lifts.note(SEVENTH, bytes(8), stable=True)
     try:
@@ -370,7 +373,7 @@ def test_a_key_is_the_credential_on_tcp(tmp_path: Path) -> None:
         ((peer, _),) = questions.waiting.items()
     finally:
         opened.close()
-    assert peer.credential == b"key " + opened.known[0]
+    assert peer.credential == b"key controller"
 
 
 def wanted(folder: Path, tell: list[str], ask: str, curve: bool = False) -> scene.Scene:

@@ -21,7 +21,8 @@ from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.joints import JointMessage
 from graspd.drivers.twins.spi import SpiTwin
-from tests.bench.live import Subscriber, held_grasp, running, spi_section
+from tests.bench.attacks.doors import HANG_UPS, hand, hang_up
+from tests.bench.live import PATIENCE_S, Subscriber, held_grasp, running, spi_section
 from tests.daemon.processes import before_others
 from tests.ports import free_port
 from tests.threads import at_work
@@ -125,6 +126,16 @@ def outages(folder: Path) -> Iterator[tuple[str, int]]:
         daemon.kill()
         while verdict is not None:  # a subscriber knows by silence alone
             verdict = subscriber.verdict(verdict.silence_ms / 1e3)
+
+
+def test_heartbeats_of_peers_that_hang_up_do_not_end_the_daemon(tmp_path: Path) -> None:
+    with hand(tmp_path) as daemon:
+        for door in daemon.doors:
+            for says in HANG_UPS:
+                hang_up(door, *says)
+        daemon.friend.drain()
+        assert daemon.friend.take(PATIENCE_S) is not None
+        assert daemon.process.poll() is None
 
 
 def test_every_outage_is_unknown_and_says_why(tmp_path: Path) -> None:

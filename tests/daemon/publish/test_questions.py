@@ -9,8 +9,8 @@ import pytest
 import zmq
 
 from graspd.daemon.judge.reasons import Decision
-from graspd.daemon.publish.door import Frames
 from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.publish.porter import Frames
 from graspd.daemon.publish.questions import WAITING_MAX, Questions
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for

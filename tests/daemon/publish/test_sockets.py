@@ -6,6 +6,7 @@ import grp
 import os
 import random
 import select
+import signal
 import stat
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,12 @@ import pytest
 import zmq
 
 from graspd.daemon import scene
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets, plan
 from graspd.daemon.trust.lift_book import GraspId
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import USER, Asked, Peers, published
-from tests.kit.inside import graspd
-from tests.kit.scenes import demo_scene
+from tests.daemon.publish.doors import USER, Asked, Peers, processes, published
 from tests.kit.waiting import PATIENCE_S, wait_until
 
 HOSTILE_MESSAGES = 2_000
@@ -97,14 +97,19 @@ def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers:
             sockets.before_wait(requests)
 
 
-def test_a_daemon_whose_proxy_ends_ends_with_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So systemd starts it again: only the code 2 of a wrong scene forbids that."""
-    monkeypatch.setattr(zmq, "proxy", lambda _front, _back: None)
-    ended = graspd("run", demo_scene(tmp_path, "loop = true"))
-    assert ended.returncode == 1
-    assert "libzmq no longer serves it" in ended.stderr
+def test_subscribers_that_hear_late_are_in_the_health(tmp_path: Path) -> None:
+    with Sockets(wanted(tmp_path)) as sockets:
+        assert sockets.health == {}
+        (process,) = processes()
+        os.kill(process, signal.SIGSTOP)
+        sockets.send(b"status.right", b"{}")
+
+        def is_late() -> bool:
+            sockets.before_wait(Asked())
+            return sockets.health == {"publish": Reason.HEARD_LATE}
+
+        wait_until(is_late)
+        os.kill(process, signal.SIGCONT)
 
 
 def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from graspd.daemon.publish.keys import KeysError, make
 from graspd.daemon.watch.feed import Feed, load_keys
 from graspd.daemon.watch.view import View
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import KeyedDoor, Publisher
+from tests.daemon.publish.doors import Asked, KeyedDoor, Publisher
 from tests.daemon.watch.watch_fakes import MS, verdict
 from tests.kit.messages import decode_verdict
 from tests.kit.waiting import PATIENCE_S, wait_until
@@ -71,9 +71,9 @@ def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoi
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[KeyedDoor]:
+def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[KeyedDoor]:
     """A door that knows `controller` and not `stranger`."""
-    made = KeyedDoor(tmp_path)
+    made = KeyedDoor(tmp_path, monkeypatch)
     made.client("stranger", tmp_path / "theirs")
     yield made
     made.close()
@@ -88,6 +88,7 @@ def hears(door: KeyedDoor, feed: Feed, until: Callable[[bool], bool]) -> bool:
     heard = False
     while not until(heard):
         assert time.monotonic() < deadline_s, feed.link
+        door.sockets.before_wait(Asked())
         door.sockets.send(b"verdict.right", verdict(0))
         time.sleep(0.01)
         heard = heard or any(topic == b"verdict.right" for topic, _ in feed.take())
@@ -127,7 +128,7 @@ def test_who_was_turned_away_is_let_in_when_its_key_is_known(
     with Feed(door.endpoint, keys_of(tmp_path, "stranger"), clock) as feed:
         hears(door, feed, lambda _: feed.is_turned_away)
         (tmp_path / "theirs" / "stranger.key").rename(door.clients / "stranger.key")
-        door.sockets.check_keys()
+        door.knows(2)
         for _ in range(6):  # looks, and is not paused
             clock.now_ns += 900 * MS
             list(feed.take())

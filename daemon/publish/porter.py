@@ -1,0 +1,391 @@
+"""The process that has the ZeroMQ sockets of peers, so that no peer can end the daemon.
+
+libzmq 4.3.5 ends its process where a peer has a full queue, sends a heartbeat and hangs up, and
+where memory or descriptors end. `Door` starts this process, and starts it again. It reads the
+keys of peers too.
+
+A call of a PUB, XPUB or ROUTER socket does not return while peers flood it, so threads serve them.
+`zmq.proxy` copies messages to the subscribers, in C. Questions go through `Courier`: `zmq.proxy`
+would take a thousand before it sends an answer. PUB, ROUTER and the sockets to the loop have an
+I/O thread each: a flood of one does not delay the others.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import resource
+import select
+import shutil
+import signal
+import struct
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import zmq
+
+from graspd.daemon.process import logs
+
+if TYPE_CHECKING:
+    from zmq.auth.thread import ThreadAuthenticator
+
+log = logging.getLogger("graspd")
+
+Frames = list[bytes]
+Socket = zmq.Socket[bytes]
+
+MESSAGES, QUESTIONS, ECHO = "messages", "questions", "echo"
+"""Sockets to the loop, in a folder that only the daemon's user may enter."""
+MESSAGE_MAX_BYTES: Final = 1024
+"""Longest frame of a peer. An outcome has 128 bytes, the handshake with keys 257 (RFC 26)."""
+TO_SUBSCRIBERS, TO_ASKERS, TO_LOOP = 1, 2, 4
+"""Bits of libzmq's I/O threads (ZMQ_AFFINITY)."""
+HANDSHAKE_MS: Final = 5000
+"""Longest handshake of a peer, ms."""
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
+"""Time between two heartbeats over TCP, and the silence after which a peer is gone, ms."""
+SUBSCRIPTIONS_QUEUED, ASK_QUEUE = 2, 16
+"""Most messages of one peer that wait: subscriptions in the PUB, questions in the ROUTER socket.
+
+Without a limit two peers fill 100 MiB a second, faster than Python reads."""
+QUESTIONS_MAX: Final = 8
+"""Most questions that the loop takes in one round: 0.3 ms on a slow computer."""
+PAUSE_MS: Final = 2
+"""Pause of the courier after `QUESTIONS_MAX` questions, ms."""
+FRAMES_MAX: Final = 4
+"""Most frames kept of a message: routing id, delimiter, text, and one that marks it as wrong."""
+LINGER_MS: Final = 500
+"""Longest wait at closing for peers to take queued messages, ms."""
+CLOSE_S: Final = 1
+"""Longest wait at closing for libzmq's threads, s; the watchdog waits 2 s."""
+LOOK_MS: Final = 1000
+"""Time between two looks at threads and keys, ms."""
+MEMORY_MAX_BYTES: Final = 512 << 20
+"""Most memory of the process; it takes 20 MiB, and 4 KiB for each peer."""
+REVOKED: Final = 3
+"""Exit code after a key was removed: libzmq cannot disconnect a single peer."""
+END: Final = b"e"
+"""Read from stdin at an orderly end of the daemon."""
+LOOP_CAME, SUBSCRIBER_CAME = b"l", b"s"
+"""Written to stdout when the loop's own subscriber has connected, or another one."""
+ZAP_DOMAIN: Final = "graspd"
+"""libzmq asks the authenticator only if there is a domain (RFC 27)."""
+FAILED: Final = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
+"""Events of failed handshakes; the second one if the peer hangs up first."""
+EVENT: Final = struct.Struct("=HI")
+"""First frame of a monitor's message: event and value (zmq_socket_monitor(3))."""
+PROBLEMS: Final = {
+    0x11000001: "it takes another key for the daemon's",
+    0x11000002: "it has no key",
+}
+"""Problem of a peer by the value of its failed handshake (ZMQ_PROTOCOL_ERROR_*)."""
+
+
+class Plan(NamedTuple):
+    """Sockets that the process serves; `Door` writes them to stdin as a line, a JSON list."""
+
+    folder: str
+    """Folder of the sockets to the loop."""
+    endpoints: Sequence[str]
+    """Endpoint of subscribers; a second one takes questions."""
+    descriptors: Sequence[int]
+    """Their listening sockets."""
+    high_water_mark: int
+    """Most messages that wait for one subscriber."""
+    processors: Sequence[int]
+    """Processors that may be used, also after a start by a loop that is restricted to some."""
+    keys: Sequence[str] | None
+    """Public and secret key of the daemon for `tcp://`, Z85, and the folder of peers' keys."""
+
+
+@dataclass(slots=True)
+class Admission:
+    """Peers that may connect to `tcp://` sockets."""
+
+    folder: Path
+    """Folder of their public keys."""
+    admitted: Mapping[bytes, str] = field(default_factory=dict)
+    """Name of each peer, by its public key, Z85."""
+    seen: object = None
+    """State of the folder when it was read."""
+
+    def look(self) -> bool:
+        """Read the folder if it has changed; return True if a key was removed.
+
+        A folder that cannot be read, or that others may write, admits no peer.
+        """
+        from graspd.daemon.publish import keys  # only where there are any
+
+        now = keys.state(self.folder)
+        if now == self.seen:
+            return False
+        self.seen = now
+        try:
+            clients = keys.load_clients(self.folder)
+        except keys.KeysError as error:
+            clients = keys.Clients({}, [str(error)])
+        for why in clients.refused:
+            log.error("%s; no key there may connect", why)
+        log.info("%d keys may connect", len(clients.admitted))
+        removed = self.admitted.keys() - clients.admitted.keys()
+        self.admitted = clients.admitted
+        return bool(removed)
+
+    def callback(self, _domain: str, key: bytes) -> bool:
+        """Return True if the key may connect; called in pyzmq's thread."""
+        name = self.admitted.get(key)
+        if name is None:
+            log.warning("turned away a peer: its key %s is not on the list", key.decode())
+            return False
+        log.info("admitted a peer with the key of %s", name)
+        return True
+
+
+class Proxy(threading.Thread):
+    """Copies messages between two sockets until their context ends, and closes them."""
+
+    def __init__(self, endpoint: str, front: Socket, back: Socket) -> None:
+        """`front`, `back`: sockets that only this thread may use after `start`."""
+        super().__init__(name=f"serve {endpoint}", daemon=True)
+        self.endpoint = endpoint
+        self._front, self._back = front, back
+
+    def run(self) -> None:
+        try:
+            self._copy()
+        except zmq.ContextTerminated:
+            pass
+        except zmq.ZMQError as error:
+            log.error("%s: %s", self.endpoint, error.strerror)
+        finally:
+            self._front.close()
+            self._back.close()
+
+    def _copy(self) -> None:
+        zmq.proxy(self._front, self._back)
+
+
+class Courier(Proxy):
+    """Carries questions of the peers to the loop, a few at a time, and all answers back.
+
+    Behind the routing id it puts a frame of its own with the sender's credential.
+    """
+
+    def __init__(
+        self, endpoint: str, front: Socket, back: Socket, admission: Admission | None
+    ) -> None:
+        """`admission`: peers with keys, for a `tcp://` endpoint; None: without keys."""
+        super().__init__(endpoint, front, back)
+        self._admission = admission
+
+    def _copy(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._front, zmq.POLLIN)
+        poller.register(self._back, zmq.POLLIN)
+        while True:
+            poller.poll()
+            self._carry_answers()
+            for _ in range(QUESTIONS_MAX):
+                if not self._carry_question():
+                    break
+            if self._back.poll(PAUSE_MS):  # meanwhile more questions wait
+                self._carry_answers()
+
+    def _carry_answers(self) -> None:
+        while self._back.poll(0):
+            self._front.send_multipart(self._back.recv_multipart(), zmq.NOBLOCK)
+
+    def _carry_question(self) -> bool:
+        """Carry one, cut at `FRAMES_MAX`; False if there is none or no room."""
+        if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
+            return False
+        first = self._front.recv(copy=False)
+        frames = [first.bytes, self._credential(first)]
+        while self._front.getsockopt(zmq.RCVMORE):
+            frame = self._front.recv()
+            if len(frames) <= FRAMES_MAX:
+                frames.append(frame)
+        self._back.send_multipart(frames)
+        return True
+
+    def _credential(self, frame: zmq.Frame) -> bytes:
+        """Return `user <uid>` by the kernel, `key <name>` by the handshake, or nothing."""
+        with suppress(zmq.ZMQError):  # libzmq knows nothing of the sender
+            if self.endpoint.startswith("ipc://"):
+                _, *numbers = str(frame.get("Peer-Address")).rsplit(":", 3)  # uid, gid, pid
+                return b"user %d" % int(numbers[0]) if len(numbers) == 3 else b""
+            if self._admission is not None:  # without keys a peer may send any `User-Id`
+                key = str(frame.get("User-Id")).encode()
+                return b"key " + self._admission.admitted.get(key, "").encode()
+        return b""
+
+
+class Lookout(threading.Thread):
+    """Warns of peers whose handshake fails, and tells `Door` who has come.
+
+    Monitors must be read all the time: libzmq waits where the queue of one is full. They are read
+    until their context ends.
+    """
+
+    def __init__(self, monitors: Sequence[Socket], echo: str) -> None:
+        """`monitors`: sockets that only this thread may use after `start`.
+
+        `echo`: endpoint of the loop's own subscriber.
+        """
+        super().__init__(name="lookout", daemon=True)
+        self._monitors = monitors
+        self._echo = echo.encode()
+
+    def run(self) -> None:
+        poller = zmq.Poller()
+        for monitor in self._monitors:
+            poller.register(monitor, zmq.POLLIN)
+        try:
+            while True:
+                for monitor, _ in poller.poll():
+                    event, endpoint = monitor.recv_multipart()
+                    kind, value = EVENT.unpack(event)
+                    if kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                        with suppress(BlockingIOError):  # it has been told often enough
+                            os.write(1, LOOP_CAME if endpoint == self._echo else SUBSCRIBER_CAME)
+                        continue
+                    problem = PROBLEMS.get(value, "it does not speak ZeroMQ with keys")
+                    log.warning("turned away a peer: %s", problem)
+        except zmq.ContextTerminated:
+            pass
+        finally:
+            for monitor in self._monitors:
+                monitor.close(0)
+
+
+class Porter:
+    """All ZeroMQ sockets that peers connect to."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._context: zmq.Context[Socket] = zmq.Context(io_threads=3)
+        self._admission = None if plan.keys is None else Admission(Path(plan.keys[2]))
+        self._authenticator: ThreadAuthenticator | None = None
+        self._monitors: list[Socket] = []
+        self._threads: list[threading.Thread] = []
+        if self._admission is not None:
+            self._authenticate(self._admission)
+        self._serve_subscribers(0)
+        if len(plan.endpoints) > 1:
+            self._serve_questions(1)
+        self._threads.append(Lookout(self._monitors, self._own(ECHO)))
+
+    def _authenticate(self, admission: Admission) -> None:
+        from zmq.auth.thread import ThreadAuthenticator  # only where there are keys
+
+        admission.look()
+        self._authenticator = ThreadAuthenticator(self._context)
+        self._authenticator.configure_curve_callback(ZAP_DOMAIN, admission)
+        self._authenticator.start()
+
+    def _serve_subscribers(self, number: int) -> None:
+        most = self._plan.high_water_mark
+        at_once = max(most // 10, 1)  # more of them would overflow the queues of subscribers
+        messages = self._socket(zmq.PULL, TO_LOOP, received=at_once)
+        messages.bind(self._own(MESSAGES))
+        peers = self._socket(zmq.PUB, TO_SUBSCRIBERS, most, SUBSCRIPTIONS_QUEUED)
+        peers.bind(self._own(ECHO))  # by the same I/O thread: late where others hear late
+        self._listen(peers, number, int(zmq.EVENT_HANDSHAKE_SUCCEEDED))
+        self._threads.append(Proxy(self._plan.endpoints[number], messages, peers))
+
+    def _serve_questions(self, number: int) -> None:
+        peers = self._socket(zmq.ROUTER, TO_ASKERS, ASK_QUEUE, ASK_QUEUE)
+        peers.router_handover = True  # a client that reconnects keeps its routing id
+        questions = self._socket(zmq.DEALER, TO_LOOP)
+        questions.bind(self._own(QUESTIONS))
+        self._listen(peers, number)
+        courier = Courier(self._plan.endpoints[number], peers, questions, self._admission)
+        self._threads.append(courier)
+
+    def _own(self, name: str) -> str:
+        return f"ipc://{self._plan.folder}/{name}"
+
+    def _socket(self, kind: int, by: int, sent: int = 1, received: int = 1) -> Socket:
+        """Return a socket that queues at most this many messages of each peer."""
+        made = self._context.socket(kind)
+        made.linger = 0
+        made.affinity = by
+        made.sndhwm, made.rcvhwm = sent, received
+        return made
+
+    def _listen(self, made: Socket, number: int, events: int = 0) -> None:
+        made.linger = LINGER_MS
+        made.maxmsgsize = MESSAGE_MAX_BYTES
+        made.handshake_ivl = HANDSHAKE_MS
+        made.use_fd = self._plan.descriptors[number]  # libzmq closes it
+        endpoint = self._plan.endpoints[number]
+        if endpoint.startswith("tcp://"):
+            made.ipv6 = "[" in endpoint
+            made.heartbeat_ivl = HEARTBEAT_MS
+            made.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
+            if self._plan.keys is not None:
+                public, secret, _ = self._plan.keys
+                made.curve_publickey, made.curve_secretkey = public.encode(), secret.encode()
+                made.curve_server = True
+                made.zap_domain = ZAP_DOMAIN.encode()
+                events |= FAILED
+        if events:
+            self._monitors.append(made.get_monitor_socket(events))
+        made.bind(endpoint)
+
+    def serve(self, ending: int) -> int:
+        """Serve until `ending` becomes readable; return the exit code.
+
+        Also ends when a thread has ended, and when a key was removed.
+        """
+        for thread in self._threads:
+            thread.start()
+        poll = select.poll()
+        poll.register(ending, select.POLLIN)
+        while not poll.poll(LOOK_MS):
+            for thread in self._threads:
+                if not thread.is_alive():
+                    log.error("%s has ended", thread.name)
+                    return 1
+            if self._authenticator is not None and not self._authenticator.is_alive():
+                log.error("pyzmq's authenticator has ended")
+                return 1
+            if self._admission is not None and self._admission.look():
+                return REVOKED
+        if os.read(ending, 1):
+            self._end()
+        else:  # the daemon was killed
+            shutil.rmtree(self._plan.folder, ignore_errors=True)
+        return 0
+
+    def _end(self) -> None:
+        """Disconnect all peers, after they had `LINGER_MS` to take what is queued."""
+        signal.alarm(2 * CLOSE_S)  # ends the process, if `Door` has not
+        if self._authenticator is not None:
+            self._authenticator.stop()
+        self._context.term()
+
+
+def main() -> None:
+    """Serve what the first line of stdin says until stdin ends."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the daemon says when to end
+    logs.set_up(os.environ)
+    stdin = open(0, "rb", buffering=0)  # noqa: SIM115 - open to the end
+    plan = Plan(*json.loads(stdin.readline()))
+    os.set_blocking(1, False)
+    with suppress(OSError):
+        os.sched_setaffinity(0, plan.processors)
+    with suppress(OSError):  # a service manager that forbids it has limits of its own
+        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
+        Path("/proc/self/oom_score_adj").write_text("1000")  # before the daemon
+    os._exit(Porter(plan).serve(0))
+
+
+if __name__ == "__main__":
+    main()
