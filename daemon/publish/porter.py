@@ -294,8 +294,9 @@ class Porter:
         messages = self._socket(zmq.PULL, TO_LOOP, received=at_once)
         messages.bind(self._own(MESSAGES))
         peers = self._socket(zmq.PUB, TO_SUBSCRIBERS, most, SUBSCRIPTIONS_QUEUED)
+        self._watch(peers, number, int(zmq.EVENT_HANDSHAKE_SUCCEEDED))
         peers.bind(self._own(ECHO))  # by the same I/O thread: late where others hear late
-        self._listen(peers, number, int(zmq.EVENT_HANDSHAKE_SUCCEEDED))
+        self._listen(peers, number)
         self._threads.append(Proxy(self._plan.endpoints[number], messages, peers))
 
     def _serve_questions(self, number: int) -> None:
@@ -303,6 +304,7 @@ class Porter:
         peers.router_handover = True  # a client that reconnects keeps its routing id
         questions = self._socket(zmq.DEALER, TO_LOOP)
         questions.bind(self._own(QUESTIONS))
+        self._watch(peers, number)
         self._listen(peers, number)
         courier = Courier(self._plan.endpoints[number], peers, questions, self._admission)
         self._threads.append(courier)
@@ -318,7 +320,17 @@ class Porter:
         made.sndhwm, made.rcvhwm = sent, received
         return made
 
-    def _listen(self, made: Socket, number: int, events: int = 0) -> None:
+    def _watch(self, made: Socket, number: int, events: int = 0) -> None:
+        """Have these events of a socket reported, before a peer can connect to it."""
+        if self._keys_at(number) is not None:
+            events |= FAILED
+        if events:
+            self._monitors.append(made.get_monitor_socket(events))
+
+    def _keys_at(self, number: int) -> Sequence[str] | None:
+        return self._plan.keys if self._plan.endpoints[number].startswith("tcp://") else None
+
+    def _listen(self, made: Socket, number: int) -> None:
         made.linger = LINGER_MS
         made.maxmsgsize = MESSAGE_MAX_BYTES
         made.handshake_ivl = HANDSHAKE_MS
@@ -328,14 +340,11 @@ class Porter:
             made.ipv6 = "[" in endpoint
             made.heartbeat_ivl = HEARTBEAT_MS
             made.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
-            if self._plan.keys is not None:
-                public, secret, _ = self._plan.keys
-                made.curve_publickey, made.curve_secretkey = public.encode(), secret.encode()
-                made.curve_server = True
-                made.zap_domain = ZAP_DOMAIN.encode()
-                events |= FAILED
-        if events:
-            self._monitors.append(made.get_monitor_socket(events))
+        if (keys := self._keys_at(number)) is not None:
+            public, secret, _ = keys
+            made.curve_publickey, made.curve_secretkey = public.encode(), secret.encode()
+            made.curve_server = True
+            made.zap_domain = ZAP_DOMAIN.encode()
         made.bind(endpoint)
 
     def serve(self, ending: int) -> int:
