@@ -109,7 +109,7 @@ def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
 def _and_sensors(scene: Scene) -> str:
     """Return advice on `tactile.sensors` if sensors are wired in the order of `hand.fingers`."""
     match scene.tactile:
-        case SpiTactile(sensors=None) | CanTactile(sensors=None, format="syntouch"):
+        case SpiTactile(sensors=None) | CanTactile(sensors=None):
             return f" and tactile.sensors = {json.dumps(scene.hand.fingers)}, as they are wired"
         case _:
             return ""

@@ -137,20 +137,15 @@ class CanTactile(Section):
     channel: Name = "can0"
     """Name of the bus at that interface."""
     sensors: Annotated[Fingers, Field(max_length=3)] | None = None
-    """Fingers in the order of the words of `syntouch`; without it `hand.fingers`."""
-    format: Literal["syntouch", "sweep_fd"] = "syntouch"
-    """SynTouch's format, or graspd's for CAN FD."""
+    """Fingers in the order of a frame's words; without it `hand.fingers`."""
     arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), unit()] | None = None
-    """Id of the samples, or of finger `ff` of `sweep_fd`. Without it `syntouch` takes the id of the
-    first sound sample."""
+    """Id of the samples; without it that of the first sound sample."""
     sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
-    """Order of the samples of `syntouch`: 24, 28 or 54."""
+    """Order of the samples of a sweep: 24, 28 or 54."""
     data_length: Annotated[int, Field(ge=3, le=8), unit("bytes")] | None = None
-    """Length of a sample frame if the board pads it."""
+    """Length of a frame if the board pads it."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
     """Rate of the bus; not with socketcan."""
-    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000), unit("bit/s")] | None = None
-    """Rate of the data phase of CAN FD; not with socketcan."""
 
 
 class PalmTactile(Section):

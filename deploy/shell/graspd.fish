@@ -51,7 +51,7 @@ function _shtab_graspd_using
 end
 
 set -g _shtab_graspd_commands run replay watch scene check doctor twin 'twin spi' 'twin can' 'twin palm' 'twin joints' data schema models session 'session show' 'session reset' 'session seed' export-grasps keys 'keys make' 'keys list' train evaluate report 'report error-vs-time' 'report stability' 'report worth' completion manual
-set -g _shtab_graspd_opts_with_value --arbitration-id --bit-flip --burst --card --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --format --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
+set -g _shtab_graspd_opts_with_value --arbitration-id --bit-flip --burst --card --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
 
 complete -c graspd -e
 complete -c graspd -f
@@ -133,8 +133,7 @@ complete -c graspd -n '_shtab_graspd_using twin; and test $_shtab_graspd_npos -e
 complete -c graspd -n '_shtab_graspd_using twin can' -s h -l help -d 'show this help message and exit'
 complete -c graspd -n '_shtab_graspd_using twin can' -l interface -xka "(__fish_complete_path (commandline -ct))" -d 'of python-can, as in a scene (default: udp_multicast, which needs msgpack)'
 complete -c graspd -n '_shtab_graspd_using twin can' -l channel -xka "(__fish_complete_path (commandline -ct))" -d 'of that interface (default: 239.74.163.2)'
-complete -c graspd -n '_shtab_graspd_using twin can' -l format -xka "syntouch sweep_fd" -d 'a frame per sample, or a CAN FD frame per finger (default: syntouch)'
-complete -c graspd -n '_shtab_graspd_using twin can' -l arbitration-id -xka "(__fish_complete_path (commandline -ct))" -d 'of its frames, such as 0x100 (default: one of the format'"'"'s)'
+complete -c graspd -n '_shtab_graspd_using twin can' -l arbitration-id -xka "(__fish_complete_path (commandline -ct))" -d 'of its frames (default: 0x100)'
 complete -c graspd -n '_shtab_graspd_using twin can' -l rate -xka "(__fish_complete_path (commandline -ct))" -d 'sweeps/s (default: 100)'
 complete -c graspd -n '_shtab_graspd_using twin can' -l sequence -xka "all electrodes interleaved" -d 'channels that a sweep samples, as in a scene (default: electrodes)'
 complete -c graspd -n '_shtab_graspd_using twin can' -l recording -xka "(__fish_complete_path (commandline -ct))" -d 'play this recording, row by row (default: synthetic grasps)'

@@ -103,11 +103,15 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (SPI + "sped = 1", "tactile.sped", "there are: driver, port, sensors, baud"),
         (SPI + "baud = 9600", "tactile.baud", "greater than or equal to 115200"),
         (CAN + "bitrate = '1M'", "tactile.bitrate", "valid integer"),
-        (CAN + "format = 'iso-tp'", "tactile.format", "'syntouch' or 'sweep_fd'"),
+        (
+            CAN + "format = 'syntouch'",
+            "tactile.format",
+            "no such key; SynTouch's is the only format",
+        ),
         (
             "[hand]\nfingers = ['ff', 'mf', 'rf', 'th']\n" + CAN,
             "scene",
-            "syntouch carries three sensors",
+            "a frame on CAN carries three sensors",
         ),
         (
             CAN + "[joints]\ndriver = 'palm'\ncalibration = 'hand.toml'",
@@ -115,11 +119,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
             "joints.driver palm needs tactile.driver palm",
         ),
         (CAN + "sensors = ['th', 'ff']", "scene", "tactile.sensors must name every finger"),
-        (
-            CAN + "format = 'sweep_fd'\nsensors = ['th', 'ff', 'mf']",
-            "scene",
-            "tactile.sensors is for syntouch",
-        ),
+        (CAN + "data_bitrate = 5_000_000", "tactile.data_bitrate", "classic CAN only"),
         (SPI.replace("/dev/ttyACM0", "") + "", "tactile.port", "at least 1"),
         (PALM + "only_from = 'the-relay'", "tactile.only_from", "does not appear to be an IPv4"),
         (PALM + "heed_finger_bits = 1", "tactile.heed_finger_bits", "valid boolean"),
