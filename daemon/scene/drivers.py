@@ -12,7 +12,6 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationInfo,
-    field_validator,
 )
 
 from graspd.drivers.base import COUNT_MAX, ELECTRODES
@@ -46,6 +45,7 @@ Fingers = Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)]
 Electrode = Annotated[int, Field(ge=1, le=ELECTRODES), unit()]
 Probability = Annotated[float, Field(ge=0.0, le=1.0), unit()]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
+UdpSource = Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
 Address = Annotated[str, AfterValidator(_ip_address)]
 FilePath = Annotated[
     Path, Field(strict=False), AfterValidator(_without_nul), AfterValidator(_beside_the_scene)
@@ -153,17 +153,12 @@ class PalmTactile(Section):
 
     driver: Literal["palm"]
     """Selects this driver."""
-    source: Name
-    """`udp://ADDRESS:PORT` to listen on, or a file of packets."""
+    source: UdpSource
+    """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
     """IP address of the relay; without it any may send."""
     heed_finger_bits: bool = True
     """False for a palm that never sets the bits of valid fingers."""
-
-    @field_validator("source")
-    @classmethod
-    def _file_beside_the_scene(cls, source: str, info: ValidationInfo) -> str:
-        return source if "://" in source else str(_beside_the_scene(Path(source), info))
 
 
 Tactile = Annotated[
@@ -186,7 +181,7 @@ class StreamJoints(Section):
 
     driver: Literal["stream"]
     """Selects this driver."""
-    source: Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
+    source: UdpSource
     """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
     """IP address of the sender; without it any may send."""

@@ -96,7 +96,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (GOOD + "[tactile.faults]\nfingers = ['lf']", "scene", "names lf, not in hand.fingers"),
         (GOOD + "rate_hz = 1e6", "tactile.rate_hz", "less than or equal to 100000"),
         (
-            "[tactile]\ndriver = 'palm'\nsource = 'packets.bin'\n[gate]\nmode = 'every'",
+            PALM + "[gate]\nmode = 'every'",
             "scene",
             "gate.mode every is for grasp tables",
         ),
@@ -121,6 +121,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (CAN + "sensors = ['th', 'ff']", "scene", "tactile.sensors must name every finger"),
         (CAN + "data_bitrate = 5_000_000", "tactile.data_bitrate", "classic CAN only"),
         (SPI.replace("/dev/ttyACM0", "") + "", "tactile.port", "at least 1"),
+        ("[tactile]\ndriver = 'palm'\nsource = 'hand.palm'", "tactile.source", "'^udp://'"),
         (PALM + "only_from = 'the-relay'", "tactile.only_from", "does not appear to be an IPv4"),
         (PALM + "heed_finger_bits = 1", "tactile.heed_finger_bits", "valid boolean"),
         (PALM + "[joints]\ndriver = 'palm'", "joints.calibration", "is missing"),
