@@ -1,6 +1,6 @@
 """Combine samples into one `TactileReading` per sweep; missing electrodes are flagged.
 
-The format has no counter. A sample's command byte names its channel; its place in the order of the
+Frames have no counter. A sample's command byte names its channel; its place in the order of the
 sequence and the time between samples tell its sweep. `deploy/can/PROTOCOL.md` says what becomes of
 each loss, copy and delay. No electrode is shifted or filled from memory.
 """
