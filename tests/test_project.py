@@ -86,7 +86,6 @@ def test_the_changelog_begins_with_what_is_not_released_or_with_this_version() -
 
 def test_the_firmware_has_one_version() -> None:
     told = f"{FIRMWARE >> 8}.{FIRMWARE & 0xFF}"
-    assert found("deploy/bridge/library.properties", r"^version=(\d+\.\d+)\.\d+$") == [told]
     assert found("deploy/CHANGELOG.md", r"^\| firmware of the bridge \| (\S+) \|$") == [told]
 
 

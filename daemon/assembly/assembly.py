@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
@@ -124,7 +124,7 @@ def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
 def _and_sensors(scene: Scene) -> str:
     """Return advice on `tactile.sensors` if sensors are wired in the order of `hand.fingers`."""
     match scene.tactile:
-        case SpiTactile(sensors=None) | CanTactile(sensors=None, format="syntouch"):
+        case SpiTactile(sensors=None) | CanTactile(sensors=None):
             return f" and tactile.sensors = {json.dumps(scene.hand.fingers)}, as they are wired"
         case _:
             return ""
@@ -246,9 +246,7 @@ def open_file(scene: Scene, driver: Driver) -> None:
 
     Raises as `open_driver`, and `DriverError` for a wrong calibration.
     """
-    tactile = scene.tactile
-    is_packets = isinstance(tactile, PalmTactile) and "://" not in tactile.source
-    if isinstance(tactile, ReplayTactile) or is_packets:
+    if isinstance(scene.tactile, ReplayTactile):
         open_driver(driver)
     if isinstance(scene.joints, PalmJoints):
         from graspd.drivers.palm.calibration import load_calibration
@@ -283,21 +281,14 @@ def _tactile(scene: Scene) -> Driver:
 
 
 def _palm(scene: Scene, options: PalmTactile) -> Driver:
+    from graspd.drivers.palm.stream import PalmDriver
+
     joints = scene.joints
-    common: dict[str, Any] = {
-        "fingers": scene.hand.fingers,
-        "calibration": joints.calibration if isinstance(joints, PalmJoints) else None,
-        "heed_finger_bits": options.heed_finger_bits,
-    }
-    if options.source.startswith("udp://"):
-        from graspd.drivers.palm.stream import PalmDriver
-
-        return PalmDriver(options.source, only_from=options.only_from, **common)
-    if "://" in options.source:
-        raise ValueError(f"source {options.source} is neither udp:// nor a file")
-    from graspd.drivers.recordings.palm_file import PalmFile
-
-    return PalmFile(Path(options.source), **common)
+    return PalmDriver(
+        fingers=scene.hand.fingers,
+        calibration=joints.calibration if isinstance(joints, PalmJoints) else None,
+        **options.model_dump(exclude={"driver"}),
+    )
 
 
 def _replay(scene: Scene, options: ReplayTactile) -> Driver:

@@ -32,7 +32,7 @@ from graspd.daemon.process.text import (
 from graspd.daemon.scene import drivers as scene_drivers
 from graspd.daemon.scene.scene import Realtime, Record, RiskSection
 from graspd.drivers.base import DriverError
-from graspd.drivers.udp import SCHEME, Endpoint
+from graspd.drivers.udp import Endpoint
 from graspd.models import zoo
 from graspd.models.contract import Finger, ModelError, SessionInput
 from graspd.models.runtime import TactileModel
@@ -135,8 +135,8 @@ def _warnings(wanted: scene.Scene) -> list[str]:
     for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
         if not isinstance(section, scene_drivers.PalmTactile | scene_drivers.StreamJoints):
             continue
-        is_heard = section.source.startswith(SCHEME) and section.only_from is None
-        if is_heard and ip_address(Endpoint.parse(section.source).address).is_unspecified:
+        address = ip_address(Endpoint.parse(section.source).address)
+        if section.only_from is None and address.is_unspecified:
             warnings.append(
                 f"[{name}] listens to {section.source}, so anybody who can reach this computer is "
                 "taken for the hand: name its sender with only_from, or listen on one address"

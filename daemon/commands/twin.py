@@ -61,16 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--channel", default=CAN_GROUP, help=f"of that interface (default: {CAN_GROUP})"
     )
     can.add_argument(
-        "--format",
-        choices=("syntouch", "sweep_fd"),
-        default="syntouch",
-        help="a frame per sample, or a CAN FD frame per finger (default: syntouch)",
-    )
-    can.add_argument(
         "--arbitration-id",
         type=lambda text: int(text, 0),
         metavar="ID",
-        help="of its frames, such as 0x100 (default: one of the format's)",
+        default=0x100,
+        help="of its frames (default: 0x100)",
     )
     for kind, target in ((palm, PALM_TARGET), (joints, JOINT_TARGET)):
         kind.add_argument("--to", default=target, help=f"where to send (default: {target})")
@@ -218,7 +213,6 @@ def _serve_can(
         args.interface,
         args.channel,
         _counts(args, args.rate),
-        format=args.format,
         arbitration_id=args.arbitration_id,
         sequence=args.sequence,
         rate_hz=args.rate,

@@ -31,14 +31,8 @@ It then loses up to two sweeps of 54 samples.
 FLASH = "flash the firmware of this graspd: deploy/bridge/BUILD.md"
 AGAIN = "look longer (--listen 20); if it goes on"
 CLOCK_ADVICE = f"it stands, was reset, or is wrong: {FLASH}"
-VERSION_ADVICE = (
-    "the board sends another version of the frame: flash the firmware that fits this graspd "
-    "(deploy/can/PROTOCOL.md)"
-)
-
 
 NOT_OURS = {
-    ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
     ("bad_lengths",): Trouble(
         Cause.VERSION,
         "no palm that graspd knows sends these: its firmware is another one, or the relay adds "
@@ -63,7 +57,7 @@ NOT_OURS = {
         *("foreign_frames", "frames"),
     ): Trouble(
         Cause.SETTINGS,
-        "let format, arbitration_id, sequence and data_length be those of the board (candump shows "
+        "let arbitration_id, sequence and data_length be those of the board (candump shows "
         "what it sends); are sensors connected to it?",
     ),
 }
@@ -73,7 +67,6 @@ FLAPS_MIN = 3
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
 """Causes that a link shows between its losses; they are not reported beside the losses."""
 COUNTERS = {
-    ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
     ("link_losses",): Trouble(
         Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"
     ),
@@ -95,10 +88,10 @@ COUNTERS = {
         Cause.COMPUTER_BUSY,
         "this computer was too late to read: top shows why; [realtime] puts graspd first",
     ),
-    ("stuck_ticks", "clock_faults"): Trouble(Cause.CLOCK, CLOCK_ADVICE),
+    ("clock_faults",): Trouble(Cause.CLOCK, CLOCK_ADVICE),
     (
         *("duplicates", "duplicate_frames", "duplicate_packets", "conflicting_packets"),
-        *("contradicting_frames", "old_messages"),
+        "old_messages",
     ): Trouble(
         Cause.REPEATED,
         "the same comes twice: is there a second sender, or does the board stand still?",

@@ -20,8 +20,8 @@ from graspd.daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTac
 from graspd.drivers.udp import Endpoint
 from graspd.models.contract import ModelError
 
-BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
-"""Default bit rates of the boards in deploy/can/PROTOCOL.md, bit/s."""
+BITRATE = 1_000_000
+"""Bit rate of the board in deploy/can/PROTOCOL.md, bit/s."""
 SERVICE_FOLDER = Path("/run/graspd")
 """Folder of sockets that the service makes when it starts."""
 NOT_HEARD = frozenset(
@@ -92,12 +92,9 @@ def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = N
 
 
 def ip_link(name: str, tactile: CanTactile | None) -> str:
-    """Return the command that brings a CAN interface up with the bit rates of a scene."""
+    """Return the command that brings a CAN interface up with the bit rate of a scene."""
     bitrate = BITRATE if tactile is None or tactile.bitrate is None else tactile.bitrate
-    line = f"sudo ip link set {name} up type can bitrate {bitrate}"
-    if tactile is not None and tactile.format == "sweep_fd":
-        line += f" dbitrate {tactile.data_bitrate or DATA_BITRATE} fd on"
-    return f"{line} restart-ms 100"
+    return f"sudo ip link set {name} up type can bitrate {bitrate} restart-ms 100"
 
 
 def socket_findings(wanted: Scene) -> list[Finding]:

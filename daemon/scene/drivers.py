@@ -12,7 +12,6 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationInfo,
-    field_validator,
 )
 
 from graspd.drivers.base import COUNT_MAX, ELECTRODES
@@ -46,6 +45,7 @@ Fingers = Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)]
 Electrode = Annotated[int, Field(ge=1, le=ELECTRODES), unit()]
 Probability = Annotated[float, Field(ge=0.0, le=1.0), unit()]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
+UdpSource = Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
 Address = Annotated[str, AfterValidator(_ip_address)]
 FilePath = Annotated[
     Path, Field(strict=False), AfterValidator(_without_nul), AfterValidator(_beside_the_scene)
@@ -137,20 +137,15 @@ class CanTactile(Section):
     channel: Name = "can0"
     """Name of the bus at that interface."""
     sensors: Annotated[Fingers, Field(max_length=3)] | None = None
-    """Fingers in the order of the words of `syntouch`; without it `hand.fingers`."""
-    format: Literal["syntouch", "sweep_fd"] = "syntouch"
-    """SynTouch's format, or graspd's for CAN FD."""
+    """Fingers in the order of a frame's words; without it `hand.fingers`."""
     arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), unit()] | None = None
-    """Id of the samples, or of finger `ff` of `sweep_fd`. Without it `syntouch` takes the id of the
-    first sound sample."""
+    """Id of the samples; without it that of the first sound sample."""
     sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
-    """Order of the samples of `syntouch`: 24, 28 or 54."""
+    """Order of the samples of a sweep: 24, 28 or 54."""
     data_length: Annotated[int, Field(ge=3, le=8), unit("bytes")] | None = None
-    """Length of a sample frame if the board pads it."""
+    """Length of a frame if the board pads it."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
     """Rate of the bus; not with socketcan."""
-    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000), unit("bit/s")] | None = None
-    """Rate of the data phase of CAN FD; not with socketcan."""
 
 
 class PalmTactile(Section):
@@ -158,17 +153,12 @@ class PalmTactile(Section):
 
     driver: Literal["palm"]
     """Selects this driver."""
-    source: Name
-    """`udp://ADDRESS:PORT` to listen on, or a file of packets."""
+    source: UdpSource
+    """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
     """IP address of the relay; without it any may send."""
     heed_finger_bits: bool = True
     """False for a palm that never sets the bits of valid fingers."""
-
-    @field_validator("source")
-    @classmethod
-    def _file_beside_the_scene(cls, source: str, info: ValidationInfo) -> str:
-        return source if "://" in source else str(_beside_the_scene(Path(source), info))
 
 
 Tactile = Annotated[
@@ -191,7 +181,7 @@ class StreamJoints(Section):
 
     driver: Literal["stream"]
     """Selects this driver."""
-    source: Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
+    source: UdpSource
     """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
     """IP address of the sender; without it any may send."""

@@ -19,6 +19,11 @@ SHOWN_MAX = 80
 """Most characters of a key or value in a line."""
 MESSAGE_MAX = 320
 """Most characters of an explanation, which may contain such a value."""
+GONE = {
+    ("CanTactile", "format"): "SynTouch's is the only format: remove the line",
+    ("CanTactile", "data_bitrate"): "graspd reads classic CAN only: remove the line",
+}
+"""Keys of former scenes by the name of their section, and what to do about them."""
 
 
 def lines_of(error: ValidationError, scene: Section, path: Path) -> list[str]:
@@ -98,6 +103,8 @@ def _tags(section: Section) -> tuple[str, ...]:
 
 def _suggestion(wrong: str, section: Section | None) -> str:
     keys = list(section.model_fields) if section else []
+    if section and (gone := GONE.get((section.__name__, wrong))):
+        return f"; {gone}"
     stem = wrong.rsplit("_", 1)[0]  # for example `max_age_s` instead of `max_age_ms`
     of_unit = (f"; did you mean {name}?" for name in keys if name.rsplit("_", 1)[0] == stem)
     return did_you_mean(wrong, keys) or next(of_unit, f"; there are: {', '.join(keys)}")

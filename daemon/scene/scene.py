@@ -287,10 +287,8 @@ class Scene(Section):
             without = [finger for finger in fingers if finger not in tactile.sensors]
             if without or len(set(tactile.sensors)) != len(tactile.sensors):
                 raise ValueError("tactile.sensors must name every finger of hand.fingers once")
-            if isinstance(tactile, CanTactile) and tactile.format == "sweep_fd":
-                raise ValueError("tactile.sensors is for syntouch: frames of sweep_fd say whose")
-        if isinstance(tactile, CanTactile) and tactile.format == "syntouch" and len(fingers) > 3:
-            raise ValueError("tactile.format syntouch carries three sensors, hand.fingers has more")
+        if isinstance(tactile, CanTactile) and len(fingers) > 3:
+            raise ValueError("a frame on CAN carries three sensors, hand.fingers has more")
         self._refuse_strangers()
         raw = self.record is not None and self.record.raw
         if raw and not isinstance(tactile, SpiTactile | CanTactile):

@@ -13,26 +13,25 @@ import contextlib
 import os
 import socket
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any, Final
 
 import can
 
 from graspd.drivers.base import DriverError, LinkCause, LinkError
-from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.can.frames import (
-    CANFD_FRAME,
+    CAN_FRAME,
     ERROR,
     EXTENDED,
     FD,
     LOST,
     REMOTE,
+    CanCounters,
     CanFrame,
     Stamped,
     unpack_frame,
 )
-from graspd.drivers.can.readings import CanCounters
 from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
 from graspd.drivers.link import is_ready
 from graspd.extras import installer
@@ -45,9 +44,6 @@ DATAGRAM_BYTES_MAX: Final = 4096
 """Longest datagram of `udp_multicast` that is read, bytes, as in python-can."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
-
-FD_CLOCK_HZ: Final = 80_000_000
-"""Clock of slcan adapters with CAN FD, Hz; bit times are counted in it (CANable 2)."""
 
 _OPTIONS: Final[dict[str, dict[str, Any]]] = {
     # The defaults wait: 2 s after opening, 1 ms in every read.
@@ -86,7 +82,7 @@ def refuse_unusable(interface: str) -> None:
     raise ValueError(f"interface: {why}")
 
 
-def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
+def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noqa: ANN401
     """Open a bus of python-can. Raises `LinkError`; `DriverError` if no retry can succeed."""
     where = f"cannot open {interface} {channel}"
     if interface == "socketcan":
@@ -115,34 +111,6 @@ def _what_is_missing(interface: str, error: Exception | None = None) -> str:
     )
 
 
-def bus_options(
-    interface: str,
-    frame_format: CanFormat,
-    bitrate: int | None = None,
-    data_bitrate: int | None = None,
-) -> dict[str, Any]:
-    """Return arguments of python-can's bus.
-
-    Raises `ValueError` for rates it would ignore, and for an interface that cannot be used.
-    """
-    refuse_unusable(interface)
-    if interface == "socketcan" and (bitrate is not None or data_bitrate is not None):
-        raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
-    wants_fd = frame_format is CanFormat.SWEEP_FD
-    if data_bitrate is not None and (bitrate is None or not wants_fd):
-        raise ValueError("data_bitrate needs a bitrate and the format sweep_fd")
-    if interface == "slcan" and data_bitrate is not None and bitrate is not None:
-        timing = can.BitTimingFd.from_sample_point(FD_CLOCK_HZ, bitrate, 80.0, data_bitrate, 80.0)
-        return {"timing": timing}
-    rates = {"bitrate": bitrate, "data_bitrate": data_bitrate}
-    options: dict[str, Any] = {name: rate for name, rate in rates.items() if rate is not None}
-    if interface == "virtual":
-        options["protocol"] = can.CanProtocol.CAN_FD if wants_fd else can.CanProtocol.CAN_20
-    elif wants_fd and interface != "slcan":
-        options["fd"] = True
-    return options
-
-
 class CanBus:
     """One bus of python-can, read without waiting."""
 
@@ -150,11 +118,19 @@ class CanBus:
         self,
         interface: str,
         channel: str,
-        options: Mapping[str, Any],
+        bitrate: int | None,
         clock: Callable[[], int],
         wall_clock: Callable[[], int],
     ) -> None:
-        """`options`: arguments of python-can's bus; they replace graspd's own."""
+        """`bitrate`: bit/s; None: that of the interface.
+
+        Raises `ValueError` for a rate of socketcan, and for an interface that cannot be used.
+        """
+        refuse_unusable(interface)
+        if interface == "socketcan" and bitrate is not None:
+            raise ValueError(
+                "bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`"
+            )
         self.failure: LinkError | None = None
         """Why the bus broke; None while it works."""
         self.more = False
@@ -164,7 +140,9 @@ class CanBus:
         self.counters = CanCounters()
         self._interface = interface
         self._channel = channel
-        self._options = {**_OPTIONS.get(interface, {}), **options}
+        self._options = dict(_OPTIONS.get(interface, {}))
+        if bitrate is not None:
+            self._options["bitrate"] = bitrate
         self._stamped = interface in STAMPED_INTERFACES
         self._clock = clock
         self._wall_clock = wall_clock
@@ -177,7 +155,7 @@ class CanBus:
         self.close()
         self.failure = None
         self._idle_ns = self._clock()
-        self._bus = bus = open_bus(self._interface, self._channel, self._options)
+        self._bus = bus = open_bus(self._interface, self._channel, **self._options)
         self.descriptor = _fileno(bus)
         if self.descriptor is not None:
             _enlarge_buffer(self.descriptor)
@@ -289,10 +267,13 @@ def _unpack_datagram(data: bytes) -> CanFrame | None:
 
 
 _UNPACK: Final[dict[str, tuple[Callable[[bytes], CanFrame | None], int]]] = {
-    "socketcan": (unpack_frame, CANFD_FRAME.size),
+    "socketcan": (unpack_frame, CAN_FRAME.size + 1),
     "udp_multicast": (_unpack_datagram, DATAGRAM_BYTES_MAX),
 }
-"""Interfaces whose socket is read directly: what unpacks a record, and its most bytes."""
+"""Interfaces whose socket is read directly: what unpacks a record, and the bytes read of it.
+
+One byte more than a frame's, so that a longer record is not read as a frame.
+"""
 
 
 def _enlarge_buffer(descriptor: int) -> None:

@@ -12,10 +12,8 @@ from collections.abc import Callable, Sequence
 from typing import Final, Unpack
 
 from graspd.drivers.base import DriverError, Fact, LinkError, Opened, Reading
-from graspd.drivers.can.bus import STAMPED_INTERFACES, CanBus, bus_options
-from graspd.drivers.can.formats import CanFormat
-from graspd.drivers.can.frames import LOST, Stamped
-from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.bus import STAMPED_INTERFACES, CanBus
+from graspd.drivers.can.frames import LOST, CanCounters, Stamped
 from graspd.drivers.can.stream import NAME, BoardOptions, CanStream
 from graspd.drivers.link import LinkState
 
@@ -33,7 +31,7 @@ RATE_WINDOW_NS: Final = 1_000_000_000
 
 
 class CanBridgeDriver(Opened):
-    """Readings from a CAN bus. See `deploy/can/PROTOCOL.md` for the two formats.
+    """Readings from a CAN bus. See `deploy/can/PROTOCOL.md` for its frames.
 
     The constructor raises `ValueError`. `open` and `read_ready` raise `DriverError` only if no
     retry can succeed. If the bus fails, the current sweep is dropped and the bus is reopened. After
@@ -51,21 +49,18 @@ class CanBridgeDriver(Opened):
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
         bitrate: int | None = None,
-        data_bitrate: int | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`fingers` and `board`: see `graspd.drivers.can.stream.make_decoder`.
+        """`fingers` and `board`: see `graspd.drivers.can.stream.SampleDecoder`.
 
-        `bitrate`, `data_bitrate`: bit/s; not for socketcan, where `ip link` sets them.
+        `bitrate`: bit/s; not for socketcan, where `ip link` sets it.
         """
         self._stamped = interface in STAMPED_INTERFACES
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)
         self.stream = self._make_stream()
-        frame_format = CanFormat(board.get("format", CanFormat.SYNTOUCH))
-        options = bus_options(interface, frame_format, bitrate, data_bitrate)
-        self._bus = CanBus(interface, channel, options, clock, wall_clock)
+        self._bus = CanBus(interface, channel, bitrate, clock, wall_clock)
         self._clock = clock
         self._resting_until_ns: int | None = None
 

@@ -1,24 +1,34 @@
-"""CAN frames, and the structs of linux/can.h and linux/can/error.h. Bytes only."""
+"""CAN frames, the structs of linux/can.h and linux/can/error.h, and the samples in their data.
+
+SynTouch's board sends one classic frame per sample: the command byte, then each sensor's response
+word (`graspd.drivers.biotac`). Source: the public driver `clearpathrobotics/numatac_can_driver`
+(`numatac_can_driver.cpp`, `bt_can.h`). Arbitration id and frame length are not public, so the scene
+gives them. `deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc` describe the frame.
+"""
 
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
 
 import msgspec
+
+from graspd.drivers.base import DriverCounters
+from graspd.drivers.biotac import channel_of, sample_command
 
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
 CLASSIC_DATA_MAX: Final = 8
 FD_DATA_MAX: Final = 64
+WORD_BYTES: Final = 2
 
 EFF_FLAG: Final = 0x80000000
 RTR_FLAG: Final = 0x40000000
 ERR_FLAG: Final = 0x20000000
 CAN_FRAME: Final = struct.Struct("=IB3x8s")
 """`struct can_frame`: id with flags, length, padding, data. 16 bytes, native byte order."""
-CANFD_FRAME: Final = struct.Struct("=IBB2x64s")
-"""`struct canfd_frame`: id with flags, length, FD flags, padding, data. 72 bytes."""
 
 ERROR_CONTROLLER: Final = 0x004
 ERROR_BUS_OFF: Final = 0x040
@@ -45,6 +55,7 @@ REMOTE: Final = 2
 ERROR: Final = 4
 """Error frame, made by the controller: the id holds error classes."""
 FD: Final = 8
+"""Frame of CAN FD, of another device on the bus."""
 LOST: Final = 16
 """Marker instead of a frame: frames were lost here."""
 
@@ -63,23 +74,74 @@ Stamped = tuple[CanFrame, int, int]
 """A frame or the marker `LOST`, and the two monotonic times, ns, between which it arrived."""
 
 
+class Reject(StrEnum):
+    """Reason why a frame is not a sample; the values are names of `CanCounters`."""
+
+    LENGTH = "wrong_length_frames"
+    COMMAND = "unknown_commands"
+    CONTENT = "malformed_frames"
+
+
+@dataclass(slots=True)
+class CanCounters(DriverCounters):
+    """Counters of frames, sweeps and the bus."""
+
+    lost_frames: int = 0
+    """Frames that never came, although others of their sweep did."""
+    duplicate_frames: int = 0
+    reordered_frames: int = 0
+    """Frames that came in time for their sweep, but after a later one."""
+    late_frames: int = 0
+    """Frames that came when their sweep was over; dropped."""
+    unsynchronised_frames: int = 0
+    """Frames dropped after opening or a known loss, until a sweep began."""
+    untimed_frames: int = 0
+    """Samples dropped because the loop stalled and the bus has no stamps."""
+    unexpected_channels: int = 0
+    """Samples of a channel that the configured sequence does not have."""
+    interrupted_sweeps: int = 0
+    """Sweeps dropped because the link broke in the middle."""
+    cut_sweeps: int = 0
+    """Sweeps ended in the middle because frames were known to be lost there."""
+    parity_words: int = 0
+    error_words: int = 0
+    unplugged_words: int = 0
+    """Response words of a line that no sensor drives."""
+    frames: int = 0
+    accepted_frames: int = 0
+    """Samples of the configured sensors, duplicates included."""
+    foreign_frames: int = 0
+    """Frames with another arbitration id; while the id is unknown, frames without counts."""
+    remote_frames: int = 0
+    error_frames: int = 0
+    """Frames in which the controller reports trouble on the bus."""
+    wrong_length_frames: int = 0
+    unknown_commands: int = 0
+    """Frames with the right id whose first byte samples no channel."""
+    malformed_frames: int = 0
+    """Frames of CAN FD with the right id, and records that hold no frame."""
+    controller_overflows: int = 0
+    """Error frames that say that the controller's receive buffer overflowed."""
+    kernel_drops: int = 0
+    """Frames that the kernel dropped because the socket's buffer was full (socketcan only)."""
+    bus_off: int = 0
+    bus_faults: int = 0
+    """Failures of the bus or of python-can, also when opening it."""
+    link_losses: int = 0
+
+
 def unpack_frame(raw: bytes) -> CanFrame | None:
-    """Return the frame in a `can_frame` or `canfd_frame`; None if it is malformed."""
-    if len(raw) == CAN_FRAME.size:
-        word, length, data = CAN_FRAME.unpack(raw)
-        longest, flags = CLASSIC_DATA_MAX, 0
-    elif len(raw) == CANFD_FRAME.size:
-        word, length, _fd_flags, data = CANFD_FRAME.unpack(raw)
-        longest, flags = FD_DATA_MAX, FD
-    else:
+    """Return the frame in a `can_frame`; None if it is malformed."""
+    if len(raw) != CAN_FRAME.size:
         return None
-    if length > longest:
+    word, length, data = CAN_FRAME.unpack(raw)
+    if length > CLASSIC_DATA_MAX:
         return None
     if word & ERR_FLAG:
-        return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | ERROR)
+        return CanFrame(word & EXTENDED_ID_MAX, data[:length], ERROR)
+    flags = 0
     if word & RTR_FLAG:
-        flags |= REMOTE
-        data = b""
+        flags, data = REMOTE, b""
     if word & EFF_FLAG:
         return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | EXTENDED)
     return CanFrame(word & STANDARD_ID_MAX, data[:length], flags)
@@ -101,3 +163,33 @@ def describe_error(frame: CanFrame) -> str:
     """Return the error classes of an error frame in words."""
     names = [name for bit, name in _ERROR_CLASSES.items() if frame.arbitration_id & bit]
     return ", ".join(names) or "unknown error class"
+
+
+def encode_sample(channel: int, words: bytes) -> bytes:
+    """Return the data of a frame. Raises `ValueError` for an unknown channel."""
+    return bytes((sample_command(channel),)) + words
+
+
+def parse_sample(frame: CanFrame, sensors: int, length: int) -> tuple[int, bytes] | Reject:
+    """Return channel and response words of a frame of `length` bytes, padding included."""
+    if frame.flags & FD:
+        return Reject.CONTENT
+    if len(frame.data) != length:
+        return Reject.LENGTH
+    channel = channel_of(frame.data[0])
+    if channel is None:
+        return Reject.COMMAND
+    return channel, frame.data[1 : 1 + WORD_BYTES * sensors]
+
+
+def sample_length(sensors: int, length: int | None) -> int:
+    """Return the number of data bytes of a frame with the samples of `sensors` fingers.
+
+    `length`: length set in the scene, bytes; None: just long enough. Raises `ValueError` for a
+    length that is too short, or over `CLASSIC_DATA_MAX`.
+    """
+    used = 1 + WORD_BYTES * sensors
+    length = length or used
+    if not used <= length <= CLASSIC_DATA_MAX:
+        raise ValueError(f"frames of {length} bytes cannot carry {sensors} sensors' samples")
+    return length

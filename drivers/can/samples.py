@@ -1,12 +1,14 @@
 """Combine samples into one `TactileReading` per sweep; missing electrodes are flagged.
 
-The format has no counter. A sample's command byte names its channel; its place in the order of the
+Frames have no counter. A sample's command byte names its channel; its place in the order of the
 sequence and the time between samples tell its sweep. `deploy/can/PROTOCOL.md` says what becomes of
 each loss, copy and delay. No electrode is shifted or filled from memory.
 """
 
 from __future__ import annotations
 
+import statistics
+from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
@@ -14,7 +16,7 @@ import numpy as np
 
 from graspd.drivers.base import ELECTRODES, ElectrodeFault, TactileReading
 from graspd.drivers.biotac import E1, E24, make_reading
-from graspd.drivers.can.readings import CanCounters, SweepPeriod
+from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.link import OUTAGE_NS
 
 REORDER_MAX: Final = 3
@@ -31,8 +33,31 @@ ARRIVAL_JITTER_NS: Final = 5_000_000
 """Delay of a sweep, ns, up to which no sweep counts as missed."""
 EVEN_SHARE: Final = 1 / 3
 """Largest gap between two samples without a lost sweep, in periods; a lost one takes half."""
+PERIODS_KEPT: Final = 15
+PERIODS_NEEDED: Final = 5
+"""Measured periods after which the period is known; it is the median of the last 15."""
 
 _ALL: Final = (1 << ELECTRODES) - 1
+
+
+class SweepPeriod:
+    """Measured time between sweeps."""
+
+    def __init__(self) -> None:
+        self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self.period_ns: int | None = None
+
+    def learn(self, gap_ns: int) -> None:
+        """Add the time between two sweeps in a row; an outage is ignored."""
+        if 0 < gap_ns <= OUTAGE_NS:
+            self._gaps_ns.append(gap_ns)
+        if len(self._gaps_ns) >= PERIODS_NEEDED:
+            self.period_ns = round(statistics.median(self._gaps_ns))
+
+    def forget(self) -> None:
+        """Forget the period, which may be that of lost sweeps."""
+        self._gaps_ns.clear()
+        self.period_ns = None
 
 
 class SampleAssembler:

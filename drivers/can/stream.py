@@ -8,7 +8,6 @@ from typing import Final, TypedDict, Unpack
 import numpy as np
 
 from graspd.drivers.base import (
-    FINGERS,
     DeviceFault,
     ElectrodeFault,
     Fact,
@@ -19,31 +18,23 @@ from graspd.drivers.base import (
     sensor_rows,
 )
 from graspd.drivers.biotac import SEQUENCES, decode_words
-from graspd.drivers.can.formats import (
-    SWEEP_BASE_ID,
-    CanFormat,
-    Reject,
-    SweepStatus,
-    parse_sample,
-    parse_sweep,
-    sample_length,
-)
 from graspd.drivers.can.frames import (
     ERROR,
     EXTENDED,
-    FD,
     LOST,
     REMOTE,
     STANDARD_ID_MAX,
+    CanCounters,
     CanFrame,
+    Reject,
     Stamped,
     describe_error,
     is_bus_off,
     is_overflow,
+    parse_sample,
+    sample_length,
 )
-from graspd.drivers.can.readings import CanCounters
 from graspd.drivers.can.samples import SampleAssembler
-from graspd.drivers.can.sweep_frames import FrameAssembler
 from graspd.drivers.link import Link, LinkState, longest_silence_ns
 
 NAME: Final = "can"
@@ -58,15 +49,15 @@ class CanStream:
     """
 
     def __init__(self, bus: str, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
-        """`bus`: name of the bus in messages. `fingers` and `board`: see `make_decoder`."""
+        """`bus`: name of the bus in messages. `fingers` and `board`: see `SampleDecoder`."""
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None
         """Last failure of the bus or error frame, for people; silence does not count."""
-        self._where = f"{bus}, {CanFormat(board.get('format', CanFormat.SYNTOUCH))}"
+        self._where = bus
         self._accepted = 0
         self._silent_at_ns = 0
-        self._decoder = make_decoder(fingers, self.counters, **board)
+        self._decoder = SampleDecoder(fingers, self.counters, **board)
 
     @property
     def period_ns(self) -> int | None:
@@ -74,7 +65,7 @@ class CanStream:
 
     @property
     def expected_ns(self) -> int | None:
-        """Time when the next reading should be complete, ns; None: not known or not used."""
+        """Time when the next reading should be complete, ns; None: not known yet."""
         return self._decoder.sweeps.expected_ns
 
     @property
@@ -148,24 +139,41 @@ class CanStream:
         return LinkError(LinkCause.BUS_OFF, "bus-off")
 
 
-class SynTouchDecoder:
-    """Decoder of SynTouch's board. Without an id it takes that of the first sound sample."""
+class BoardOptions(TypedDict, total=False):
+    """Options of `SampleDecoder` that describe a board."""
+
+    sensors: Sequence[str] | None
+    arbitration_id: int | None
+    sequence: str
+    data_length: int | None
+
+
+class SampleDecoder:
+    """Decoder of the frames of SynTouch's board."""
 
     def __init__(
         self,
         fingers: Sequence[str],
-        sensors: Sequence[str] | None,
-        arbitration_id: int | None,
-        sequence: str,
-        data_length: int | None,
         counters: CanCounters,
+        *,
+        sensors: Sequence[str] | None = None,
+        arbitration_id: int | None = None,
+        sequence: str = "interleaved",
+        data_length: int | None = None,
     ) -> None:
+        """`fingers`: the rows of a reading. Raises `ValueError` for options that do not fit.
+
+        `sensors`: the fingers in the order of the board's words, three at most; None: `fingers`.
+        `arbitration_id`: above 0x7FF it has 29 bits. None: that of the first sound sample, until
+        the link is lost; use that for bring-up only. `sequence`: a key of `SEQUENCES`.
+        `data_length`: bytes of a frame that the board pads.
+        """
         rows = sensor_rows(fingers, sensors)
         self._sensors = len(fingers if sensors is None else sensors)
         self._length = sample_length(self._sensors, data_length)
         self._configured_id = self.arbitration_id = arbitration_id
         """Id of the frames that are decoded; None: not known yet."""
-        self._flags = _id_flags(arbitration_id)
+        self._flags = 0 if (arbitration_id or 0) <= STANDARD_ID_MAX else EXTENDED
         self._counters = counters
         self.sweeps = SampleAssembler(self._sensors, SEQUENCES[sequence], counters, rows)
 
@@ -182,11 +190,10 @@ class SynTouchDecoder:
         ):
             self._counters.foreign_frames += 1
             return ()
-        sample = parse_sample(frame.data, self._sensors, self._length)
-        if frame.flags & FD:
-            sample = Reject.CONTENT
+        sample = parse_sample(frame, self._sensors, self._length)
         if isinstance(sample, Reject):
-            _count_reject(self._counters, sample, identifier)
+            counter = "foreign_frames" if identifier is None else sample.value
+            setattr(self._counters, counter, getattr(self._counters, counter) + 1)
             return ()
         channel, words = sample
         if identifier is None:
@@ -203,111 +210,7 @@ class SynTouchDecoder:
         self.arbitration_id = self._configured_id
 
 
-class SweepFrameDecoder:
-    """Decoder of graspd's own format: one frame per finger and sweep."""
-
-    def __init__(self, fingers: Sequence[str], base_id: int, counters: CanCounters) -> None:
-        self._rows = {FINGERS.index(finger): row for row, finger in enumerate(fingers)}
-        self.arbitration_id = base_id
-        """Id of the frames of finger 0."""
-        self._flags = _id_flags(base_id + len(FINGERS) - 1)
-        if _id_flags(base_id) != self._flags:
-            raise ValueError(f"arbitration_id {base_id:#x}: the fingers' ids are of two kinds")
-        self._ticks: dict[int, tuple[int, int]] = {}
-        self._counters = counters
-        self.sweeps = FrameAssembler(list(self._rows), counters)
-
-    def push(
-        self, frame: CanFrame, t_ns: int, _until_ns: int | None = None
-    ) -> Sequence[TactileReading]:
-        base_id, counters = self.arbitration_id, self._counters
-        finger = frame.arbitration_id - base_id
-        if finger not in self._rows or frame.flags & EXTENDED != self._flags:
-            counters.foreign_frames += 1
-            return ()
-        sweep = parse_sweep(frame.data) if frame.flags & FD else Reject.CONTENT
-        if not isinstance(sweep, Reject) and sweep.finger != finger:
-            sweep = Reject.CONTENT
-        if isinstance(sweep, Reject):
-            _count_reject(counters, sweep, base_id)
-            return ()
-        counters.accepted_frames += 1
-        stands = self._tick_stands(finger, sweep.sequence, sweep.tick_us)
-        counters.overruns += bool(sweep.status & SweepStatus.OVERRUN)
-        faults = ElectrodeFault.NONE
-        if sweep.status & SweepStatus.ABSENT:
-            faults |= ElectrodeFault.MISSING
-        if stands or sweep.status & SweepStatus.REPEATED:
-            faults |= ElectrodeFault.HELD
-        row = self._rows[finger]
-        return self.sweeps.push(row, sweep.sequence, sweep.tick_us, sweep.words, faults, t_ns)
-
-    def interrupt(self) -> None:
-        self.sweeps.interrupt()
-
-    def _tick_stands(self, finger: int, sequence: int, tick_us: int) -> bool:
-        """Return True if the sweep before ended at the same tick: nothing was sampled."""
-        before = self._ticks.get(finger)
-        stands = before is not None and before[1] == tick_us and before[0] != sequence
-        self._counters.stuck_ticks += stands
-        self._ticks[finger] = (sequence, tick_us)
-        return stands
-
-
-CanDecoder = SynTouchDecoder | SweepFrameDecoder
-
-
-class BoardOptions(TypedDict, total=False):
-    """Options of `make_decoder` that describe a board."""
-
-    sensors: Sequence[str] | None
-    format: str
-    arbitration_id: int | None
-    sequence: str
-    data_length: int | None
-
-
-def make_decoder(
-    fingers: Sequence[str],
-    counters: CanCounters,
-    *,
-    sensors: Sequence[str] | None = None,
-    format: str = CanFormat.SYNTOUCH,  # noqa: A002 (the key of the scene)
-    arbitration_id: int | None = None,
-    sequence: str = "interleaved",
-    data_length: int | None = None,
-) -> CanDecoder:
-    """Return the decoder of a `CanFormat`. Raises `ValueError` for options that do not fit it.
-
-    `fingers`: the rows of a reading. `arbitration_id`: id of the samples, or of finger 0 (`ff`) of
-    the sweep frames (default 0x5B0); ids above 0x7FF have 29 bits. A decoder of samples without one
-    takes the id of the first sound sample until the link is lost; use that for bring-up only.
-
-    For `syntouch` only: `sensors`, the fingers in the order of the board's words, three at most, by
-    default `fingers`; `sequence`, a key of `graspd.drivers.biotac.SEQUENCES`; `data_length`, bytes
-    of a frame that the board pads.
-    """
-    if CanFormat(format) is CanFormat.SYNTOUCH:
-        return SynTouchDecoder(fingers, sensors, arbitration_id, sequence, data_length, counters)
-    if data_length is not None:
-        raise ValueError("data_length is for the format syntouch; sweep frames have 64 bytes")
-    base_id = SWEEP_BASE_ID if arbitration_id is None else arbitration_id
-    return SweepFrameDecoder(fingers, base_id, counters)
-
-
 def _is_sound(words: bytes) -> bool:
     """Return True if at least one word is a count and all others are of absent sensors."""
     _, faults = decode_words(np.frombuffer(words, dtype=">u2"))
     return not (faults & ~np.uint8(ElectrodeFault.MISSING)).any() and not faults.all()
-
-
-def _id_flags(identifier: int | None) -> int:
-    if identifier is None or identifier <= STANDARD_ID_MAX:
-        return 0
-    return EXTENDED
-
-
-def _count_reject(counters: CanCounters, reject: Reject, identifier: int | None) -> None:
-    """Count a refused frame by its kind; as foreign while the id is not known."""
-    name = "foreign_frames" if identifier is None else reject.value
-    setattr(counters, name, getattr(counters, name) + 1)

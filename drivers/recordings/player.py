@@ -146,7 +146,7 @@ class LinkLogDriver(RecordedDriver[Item]):
 
     @abstractmethod
     def begin(self) -> None:
-        """Make a new `stream`. Raises `DriverError`."""
+        """Make a new `stream`."""
 
     @abstractmethod
     def feed(self, t_ns: int, record: Item) -> Sequence[Reading]:

@@ -10,17 +10,10 @@ from typing import Final
 
 import can
 
-from graspd.drivers.base import FINGERS, Opened
+from graspd.drivers.base import Opened
 from graspd.drivers.biotac import E1, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
-from graspd.drivers.can.bus import bus_options, open_bus
-from graspd.drivers.can.formats import (
-    SWEEP_BASE_ID,
-    SWEEP_VERSION,
-    CanFormat,
-    SweepFrame,
-    encode_sample,
-)
-from graspd.drivers.can.frames import STANDARD_ID_MAX
+from graspd.drivers.can.bus import open_bus, refuse_unusable
+from graspd.drivers.can.frames import STANDARD_ID_MAX, encode_sample
 from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 
@@ -41,10 +34,7 @@ Outgoing = tuple[int, bytes]
 
 
 class CanTwin(Opened):
-    """Send the sweeps of `counts` in one of the two formats. The constructor raises `ValueError`.
-
-    `rate_hz`: sweeps per second of `serve`. `first_sweep`: number of the first sweep frame.
-    """
+    """Send the sweeps of `counts`, sample by sample. The constructor raises `ValueError`."""
 
     def __init__(
         self,
@@ -53,25 +43,23 @@ class CanTwin(Opened):
         counts: Iterator[Counts],
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
-        format: str = CanFormat.SYNTOUCH,  # noqa: A002 (as the driver calls it)
-        arbitration_id: int | None = None,
+        arbitration_id: int = SAMPLE_ID,
         sequence: str = "interleaved",
         rate_hz: float = 100.0,
-        first_sweep: int = 0,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._format = CanFormat(format)
-        is_sweep = self._format is CanFormat.SWEEP_FD
+        """`fingers`: of the rows of `counts`. `rate_hz`: sweeps per second of `serve`.
+
+        Raises `ValueError`, also for an interface that cannot be used here.
+        """
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
-        faults.refuse("CAN", "one_byte_at_a_time")
-        if not is_sweep:
-            faults.refuse("SynTouch's format", "wrong_version", "stuck_clock")
-        self._fingers = tuple(FINGERS.index(finger) for finger in fingers)
+        refuse_unusable(interface)
+        faults.refuse("CAN", "one_byte_at_a_time", "wrong_version", "stuck_clock")
+        self._fingers = len(fingers)
         self._channels = SEQUENCES[sequence]
-        default_id = SWEEP_BASE_ID if is_sweep else SAMPLE_ID
-        self._id = default_id if arbitration_id is None else arbitration_id
+        self._id = arbitration_id
         self._counts = counts
         self._period_ns = round(1e9 / rate_hz)
         self._faults = faults
@@ -79,17 +67,14 @@ class CanTwin(Opened):
         self.injected = self._injector.injected
         self._clock = clock
         self._interface, self._channel = interface, channel
-        self._options = bus_options(interface, self._format)
         self._send_timeout_s = 0.0 if interface == "virtual" else SEND_TIMEOUT_S
         self._bus: can.BusABC | None = None
-        self._sweep = first_sweep
-        self._stuck_tick_us = self._tick_us()
         self.unsent = 0
 
     def open(self) -> None:
         """Open the bus. Raises `DriverError`, also if a package is missing."""
         self.close()
-        self._bus = open_bus(self._interface, self._channel, self._options)
+        self._bus = open_bus(self._interface, self._channel)
 
     def close(self) -> None:
         bus, self._bus = self._bus, None
@@ -128,9 +113,10 @@ class CanTwin(Opened):
         counts = next(self._counts, None)
         if counts is None:
             return []
-        is_sweep = self._format is CanFormat.SWEEP_FD
-        frames = self._sweep_frames(counts) if is_sweep else self._sample_frames(counts)
-        self._sweep += 1
+        frames = []
+        for channel in self._channels:
+            words = [self._word(row, channel, counts) for row in range(self._fingers)]
+            frames.append((self._id, encode_sample(channel, b"".join(words))))
         return frames
 
     def _word(self, row: int, channel: int, counts: Counts) -> bytes:
@@ -141,28 +127,6 @@ class CanTwin(Opened):
             return _WORDS[OTHER_COUNTS[channel]]
         is_dead = (row, channel - E1) in self._faults.dead_electrodes
         return _WORDS[0 if is_dead else counts[row, channel - E1]]
-
-    def _sample_frames(self, counts: Counts) -> list[Outgoing]:
-        frames = []
-        for channel in self._channels:
-            words = [self._word(row, channel, counts) for row in range(len(self._fingers))]
-            frames.append((self._id, encode_sample(channel, b"".join(words))))
-        return frames
-
-    def _sweep_frames(self, counts: Counts) -> list[Outgoing]:
-        tick_us = self._stuck_tick_us if self._faults.stuck_clock else self._tick_us()
-        frames = []
-        for row, finger in enumerate(self._fingers):
-            words = [self._word(row, channel, counts) for channel in SEQUENCES["electrodes"]]
-            sweep = SweepFrame(finger, self._sweep % (1 << 16), tick_us, b"".join(words))
-            data = sweep.to_bytes()
-            if self._faults.wrong_version:
-                data = bytes((SWEEP_VERSION + 1,)) + data[1:]
-            frames.append((self._id + finger, data))
-        return frames
-
-    def _tick_us(self) -> int:
-        return self._clock() // 1000 % (1 << 32)
 
     def _send(self, frame: Outgoing) -> bool:
         if self._injector.breaks_here():
@@ -183,8 +147,6 @@ class CanTwin(Opened):
                 arbitration_id=identifier,
                 is_extended_id=identifier > STANDARD_ID_MAX,
                 data=frame[ID_BYTES:],
-                is_fd=self._format is CanFormat.SWEEP_FD,
-                bitrate_switch=self._format is CanFormat.SWEEP_FD,
             )
             try:
                 self._bus.send(message, timeout=self._send_timeout_s)

@@ -130,7 +130,7 @@ def test_folders_have_the_same_rights_whoever_makes_them_first() -> None:
 def test_the_bus_has_the_rate_of_the_protocol() -> None:
     network = settings(DEPLOY / "network/80-graspd-can.network")
     protocol = (DEPLOY / "can/PROTOCOL.md").read_text()
-    assert "ip link set can0 type can bitrate 1000000 restart-ms 100 " in protocol
+    assert "ip link set can0 type can bitrate 1000000 restart-ms 100\n" in protocol
     assert (network["BitRate"], network["RestartSec"]) == (["1M"], ["100ms"])
 
 

@@ -35,7 +35,7 @@ from graspd.drivers.biotac import (
     sample_command,
 )
 from graspd.drivers.can.driver import CanBridgeDriver
-from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.joints import JointCounters, JointStreamDriver
 from graspd.drivers.link import Link, LinkState
 from graspd.drivers.palm.packet import PalmCounters

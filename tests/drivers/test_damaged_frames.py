@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd.drivers.base import COUNT_MAX, FINGERS, TactileReading
-from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.can.frames import ERROR, REMOTE, unpack_frame
 from graspd.drivers.palm.packet import CAN_RECORD_BYTES, Palm, parse_packet
 from graspd.drivers.palm.stream import PalmStream
@@ -20,7 +19,7 @@ from graspd.drivers.spi.messages import (
     encode_frame,
 )
 from graspd.drivers.twins.datagrams import PalmTwin
-from tests.drivers.can.can_standin import decoder, sweep_frames
+from tests.drivers.can.can_standin import decoder, sweep_of_frames
 from tests.drivers.can.can_words import pack_frame, truth
 from tests.drivers.twins.signals import GeneratedContact
 
@@ -105,12 +104,10 @@ def test_no_damaged_packet_of_a_palm_gives_a_count_that_is_none(
 
 
 @settings(max_examples=500)
-@given(st.sampled_from(CanFormat), st.booleans(), st.data())
-def test_damaged_can_frames_hide_no_later_sweep(
-    frame_format: CanFormat, is_lost: bool, data: st.DataObject
-) -> None:
-    made, counters = decoder(frame_format)
-    good = [pack_frame(frame) for frame in sweep_frames(frame_format, 0)]
+@given(st.booleans(), st.data())
+def test_damaged_can_frames_hide_no_later_sweep(is_lost: bool, data: st.DataObject) -> None:
+    made, counters = decoder()
+    good = [pack_frame(frame) for frame in sweep_of_frames(0)]
     bad = damaged(data.draw(st.sampled_from(good)), good[-1])
     readings: list[TactileReading] = []
     for at, raw in enumerate(data.draw(st.lists(bad | st.sampled_from(good), max_size=30))):
@@ -119,9 +116,8 @@ def test_damaged_can_frames_hide_no_later_sweep(
             readings += made.push(frame, at * MS)
     if is_lost:
         made.interrupt()
-    # A damaged number of a sweep may make up to eight good ones look late, until time passes.
     start_ns = 5_000 * MS
-    for at, frame in enumerate(frame for n in (1, 2, 3) for frame in sweep_frames(frame_format, n)):
+    for at, frame in enumerate(frame for n in (1, 2, 3) for frame in sweep_of_frames(n)):
         readings += made.push(frame, start_ns + at * 227_000)
     assert counters.readings == len(readings)
     assert not readings[-1].faults.any()

@@ -8,9 +8,8 @@ import numpy as np
 
 from graspd.drivers.base import Reading, TactileReading
 from graspd.drivers.biotac import SEQUENCES, encode_word
-from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.can.samples import SampleAssembler
-from graspd.drivers.can.sweep_frames import FrameAssembler
 from graspd.drivers.joints import JointMessage, JointStream
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.spi.sweeps import BridgeCounters, SweepDecoder
@@ -23,20 +22,6 @@ WORDS = encode_word(2602).to_bytes(2, "big")
 def interrupted(readings: list[Reading]) -> list[int]:
     """Places of the readings that do not follow the one before."""
     return [place for place, reading in enumerate(readings) if reading.interrupted]
-
-
-def test_numbers_of_can_frames_that_go_back_interrupt() -> None:
-    assembler = FrameAssembler([0, 1], CanCounters())
-    readings: list[Reading] = []
-    tape = [(number, row) for number in range(100, 120) for row in (0, 1)]
-    for place, (number, row) in enumerate([*tape, *tape]):
-        t_ns = place // 2 * PERIOD_NS
-        readings += assembler.push(row, number, number * 10_000, 24 * WORDS, 0, t_ns)
-    assert interrupted(readings) == [20]
-    assembler.interrupt()
-    for row in (0, 1):
-        readings += assembler.push(row, 121, 1_210_000, 24 * WORDS, 0, 41 * PERIOD_NS)
-    assert interrupted(readings) == [20, 40]
 
 
 def test_samples_after_a_lost_bus_interrupt() -> None:

@@ -82,7 +82,7 @@ def slcan(folder: Path) -> Iterator[Bench]:
 def multicast(_: Path) -> Iterator[Bench]:
     group = multicast_group()
     where, number = ("udp_multicast", group), can_id(group)
-    options = {"format": "syntouch", "arbitration_id": number, "sequence": "electrodes"}
+    options = {"arbitration_id": number, "sequence": "electrodes"}
     twin = CanTwin(*where, itertools.cycle(contact(50)), **options)  # type: ignore[arg-type]
     with twin, CanBridgeDriver(*where, **options) as driver:  # type: ignore[arg-type]
         yield Bench(driver, twin.send_sweep, driver.close, driver.open)

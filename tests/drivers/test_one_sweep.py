@@ -6,7 +6,6 @@ What boards must number and how long links may hold frames back, so that this ho
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +17,8 @@ from hypothesis import strategies as st
 
 from graspd.drivers.base import Reading
 from graspd.drivers.biotac import SEQUENCES
-from graspd.drivers.can.formats import CanFormat, SweepFrame, encode_sample
-from graspd.drivers.can.frames import FD, CanFrame
-from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.can.stream import CanDecoder, make_decoder
+from graspd.drivers.can.frames import CanCounters, CanFrame, encode_sample
+from graspd.drivers.can.stream import SampleDecoder
 from graspd.drivers.joints import JointMessage, JointStream
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
@@ -43,7 +40,6 @@ from tests.drivers.spi.bridge_bench import T0, greeted, hello
 
 FINGERS = ("ff", "mf", "th")
 MS = 1_000_000
-FRAME_NS = 10 * MS // 3
 BASE_ID = 0x100
 SILENT_NS = 110 * MS
 """How long a board says nothing after a reset, as deploy/can/PROTOCOL.md asks."""
@@ -54,47 +50,6 @@ PACKETS = [
     for packet in PalmTwin(counts_of(number_of(at)) for at in range(600)).packets()
 ]
 """More rounds than the longest plan has, and some for other starts."""
-
-
-def sweep_frame(unit: Unit, first: int) -> CanFrame:
-    """Frames of three fingers follow each other; number and tick begin anew with the board."""
-    sweep, row = divmod(unit.index, len(FINGERS))
-    finger = (0, 1, 4)[row]
-    words = WORDS[number_of(sweep, unit.boot)] * 24
-    frame = SweepFrame(finger, (first + sweep) % (1 << 16), (sweep + 1) * 10_000, words)
-    return CanFrame(BASE_ID + finger, frame.to_bytes(), FD)
-
-
-@settings(max_examples=50)
-@given(st.integers(1, 3), st.integers(0, 2), st.integers(-2, 2))
-def test_a_counter_that_goes_round_while_frames_are_lost_is_told_by_time(
-    came: int, row: int, off: int
-) -> None:
-    """All 65536 numbers are lost, so the next frame has the number of the sweep at hand."""
-    decoder, seen = sweep_fd_decoder(), 0
-    before = [Unit(at, at, 0) for at in range(30 + came)]
-    lost = 3 * (1 << 16) + 3 * off
-    after = [Unit(at, at, 0) for at in range(lost + 30 + row, lost + 60)]
-    for unit in (*before, *after):
-        seen += expect_one_sweep(decoder.push(sweep_frame(unit, 0), unit.at * FRAME_NS))
-    assert seen >= 17
-
-
-def sweep_fd_decoder() -> CanDecoder:
-    return make_decoder(FINGERS, CanCounters(), format=CanFormat.SWEEP_FD, arbitration_id=BASE_ID)
-
-
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
-@pytest.mark.parametrize("place", [0, 1])
-def test_frames_that_repeat_number_and_tick_with_other_words_are_of_another_start(
-    order: tuple[int, ...], place: int
-) -> None:
-    """A board that is reset within two periods and numbers as before, heard of one finger."""
-    decoder, seen = sweep_fd_decoder(), 0
-    for boot, rows in ((1, (order[place],)), (2, order), (2, ())):
-        for row in rows:
-            seen += expect_one_sweep(decoder.push(sweep_frame(Unit(0, row, boot), 0), boot * MS))
-    assert seen == (place == 0)
 
 
 def sample(unit: Unit, channels: Sequence[int]) -> CanFrame:
@@ -118,35 +73,25 @@ def palm(first: int) -> Feed:
     return feed
 
 
-def sweep_frames(first: int) -> Feed:
-    decoder = sweep_fd_decoder()
-    return lambda unit: decoder.push(sweep_frame(unit, first), unit.at * FRAME_NS)
-
-
 def samples(sequence: str) -> Callable[[int], Feed]:
     def begin(_first: int) -> Feed:
-        decoder = make_decoder(FINGERS, CanCounters(), arbitration_id=BASE_ID, sequence=sequence)
+        decoder = SampleDecoder(FINGERS, CanCounters(), arbitration_id=BASE_ID, sequence=sequence)
         return lambda unit: decoder.push(sample(unit, SEQUENCES[sequence]), unit.at * SLOT_NS)
 
     return begin
 
 
-def bus_log(form: str, frame: Callable[[Unit], CanFrame], unit_ns: int) -> Callable[[int], Feed]:
+def bus_log(_first: int) -> Feed:
     """Through the lines of a log, which must tell no other story than the bus."""
+    log = CanLog([Path("bus.log")], FINGERS, arbitration_id=BASE_ID, sequence="electrodes")
 
-    def begin(_first: int) -> Feed:
-        log = CanLog(
-            [Path("bus.log")], FINGERS, format=form, arbitration_id=BASE_ID, sequence="electrodes"
-        )
+    def feed(unit: Unit) -> Sequence[Reading]:
+        frame = sample(unit, SEQUENCES["electrodes"])
+        logged = frame_of(line_of(frame, unit.at * SLOT_NS, "can0"))
+        assert logged is not None
+        return log.feed(*logged)
 
-        def feed(unit: Unit) -> Sequence[Reading]:
-            logged = frame_of(line_of(frame(unit), unit.at * unit_ns, "can0"))
-            assert logged is not None
-            return log.feed(*logged)
-
-        return feed
-
-    return begin
+    return feed
 
 
 def spi_sweep(unit: Unit) -> bytes:
@@ -193,14 +138,8 @@ ASSEMBLERS = {
     "bridge": Assembler(bridge, 1, silent=11),
     "log of a bridge": Assembler(bridge_log, 1, silent=11),
     "palm": Assembler(palm, ROUND, silent=25, steady_sweeps=2),  # it may begin within a round
-    "sweep frames": Assembler(sweep_frames, 3, silent=SILENT_NS // FRAME_NS + 1, late_max=4),
-    "log of sweep frames": Assembler(
-        bus_log("sweep_fd", lambda unit: sweep_frame(unit, 0), FRAME_NS),
-        3,
-        silent=SILENT_NS // FRAME_NS + 1,
-    ),
     "log of samples": Assembler(
-        bus_log("syntouch", lambda unit: sample(unit, SEQUENCES["electrodes"]), SLOT_NS),
+        bus_log,
         24,
         silent=SILENT_NS // SLOT_NS + 1,
         steady_sweeps=3,

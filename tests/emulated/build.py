@@ -14,16 +14,13 @@ from typing import Final, Literal
 
 from tests.conftest import ROOT, data_dir
 
-Port = Literal["pico", "sketch"]
 Sequence = Literal["electrodes", "all", "interleaved"]
 
 BRIDGE: Final = ROOT / "deploy" / "bridge"
-SKETCH: Final = Path(__file__).parent / "firmware" / "sketch.cmake"
-SOURCES: Final = (BRIDGE / "src", BRIDGE / "pico", BRIDGE / "rp2040", SKETCH.parent)
+SOURCES: Final = (BRIDGE / "src", BRIDGE / "pico")
 FOLDER: Final = ROOT / "build" / "pico"
 EMULATOR_FOLDER: Final = ROOT / "build" / "emulated"
 """Everything made here is in these two, which git does not see."""
-TARGETS: Final[dict[Port, str]] = {"pico": "bridge", "sketch": "sketch"}
 CLOCKS_MHZ: Final = (125, 133, 200)
 COMPILER: Final = "arm-none-eabi-gcc"
 NEEDED: Final = {
@@ -60,17 +57,15 @@ def shared_dir() -> Path | None:
 
 
 def image(
-    port: Port = "pico",
     sensors: int = 3,
     clock_mhz: int = 125,
     sequence: Sequence = "electrodes",
 ) -> Path:
     """Build an image, or find the one that was built of the same sources.
 
-    `port` is the C port or the Arduino sketch, `clock_mhz` the chip's system clock (125, 133, 200).
-    Gives the `.bin` as it lies in flash from 0x10000000; the `.elf` with symbols is beside it.
-    Raises `MissingError` where a tool or the pico-sdk is missing, `BuildError` where the compiler
-    objects.
+    `clock_mhz` is the chip's system clock (125, 133, 200). Gives the `.bin` as it lies in flash
+    from 0x10000000; the `.elf` with symbols is beside it. Raises `MissingError` where a tool or the
+    pico-sdk is missing, `BuildError` where the compiler objects.
     """
     check_tools()
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -78,29 +73,28 @@ def image(
         sdk = pico_sdk()
         options = {
             "PICO_SDK_PATH": str(sdk),
-            "CMAKE_PROJECT_graspd_bridge_INCLUDE": str(SKETCH),
             "BRIDGE_SENSORS": str(sensors),
             "BRIDGE_SYS_CLOCK_MHZ": str(clock_mhz),
             "BRIDGE_SEQUENCE": f"BIOTAC_{sequence.upper()}",
         }
-        kind = f"{port}-{sensors}-{clock_mhz}-{sequence}"
+        kind = f"{sensors}-{clock_mhz}-{sequence}"
         made = FOLDER / "images" / f"{kind}-{_digest(sdk, options)}.bin"
         if not made.is_file():
             made.parent.mkdir(exist_ok=True)
             for old in made.parent.glob(f"{kind}-*"):
                 old.unlink()
             place = hashlib.sha256(f"{ROOT} {sdk}".encode()).hexdigest()[:8]
-            _build(FOLDER / f"{clock_mhz}-{place}", TARGETS[port], options, made)
+            _build(FOLDER / f"{clock_mhz}-{place}", options, made)
     return made
 
 
-def _build(folder: Path, target: str, options: dict[str, str], made: Path) -> None:
+def _build(folder: Path, options: dict[str, str], made: Path) -> None:
     """Compile one image; what it has in common with the last one in this folder stays there."""
     settings = [f"-D{name}={value}" for name, value in options.items()]
     _run("cmake", "-G", "Ninja", "-S", BRIDGE / "pico", "-B", folder, *settings)
-    _run("ninja", "-C", folder, target)
-    shutil.copy(folder / f"{target}.elf", made.with_suffix(".elf"))
-    shutil.copy(folder / f"{target}.bin", made.with_suffix(".part"))
+    _run("ninja", "-C", folder, "bridge")
+    shutil.copy(folder / "bridge.elf", made.with_suffix(".elf"))
+    shutil.copy(folder / "bridge.bin", made.with_suffix(".part"))
     made.with_suffix(".part").rename(made)
 
 

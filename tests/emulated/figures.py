@@ -11,24 +11,24 @@ from pathlib import Path
 from typing import Final
 
 from tests.emulated.board import Board, sweeps, timing, transactions
-from tests.emulated.build import CLOCKS_MHZ, TARGETS, Port, Sequence, flash_and_ram, image
+from tests.emulated.build import CLOCKS_MHZ, Sequence, flash_and_ram, image
 
 SECONDS = 2
 """In which STATUS is sent twice."""
-OTHERS: Final[tuple[tuple[Port, int, int, Sequence, int], ...]] = (
-    ("pico", 125, 1, "all", 28),
-    ("pico", 125, 5, "interleaved", 54),
+OTHERS: Final[tuple[tuple[int, int, Sequence, int], ...]] = (
+    (125, 1, "all", 28),
+    (125, 5, "interleaved", 54),
 )
-"""Port, clock, sensors, sequence and its slots, beside three sensors and 24 electrodes."""
+"""Clock, sensors, sequence and its slots, beside three sensors and 24 electrodes."""
 HEAD = """\
-| image | sensors, samples | flash | RAM | SPI | longest sweep | start jitter | settle | gap |
+| clock | sensors, samples | flash | RAM | SPI | longest sweep | start jitter | settle | gap |
 |---|---|---|---|---|---|---|---|---|
 """
 
 
-def row(port: Port, clock_mhz: int, sensors: int, sequence: Sequence, slots: int) -> str:
+def row(clock_mhz: int, sensors: int, sequence: Sequence, slots: int) -> str:
     """Figures of one image, as a row of the table."""
-    file = image(port, sensors, clock_mhz, sequence)
+    file = image(sensors, clock_mhz, sequence)
     flash, ram = flash_and_ram(file)
     with Board() as board, tempfile.TemporaryDirectory() as folder:
         board.power(file)
@@ -38,7 +38,7 @@ def row(port: Port, clock_mhz: int, sensors: int, sequence: Sequence, slots: int
             board.run(1000.0 * SECONDS)
     found = timing(sweeps(transactions(events()), slots, sensors), 10_000.0)
     columns = (
-        f"{port}, {clock_mhz} MHz",
+        f"{clock_mhz} MHz",
         f"{sensors}, {slots}",
         f"{flash / 1e3:.1f} kB",
         f"{ram / 1e3:.1f} kB",
@@ -54,9 +54,8 @@ def row(port: Port, clock_mhz: int, sensors: int, sequence: Sequence, slots: int
 def main() -> None:
     """Print the table."""
     sys.stdout.write(HEAD)
-    for port in TARGETS:
-        for clock_mhz in CLOCKS_MHZ:
-            sys.stdout.write(row(port, clock_mhz, 3, "electrodes", 24))
+    for clock_mhz in CLOCKS_MHZ:
+        sys.stdout.write(row(clock_mhz, 3, "electrodes", 24))
     for other in OTHERS:
         sys.stdout.write(row(*other))
 

@@ -110,14 +110,13 @@ def main() -> None:
     )
     parser.add_argument("--link", type=Path, required=True, help="made when the board is ready")
     parser.add_argument("--counts", type=Path, help="what the sensors feel, five in each line")
-    parser.add_argument("--port", choices=("pico", "sketch"), default="pico")
     options = parser.parse_args()
     if (lacking := missing()) is not None:
         parser.error(f"{lacking}. {NEEDS}")
     sys.stderr.write("building the firmware and the emulator, the first time some minutes\n")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with Board() as board:
-        live = LiveBoard(board.power(image(options.port), options.counts), options.link)
+        live = LiveBoard(board.power(image(), options.counts), options.link)
         live.warm_up()
         with contextlib.suppress(KeyboardInterrupt):
             live.run()

@@ -24,16 +24,15 @@ def without_ticks(hello: bytes, sweeps: list[bytes]) -> tuple[bytes, list[bytes]
     return hello[:9] + hello[17:], [sweep[:4] + sweep[20:] for sweep in sweeps]
 
 
-@pytest.mark.parametrize("port", ["pico", "sketch"])
 def test_hello_and_300_sweeps_are_those_of_the_pc(
-    port: str, image: Image, board: Board, start_bridge: StartBridge
+    image: Image, board: Board, start_bridge: StartBridge
 ) -> None:
     host = start_bridge("--board", BOARD_ID)
     on_the_pc = host.hello()
     host.send(frame(START))
     swept = [one for _ in range(SWEEPS // AT_ONCE) for one in host.next_of(SWEEP, AT_ONCE)]
     expected = without_ticks(on_the_pc, swept)
-    board.power(image(port))
+    board.power(image())
     hello = board.hello()
     board.start()
     sweeps = board.until(SWEEP, SWEEPS, 10.0 * SWEEPS + 20.0)
@@ -60,7 +59,7 @@ def blinking(half_ms: int, found: list[tuple[bool, int]]) -> bool:
 def test_the_light_tells_idle_sweeping_and_a_missing_sensor_apart(
     image: Image, board: Board
 ) -> None:
-    board.power(image("pico"))
+    board.power(image())
     board.hello()
     assert blinking(500, turns(board, 2500)), "waits for START"
     board.start()
@@ -78,20 +77,19 @@ def test_the_light_tells_idle_sweeping_and_a_missing_sensor_apart(
 
 
 def test_an_image_is_built_once(image: Image, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = image("pico")
+    made = image()
     monkeypatch.setattr(build, "_build", lambda *_: pytest.fail("built again"))
-    assert image("pico") == made
+    assert image() == made
 
 
-@pytest.mark.parametrize("port", ["pico", "sketch"])
-def test_an_image_leaves_most_of_the_chip_free(port: str, image: Image) -> None:
-    flash, ram = build.flash_and_ram(image(port))
+def test_an_image_leaves_most_of_the_chip_free(image: Image) -> None:
+    flash, ram = build.flash_and_ram(image())
     assert 10_000 < flash < 64 * 1024, "of 2 MB"
     assert 4_000 < ram < 64 * 1024, "of 264 kB"
 
 
 def test_picotool_is_fetched_if_the_option_asks_for_it(image: Image, tmp_path: Path) -> None:
-    image("pico")  # or skip: no tools, no SDK
+    image()  # or skip: no tools, no SDK
     nowhere = tmp_path / "nowhere"
     options = {"PICO_NO_PICOTOOL": 0, "PICOTOOL_GIT_REPOSITORY_URL": nowhere}
     settings = [f"-D{name}={value}" for name, value in options.items()]

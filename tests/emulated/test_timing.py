@@ -55,23 +55,20 @@ OWN_TIME = 1.25
 
 @dataclass(frozen=True)
 class Setting:
-    port: str
     clock_mhz: int = 125
     sensors: int = 3
     sequence: str = "electrodes"
 
     def __str__(self) -> str:
-        return f"{self.port}-{self.clock_mhz}MHz-{self.sensors}-{self.sequence}"
+        return f"{self.clock_mhz}MHz-{self.sensors}-{self.sequence}"
 
 
 SETTINGS = (
-    Setting("pico"),
-    Setting("pico", 133),
-    Setting("pico", 200),
-    Setting("pico", 133, 1, "all"),
-    Setting("pico", 200, 5, "interleaved"),
-    Setting("sketch"),
-    Setting("sketch", 200),
+    Setting(),
+    Setting(133),
+    Setting(200),
+    Setting(133, 1, "all"),
+    Setting(200, 5, "interleaved"),
 )
 
 
@@ -101,7 +98,7 @@ def run(
     setting: Setting = request.param
     folder = tmp_path_factory.mktemp("events")
     with Board() as board:
-        board.power(image(setting.port, setting.sensors, setting.clock_mhz, setting.sequence))
+        board.power(image(setting.sensors, setting.clock_mhz, setting.sequence))
         with board.recording(folder) as greeting:
             hello = board.hello()
         board.start()

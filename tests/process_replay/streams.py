@@ -13,8 +13,7 @@ import numpy as np
 
 from graspd.drivers.base import Reading
 from graspd.drivers.biotac import SEQUENCES, encode_word, sample_command
-from graspd.drivers.can.formats import CanFormat
-from graspd.drivers.can.frames import FD, CanFrame
+from graspd.drivers.can.frames import CanFrame
 from graspd.drivers.can.stream import CanStream
 from graspd.drivers.link import LinkState
 from graspd.drivers.palm.stream import PalmStream
@@ -77,25 +76,18 @@ def demo() -> Iterator[Reading]:
     return recording(DEMO_RECORDING)
 
 
-def can(
-    frame_format: CanFormat = CanFormat.SYNTOUCH,
-    faults: LinkFaults = FAULTS,
-    log: BinaryIO | None = None,
-) -> Iterator[Reading]:
+def can(log: BinaryIO | None = None) -> Iterator[Reading]:
     """Play the demo's grasps from a CAN twin; write its frames to `log`, as candump text."""
     clock = Clock(START_NS)
-    twin = CanTwin(
-        "virtual", "none", _counts(), FINGERS, format=frame_format, faults=faults, clock=clock
-    )
-    injector = LinkFaultInjector(faults)
-    stream = CanStream("virtual", FINGERS, format=frame_format)
+    twin = CanTwin("virtual", "none", _counts(), FINGERS, faults=FAULTS, clock=clock)
+    injector = LinkFaultInjector(FAULTS)
+    stream = CanStream("virtual", FINGERS)
     stream.link.greeting()
-    flags = FD if frame_format is CanFormat.SWEEP_FD else 0
     while frames := twin.next_frames():
         for number, (arbitration_id, data) in enumerate(frames):
             t_ns = clock.now_ns + PERIOD_NS * (number + 1) // len(frames)
             for spoilt in injector.spoil(data):
-                frame = CanFrame(arbitration_id, spoilt, flags)
+                frame = CanFrame(arbitration_id, spoilt)
                 if log is not None:
                     log.write(line_of(frame, t_ns, "can0").encode())
                 readings, _ = stream.receive([(frame, t_ns, t_ns)])

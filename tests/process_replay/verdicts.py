@@ -16,13 +16,12 @@ from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, Final
 
 from graspd.drivers.base import Reading
-from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING
 from tests.daemon.record.recorded import IGNORED_FIELDS
 from tests.process_replay import streams
 from tests.process_replay.commands import execute
 from tests.process_replay.judging import Case, Message, run
-from tests.process_replay.streams import FRAME_FAULTS, WIRED
+from tests.process_replay.streams import WIRED
 
 FOLDER: Final = Path(__file__).parents[1] / "references"
 P_SLIP_TOLERANCE: Final = 1e-4
@@ -52,9 +51,6 @@ CASES: Final[Mapping[str, Case]] = {
     "demo": Case(readings=streams.demo, joints=True),
     "twin_faults": Case(readings=streams.can),
     "spi_early": Case(readings=streams.spi, sections={"gate": {"early": True}}, readings_max=1500),
-    "can_sweep": Case(
-        readings=partial(streams.can, CanFormat.SWEEP_FD, FRAME_FAULTS), readings_max=1500
-    ),
     "palm": Case(readings=streams.palm, joints=True, readings_max=1500),
     "request_risk": Case(
         readings=streams.demo,
@@ -93,9 +89,8 @@ def _serial_log(folder: Path) -> list[str]:
 
 
 def _can_log(folder: Path) -> list[str]:
-    board = 'driver = "can"\nchannel = "can0"\nformat = "sweep_fd"'
-    play = partial(streams.can, CanFormat.SWEEP_FD, FRAME_FAULTS)
-    return _link_log(folder, "log", board, lambda log: play(log=log))
+    board = 'driver = "can"\nchannel = "can0"'
+    return _link_log(folder, "log", board, streams.can)
 
 
 def _link_log(

@@ -174,7 +174,7 @@ class Lab:
         self.sh(
             "systemctl stop twin-can 2>/dev/null; systemctl reset-failed twin-can 2>/dev/null\n"
             "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
-            f"--interface socketcan --channel vcan0 --format sweep_fd --rate {rate_hz} "
+            f"--interface socketcan --channel vcan0 --rate {rate_hz} "
             f"--recording {PAYLOAD}/recording.csv --loop"
         )
 

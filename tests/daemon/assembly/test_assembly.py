@@ -132,11 +132,10 @@ def test_a_model_of_other_fingers_is_refused_and_those_that_fit_are_named(
     [
         (SPI, ["th", "ff"]),
         ({"driver": "can"}, ["th", "ff"]),
-        ({"driver": "can", "format": "sweep_fd"}, None),
         (SPI | {"sensors": ["mf", "th", "ff"]}, ["mf", "th", "ff"]),
         (PALM, None),
     ],
-    ids=["spi", "can", "can-fd", "spi-sensors", "palm"],
+    ids=["spi", "can", "spi-sensors", "palm"],
 )
 def test_fingers_in_another_order_are_told_what_to_write_instead(
     tactile: dict[str, Any], sensors: list[str] | None

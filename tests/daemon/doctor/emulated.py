@@ -74,39 +74,23 @@ def spi(hand: Hand, folder: Path, faults: LinkFaults = NO_FAULTS) -> Iterator[tu
         yield driver, step
 
 
-def can(frame_format: str) -> Callable[[Hand, Path, LinkFaults], Link]:
+@contextlib.contextmanager
+def can(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver, Step]]:
     """A board on a virtual bus, at 100 Hz."""
+    clock, where = Clock(), channel()
+    driver = CanBridgeDriver(
+        "virtual", where, FINGERS, sequence="electrodes", clock=clock, wall_clock=clock
+    )
+    twin = StampingTwin(
+        "virtual", where, iter(hand), sequence="electrodes", faults=faults, clock=clock
+    )
+    with driver, twin:
 
-    @contextlib.contextmanager
-    def link(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver, Step]]:
-        clock, where = Clock(), channel()
-        driver = CanBridgeDriver(
-            "virtual",
-            where,
-            FINGERS,
-            format=frame_format,
-            sequence="electrodes",
-            clock=clock,
-            wall_clock=clock,
-        )
-        twin = StampingTwin(
-            "virtual",
-            where,
-            iter(hand),
-            format=frame_format,
-            sequence="electrodes",
-            faults=faults,
-            clock=clock,
-        )
-        with driver, twin:
+        def step() -> None:
+            clock.now_ns += 10 * MS
+            twin.send_sweep()
 
-            def step() -> None:
-                clock.now_ns += 10 * MS
-                twin.send_sweep()
-
-            yield driver, step
-
-    return link
+        yield driver, step
 
 
 @contextlib.contextmanager
@@ -143,12 +127,11 @@ def joints(_hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Dri
 
 LINKS: dict[str, Callable[[Hand, Path, LinkFaults], Link]] = {
     "spi": spi,
-    "can": can("syntouch"),
-    "can fd": can("sweep_fd"),
+    "can": can,
     "palm": palm,
     "joints": joints,
 }
-STEPS_PER_S = {"spi": 100, "can": 100, "can fd": 100, "palm": 1000, "joints": 100}
+STEPS_PER_S = {"spi": 100, "can": 100, "palm": 1000, "joints": 100}
 
 
 def listen(driver: Driver, step: Step, steps: int, statistics: ElectrodeStatistics) -> None:

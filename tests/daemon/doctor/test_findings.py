@@ -15,7 +15,7 @@ from graspd.daemon.doctor.finding import Cause, Level
 from graspd.daemon.doctor.link import COUNTERS, counter_findings, device_findings, rate_finding
 from graspd.daemon.record.player import McapCounters
 from graspd.drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
-from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.joints import JointCounters
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.recordings.faults import ReplayCounters

@@ -42,7 +42,6 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
         {
             "spi": Cause.DAMAGED,
             "can": Cause.DAMAGED,
-            "can fd": Cause.DAMAGED,
             "palm": Cause.DAMAGED,
             "joints": Cause.JOINTS,
         },
@@ -54,7 +53,7 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
     ),
     "frames out of order": (
         LinkFaults(reorder_probability=0.05),
-        dict.fromkeys(("spi", "can", "can fd", "palm"), Cause.OUT_OF_ORDER),
+        dict.fromkeys(("spi", "can", "palm"), Cause.OUT_OF_ORDER),
     ),
     "a link that breaks": (
         LinkFaults(disconnect_every_frames=50),
@@ -62,23 +61,23 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
     ),
     "another protocol version": (
         LinkFaults(wrong_version=True),
-        dict.fromkeys(("spi", "can fd", "palm"), Cause.VERSION),
+        dict.fromkeys(("spi", "palm"), Cause.VERSION),
     ),
     "a dead electrode": (
         LinkFaults(dead_electrodes=((2, 23),)),
-        dict.fromkeys(("spi", "can", "can fd", "palm"), Cause.ELECTRODE_DEAD),
+        dict.fromkeys(("spi", "can", "palm"), Cause.ELECTRODE_DEAD),
     ),
     "one sensor unplugged": (
         LinkFaults(unplugged_fingers=(1,)),
-        dict.fromkeys(("spi", "can", "can fd", "palm"), Cause.SENSOR_ABSENT),
+        dict.fromkeys(("spi", "can", "palm"), Cause.SENSOR_ABSENT),
     ),
     "all sensors unplugged": (
         LinkFaults(unplugged_fingers=(0, 1, 2)),
-        dict.fromkeys(("spi", "can fd", "palm"), Cause.SENSOR_ABSENT),
+        dict.fromkeys(("spi", "palm"), Cause.SENSOR_ABSENT),
     ),
     "a clock that stands": (
         LinkFaults(stuck_clock=True),
-        {"spi": Cause.CLOCK, "can fd": Cause.CLOCK, "palm": Cause.REPEATED},
+        {"spi": Cause.CLOCK, "palm": Cause.REPEATED},
     ),
     "a silent board": (LinkFaults(drop_probability=1.0), dict.fromkeys(LINKS, Cause.SILENT)),
 }

@@ -14,15 +14,13 @@ import pytest
 
 from graspd.drivers.base import TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
-from graspd.drivers.can.formats import CanFormat, SweepFrame, encode_sample
-from graspd.drivers.can.frames import FD, CanFrame
-from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.can.stream import CanDecoder, make_decoder
+from graspd.drivers.can.frames import CanCounters, CanFrame, encode_sample
+from graspd.drivers.can.stream import SampleDecoder
 from graspd.drivers.kernel_stamps import SO_TIMESTAMPNS
 from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
-from tests.drivers.can.can_words import pack_frame, samples, truth, word
+from tests.drivers.can.can_words import pack_frame, samples
 from tests.drivers.one_sweep import tactile
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
@@ -105,12 +103,11 @@ def channel() -> str:
     return f"test-{next(CHANNELS)}"
 
 
-def bridge(where: str, frame_format: str = "syntouch", **options: Any) -> CanBridgeDriver:  # noqa: ANN401
+def bridge(where: str, **options: Any) -> CanBridgeDriver:  # noqa: ANN401
     """A driver on a virtual bus, without the samples that it does not use."""
-    if frame_format == "syntouch":
-        options.setdefault("arbitration_id", SAMPLE_ID)
-        options.setdefault("sequence", "electrodes")
-    return CanBridgeDriver("virtual", where, format=frame_format, **options)
+    options.setdefault("arbitration_id", SAMPLE_ID)
+    options.setdefault("sequence", "electrodes")
+    return CanBridgeDriver("virtual", where, **options)
 
 
 def contact(sweeps: int, seed: int = 0) -> list[Counts]:
@@ -144,15 +141,11 @@ class StampingTwin(CanTwin):
 class TwinLink:
     """Driver and twins on one virtual bus and one clock that tests move, sweep by sweep."""
 
-    def __init__(self, frame_format: str, sequence: str = "electrodes") -> None:
+    def __init__(self, sequence: str = "electrodes") -> None:
         self.clock = Clock()
-        self.where, self.format, self.sequence = channel(), frame_format, sequence
-        self.driver = bridge(
-            self.where, frame_format, sequence=sequence, clock=self.clock, wall_clock=self.clock
-        )
+        self.where, self.sequence = channel(), sequence
+        self.driver = bridge(self.where, sequence=sequence, clock=self.clock, wall_clock=self.clock)
         self.readings: list[TactileReading] = []
-        self.sweeps_sent = 65_500
-        """The number of sweep frames wraps in the middle of the longer tests."""
 
     def send(self, counts: Sequence[Counts], faults: LinkFaults = LinkFaults()) -> CanTwin:  # noqa: B008
         """Send sweeps at 100 Hz; the frames of each arrive at once."""
@@ -160,13 +153,10 @@ class TwinLink:
             "virtual",
             self.where,
             iter(counts),
-            format=self.format,
             sequence=self.sequence,
-            first_sweep=self.sweeps_sent,
             faults=faults,
             clock=self.clock,
         )
-        self.sweeps_sent += len(counts)
         with twin:
             for _ in counts:
                 self.clock.now_ns += 10 * MS
@@ -179,34 +169,14 @@ class TwinLink:
 
 
 def decoder(
-    frame_format: CanFormat, arbitration_id: int | None = SAMPLE_ID, **options: int
-) -> tuple[CanDecoder, CanCounters]:
+    arbitration_id: int | None = SAMPLE_ID, data_length: int | None = None
+) -> tuple[SampleDecoder, CanCounters]:
     counters = CanCounters()
-    made = make_decoder(
+    made = SampleDecoder(
         ("ff", "mf", "th"),
         counters,
-        format=frame_format,
         arbitration_id=arbitration_id,
         sequence="electrodes",
-        data_length=options.get("data_length"),
+        data_length=data_length,
     )
     return made, counters
-
-
-def sweep_frames(frame_format: CanFormat, sweep: int) -> list[CanFrame]:
-    """Undamaged frames of one sweep."""
-    if frame_format is CanFormat.SYNTOUCH:
-        return sweep_of_frames(sweep)
-    return [
-        CanFrame(
-            SAMPLE_ID + finger,
-            SweepFrame(
-                finger,
-                sweep % (1 << 16),
-                10_000 * sweep,
-                b"".join(word(int(count)) for count in truth(sweep)[row]),
-            ).to_bytes(),
-            FD,
-        )
-        for row, finger in enumerate((0, 1, 4))
-    ]

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import E1, SEQUENCES
-from graspd.drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
-from graspd.drivers.can.readings import CanCounters
+from graspd.drivers.can.frames import ERROR, EXTENDED, REMOTE, CanCounters, CanFrame
 from graspd.drivers.can.samples import SampleAssembler
 
 # linux/can.h
 EFF_FLAG, RTR_FLAG, ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
-CAN_FRAME, CANFD_FRAME = struct.Struct("=IB3x8s"), struct.Struct("=IBB2x64s")
+CAN_FRAME = struct.Struct("=IB3x8s")
 
 FINGERS = 3
 SLOT_NS = 227_000
@@ -85,6 +84,4 @@ def pack_frame(frame: CanFrame) -> bytes:
     word |= EFF_FLAG if frame.flags & EXTENDED else 0
     word |= RTR_FLAG if frame.flags & REMOTE else 0
     word |= ERR_FLAG if frame.flags & ERROR else 0
-    if frame.flags & FD:
-        return CANFD_FRAME.pack(word, len(frame.data), 0, frame.data)
     return CAN_FRAME.pack(word, len(frame.data), frame.data)

@@ -171,7 +171,7 @@ def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(
 
 def test_a_board_that_falls_silent_is_not_up_and_comes_back_by_itself() -> None:
     """No error tells of it: the bus is there, others even talk on it."""
-    link = TwinLink("syntouch")
+    link = TwinLink()
     driver, clock = link.driver, link.clock
     with driver:
         link.send(contact(8))
@@ -198,7 +198,7 @@ def test_a_board_that_falls_silent_is_not_up_and_comes_back_by_itself() -> None:
 
 
 def test_slow_boards_have_ten_periods() -> None:
-    link = TwinLink("sweep_fd")
+    link = TwinLink()
     with link.driver:
         for sweep in contact(12):
             link.clock.now_ns += 40 * MS
@@ -239,7 +239,7 @@ def test_a_frame_is_as_old_as_its_stamp_by_the_wall_clock(
     received = message(b"\0", 0x7FF)
     received.timestamp = stamp_s
     stand_in(monkeypatch, lambda: ScriptedBus([received]))
-    bus = CanBus("virtual", "x", {}, Clock(7_000_000_000), Clock(100_500_000_000))
+    bus = CanBus("virtual", "x", None, Clock(7_000_000_000), Clock(100_500_000_000))
     bus.open()
     ((_, t_ns, until_ns),) = bus.drain()
     assert t_ns == until_ns == 7_000_000_000 - age_ns
@@ -252,7 +252,7 @@ def test_a_frame_without_a_stamp_came_since_the_bus_was_last_empty(
 ) -> None:
     scripted, clock = ScriptedBus(), Clock(1_000)
     stand_in(monkeypatch, lambda: scripted)
-    bus = CanBus("pcan", "x", {}, clock, Clock(0))
+    bus = CanBus("pcan", "x", None, clock, Clock(0))
     bus.open()
     doubts = []
     for now_ns, frames in ((2_000, 1), (3_000, 0), (5_000, 2)):

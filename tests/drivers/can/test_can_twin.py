@@ -10,10 +10,9 @@ from typing import Any
 import can
 import pytest
 
-from graspd.drivers.base import DriverError, ElectrodeFault, TactileReading
+from graspd.drivers.base import DriverError, TactileReading
 from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.driver import CanBridgeDriver
-from graspd.drivers.can.formats import CanFormat
 from graspd.drivers.link import LinkState
 from graspd.drivers.twins.can import CanTwin
 from graspd.drivers.twins.faults import LinkFaults
@@ -37,7 +36,6 @@ MS = 1_000_000
 @pytest.mark.parametrize(
     "options",
     [
-        {"format": "brand_new"},
         {"rate_hz": 0.0},
         {"rate_hz": 1e6},
         {"faults": LinkFaults(one_byte_at_a_time=True)},
@@ -45,7 +43,7 @@ MS = 1_000_000
         {"faults": LinkFaults(wrong_version=True)},
     ],
 )
-def test_a_twin_refuses_what_its_format_cannot_show(options: Mapping[str, Any]) -> None:
+def test_a_twin_refuses_what_its_frames_cannot_show(options: Mapping[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         CanTwin("virtual", "x", iter(()), **options)
 
@@ -112,10 +110,6 @@ def test_an_interface_that_cannot_be_used_is_refused(
         make(interface, "can0", *arguments)
 
 
-FORMATS = list(CanFormat)
-
-
-@pytest.mark.parametrize("frame_format", FORMATS)
 @pytest.mark.parametrize(
     "faults",
     [
@@ -127,10 +121,8 @@ FORMATS = list(CanFormat)
     ],
     ids=["drop", "duplicate", "reorder", "burst", "disconnect"],
 )
-def test_link_faults_are_counted_one_by_one_and_invent_nothing(
-    frame_format: str, faults: LinkFaults
-) -> None:
-    link = TwinLink(frame_format)
+def test_link_faults_are_counted_one_by_one_and_invent_nothing(faults: LinkFaults) -> None:
+    link = TwinLink()
     before, during, after = contact(2, 1), contact(200, 2), contact(2, 3)
     with link.driver:
         link.send(before)
@@ -163,7 +155,7 @@ def assert_same_tail(readings: Sequence[TactileReading], counts: Sequence[Counts
 
 
 def test_flipped_bits_are_counted_and_never_become_counts() -> None:
-    link = TwinLink("syntouch")
+    link = TwinLink()
     sent = contact(300)
     with link.driver:
         link.send(sent[:2])
@@ -177,9 +169,8 @@ def test_flipped_bits_are_counted_and_never_become_counts() -> None:
     assert_same_tail(link.readings, sent[298:])
 
 
-@pytest.mark.parametrize("frame_format", FORMATS)
-def test_an_unplugged_sensor_is_missing_and_the_others_are_not(frame_format: str) -> None:
-    link = TwinLink(frame_format)
+def test_an_unplugged_sensor_is_missing_and_the_others_are_not() -> None:
+    link = TwinLink()
     with link.driver:
         link.send(contact(20), LinkFaults(unplugged_fingers=(1,)))
     assert len(link.readings) == 20
@@ -191,26 +182,15 @@ def test_an_unplugged_sensor_is_missing_and_the_others_are_not(frame_format: str
     assert link.driver.counters.unplugged_words == 20 * 24
 
 
-def test_a_stuck_clock_is_counted() -> None:
-    link = TwinLink("sweep_fd")
-    with link.driver:
-        link.send(contact(5), LinkFaults(stuck_clock=True))
-    assert link.driver.counters.stuck_ticks == 3 * 4
-    assert not link.readings[0].faults.any()
-    assert len(link.readings) == 5
-    assert all((reading.faults == ElectrodeFault.HELD).all() for reading in link.readings[1:])
-
-
 def assert_same(readings: Sequence[TactileReading], counts: Sequence[Counts]) -> None:
     assert [reading.seq for reading in readings] == list(range(len(counts)))
     assert_same_tail(readings, counts)
 
 
-@pytest.mark.parametrize("frame_format", FORMATS)
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-def test_every_sweep_arrives_count_for_count(frame_format: str, sequence: str) -> None:
+def test_every_sweep_arrives_count_for_count(sequence: str) -> None:
     counts = contact(200)
-    link = TwinLink(frame_format, sequence)
+    link = TwinLink(sequence)
     with link.driver:
         link.send(counts)
         assert_same(link.readings, counts)
@@ -254,14 +234,9 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"format": "brand_new"},
         {"fingers": ("ff", "mf", "rf", "th")},
         {"data_length": 6},
         {"data_length": 9},
-        {"format": "sweep_fd", "data_length": 7},
-        {"format": "sweep_fd", "arbitration_id": 0x7FC},
-        {"data_bitrate": 5_000_000},
-        {"format": "sweep_fd", "data_bitrate": 5_000_000},
     ],
 )
 def test_arguments_out_of_range_are_refused(options: Mapping[str, Any]) -> None:

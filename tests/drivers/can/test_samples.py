@@ -7,7 +7,7 @@ import pytest
 
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.biotac import PAC, SEQUENCES
-from graspd.drivers.can.readings import SweepPeriod
+from graspd.drivers.can.samples import SweepPeriod
 from tests.drivers.can.can_words import (
     FINGERS,
     SLOT_NS,

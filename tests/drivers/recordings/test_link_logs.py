@@ -1,4 +1,4 @@
-"""Link logs and palm packets play as they were; damage costs what is damaged and no more."""
+"""Link logs play as they were; damage costs what is damaged and no more."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from hypothesis import strategies as st
 from graspd.drivers.base import JointReading, RecordingError, TactileReading
 from graspd.drivers.biotac import sample_command
 from graspd.drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
-from graspd.drivers.palm.packet import Palm
 from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
-from graspd.drivers.recordings.palm_file import PalmFile
 from graspd.drivers.recordings.player import RecordedDriver
 from graspd.drivers.recordings.serial_log import (
     Record,
@@ -28,9 +26,7 @@ from graspd.drivers.recordings.serial_log import (
 )
 from graspd.drivers.spi.driver import LineEvent
 from graspd.drivers.spi.messages import FrameParser
-from graspd.drivers.twins.datagrams import PalmTwin
-from tests.drivers.one_sweep import tactile
-from tests.drivers.palm.palm_stream import MS, datagrams, rows
+from tests.drivers.palm.palm_stream import MS
 from tests.kit.clock import Clock
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -298,69 +294,13 @@ def test_an_error_waits_until_what_is_before_it_was_taken() -> None:
     assert player.exhausted
 
 
-@pytest.mark.parametrize(("palm", "appended"), [(Palm.PALM_0220, bytes(12)), (Palm.PALM_0250, b"")])
-def test_a_file_of_packets_plays_count_for_count(
-    tmp_path: Path, palm: Palm, appended: bytes
-) -> None:
-    twin = PalmTwin(rows(40), palm=palm)
-    path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(packet.to_bytes() + appended for packet in twin.packets()) + bytes(5))
-    readings = []
-    clock = Clock()
-    with PalmFile(path, clock=clock) as driver:
-        while not driver.exhausted:
-            clock.now_ns = driver.due_ns() or clock.now_ns
-            readings += tactile(driver.read_ready())
-        assert driver.stream.counters.bad_lengths == 1  # the file ends in the middle of a packet
-        assert driver.due_ns() is None
-    assert np.array_equal([reading.counts for reading in readings], rows(40))
-
-
-@pytest.mark.parametrize(
-    ("good", "nonsense", "plays"),
-    # One packet and 20 bytes may be a packet with a CAN record (12 bytes) and 8 bytes.
-    [(14, 14 * 220, True), (13, 15 * 220, False), (1, 12, True), (1, 20, False)],
-)
-def test_half_of_the_packets_of_a_file_make_sense_and_with_one_length(
-    tmp_path: Path, good: int, nonsense: int, plays: bool
-) -> None:
-    path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(datagrams(1)[:good]) + bytes(nonsense))
-    driver = PalmFile(path)
-    if plays:
-        driver.open()
-        driver.close()
-    else:
-        with pytest.raises(RecordingError, match="not a file of palm packets"):
-            driver.open()
-
-
-def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
-    clock = Clock()
-    path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(datagrams(10)))
-    times = []
-    with PalmFile(path, clock=clock) as driver:
-        start_ns = clock.now_ns
-        while (due_ns := driver.due_ns()) is not None:
-            clock.now_ns = due_ns
-            times += [reading.t_ns - start_ns for reading in driver.read_ready()]
-    assert times == [(14 * number + 13) * MS for number in range(10)]
-
-
 def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
-    path = tmp_path / "hand.palm"
+    path = tmp_path / "pipe.log"
     os.mkfifo(path)
     with pytest.raises(RecordingError, match="is not a regular file"):
-        PalmFile(path).open()
+        CanLog([path], ("ff",)).open()
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no packets at all" * 500, bytes(22000)])
-def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None) -> None:
-    path = tmp_path / "hand.palm"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(RecordingError, match=r"hand\.palm"):
-        PalmFile(path).open()
+def test_a_folder_is_no_log(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="is a directory"):
-        PalmFile(tmp_path).open()
+        CanLog([tmp_path], ("ff",)).open()

@@ -174,18 +174,6 @@ class Host:
             if struct.unpack_from("<I", payload, 5)[0] == nonce:
                 return payload
 
-    def first_sweeps(self, count: int) -> list[bytes]:
-        """Sweeps 0 to `count` - 1 of a run; begun anew where a host that stalled lost some."""
-        found: dict[int, bytes] = {}
-        while not found.keys() >= set(range(count)):
-            self.send(frame(STOP), frame(START))
-            for kind, payload in self.frames():
-                if kind == SWEEP:
-                    found[seq_of(payload)] = payload
-                    if seq_of(payload) >= count - 1:
-                        break
-        return [found[seq] for seq in range(count)]
-
 
 StartBridge = Callable[..., Host]
 """Starts a bridge with the given options; `stdin` is what it may read."""

@@ -6,7 +6,6 @@ import os
 import random
 import re
 import select
-import shutil
 import signal
 import struct
 import subprocess
@@ -22,7 +21,6 @@ from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.biotac import ERROR_WORDS
 from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.spi.messages import FIRMWARE
-from tests.conftest import ROOT
 from tests.drivers.one_sweep import tactile
 from tests.drivers.spi.bridge_c import (
     BRIDGE,
@@ -82,41 +80,6 @@ def test_the_core_needs_no_heap_and_no_floating_point() -> None:
     for source in sorted((BRIDGE / "src").glob("*.[ch]")):
         code = re.sub(r"/\*.*?\*/", "", source.read_text(), flags=re.DOTALL)
         assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|float|double)\b", code), source
-
-
-ARDUINO = ROOT / "tests" / "emulated" / "firmware" / "arduino"
-STAND_INS = {
-    "hardware/gpio.h": """
-        #include <stdint.h>
-        void gpio_pull_up(unsigned pin);
-        void gpio_put_masked(uint32_t mask, uint32_t value);
-        """,
-    "hardware/timer.h": """
-        #include <stdint.h>
-        uint64_t time_us_64();
-        void busy_wait_us_32(uint32_t us);
-        """,
-    "pico/unique_id.h": """
-        #include <stdint.h>
-        struct pico_unique_board_id_t { uint8_t id[8]; };
-        void pico_get_unique_board_id(pico_unique_board_id_t *id);
-        """,
-}
-"""As much of the pico-sdk's headers as the sketch uses; those of the Arduino core are ARDUINO's."""
-
-
-@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler (c++)")
-def test_the_sketch_compiles_against_stand_ins(tmp_path: Path) -> None:
-    for name, text in STAND_INS.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("#pragma once\n" + text)
-    sketch = BRIDGE / "rp2040" / "graspd_bridge" / "graspd_bridge.ino"
-    flags = ["-std=gnu++17", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-x", "c++"]
-    includes = [f"-I{BRIDGE}/src", f"-I{ARDUINO}", f"-I{tmp_path}", "-include", "Arduino.h"]
-    done = subprocess.run(
-        ["c++", *flags, *includes, str(sketch)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_commands_are_those_of_the_manual(bridge_probe: Path) -> None:

@@ -8,33 +8,24 @@ import cantools.database
 import numpy as np
 import pytest
 from cantools.database.can.database import Database
-from hypothesis import given
-from hypothesis import strategies as st
 
-from graspd.drivers.base import FINGERS, ElectrodeFault, TactileReading
-from graspd.drivers.can.formats import (
-    SWEEP_BASE_ID,
-    CanFormat,
-    Reject,
-    SweepFrame,
-    SweepStatus,
-    encode_sample,
-    parse_sample,
-    parse_sweep,
-)
+from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.can.frames import (
     ERROR,
     EXTENDED,
     FD,
     REMOTE,
+    CanCounters,
     CanFrame,
+    Reject,
     describe_error,
+    encode_sample,
     is_bus_off,
     is_overflow,
+    parse_sample,
     unpack_frame,
 )
-from graspd.drivers.can.readings import CanCounters
-from graspd.drivers.can.stream import make_decoder
+from graspd.drivers.can.stream import SampleDecoder
 from graspd.drivers.twins.can import SAMPLE_ID
 from tests.conftest import ROOT
 from tests.drivers.can.can_standin import decoder
@@ -42,8 +33,6 @@ from tests.drivers.can.can_words import samples, truth, word
 
 E1_SAMPLE = bytes.fromhex("A2 A251 A8C8 94B9")
 """Electrode 1 of three sensors: 2602, 2713, 2391."""
-SWEEP_EXAMPLE = bytes.fromhex("01 04 3412 40420F00" + "A251" * 24 + "0000 000000000000")
-"""The example in deploy/can/PROTOCOL.md."""
 
 
 @pytest.fixture(scope="module")
@@ -54,33 +43,12 @@ def dbc() -> Database:
 
 
 def test_the_real_formats_sample_is_read_and_written() -> None:
-    sample = parse_sample(E1_SAMPLE, 3, 7)
+    sample = parse_sample(CanFrame(0x100, E1_SAMPLE), 3, 7)
     assert not isinstance(sample, Reject)
     channel, words = sample
     assert channel == 17
     assert words == word(2602) + word(2713) + word(2391)
     assert encode_sample(17, words) == E1_SAMPLE
-
-
-def test_the_protocols_example_of_a_sweep_frame_is_read_and_written() -> None:
-    sweep = SweepFrame(4, 0x1234, 1_000_000, bytes.fromhex("A251") * 24)
-    assert len(SWEEP_EXAMPLE) == 64
-    assert parse_sweep(SWEEP_EXAMPLE) == sweep
-    assert sweep.to_bytes() == SWEEP_EXAMPLE
-
-
-@given(
-    st.integers(0, 4),
-    st.integers(0, 65535),
-    st.integers(0, (1 << 32) - 1),
-    st.binary(min_size=48, max_size=48),
-    st.integers(0, 7),
-)
-def test_every_sweep_frame_comes_back_as_it_went(
-    finger: int, sequence: int, tick_us: int, words: bytes, status: int
-) -> None:
-    sweep = SweepFrame(finger, sequence, tick_us, words, status)
-    assert parse_sweep(sweep.to_bytes()) == sweep
 
 
 def test_the_dbc_file_reads_the_real_formats_sample(dbc: Database) -> None:
@@ -99,29 +67,6 @@ def test_the_dbc_file_knows_every_channel_of_the_manual(dbc: Database) -> None:
         assert values[f"{name}_S2"] == 0xA8C8
 
 
-@pytest.mark.parametrize("finger", FINGERS)
-def test_the_dbc_file_reads_a_sweep_frame_field_by_field(dbc: Database, finger: str) -> None:
-    message = dbc.get_message_by_name(f"Sweep_{finger}")
-    words = b"".join(word(100 * electrode) for electrode in range(24))
-    number = FINGERS.index(finger)
-    status = int(SweepStatus.ABSENT | SweepStatus.OVERRUN)
-    values = message.decode(SweepFrame(number, 513, 70_000, words, status).to_bytes())
-    assert (message.frame_id, message.length, message.is_fd) == (SWEEP_BASE_ID + number, 64, True)
-    assert values == {
-        "Version": 1,
-        "Finger": finger,
-        "Sequence": 513,
-        "Tick": 70_000,
-        "Absent": 1,
-        "Repeated": 0,
-        "Overrun": 1,
-        **{
-            f"E{electrode + 1}": int.from_bytes(word(100 * electrode), "big")
-            for electrode in range(24)
-        },
-    }
-
-
 @pytest.mark.parametrize(
     ("raw", "frame"),
     [
@@ -132,7 +77,6 @@ def test_the_dbc_file_reads_a_sweep_frame_field_by_field(dbc: Database, finger: 
             "40000020 08 000000 0000000000000000",
             CanFrame(0x40, bytes(8), ERROR),
         ),
-        ("B0050000 40 01 0000" + "55" * 64, CanFrame(0x5B0, b"\x55" * 64, FD)),
     ],
 )
 def test_the_kernels_structs_are_read(raw: str, frame: CanFrame) -> None:
@@ -143,9 +87,8 @@ def test_the_kernels_structs_are_read(raw: str, frame: CanFrame) -> None:
 @pytest.mark.parametrize(
     "raw",
     [
-        *(bytes(length) for length in (0, 15, 17, 71, 73)),
+        *(bytes(length) for length in (0, 15, 17, 72)),  # 72: of CAN FD
         bytes.fromhex("00010000 09") + bytes(11),
-        bytes.fromhex("00010000 41") + bytes(67),
     ],
 )
 def test_what_is_no_struct_of_the_kernel_is_no_frame(raw: bytes) -> None:
@@ -192,38 +135,7 @@ def test_error_frames_say_what_happened() -> None:
     ],
 )
 def test_every_dropped_sample_frame_is_counted_by_its_reason(frame: CanFrame, counter: str) -> None:
-    made, counters = decoder(CanFormat.SYNTOUCH)
-    made.push(frame, 0)
-    assert getattr(counters, counter) == 1
-    assert sum(counters.as_dict().values()) == 1
-
-
-def changed(at: int, value: int) -> bytes:
-    return SWEEP_EXAMPLE[:at] + bytes((value,)) + SWEEP_EXAMPLE[at + 1 :]
-
-
-@pytest.mark.parametrize(
-    ("frame", "counter"),
-    [
-        (CanFrame(0x104, SWEEP_EXAMPLE, FD), "accepted_frames"),
-        (CanFrame(0x105, SWEEP_EXAMPLE, FD), "foreign_frames"),
-        (CanFrame(0x102, SWEEP_EXAMPLE, FD), "foreign_frames"),  # rf, which the scene lacks
-        (CanFrame(0x104, SWEEP_EXAMPLE, FD | EXTENDED), "foreign_frames"),
-        (CanFrame(0x100, SWEEP_EXAMPLE, FD), "malformed_frames"),  # the id of ff, the data of th
-        (CanFrame(0x104, SWEEP_EXAMPLE), "malformed_frames"),
-        *((CanFrame(0x104, changed(0, it), FD), "unknown_versions") for it in (0, 2)),
-        *(
-            (CanFrame(0x104, changed(at, value), FD), "malformed_frames")
-            for at, value in ((1, 2), (1, 5), (56, 8), (57, 1), (58, 1), (63, 1), (63, 0x80))
-        ),
-        *(
-            (CanFrame(0x104, SWEEP_EXAMPLE[:length], FD), "wrong_length_frames")
-            for length in (0, 1, 8, 48, 63)
-        ),
-    ],
-)
-def test_every_dropped_sweep_frame_is_counted_by_its_reason(frame: CanFrame, counter: str) -> None:
-    made, counters = decoder(CanFormat.SWEEP_FD)
+    made, counters = decoder()
     made.push(frame, 0)
     assert getattr(counters, counter) == 1
     assert sum(counters.as_dict().values()) == 1
@@ -242,7 +154,7 @@ def test_every_dropped_sweep_frame_is_counted_by_its_reason(frame: CanFrame, cou
     ],
 )
 def test_without_an_id_that_of_the_first_sound_sample_is_taken(unsound: CanFrame) -> None:
-    made, counters = decoder(CanFormat.SYNTOUCH, None)
+    made, counters = decoder(None)
     made.push(unsound, 0)
     assert made.arbitration_id is None
     assert counters.foreign_frames == 1
@@ -258,7 +170,7 @@ def test_without_an_id_that_of_the_first_sound_sample_is_taken(unsound: CanFrame
 
 @pytest.mark.parametrize("configured", [None, 0x100])
 def test_an_id_that_was_heard_is_forgotten_with_the_link(configured: int | None) -> None:
-    made, counters = decoder(CanFormat.SYNTOUCH, configured)
+    made, counters = decoder(configured)
     made.push(CanFrame(0x100, E1_SAMPLE), 0)
     made.interrupt()
     assert made.arbitration_id == configured
@@ -267,7 +179,7 @@ def test_an_id_that_was_heard_is_forgotten_with_the_link(configured: int | None)
 
 
 def test_a_board_that_pads_its_frames_is_read_when_told_so() -> None:
-    made, counters = decoder(CanFormat.SYNTOUCH, data_length=8)
+    made, counters = decoder(data_length=8)
     readings: list[TactileReading] = []
     for channel, words, t_ns in samples(0):
         readings += made.push(CanFrame(SAMPLE_ID, encode_sample(channel, words) + b"\x55"), t_ns)
@@ -284,7 +196,7 @@ def with_sensors(
 ) -> tuple[list[TactileReading], CanCounters]:
     """What becomes of two sweeps of `ORDER`. `spoilt`: words of channels of the first sweep."""
     counters = CanCounters()
-    made = make_decoder(
+    made = SampleDecoder(
         fingers, counters, sensors=ORDER, arbitration_id=SAMPLE_ID, sequence="electrodes"
     )
     changed = [(at, (spoilt or {}).get(at, words), t_ns) for at, words, t_ns in samples(0)]
@@ -321,15 +233,4 @@ def test_a_damaged_word_is_flagged_at_its_finger_only(
 )
 def test_sensors_that_cannot_be_are_refused(sensors: Sequence[str], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        make_decoder(("ff", "mf", "th"), CanCounters(), sensors=sensors)
-
-
-def test_a_tick_that_stands_and_a_sweep_that_began_late_are_counted() -> None:
-    made, counters = decoder(CanFormat.SWEEP_FD)
-    for sequence in range(3):
-        for finger in (0, 1, 4):
-            sweep = SweepFrame(finger, sequence, 77, word(2602) * 24, SweepStatus.OVERRUN)
-            made.push(CanFrame(SAMPLE_ID + finger, sweep.to_bytes(), FD), sequence)
-    assert (counters.stuck_ticks, counters.faulty_readings) == (6, 2)
-    assert counters.overruns == 9
-    assert counters.readings == 3
+        SampleDecoder(("ff", "mf", "th"), CanCounters(), sensors=sensors)
