@@ -67,6 +67,7 @@ class Cause(StrEnum):
     SOCKET_DENIED = "socket-denied"
     SOCKET_HELD = "socket-held"
     SOCKET_GROUP = "socket-group"
+    SOCKET_USER = "socket-user"
     REALTIME = "realtime"
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from graspd.daemon.assembly import assembly
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.finding import Cause, Finding, Level, fine
+from graspd.daemon.publish.listener import PublishError, user_id
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
@@ -106,7 +107,8 @@ def socket_findings(wanted: Scene) -> list[Finding]:
     for name, endpoint, group in sockets:
         scheme, _, address = endpoint.partition("://")
         if scheme == "ipc":
-            told = (*_of_socket(name, Path(address)), *_of_group(name, group))
+            users = () if name == "publish" else _of_users(wanted)
+            told = (*_of_socket(name, Path(address)), *_of_group(name, group), *users)
         else:
             told = tuple(_of_port(name, address))
         for finding in told:
@@ -217,3 +219,12 @@ def _of_group(name: str, group: str | None) -> Iterator[Finding]:
         what = f"{name}: you are not in the group {group} and cannot give the socket to it"
         advice = f"sudo usermod -aG {group} $USER, then log in again"
         yield Finding(Level.WARNING, what, Cause.SOCKET_GROUP, advice)
+
+
+def _of_users(wanted: Scene) -> Iterator[Finding]:
+    for user in () if wanted.ask is None else wanted.ask.tell or ():
+        try:
+            user_id(user)
+        except PublishError as problem:
+            advice = "getent passwd lists users"
+            yield Finding(Level.ERROR, str(problem), Cause.SOCKET_USER, advice)

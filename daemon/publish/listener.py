@@ -101,11 +101,11 @@ class Listener:
 
 
 def user_id(name: str) -> int:
-    """Return the number of a user, by name or number. Raises `PublishError`."""
+    """Return the number of a user of `ask.tell`, by name or number. Raises `PublishError`."""
     try:
         return int(name) if name.isdecimal() else pwd.getpwnam(name).pw_uid
-    except KeyError:
-        raise PublishError(f"there is no user {name}") from None
+    except (KeyError, ValueError):  # the second one for a number of over 4300 digits
+        raise PublishError(f"ask.tell: there is no user {name}") from None
 
 
 def _listening(endpoint: str) -> socket.socket:

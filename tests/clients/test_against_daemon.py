@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from deploy.clients.python.graspd_client import Client, Keys, Outcome
+from deploy.clients.python.graspd_client import Client, Keys, Outcome, Verdict
 from graspd.daemon.publish.keys import make
 from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome
 from tests.clients.bench import Daemon, free_endpoint
@@ -90,7 +90,7 @@ def test_a_supervised_grasp_is_never_early(tmp_path: Path) -> None:
 
 def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: Path) -> None:
     with (
-        Daemon(tmp_path) as daemon,
+        Daemon(tmp_path, whole_grasps=True) as daemon,
         Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as graspd,
         zmq.Context() as context,
         context.socket(zmq.SUB) as listener,
@@ -99,14 +99,24 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
         listener.connect(daemon.endpoint)
         for topic in ("outcome.right", "verdict.right"):
             listener.subscribe(topic)
-        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
         assert listener.poll(100_000)  # so its first subscription has been taken, too
-        lifted_on = graspd.verdict()
-        assert graspd.tell(lifted_on, Outcome.SLIPPED, "mug", wait_s=10.0)
+        lifted: list[Verdict] = []
+
+        def may_i_lift() -> bool:
+            answer = graspd.may_i_lift(1.0)
+            lifted.append(answer.verdict)
+            return bool(answer)
+
+        wait_until(may_i_lift)
+        lifted_on = lifted[-1]
         grasp = [str(lifted_on.boot_id), str(lifted_on.grasp)]
-        tell = [str(lift_gate), "--tell", daemon.endpoint, daemon.ask_endpoint, *grasp]
-        assert subprocess.run([*tell, "stable"], check=False, timeout=200).returncode == 1
-        subprocess.run([*tell, "slip"], check=True, timeout=200)
+        tell = [str(lift_gate), "--tell", daemon.endpoint, daemon.ask_endpoint, *grasp, "stable"]
+        refused = subprocess.run(tell, check=False, timeout=200, capture_output=True, text=True)
+        assert (refused.returncode, refused.stdout[:9]) == (1, "not yours")
+        assert graspd.tell(lifted_on, Outcome.SLIPPED, "mug", wait_s=10.0)
+        assert graspd.tell(lifted_on, Outcome.SLIPPED, wait_s=10.0)
+        contradicts = graspd.tell(lifted_on, Outcome.HELD, wait_s=10.0)
+        assert contradicts.why.startswith("contradicts")
         heard: list[OutcomeMessage] = []
         verdicts = 0
         while verdicts < 20 or not heard:

@@ -285,6 +285,12 @@ SURROUNDINGS: dict[str, tuple[str, str, str]] = {
         "socket-group",
         "sudo groupadd --system nonesuch",
     ),
+    "no such user": (
+        '[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+        '[ask]\nendpoint = "ipc://{folder}/ask"\ntell = ["root", "nonesuch"]\n',
+        "socket-user",
+        "getent passwd",
+    ),
 }
 
 

@@ -390,12 +390,13 @@ def wanted(folder: Path, tell: list[str], ask: str, curve: bool = False) -> scen
 def test_tellers_are_users_or_keys_of_the_scene(tmp_path: Path) -> None:
     make(tmp_path, "daemon")
     public = load_pair(make(tmp_path / "clients", "controller")[1])[0]
+    make(tmp_path / "clients", "dashboard")
     for ask, curve, credentials in (
         (f"ipc://{tmp_path}/ask", False, (b"user 12345", b"user 1", b"", b"key x")),
         (
             f"tcp://127.0.0.1:{free_port()}",
             True,
-            (b"key " + public, b"", b"key " + b"0" * 40, b"user 0"),
+            (b"key controller", b"", b"key ", b"key dashboard", b"key " + public, b"user 0"),
         ),
     ):
         tell = ["controller"] if curve else ["root", "12345"]

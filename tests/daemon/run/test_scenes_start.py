@@ -21,6 +21,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly
 from graspd.daemon.commands import check
 from graspd.daemon.doctor import surroundings
+from graspd.daemon.publish.keys import make
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.run.runner import enter_realtime, prepare
 from graspd.daemon.scene.scene import Scene
@@ -52,8 +53,12 @@ PLACES: dict[str, tuple[list[Any], list[Any]]] = {
     "file": (["F/kept.json"], ["F/absent/kept.json", "F/folder"]),
     "directory": (["F/record"], ["F/a-file", "/proc/absent"]),
     "group": (["root"], ["absent"]),
-    "secret_key": ([], ["absent"]),
-    "clients": (["F/folder"], []),
+    "tell": (
+        [["daemon"], ["0"], ["12345", "root"], []],
+        [["absent"], ["root", "-1"], ["9" * 5000]],
+    ),
+    "secret_key": (["F/keys/daemon.key_secret"], ["absent"]),
+    "clients": (["F/folder", "F/keys"], ["F/absent"]),
     "only_from": (["127.0.0.1", "::1"], []),
     "fingers": ([["ff", "mf", "th"], ["ff", "th"]], [["th", "ff"]]),
     "sensors": ([["ff", "mf", "th"]], [["ff"]]),
@@ -176,6 +181,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]
     """A folder with what scenes name, and a free port. No service makes folders here."""
     folder = tmp_path_factory.mktemp("s")
     (folder / "folder").mkdir()
+    make(folder / "keys", "daemon")
     (folder / "a-file").write_text("x")
     (folder / "link").symlink_to(folder)
     with socket.socket() as probe:
