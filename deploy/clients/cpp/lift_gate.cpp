@@ -5,9 +5,9 @@
 //                                                     one question; a person watches the lift; the
 //                                                     hand must have been still for so long
 //     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]
-//                                                     `boot` and `grasp` are those of the answer to
-//                                                     a question without ASK_ENDPOINT: who asks
-//                                                     there must tell too
+//                                                     shows the answer to a client that never got a
+//                                                     yes: `not yours`. A controller tells by the
+//                                                     client that asked (`tell` below)
 //     lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]
 //                                                     each change of the verdict, until it is killed
 #include "graspd_client.hpp"
