@@ -51,7 +51,7 @@ function _shtab_graspd_using
 end
 
 set -g _shtab_graspd_commands run replay watch scene check doctor twin 'twin spi' 'twin can' 'twin palm' 'twin joints' data schema models session 'session show' 'session reset' 'session settle' 'session seed' export-grasps keys 'keys make' 'keys list' train evaluate report 'report error-vs-time' 'report stability' 'report worth' completion manual
-set -g _shtab_graspd_opts_with_value --arbitration-id --as --bit-flip --burst --card --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --format --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
+set -g _shtab_graspd_opts_with_value --arbitration-id --as --bit-flip --burst --card --channel --connect --dask --data --dead --dir --disconnect-every --drop --duplicate --example --explore --folds --from --gate --interface --jobs --keys --listen --max-slip-when-stable --min-confidence --model --models --name --object --only --out --own --path --plots --port --protocol --publish --rate --recording --reorder --results --scene --seed --seeds --sequence --server-key --session --speed --table --to --unplugged --url --wait --warm-up
 
 complete -c graspd -e
 complete -c graspd -f

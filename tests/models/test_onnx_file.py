@@ -132,7 +132,7 @@ def test_the_zoo_may_be_used(name: str) -> None:
 
 def test_operators_are_those_of_zoo_and_training() -> None:
     """The zoo has no network with pooling, no blend and no boosting; training has."""
-    pytest.importorskip("torch", reason="needs the train extra")
+    pytest.importorskip("torch", reason="needs the extra `train`")
     from graspd.models.training.fitting.trained import fit
     from graspd.models.training.systems.registry import SYSTEMS, with_recipes
 

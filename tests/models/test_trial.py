@@ -96,7 +96,7 @@ def damaged(content: bytes) -> bytes:
 
 
 def test_a_tree_with_a_cycle_is_refused(tmp_path: Path) -> None:
-    pytest.importorskip("onnx", reason="needs the train extra")
+    pytest.importorskip("onnx", reason="needs the extra `train`")
     path = hostile.cyclic(tmp_path)
     for load in (trial.load, TactileModel):
         with pytest.raises(ModelError, match="has a tree with a cycle"):
