@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from graspd.daemon.process.text import markdown_table
-from tests.bench.attacks import doors, files, hands, rings, standing, who
+from tests.bench.attacks import doors, files, hands, hang_ups, rings, standing, who
 from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import end_children_at_sigterm
 from tests.daemon.processes import before_others
@@ -30,7 +30,7 @@ ATTACKS: Final[dict[str, Callable[[Plan], Outcome]]] = {
     "connections-curve": doors.connections,
     "noise-ipc": doors.noises,
     "flood": doors.flood,
-    "ping-hangup": doors.hang_ups,
+    "ping-hangup": hang_ups.hang_ups,
     "scene-nested": files.nested_scenes,
     "sighup-storm": files.sighup_storm,
     "model-giant": files.giant_model,

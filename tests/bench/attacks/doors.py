@@ -20,7 +20,7 @@ from pathlib import Path
 
 import zmq
 
-from graspd.daemon.publish.keys import load_pair, make
+from graspd.daemon.publish.keys import make
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import (
@@ -58,24 +58,6 @@ READY_DEALER = bytes.fromhex("04 1c 05") + b"READY\x0bSocket-Type\x00\x00\x00\x0
 AS_SUB = GREETING + READY + b"SUB"
 AS_DEALER = GREETING + READY_DEALER
 QUESTION = bytes.fromhex("00 05") + b"judge"
-PING = bytes.fromhex("04 07 04") + b"PING" + bytes(2)
-SUBSCRIPTIONS = b"".join(bytes([0, 2, 1, 97 + number]) for number in range(12))
-HANG_UPS = (
-    (b"", b"", PING),
-    (GREETING[:12], b"", PING),
-    (GREETING, b"\x04", PING),
-    (AS_SUB, b"READY", PING),
-    (AS_SUB, b"READY", SUBSCRIPTIONS + PING),
-    (AS_SUB, b"READY", SUBSCRIPTIONS * 50 + PING),
-    (AS_DEALER, b"READY", (b"\0\5clock") * 40 + PING),
-    (AS_DEALER, b"READY", (b"\0\5clock") * 40 + PING * 20),
-)
-"""What a peer says, what it waits for, and what it says before it hangs up."""
-HANG_UPS_AT_ONCE = 50
-KEPT_SUBSCRIPTIONS = 300
-"""Of a peer with a key, more than the daemon's process takes at once."""
-RESTART_S = 3.0
-"""Longest start of libzmq's process."""
 KEEPS_RULES = (
     (0, AS_SUB, bytes.fromhex("00 02 01 78 00 02 00 78") * 300),
     (1, AS_DEALER, bytes.fromhex("00 02 78 78") * 500),
@@ -231,14 +213,14 @@ def flood(plan: Plan) -> Outcome:
     tried, added_ms, share = 0, 0.0, 1.0
     with hand(plan.folder) as daemon:
         for _ in plan.rounds():
-            rest_ms, _ = _cost(daemon)
+            rest_ms, _ = cost(daemon)
             peers = [
                 partial(_keep_rules, daemon.doors[door], first, then)
                 for door, first, then in KEEPS_RULES * 2
             ]
             with at_work(*peers):
                 time.sleep(1.0)
-                busy_ms, heard = _cost(daemon)
+                busy_ms, heard = cost(daemon)
             added_ms = max(added_ms, busy_ms - rest_ms)
             share = min(share, heard)
             tried += len(peers)
@@ -246,7 +228,7 @@ def flood(plan: Plan) -> Outcome:
         return daemon.outcome(tried, added_ms <= ADDED_MAX_MS and share >= HEARD_MIN, said)
 
 
-def _cost(daemon: Hand) -> tuple[float, float]:
+def cost(daemon: Hand) -> tuple[float, float]:
     """Processor time of the loop's thread for each verdict, ms, and share of verdicts heard."""
     daemon.friend.drain()
     path = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/schedstat")
@@ -335,75 +317,6 @@ def as_nobody(endpoint: str, name: bytes) -> Iterator[Tells]:
 
         yield tell
         says.close()
-
-
-def hang_ups(plan: Plan) -> Outcome:
-    """Fill a queue, send a heartbeat and hang up, in every state of the handshake."""
-    tried, ends, share = 0, 0, 1.0
-    for folder in plan.folders():
-        for number, (tcp, keyed) in enumerate(((False, False), (True, False), (True, True))):
-            place = folder / str(number)
-            place.mkdir()
-            with hand(place, curve=keyed, tcp=tcp) as daemon:
-                _, rest_hz = _cost(daemon)
-                first, began_s = daemon.friend.wait_for(lambda _: True), time.monotonic()
-                for door in daemon.doors:
-                    for says in HANG_UPS:
-                        tried += hang_up(door, *says)
-                if keyed:
-                    tried += _hang_up_with_keys(daemon.publish, place)
-                time.sleep(RESTART_S)
-                daemon.friend.drain()
-                last = daemon.friend.wait_for(lambda _: True)
-                took_s = time.monotonic() - began_s
-                share = min(share, (last.seq - first.seq) / took_s / rest_hz)
-                outcome = daemon.outcome(tried)
-                ends += (place / "log").read_text().count("process has ended")
-                if not outcome.held:
-                    return outcome
-    said = f"{ends} ends of libzmq's process, {100 * share:.0f} % of the verdicts made, "
-    return Outcome(tried, said + "the daemon goes on and is heard again", share >= HEARD_MIN)
-
-
-def hang_up(door: Connect, first: bytes, awaited: bytes, then: bytes) -> int:
-    """Return the number of peers that said all."""
-    with contextlib.ExitStack() as stack:
-        peers = []
-        for _ in range(HANG_UPS_AT_ONCE):
-            with contextlib.suppress(OSError):
-                peers.append(stack.enter_context(door()))
-                peers[-1].settimeout(2.0)
-                peers[-1].sendall(first)
-        said = 0
-        for peer in peers:
-            with contextlib.suppress(OSError):
-                greeted = b""
-                while awaited not in greeted:
-                    more = peer.recv(1 << 10)
-                    if not more:
-                        raise ConnectionResetError
-                    greeted += more
-                peer.sendall(then)
-                said += 1
-        return said
-
-
-def _hang_up_with_keys(endpoint: str, folder: Path) -> int:
-    """The same by peers that may connect: libzmq sends the heartbeats."""
-    own, server = load_pair(folder / "clients" / "friend.key_secret"), folder / "daemon.key_secret"
-    with zmq.Context() as context:
-        for _ in range(HANG_UPS_AT_ONCE):
-            with context.socket(zmq.SUB) as peer:
-                peer.linger = 0
-                peer.heartbeat_ivl = 1
-                peer.curve_publickey, peer.curve_secretkey = own
-                peer.curve_serverkey = load_pair(server)[0]
-                for number in range(KEPT_SUBSCRIPTIONS):
-                    peer.subscribe(b"%d" % number)
-                peer.subscribe("verdict.")
-                peer.connect(endpoint)
-                peer.poll(1000)
-    return HANG_UPS_AT_ONCE
 
 
 def forged(plan: Plan) -> Outcome:

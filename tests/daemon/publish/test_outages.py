@@ -21,7 +21,8 @@ from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.joints import JointMessage
 from graspd.drivers.twins.spi import SpiTwin
-from tests.bench.attacks.doors import HANG_UPS, hand, hang_up
+from tests.bench.attacks.doors import hand
+from tests.bench.attacks.hang_ups import HANG_UPS, hang_up
 from tests.bench.live import PATIENCE_S, Subscriber, held_grasp, running, spi_section
 from tests.daemon.processes import before_others
 from tests.ports import free_port

@@ -1,0 +1,203 @@
+"""What the kernel and the handshake say of who asks, and what the scene lets them do."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+
+from graspd.daemon import scene
+from graspd.daemon.publish.door import Door
+from graspd.daemon.publish.keys import load_pair, make
+from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.porter import Frames
+from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.trust.lift_book import GraspId, LiftBook
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.daemon.publish.doors import WAIT_MS, Asked, KeyedDoor, Peers, published
+from tests.kit.waiting import wait_until
+from tests.ports import free_port
+
+ROBOT, STRANGER = b"user 1000", b"user 1001"
+NAME, OTHER = b"controller-16byt", b"another-16-bytes"
+SEVENTH = GraspId("0" * 32, 7)
+
+
+@pytest.fixture
+def door() -> Iterator[tuple[Door, str]]:
+    """A door that other users can reach, and its socket for questions."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        listeners = [Listener(f"ipc://{folder}/{name}", 0o666) for name in ("v", "ask")]
+        opened = Door(listeners)
+        yield opened, f"{folder}/ask"
+        assert opened.close()
+        for listener in listeners:
+            listener.close()
+
+
+def first_of(receive: Callable[[], list[Frames]]) -> Frames:
+    got: list[Frames] = []
+
+    def has_come() -> bool:
+        got.extend(receive())
+        return bool(got)
+
+    wait_until(has_come)
+    return got[0]
+
+
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
+CONNECTS_AS = """
+import os, socket, sys, time
+path, uid, hello = sys.argv[1], int(sys.argv[2]), bytes.fromhex(sys.argv[3])
+made = socket.socket(socket.AF_UNIX)
+os.setgroups([]); os.setgid(uid); os.setuid(uid)
+made.connect(path); made.settimeout(30); made.sendall(hello[:64])
+assert made.recv(64, socket.MSG_WAITALL); made.sendall(hello[64:])
+while made.recv(100): pass
+"""
+
+
+def hello(*properties: tuple[bytes, bytes]) -> bytes:
+    """A DEALER's handshake (RFC 23) with these properties, and a question."""
+    fields = b"\x05READY"
+    for name, value in ((b"Socket-Type", b"DEALER"), (b"Identity", NAME), *properties):
+        fields += bytes([len(name)]) + name + struct.pack(">I", len(value)) + value
+    return b"\x04" + bytes([len(fields)]) + fields + b"\x00\x04lift"
+
+
+@pytest.mark.parametrize("forged", [b"Peer-Address", b"User-Id"])
+def test_a_peer_cannot_name_its_own_user(door: tuple[Door, str], forged: bytes) -> None:
+    with socket.socket(socket.AF_UNIX) as rogue:
+        rogue.connect(door[1])
+        rogue.sendall(GREETING)
+        assert len(rogue.recv(64, socket.MSG_WAITALL)) == 64
+        rogue.sendall(hello((forged, b"localhost:4242:4242:1")))
+        assert first_of(door[0].receive) == [NAME, b"user %d" % os.getuid(), b"lift"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_another_user_with_the_same_routing_id_is_told_apart(door: tuple[Door, str]) -> None:
+    command = [sys.executable, "-I", "-c", CONNECTS_AS, door[1]]
+    said = (GREETING + hello()).hex()
+    # A DEALER of libzmq would connect again, and take its routing id back.
+    with subprocess.Popen([*command, "0", said]) as owner:
+        assert first_of(door[0].receive) == [NAME, b"user 0", b"lift"]
+        with subprocess.Popen([*command, "65534", said]) as rogue:
+            assert first_of(door[0].receive) == [NAME, b"user 65534", b"lift"]
+            rogue.kill()
+        owner.kill()
+
+
+def test_the_name_of_a_key_is_the_credential_on_tcp(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = KeyedDoor(tmp_path, monkeypatch)
+    lifts = LiftBook()
+    lifts.note(SEVENTH, bytes(8), stable=True)
+    try:
+        made = opened.connect(opened.known, zmq.DEALER)
+        made.send(b"lift")
+        requests, questions = Asked(), opened.sockets.questions
+        assert questions is not None
+
+        def has_come() -> bool:
+            opened.sockets.before_wait(requests)
+            return bool(requests.times)
+
+        wait_until(has_come)
+        ((peer, _),) = questions.waiting.items()
+    finally:
+        opened.close()
+    assert peer.credential == b"key controller"
+
+
+def wanted(folder: Path, tell: list[str], ask: str, curve: bool = False) -> scene.Scene:
+    text: dict[str, Any] = {
+        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        "publish": {"endpoint": f"ipc://{folder}/v"},
+        "ask": {"endpoint": ask, "tell": tell},
+    }
+    if curve:
+        text["curve"] = {"secret_key": "daemon.key_secret", "clients": "clients"}
+    return scene.parse(text, folder / "scene.toml")
+
+
+def test_tellers_are_users_or_keys_of_the_scene(tmp_path: Path) -> None:
+    make(tmp_path, "daemon")
+    public = load_pair(make(tmp_path / "clients", "controller")[1])[0]
+    make(tmp_path / "clients", "dashboard")
+    for ask, curve, credentials in (
+        (f"ipc://{tmp_path}/ask", False, (b"user 12345", b"user 1", b"", b"key x")),
+        (
+            f"tcp://127.0.0.1:{free_port()}",
+            True,
+            (b"key controller", b"", b"key ", b"key dashboard", b"key " + public, b"user 0"),
+        ),
+    ):
+        tell = ["controller"] if curve else ["root", "12345"]
+        with Sockets(wanted(tmp_path, tell, ask, curve)) as sockets:
+            assert sockets.questions is not None
+            lifts, may = LiftBook(), []
+            lifts.note(SEVENTH, bytes(8), stable=True)
+            for credential in credentials:
+                peer = [[NAME, credential, b"lift"]]
+                sockets.questions.take(peer, 0, Asked())
+                before = lifts.lifter
+                sockets.on_verdict(published(lifts=lifts))
+                may.append(lifts.lifter != before)
+                lifts.lifter = None
+                lifts.note(SEVENTH, bytes(8), stable=True)
+        assert may == [credential == credentials[0] for credential in credentials]
+
+
+def test_a_teller_that_is_no_user_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PublishError, match="there is no user no-such-user"):
+        Sockets(wanted(tmp_path, ["no-such-user"], f"ipc://{tmp_path}/ask"))
+
+
+def test_tellers_cannot_be_checked_on_plain_tcp(tmp_path: Path) -> None:
+    with pytest.raises(scene.SceneError, match=r"ask\.tell needs an ipc:// socket"):
+        wanted(tmp_path, ["root"], "tcp://127.0.0.1:5555")
+
+
+def test_a_killed_daemon_takes_the_outcome_after_its_restart(tmp_path: Path, peers: Peers) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[tactile]\ndriver = "replay"\nloop = true\nspeed = 2.0\n'
+        f'recordings = ["{DEMO_RECORDING}"]\n[session]\nkeep = true\nfile = "s.json"\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n[ask]\nendpoint = "ipc://{tmp_path}/ask"\n'
+    )
+    asker = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask", name=NAME)
+    asker.rcvtimeo = WAIT_MS
+    with start("run", path) as daemon:
+        wait_for(tmp_path / "ask")
+        answer: dict[str, Any] = {}
+        while answer.get("verdict") != "stable":
+            asker.send(b"lift")
+            answer = json.loads(asker.recv())
+        daemon.send_signal(signal.SIGKILL)
+        daemon.communicate(timeout=TIMEOUT_S)
+    with start("run", path) as daemon:
+        told = f"outcome {answer['boot_id']} {answer['grasp']} slip".encode()
+        stranger = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask", name=OTHER)
+        taken = []
+        for peer in (stranger, asker):
+            peer.send(told)
+            taken.append(json.loads(peer.recv())["ok"])
+        daemon.terminate()
+        daemon.communicate(timeout=TIMEOUT_S)
+    assert taken == [False, True]
