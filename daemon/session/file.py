@@ -7,6 +7,7 @@ import glob
 import hashlib
 import logging
 import os
+import string
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -141,13 +142,19 @@ class SessionFile:
         try:
             if not self._is_ours:
                 with suppress(FileNotFoundError):
-                    os.replace(self.path, f"{self.path}.{ASIDE}{os.urandom(1).hex()[0]}")
+                    os.replace(self.path, self._aside())
             self._is_ours = True
             write_atomically(self.path, msgspec.json.encode(sealed) + b"\n")
         except OSError as error:
             raise SessionFileError(
                 f"{self.path}: cannot keep the session: {error.strerror}"
             ) from error
+
+    def _aside(self) -> Path:
+        """Return a free path to put a file aside, or that of the oldest file put aside."""
+        paths = [Path(f"{self.path}.{ASIDE}{digit}") for digit in string.hexdigits[:16]]
+        free = (path for path in paths if not path.exists())
+        return next(free, None) or min(paths, key=lambda path: path.stat().st_mtime)
 
     def remove(self) -> bool:
         """Delete all that was kept; return False if that is nothing. Raises `SessionFileError`."""
