@@ -112,7 +112,8 @@ class Door:
         made = self._context.socket(kind)
         made.linger = 0
         made.sndhwm, made.rcvhwm = sent, received
-        made.immediate = True  # nothing waits for a process that has ended
+        # No answer waits for a process that has ended. A subscriber would lose half a message.
+        made.immediate = kind != zmq.SUB
         made.reconnect_ivl = RECONNECT_MS
         if name != porter.QUESTIONS or len(self._plan.endpoints) > 1:
             made.connect(f"ipc://{self._folder}/{name}")
@@ -153,14 +154,14 @@ class Door:
 
     def answer(self, frames: Sequence[bytes]) -> bool:
         """Send an answer with its routing id; False if it is dropped."""
-        return _sent(self._ask, frames)
+        return _sent(self._ask, [porter.packed(frames)])
 
     def receive(self) -> list[Frames]:
         """Return at most `QUESTIONS_MAX` questions, each with its routing id."""
         received: list[Frames] = []
         with suppress(zmq.Again):
             while len(received) < QUESTIONS_MAX:
-                received.append(self._ask.recv_multipart(zmq.NOBLOCK))
+                received.append(porter.unpacked(self._ask.recv(zmq.NOBLOCK)))
         return received
 
     def check(self) -> None:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import pwd
 import re
 import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from graspd.daemon.process.files import SceneError, read_regular
+
+log = logging.getLogger("graspd")
 
 PUBLIC, SECRET = ".key", ".key_secret"
 """Endings of key files, as pyzmq and czmq have them."""
@@ -103,6 +108,47 @@ def load_clients(folder: Path) -> Clients:
         except KeysError as error:
             clients.refused.append(str(error))
     return clients
+
+
+@dataclass(slots=True)
+class Admission:
+    """Peers that may connect to `tcp://` sockets."""
+
+    folder: Path
+    """Folder of their public keys."""
+    admitted: Mapping[bytes, str] = field(default_factory=dict)
+    """Name of each peer, by its public key, Z85."""
+    seen: object = None
+    """State of the folder when it was read."""
+
+    def look(self) -> bool:
+        """Read the folder if it has changed; return True if a key was removed.
+
+        A folder that cannot be read, or that others may write, admits no peer.
+        """
+        now = state(self.folder)
+        if now == self.seen:
+            return False
+        self.seen = now
+        try:
+            clients = load_clients(self.folder)
+        except KeysError as error:
+            clients = Clients({}, [str(error)])
+        for why in clients.refused:
+            log.error("%s; no key there may connect", why)
+        log.info("%d keys may connect", len(clients.admitted))
+        removed = self.admitted.keys() - clients.admitted.keys()
+        self.admitted = clients.admitted
+        return bool(removed)
+
+    def callback(self, _domain: str, key: bytes) -> bool:
+        """Return True if the key may connect; called in pyzmq's thread."""
+        name = self.admitted.get(key)
+        if name is None:
+            log.warning("turned away a peer: its key %s is not on the list", key.decode())
+            return False
+        log.info("admitted a peer with the key of %s", name)
+        return True
 
 
 def state(folder: Path) -> object:

@@ -21,18 +21,20 @@ import shutil
 import signal
 import struct
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import msgspec
 import zmq
 
 from graspd.daemon.process import logs
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
+
+    from graspd.daemon.publish.keys import Admission
 
 log = logging.getLogger("graspd")
 
@@ -103,47 +105,9 @@ class Plan(NamedTuple):
     """Public and secret key of the daemon for `tcp://`, Z85, and the folder of peers' keys."""
 
 
-@dataclass(slots=True)
-class Admission:
-    """Peers that may connect to `tcp://` sockets."""
-
-    folder: Path
-    """Folder of their public keys."""
-    admitted: Mapping[bytes, str] = field(default_factory=dict)
-    """Name of each peer, by its public key, Z85."""
-    seen: object = None
-    """State of the folder when it was read."""
-
-    def look(self) -> bool:
-        """Read the folder if it has changed; return True if a key was removed.
-
-        A folder that cannot be read, or that others may write, admits no peer.
-        """
-        from graspd.daemon.publish import keys  # only where there are any
-
-        now = keys.state(self.folder)
-        if now == self.seen:
-            return False
-        self.seen = now
-        try:
-            clients = keys.load_clients(self.folder)
-        except keys.KeysError as error:
-            clients = keys.Clients({}, [str(error)])
-        for why in clients.refused:
-            log.error("%s; no key there may connect", why)
-        log.info("%d keys may connect", len(clients.admitted))
-        removed = self.admitted.keys() - clients.admitted.keys()
-        self.admitted = clients.admitted
-        return bool(removed)
-
-    def callback(self, _domain: str, key: bytes) -> bool:
-        """Return True if the key may connect; called in pyzmq's thread."""
-        name = self.admitted.get(key)
-        if name is None:
-            log.warning("turned away a peer: its key %s is not on the list", key.decode())
-            return False
-        log.info("admitted a peer with the key of %s", name)
-        return True
+packed: Final = msgspec.msgpack.encode
+"""Returns frames as one: libzmq ends a process whose peer ends between two frames of a message."""
+unpacked: Final = msgspec.msgpack.Decoder(Frames).decode
 
 
 class Proxy(threading.Thread):
@@ -198,7 +162,7 @@ class Courier(Proxy):
 
     def _carry_answers(self) -> None:
         while self._back.poll(0):
-            self._front.send_multipart(self._back.recv_multipart(), zmq.NOBLOCK)
+            self._front.send_multipart(unpacked(self._back.recv()), zmq.NOBLOCK)
 
     def _carry_question(self) -> bool:
         """Carry one, cut at `FRAMES_MAX`; False if there is none or no room."""
@@ -210,7 +174,7 @@ class Courier(Proxy):
             frame = self._front.recv()
             if len(frames) <= FRAMES_MAX:
                 frames.append(frame)
-        self._back.send_multipart(frames)
+        self._back.send(packed(frames))
         return True
 
     def _credential(self, frame: zmq.Frame) -> bytes:
@@ -269,20 +233,23 @@ class Porter:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._context: zmq.Context[Socket] = zmq.Context(io_threads=3)
-        self._admission = None if plan.keys is None else Admission(Path(plan.keys[2]))
+        self._admission: Admission | None = None
         self._authenticator: ThreadAuthenticator | None = None
         self._monitors: list[Socket] = []
         self._threads: list[threading.Thread] = []
-        if self._admission is not None:
-            self._authenticate(self._admission)
+        if plan.keys is not None:
+            self._authenticate(Path(plan.keys[2]))
         self._serve_subscribers(0)
         if len(plan.endpoints) > 1:
             self._serve_questions(1)
         self._threads.append(Lookout(self._monitors, self._own(ECHO)))
 
-    def _authenticate(self, admission: Admission) -> None:
+    def _authenticate(self, folder: Path) -> None:
         from zmq.auth.thread import ThreadAuthenticator  # only where there are keys
 
+        from graspd.daemon.publish.keys import Admission
+
+        self._admission = admission = Admission(folder)
         admission.look()
         self._authenticator = ThreadAuthenticator(self._context)
         self._authenticator.configure_curve_callback(ZAP_DOMAIN, admission)
