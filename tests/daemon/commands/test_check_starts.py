@@ -54,4 +54,4 @@ def test_check_finds_a_palm_source_of_another_kind(tmp_path: Path) -> None:
         "check", written(tmp_path, text + f'[publish]\nendpoint = "ipc://{tmp_path}/v"')
     )
     assert refused.returncode == 2
-    assert "[tactile] source tcp://127.0.0.1:5 is neither udp:// nor a file" in refused.stderr
+    assert "tactile.source: string should match pattern '^udp://'" in refused.stderr

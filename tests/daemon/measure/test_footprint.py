@@ -80,12 +80,12 @@ STANDARD = 3
 """Descriptors of standard input, output and error."""
 SIGNALS = 2
 """Descriptors of the pipe by which a signal wakes the loop."""
-SOCKET = 13
-"""Descriptors of a socket at a path, and of the threads of libzmq that serve it."""
-ASK_SOCKET = 5
-"""Descriptors of a second one at the same threads."""
-ZMQ_THREADS = 3
-"""One copies messages, one serves peers, one closes sockets."""
+SOCKET = 14
+"""Descriptors of a socket at a path, and of the sockets and pipes to the process that serves it."""
+ASK_SOCKET = 3
+"""Descriptors of a second one."""
+ZMQ_THREADS = 2
+"""One serves sockets, one closes them. Those of peers are in a process of their own."""
 FILE = 1
 """The recording that plays, or the lock of the kept session."""
 
@@ -198,7 +198,7 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     assert HALL | ASK | {"graspd.daemon.judge.joint_motion"} <= set(found["modules"])
     others = {"graspd.drivers.joints", *BUSES["spi"], *BUSES["can"]}
     assert below(others, found["modules"]) == []
-    assert parts["sockets"]["threads"] == ZMQ_THREADS + 1
+    assert parts["sockets"]["threads"] == ZMQ_THREADS
     assert parts["sockets"]["descriptors"] == SOCKET + ASK_SOCKET
     assert found["timed"]["judged"]["number"] > 0
 
