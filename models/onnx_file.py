@@ -41,6 +41,8 @@ SHAPED = frozenset({"ReduceSumSquare", "Reshape", "Slice"})
 
 These inputs must be constants of the model, so that each run takes as long as the first.
 """
+ELEMENTWISE = frozenset({"Mul", "Sub"})
+"""Operators whose result is as wide as their widest input. Trees may read what they standardise."""
 TEXTS = {"LEAF": 0, "BRANCH_LEQ": 1}
 """Numbers of the texts that an attribute may have, the kinds of a tree's nodes; 2: another."""
 LEAF, BRANCH = TEXTS.values()
@@ -160,6 +162,9 @@ class _Reader:
         if operator in TREES:
             width = self._widths.get(node.inputs[0], 0) if node.inputs else 0
             _check_trees(defaultdict(list, node.attributes), width)
+        if operator in ELEMENTWISE and node.outputs:
+            width = max((self._widths.get(name, 0) for name in node.inputs), default=0)
+            self._widths[node.outputs[0]] = width
         if all(fixed):
             self._fixed.update(node.outputs)
 

@@ -28,8 +28,9 @@ QUOTAS: Final = (20, 10, 5, 2)
 The smallest is for a host so busy that the twin sends few sweeps."""
 BURST_HZ: Final = 30.0
 """Sweeps/s that are to overload it: the twin on a busy host can send them."""
-OVERLOADS_IN_S: Final = 15.0
-"""A daemon that skips readings calls that overload after 3 s."""
+OVERLOADS_IN_S: Final = 30.0
+"""A daemon that skips readings calls that overload after 3 s. The process that sends its messages
+gets no more of the processor."""
 BURST_S: Final = 10.0
 
 
