@@ -144,6 +144,10 @@ class Bench:
         while not (answer := self._client.tell(said, how, wait_s=ANSWER_S)):
             if answer.why.startswith("unknown"):
                 return  # the kill came before it was kept, and it is not known any more
+            if answer.why.startswith("not yours"):
+                # Since its start the daemon has offered this client no lift. The offer counts: with
+                # every row a grasp none lasts until it is on the disk and answered.
+                self._client.may_i_lift(ANSWER_S, supervised=True)
             if self._process.poll() is not None:
                 self._look_and_start_again((grasp, slipped))
         self.acknowledged += 1

@@ -1,4 +1,4 @@
-"""Ask about each grasp of deploy/clients/loop.toml, and tell the outcome that you type.
+"""Ask to lift the grasps of deploy/clients/loop.toml, and tell the outcome that you type.
 
 `graspd run deploy/clients/loop.toml`, then `python try_outcomes.py` with any Python that has pyzmq.
 """
@@ -16,8 +16,9 @@ def main() -> None:
     """Ask and tell until the input ends."""
     with Client(VERDICTS, ask_endpoint=QUESTIONS) as client:
         while True:
-            verdict = client.may_i_lift(10.0).verdict
-            if verdict.p_slip is None:
+            answer = client.may_i_lift(10.0, supervised=True)
+            verdict = answer.verdict
+            if not answer or verdict.p_slip is None:
                 continue
             said = f"{verdict.decision}, p_slip {verdict.p_slip:.2f} {verdict.risk}"
             sys.stdout.write(f"grasp {verdict.grasp}: {said}\n")
@@ -25,10 +26,11 @@ def main() -> None:
             sys.stdout.flush()
             line = sys.stdin.readline()
             if not line:
+                client.tell(verdict, Outcome.NOT_LIFTED)
                 return
             outcome = Outcome.HELD if line.strip() == "y" else Outcome.SLIPPED
-            answer = client.tell(verdict, outcome, "mug")
-            sys.stdout.write("told\n" if answer else f"{answer.why}\n")
+            told = client.tell(verdict, outcome, "mug")
+            sys.stdout.write("told\n" if told else f"{told.why}\n")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import zmq
 
 from graspd.daemon import scene as scenes
 from graspd.daemon.publish.messages import Verdict
+from graspd.daemon.trust.lift_book import NAME_BYTES
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon import processes
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
@@ -252,10 +253,11 @@ def test_the_scene_of_the_whole_loop_asks_learns_and_records(tmp_path: Path) -> 
         context.socket(zmq.DEALER) as controller,
     ):
         controller.linger = 0
+        controller.routing_id = bytes([1]) * NAME_BYTES
         controller.connect(f"ipc://{tmp_path}/loop.ask.ipc")
-        verdict = asked(controller)
-        while verdict.p_slip is None:
-            verdict = asked(controller)
+        verdict = asked(controller, b"lift")
+        while not verdict.supervised:
+            verdict = asked(controller, b"lift")
         assert (verdict.outcomes, verdict.risk and verdict.risk.warm_up_left) == (0, 5)
         controller.send(b"outcome %b %d slip mug" % (verdict.boot_id.encode(), verdict.grasp))
         assert controller.poll(TIMEOUT_S * 1000)
@@ -271,8 +273,8 @@ def test_the_scene_of_the_whole_loop_asks_learns_and_records(tmp_path: Path) -> 
     assert summary["scores"]["f1"] == float(verdict.verdict == "slip")
 
 
-def asked(controller: zmq.Socket[bytes]) -> Verdict:
+def asked(controller: zmq.Socket[bytes], question: bytes = b"judge") -> Verdict:
     """What graspd answers to a controller that asks."""
-    controller.send(b"judge")
+    controller.send(question)
     assert controller.poll(TIMEOUT_S * 1000)
     return decode_verdict(controller.recv())

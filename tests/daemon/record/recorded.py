@@ -15,12 +15,15 @@ from graspd.daemon.publish.messages import Status, Verdict
 from graspd.daemon.record.mcap import McapReader, RecordingHeader
 from graspd.daemon.record.recorder import MakeHeader, Recorder
 from graspd.daemon.scene.scene import Record
+from graspd.daemon.trust.lift_book import NAME_BYTES
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.drivers.recordings.csv_rows import open_recording
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_verdict
 
 BOOT = "0123456789abcdef" * 2
+NAME = bytes([1]) * NAME_BYTES
+"""Routing id of a peer that may tell outcomes."""
 HEADER = RecordingHeader(
     fingers=("ff", "th"), joints=True, boot_id=BOOT, scene={}, model="any", model_sha256=""
 )
@@ -105,32 +108,53 @@ def work(folder: Path, grasps: int, more: str = "", record: str = "") -> Lab:
     lab = Lab(folder)
     with start("run", scene(folder, record, more)) as daemon, zmq.Context() as context:
         wait_for(folder / "ask")
-        with context.socket(zmq.SUB) as listener, context.socket(zmq.REQ) as teller:
+        with context.socket(zmq.SUB) as listener, context.socket(zmq.REQ) as controller:
             listener.connect(f"ipc://{folder}/graspd")
             listener.subscribe("verdict.")
-            teller.connect(f"ipc://{folder}/ask")
-            teller.linger = 0
-            _lift(lab, grasps, listener, teller)
+            controller.routing_id = NAME
+            controller.connect(f"ipc://{folder}/ask")
+            controller.linger = 0
+            _lift(lab, grasps, listener, controller)
         daemon.terminate()
         _, said = daemon.communicate(timeout=TIMEOUT_S)
     assert daemon.returncode == 0, said
     return lab
 
 
-def _lift(lab: Lab, grasps: int, listener: zmq.Socket[bytes], teller: zmq.Socket[bytes]) -> None:
+def _lift(
+    lab: Lab, grasps: int, listener: zmq.Socket[bytes], controller: zmq.Socket[bytes]
+) -> None:
     deadline_s = time.monotonic() + TIMEOUT_S
-    seen: set[int] = set()
-    while len(seen) < grasps:
+    seen: dict[int, Verdict] = {}
+    may_tell = False
+    while len(lab.told) < grasps - 1:
         assert time.monotonic() < deadline_s
         assert listener.poll(100_000)
         verdict = decode_verdict(listener.recv_multipart()[1])
         lab.verdicts.append(verdict)
-        if not verdict.judged or verdict.grasp in seen:
-            continue
-        seen.add(verdict.grasp)
-        if len(seen) == 1:
-            continue
-        outcome = lab.told[verdict.grasp] = "slip" if len(seen) % 2 else "stable"
-        teller.send(f"outcome {verdict.boot_id} {verdict.grasp} {outcome}".encode())
-        assert teller.poll(100_000)
-        lab.answers.append(json.loads(teller.recv()))
+        if verdict.judged and len(seen) < grasps:
+            seen.setdefault(verdict.grasp, verdict)
+        if not may_tell and is_offer(verdict):
+            may_tell = is_offer(decode_verdict(answer_to(b"lift", controller)))
+        if may_tell:
+            _tell(lab, list(seen.values()), controller)
+
+
+def _tell(lab: Lab, seen: list[Verdict], controller: zmq.Socket[bytes]) -> None:
+    for number, verdict in enumerate(seen[1:], 2):
+        if verdict.grasp not in lab.told:
+            outcome = lab.told[verdict.grasp] = "slip" if number % 2 else "stable"
+            told = f"outcome {verdict.boot_id} {verdict.grasp} {outcome}".encode()
+            lab.answers.append(json.loads(answer_to(told, controller)))
+
+
+def is_offer(verdict: Verdict) -> bool:
+    """Whether a hand may lift on it: the peer that is answered so may tell outcomes."""
+    return verdict.verdict == "stable" or verdict.supervised
+
+
+def answer_to(text: bytes, controller: zmq.Socket[bytes]) -> bytes:
+    """What graspd answers."""
+    controller.send(text)
+    assert controller.poll(100_000)
+    return controller.recv()

@@ -26,6 +26,7 @@ from graspd.models.training.data.datasets import read_table
 from tests.bench.live import Subscriber
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import (
+    NAME,
     Lab,
     compared,
     files,
@@ -72,7 +73,7 @@ def test_a_recording_has_all_that_was_published_and_the_joints(lab: Lab) -> None
     (path,) = lab.files
     kinds = [kind for kind, _ in messages(path)]
     sent = {"tactile", "verdict", "gate", "outcome", "status"}
-    assert set(kinds) == sent | {"joints", "judged", "image", "log"}
+    assert set(kinds) == sent | {"joints", "judged", "image", "log", "asked", "announced"}
     assert kinds.count("tactile") == kinds.count("joints") == len(of_readings(path)) > 0
     recorded = {content["seq"]: content for content in of_kind(path, "verdict")}
     published = {verdict.seq: json.loads(encode(verdict)) for verdict in lab.verdicts}
@@ -208,6 +209,7 @@ def test_questions_and_announcements_are_in_the_recording_and_repeated(tmp_path:
     ):
         wait_for(tmp_path / "ask")
         asker.linger = 0
+        asker.routing_id = NAME
         asker.connect(f"ipc://{tmp_path}/ask")
         judged = 0
         for _ in range(1000):
