@@ -64,6 +64,8 @@ FAULTS = LinkFaults(
     disconnect_every_frames=500,
     dead_electrodes=((0, 3), (2, 17)),
 )
+PUBLISH = "high_water_mark = 1000\n"
+"""So that a busy computer, on which the subscriber is slow, loses no message."""
 LISTENER = """
 import sys, zmq
 socket = zmq.Context().socket(zmq.SUB)
@@ -113,7 +115,10 @@ class Soak:
         listener = [sys.executable, "-c", LISTENER, endpoint]
         topics = ("verdict.", "status.")
         with (
-            running(self._folder, sections, topics=topics) as (self._daemon, self._subscriber),
+            running(self._folder, sections, publish=PUBLISH, topics=topics) as (
+                self._daemon,
+                self._subscriber,
+            ),
             Child(listener, stdout=subprocess.PIPE) as self._other,
             ExitStack() as self._twins,
         ):
