@@ -211,7 +211,8 @@ def noises(plan: Plan) -> Outcome:
 def flood(plan: Plan) -> Outcome:
     """Eight peers that keep every rule, as fast as can be."""
     tried, added_ms, share = 0, 0.0, 1.0
-    with hand(plan.folder) as daemon:
+    # As many as the friend takes late; by default ten wait for a subscriber.
+    with hand(plan.folder, publish="high_water_mark = 1000\n") as daemon:
         for _ in plan.rounds():
             rest_ms, _ = cost(daemon)
             peers = [
