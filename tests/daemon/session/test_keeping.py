@@ -14,6 +14,7 @@ from typing import cast
 
 import pytest
 
+from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.session.file import SessionFile, kept_now, load
 from graspd.daemon.session.keeper import (
@@ -107,6 +108,17 @@ def kept_trust(file: SessionFile) -> TrustState | None:
 def outcomes(file: SessionFile) -> int:
     kept = kept_trust(file)
     return 0 if kept is None else kept.learner.outcomes
+
+
+def taught(file: SessionFile) -> tuple[SessionCalibration, Trust, SessionKeeper]:
+    """A session of 30 grasps, and what the outcomes of 20 have taught."""
+    session, part = calibration(), trust()
+    keeper = session_keeper(session, sensors(), file, part=part)
+    observe(session, 30)
+    for grasp in range(20):
+        judge(part, grasp)
+        tell(part, grasp)
+    return session, part, keeper
 
 
 def test_an_outcome_is_answered_when_it_is_on_the_disk(
@@ -253,12 +265,7 @@ def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
 
 
 def test_a_start_with_other_fingers_destroys_nothing(file: SessionFile) -> None:
-    session, part = calibration(), trust()
-    keeper = session_keeper(session, sensors(), file, part=part)
-    observe(session, 30)
-    for grasp in range(20):
-        judge(part, grasp)
-        tell(part, grasp)
+    session, part, keeper = taught(file)
     keeper.save()
     other = trust("of two fingers", inputs=52)
     judged = cast(Pipeline, FakeJudge(None, other))
@@ -374,12 +381,7 @@ def test_whoever_waits_is_answered_whatever_ends_the_writing(
 
 
 def test_session_and_what_was_learned_are_restored_together(file: SessionFile) -> None:
-    session, part = calibration(), trust()
-    keeper = session_keeper(session, sensors(), file, part=part)
-    observe(session, 30)
-    for grasp in range(20):
-        judge(part, grasp)
-        tell(part, grasp)
+    session, part, keeper = taught(file)
     judge(part, 20)
     keeper.save()
     again, other = calibration(), trust()
