@@ -123,8 +123,9 @@ class GraspModel:
     def _counts(self, given: ArrayLike | pd.DataFrame) -> NDArray[np.float64]:
         """Return counts of shape (n, fingers, 24). Raises `ValueError`."""
         values = _of_table(given, self.fingers) if hasattr(given, "columns") else given
-        if np.asarray(values).dtype.kind in "cmM":
-            raise ValueError(f"counts are of type {np.asarray(values).dtype}, not numbers")
+        given = np.asarray(values).dtype
+        if given.kind in "cmM":
+            raise ValueError(f"counts are of type {given}, not numbers")
         counts: NDArray[np.float64] = np.ma.array(values, dtype=np.float64).filled(np.nan)
         fingers = len(self.fingers)
         if counts.ndim != 3 or counts.shape[1:] != (fingers, ELECTRODES):
