@@ -9,6 +9,7 @@ import socket
 import time
 import tty
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -247,18 +248,23 @@ def test_real_socketcan_plays_count_for_count() -> None:
 
 
 @pytest.fixture
-def slcan_line() -> Iterator[tuple[str, Callable[[bytes], None], Callable[[], None]]]:
+def slcan_line(
+    tmp_path: Path,
+) -> Iterator[tuple[str, Callable[[bytes], None], Callable[[], None]]]:
     """Path of a terminal that plays an slcan adapter, a way to write to it and to unplug it."""
     near, far = pty.openpty()
     tty.setraw(far)
-    path = os.ttyname(far)
+    # Its name goes with it: the kernel gives the terminal's to another program at once.
+    path = tmp_path / "slcan"
+    path.symlink_to(os.ttyname(far))
     descriptors = [near, far]
 
     def unplug() -> None:
+        path.unlink(missing_ok=True)
         while descriptors:
             os.close(descriptors.pop())
 
-    yield path, lambda data: (os.write(near, data), None)[1], unplug
+    yield str(path), lambda data: (os.write(near, data), None)[1], unplug
     unplug()
 
 
