@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from graspd.daemon.record.mcap import RecordingHeader
     from graspd.daemon.record.player import McapReplayDriver
     from graspd.daemon.record.recorder import Recorder
-    from graspd.daemon.session.file import SessionFile
+    from graspd.daemon.session.folder import SessionFolder
     from graspd.drivers.recordings.player import LinkLogDriver
 
 
@@ -103,27 +103,27 @@ class Assembly:
         Return False if no session is kept. The last save is when the stack closes.
         """
         pipeline, tactile = self._parts.pipeline, self._parts.drivers[0]
-        file = self._session_file()
-        if file is None:
+        folder = self._session_folder()
+        if folder is None:
             self.companions.append(SensorWatch(pipeline, tactile))
             return False
         from graspd.daemon.session.keeper import SessionKeeper
 
-        self._stack.callback(file.close)
-        keeper = SessionKeeper(pipeline, self._parts.scene.hand.fingers, tactile, file)
+        self._stack.callback(folder.close)
+        keeper = SessionKeeper(pipeline, self._parts.scene.hand.fingers, tactile, folder)
         self._stack.callback(keeper.save)
         self.keep = keeper.keep
         self.companions.insert(0, keeper)  # its answers must come before the socket is read
         return True
 
-    def _session_file(self) -> SessionFile | None:
-        """Return the session's file, not locked yet; None if no session is kept."""
+    def _session_folder(self) -> SessionFolder | None:
+        """Return the folder of sessions, not locked yet; None if no session is kept."""
         scene, pipeline = self._parts.scene, self._parts.pipeline
         if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
             return None
-        from graspd.daemon.session.file import SessionFile
+        from graspd.daemon.session.folder import SessionFolder
 
-        return SessionFile(scene.session_path)
+        return SessionFolder(scene.session_path)
 
     def record(self) -> None:
         """Record if the scene asks for it. Call after `keep_session`. Raises `SceneError`."""

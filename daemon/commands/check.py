@@ -330,8 +330,8 @@ def _risk(wanted: RiskSection) -> str:
 
 def _session(wanted: scene.Scene, needs: SessionInput) -> str:
     kept = f"kept in {wanted.session_path}" if wanted.keeps_session else "not kept"
-    if wanted.session.file is not None and not wanted.keeps_session:
-        kept = "not kept and its file not read: that takes keep = true"
+    if wanted.session.folder is not None and not wanted.keeps_session:
+        kept = "not kept and its folder not read: that takes keep = true"
     learns = "by what is judged" if wanted.session.learn else "by `graspd session seed`"
     return f"calibrated {learns}, from {needs.calibrated_from:g} grasps on, {kept}"
 

@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,11 @@ from graspd.daemon.process.text import complain, printable, write_json, write_li
 from graspd.daemon.run.replaying import trained_on
 from graspd.daemon.scene import drivers as scene_drivers
 from graspd.daemon.scene.scene import GateMode
-from graspd.daemon.session.file import (
-    KeptSession,
-    SessionFile,
-    SessionFileError,
-    kept_now,
-    load,
-    restore_kept,
-)
+from graspd.daemon.session.file import KeptSession, SessionFileError, restore_kept
+from graspd.daemon.session.folder import ENDING, SessionFolder, look
 from graspd.daemon.session.keeper import is_of_unknown_sensors
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
-from graspd.daemon.trust.trust import Trust, TrustState, decode, encode
+from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
@@ -78,49 +72,58 @@ def run(args: argparse.Namespace) -> int:
     learns = wanted.learn.enabled or wanted.risk is not None
     if not (learns or isinstance(model.contract.input, SessionInput)):
         raise ModelError(f"the model {model.contract.name} keeps no session")
-    if args.action != "show" and not _has_file(wanted):
+    if args.action != "show" and not _has_folder(wanted):
         raise SessionFileError(
             f"{args.scene} keeps no session, and {wanted.session_path} may be that of a hand: "
             "say `[session] keep = true`"
         )
     if args.action == "show":
-        _show(wanted, model, as_json=args.json)
-    elif args.action == "settle":
+        return _show(wanted, model, as_json=args.json)
+    if args.action == "settle":
         _settle(wanted, model, args.lifts, args.told)
     elif args.action == "reset":
-        with SessionFile(wanted.session_path) as file:
-            result = "forgotten" if file.remove() else "no session was kept"
+        with SessionFolder(wanted.session_path) as folder:
+            result = "forgotten" if folder.remove() else "no session was kept"
         write_lines(f"{printable(str(wanted.session_path))}: {result}")
     else:
         _seed(wanted, model, args.recordings)
     return 0
 
 
-def _has_file(wanted: scene.Scene) -> bool:
-    """Return True if the scene keeps a session, or names the file for one and does not say no."""
-    named = wanted.session.file is not None and wanted.session.keep is None
+def _has_folder(wanted: scene.Scene) -> bool:
+    """Return True if the scene keeps sessions, or names a folder for them and does not say no."""
+    named = wanted.session.folder is not None and wanted.session.keep is None
     return wanted.keeps_session or named
 
 
-def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
-    path = wanted.session_path
-    kept = load(path)
-    calibrated = _is_calibrated(wanted, model, kept)
+def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
+    """Show what is kept; return 2 if a file cannot be read."""
+    path, found = wanted.session_path, look(wanted.session_path)
+    sessions = {n: kept for n, kept in found.items() if isinstance(kept, KeptSession)}
+    fingers = tuple(wanted.hand.fingers)
+    mine = {n: kept for n, kept in sessions.items() if kept.fingers == fingers}
+    sessions = mine | sessions  # those of the hand first
+    for problem in found.values():
+        if isinstance(problem, SessionFileError):
+            complain(str(problem))
+    calibrated = _is_calibrated(wanted, model, next(iter(sessions.values()), None))
     if as_json:
-        others = () if kept is None else kept.others
+        documents = [_document(number, kept) for number, kept in sessions.items()]
         document = {
-            "file": str(path),
+            "folder": str(path),
             "calibrated": calibrated,
-            "session": None if kept is None else _document(kept),
-            "others": [_document(each) for each in others],
+            "session": documents[0] if documents else None,
+            "others": documents[1:],
         }
         write_json(document)
     else:
-        write_lines(*_lines(path, kept, model, calibrated))
+        write_lines(*_lines(path, sessions, model, calibrated))
+    return 2 if len(sessions) < len(found) else 0
 
 
-def _document(kept: KeptSession) -> dict[str, Any]:
-    return {**msgspec.to_builtins(replace(kept, others=())), "trust": _learned(kept)}
+def _document(number: int, kept: KeptSession) -> dict[str, Any]:
+    content = msgspec.to_builtins(kept)
+    return {"file": f"{number}{ENDING}", **content, "trust": _learned(kept.trust)}
 
 
 def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession | None) -> bool:
@@ -137,28 +140,26 @@ def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession |
     return session.now.calibrated
 
 
-def _grasps(kept: KeptSession) -> int:
-    return 0 if kept.statistics is None else kept.statistics.grasps
-
-
 def _lines(
-    path: Path, kept: KeptSession | None, model: TactileModel, calibrated: bool
+    path: Path, sessions: Mapping[int, KeptSession], model: TactileModel, calibrated: bool
 ) -> Iterator[str]:
-    if kept is None:
+    if not sessions:
         yield f"{printable(str(path))}: no session is kept"
         return
+    (newest, kept), *others = sessions.items()
     state, given = "", model.contract.input
     if isinstance(given, SessionInput):
         state = "calibrated" if calibrated else "not calibrated yet"
         state = f", {state} (from {given.calibrated_from:g} on)"
-    yield f"{printable(str(path))}: {_grasps(kept)} grasps{state}"
-    yield f"  saved    {_when(kept)}"
-    for each in kept.others:
+    yield f"{printable(str(path))}: {kept.grasps} grasps{state}"
+    yield f"  saved    {_when(kept)}, {newest}{ENDING}"
+    for number, each in others:
         names = ", ".join(" ".join((name, each.serials.get(name, "?"))) for name in each.fingers)
-        yield f"  other    {_when(each)}, {_grasps(each)} grasps of {printable(names)}"
+        what = f"{each.grasps} grasps of {printable(names)}"
+        yield f"  other    {_when(each)}, {number}{ENDING}, {what}"
     for finger in kept.fingers:
         yield f"  {finger:8} sensor {printable(kept.serials.get(finger, 'of unknown serial'))}"
-    learned = _learned(kept)
+    learned = _learned(kept.trust)
     if learned is None:
         yield "  learned  nothing"
         return
@@ -174,14 +175,9 @@ def _when(kept: KeptSession) -> str:
     return f"{saved}, {max(time.time() - kept.saved_at, 0.0) / 60.0:.0f} minutes ago"
 
 
-def _learned(kept: KeptSession) -> dict[str, Any] | None:
-    """Return what outcomes have taught; None if that is nothing, or cannot be read."""
-    if kept.trust is None:
-        return None
-    try:
-        state = decode(kept.trust)
-    except ValueError as error:
-        complain(f"what was learned {error}")
+def _learned(state: TrustState | None) -> dict[str, Any] | None:
+    """Return what outcomes have taught; None if that is nothing."""
+    if state is None:
         return None
     return {
         "model": state.model,
@@ -202,7 +198,8 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
     wanted = _on_recordings(wanted, recordings, "every" if is_mcap else None)
     pipeline = assembly.build_pipeline(wanted, model)
     session, trust = pipeline.session, pipeline.trust
-    with SessionFile(wanted.session_path) as file:
+    with SessionFolder(wanted.session_path) as folder:
+        before = [kept for kept in folder.load() if isinstance(kept, KeptSession)]
         judgements = _judge(wanted, pipeline)
         readings = len(judgements)
         outcomes = 0 if trust is None else trust.learner.outcomes
@@ -217,10 +214,13 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
         elif not outcomes:
             raise DriverError(f"of {readings} readings none is a grasp whose outcome is known")
         rest = _rest(wanted, model, recordings)
-        learned = (
-            _learned_before(file) if trust is None else _taught(trust, proves=rest is not None)
-        )
-        file.save(kept_now(state, wanted.hand.fingers, {}, learned, rest))
+        mine = [kept for kept in before if kept.fingers == tuple(wanted.hand.fingers)]
+        if trust is None:  # the scene may learn again later
+            learned = next((kept.trust for kept in mine if kept.trust is not None), None)
+        else:
+            learned = _taught(trust, proves=rest is not None)
+        seeded = KeptSession(state, tuple(wanted.hand.fingers), {}, learned, rest)
+        folder.save([seeded, *(kept for kept in before if kept not in mine)])
     write_lines(
         f"{printable(str(wanted.session_path))}: {grasps} grasps of {readings} readings taken in, "
         f"each once for as long as it was held, {outcomes} outcomes learned"
@@ -242,12 +242,13 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
 def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: str | None) -> None:
     """Tell how open lifts ended, as their controller would have; show which are open."""
     path, trust = wanted.session_path, assembly.build_pipeline(wanted, model).trust
-    with SessionFile(path) as file:
-        kept = file.load()
-        if trust is None or kept is None or kept.trust is None:
+    with SessionFolder(path) as folder:
+        before = [kept for kept in folder.load() if isinstance(kept, KeptSession)]
+        mine = next((kept for kept in before if kept.model == model.sha256), None)
+        if trust is None or mine is None or mine.trust is None:
             raise SessionFileError(f"{path}: no lifts are kept")
         try:
-            trust.restore(decode(kept.trust))
+            trust.restore(mine.trust)
         except ValueError as error:
             raise SessionFileError(f"{path}: what was learned {error}") from error
         grasps = [lift.id for lift in trust.lifts.state().records if lift.is_awaited]
@@ -262,18 +263,9 @@ def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: st
                 trust.lifts.take_back(lifts[name])
             else:
                 trust.outcome(lifts[name], slipped=told == "slipped")
-        file.save(replace(kept, trust=encode(trust.state()), saved_at=time.time()))
+        settled = replace(mine, trust=trust.state())
+        folder.save([settled, *(kept for kept in before if kept is not mine)])
     write_lines(f"{printable(str(path))}: {len(names or lifts)} lifts {told}")
-
-
-def _learned_before(file: SessionFile) -> TrustState | None:
-    """Return what was kept, for a scene that may learn again later."""
-    try:
-        kept = file.load()
-        return None if kept is None or kept.trust is None else decode(kept.trust)
-    except (SessionFileError, ValueError) as error:
-        complain(f"what was learned is lost: {error}")
-        return None
 
 
 def _taught(trust: Trust, *, proves: bool) -> TrustState:

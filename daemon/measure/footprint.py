@@ -140,7 +140,7 @@ def _apart(wanted: Scene, folder: Path) -> Scene:
 
     changes: dict[str, object] = {
         "publish": wanted.publish.model_copy(update={"endpoint": f"ipc://{folder}/verdicts"}),
-        "session": wanted.session.model_copy(update={"file": folder / "session.json"}),
+        "session": wanted.session.model_copy(update={"folder": folder / "session"}),
     }
     if wanted.ask_endpoint is not None:
         changes["ask"] = Ask(endpoint=f"ipc://{folder}/questions")

@@ -45,9 +45,13 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
         with suppress(OSError):
             part.unlink()
         raise
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    sync_folder(path.parent)
+
+
+def sync_folder(path: Path) -> None:
+    """Let the names in a folder last through a power cut, where its file system can."""
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        # The new file is complete; some file systems cannot sync a folder.
         with suppress(OSError):
             os.fsync(folder)
     finally:

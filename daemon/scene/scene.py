@@ -82,13 +82,13 @@ class SessionSection(Section):
     """`[session]`: calibration of a session model by its grasps."""
 
     keep: bool | None = None
-    """True: keep the session in a file. Without it only sessions of live sensors are kept."""
+    """True: keep sessions on the disk. Without it only those of live sensors are kept."""
     learn: bool = True
     """True: judged grasps calibrate the session."""
     required: bool = False
     """True: the verdict is `unknown` until the session is calibrated."""
-    file: FilePath | None = None
-    """Without it `/var/lib/graspd/<hand>.session.json`."""
+    folder: FilePath | None = None
+    """Without it `/var/lib/graspd/<hand>.session`."""
 
 
 class RiskSection(Section):
@@ -345,12 +345,12 @@ class Scene(Section):
 
     @property
     def session_path(self) -> Path:
-        """File of the session, also if none is kept."""
-        return self.session.file or STATE_DIRECTORY / f"{self.hand.name}.session.json"
+        """Folder of the sessions, also if none are kept."""
+        return self.session.folder or STATE_DIRECTORY / f"{self.hand.name}.session"
 
     @property
     def keeps_session(self) -> bool:
-        """True if the session is kept in a file."""
+        """True if sessions are kept on the disk."""
         if self.session.keep is None:
             return not isinstance(self.tactile, ReplayTactile)
         return self.session.keep

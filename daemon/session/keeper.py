@@ -1,8 +1,7 @@
-"""Keep the session of a running daemon in a file; answer outcomes once they are on the disk."""
+"""Keep the session of a running daemon in its folder; answer outcomes once they are on the disk."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import time
 from collections import deque
@@ -18,15 +17,12 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Answer, Requests
 from graspd.daemon.session.file import (
-    OTHERS_MAX,
     KeptSession,
-    SavedState,
-    SessionFile,
     SessionFileError,
-    kept_now,
     of_fingers,
     restore_kept,
 )
+from graspd.daemon.session.folder import KEPT_MAX, SessionFolder
 from graspd.daemon.session.sensors import (
     FIT_GRASPS,
     Rest,
@@ -35,7 +31,6 @@ from graspd.daemon.session.sensors import (
     moved_fingers,
     numbers,
 )
-from graspd.daemon.trust.trust import TrustState, decode
 from graspd.drivers.base import ELECTRODES, Driver
 
 log = logging.getLogger("graspd")
@@ -52,44 +47,48 @@ SEEDED: Final = "the seeded session names no sensors: it is used once %d grasps 
 HANGS: Final = "not kept: the disk does not answer"
 
 
+Sessions = tuple[KeptSession, ...]
+"""All that is saved: the session that runs, then the others."""
+
+
 class SessionKeeper(SensorWatch):
-    """Restore, save and drop one session. A failure of the file is only a warning."""
+    """Restore, save and drop one session. A failure of the disk is only a warning."""
 
     def __init__(
         self,
         pipeline: Pipeline,
         fingers: Sequence[str],
         tactile: Driver,
-        file: SessionFile,
+        folder: SessionFolder,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Restore the session in `file` that is of these fingers, model and sensors, if one is.
+        """Restore the last session of these fingers, and what this model learned with its sensors.
 
-        The file keeps what `pipeline` has no use for. A file that cannot be locked is tried again.
+        State that `pipeline` does not use stays kept. A folder that cannot be locked is tried again.
         """
         self._session = pipeline.session
         self._trust = pipeline.trust
         super().__init__(pipeline, tactile)
         self._fingers = tuple(fingers)
-        self._file = file
+        self._folder = folder
         self._clock = clock
-        self._unused = SavedState({})
-        """Content of the file that this run does not use."""
-        self._others: list[KeptSession] = []
-        """Sessions of other fingers, models or sensors, newest first."""
+        self._unused = KeptSession(None, self._fingers, {})
+        """State that was kept and that this run does not use."""
+        self._others: tuple[KeptSession, ...] = ()
+        """Sessions of other fingers, models or sensors, the last used first."""
         self._warned = False
         try:
-            file.lock()
+            folder.lock()
         except SessionFileError as error:
             log.warning("%s; outcomes are `not kept` until it can be", error)
             self._warned = True
         self._restore()
-        self._saved = self._now()
+        self._saved: Sessions = (self._now(), *self._others)
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._waiting: deque[Answer] = deque()
         self._in_writing = 0
         """Number of the first answers, which wait for the current save."""
-        self._worker: Worker[SavedState] = Worker("session")
+        self._worker: Worker[Sessions] = Worker("session")
 
     def filenos(self) -> list[int]:
         return self._worker.filenos()
@@ -138,7 +137,7 @@ class SessionKeeper(SensorWatch):
         if self._worker.busy:
             return
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
-        state = self._now()
+        state = self._now(), *self._others
         if state == self._saved:
             self._answer(len(self._waiting), None)
         elif self._worker.submit(partial(self._write, state)):
@@ -146,14 +145,10 @@ class SessionKeeper(SensorWatch):
         else:
             self._answer(len(self._waiting), f"not kept: {UNEXPECTED}")
 
-    def _write(self, state: SavedState) -> SavedState:
+    def _write(self, state: Sessions) -> Sessions:
         """Write `state` in the worker, and return it. Raises `SessionFileError`."""
-        self._file.save(self._kept(state))
+        self._folder.save(state)
         return state
-
-    def _kept(self, state: SavedState) -> KeptSession:
-        fingers, serials, statistics, trust, rest, others = self._fingers, *state
-        return kept_now(statistics, fingers, serials, trust, rest, others)
 
     def _answer(self, count: int, why: str | None) -> None:
         """Give the first `count` answers, with the failure `why` or None."""
@@ -161,51 +156,52 @@ class SessionKeeper(SensorWatch):
         for _ in range(count):
             self._waiting.popleft()(why)
 
-    def _now(self) -> SavedState:
+    def _now(self) -> KeptSession:
         statistics, trust = self._unused.statistics, self._unused.trust
         if self._session is not None:
             statistics = self._session.state()
         if self._trust is not None:
             trust = self._trust.state()
         rest = None if self._rest is None else tuple(self._rest.ravel().tolist())
-        serials = numbers(self._serials)
-        return SavedState(serials, statistics, trust, rest, tuple(self._others))
+        return KeptSession(statistics, self._fingers, numbers(self._serials), trust, rest)
 
     def _restore(self) -> None:
         try:
-            newest = self._file.load()
+            found = self._folder.load()
         except SessionFileError as error:
-            log.warning("%s; it is put aside, and a new session begins", error)
-            return
-        if newest is None:
-            return
-        kept = [newest, *newest.others]
-        used = next((each for each in kept if self._goes_on(each)), None)
+            found = [error]
+        for at, problem in enumerate(found):
+            if isinstance(problem, SessionFileError):
+                then = "" if at else ", and a new session begins"
+                log.warning("%s; it stays as it is%s", problem, then)
+        kept = newest_of_each([each for each in found if isinstance(each, KeptSession)])
+        used = next((each for each in kept if self._continues(each)), None)
         learned = None if used is None else self._restore_trust(used, kept)
-        self._others = list(newest.others)
-        if newest is not used or (newest.trust is not None and newest is not learned):
-            self._others = with_other(newest.others, newest)
+        continued = used if used is not None and used.trust is None else learned
+        self._others = tuple(each for each in kept if each not in (continued, learned))
         if used is None:
             if any(is_of_unknown_sensors(each) for each in self._others):
                 self._sensors_exchanged()  # nothing is judged before they are known
             return
         self._serials, self._rest = numbers(used.serials), self._rest_of(used.rest)
         grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
-        log.info("session%s restored from %s", grasps, self._file.path)
+        log.info("session%s restored from %s", grasps, self._folder.path)
+        if isinstance(found[0], SessionFileError):  # it may have been of other sensors
+            self._begin(None)
 
-    def _goes_on(self, kept: KeptSession) -> bool:
+    def _continues(self, kept: KeptSession) -> bool:
         """Continue a session; return False if it is of other fingers or may be of other sensors."""
         try:
             of_fingers(kept, self._fingers)
             if self._session is None:
-                self._unused = self._unused._replace(statistics=kept.statistics)
+                self._unused = replace(self._unused, statistics=kept.statistics)
             elif self._read_rest is not None and is_of_unknown_sensors(kept):
                 log.warning(SEEDED, FIT_GRASPS)
                 return False
             else:
                 restore_kept(kept, self._fingers, self._session)
         except SessionFileError as error:
-            log.warning("%s; it is kept beside that of this start", error)
+            log.warning("%s; it stays kept", error)
             return False
         return True
 
@@ -215,19 +211,19 @@ class SessionKeeper(SensorWatch):
         for each in (used, *kept):
             if each.trust is None or not is_of_sensors(each, used):
                 continue
-            try:
-                learned = decode(each.trust)
-                if self._trust is None:
-                    self._unused = self._unused._replace(trust=learned)
-                else:
-                    self._trust.restore(learned)
-                    log.info("%d outcomes restored", learned.learner.outcomes)
+            if self._trust is None:
+                self._unused = replace(self._unused, trust=each.trust)
                 return each
+            try:
+                self._trust.restore(each.trust)
             except ValueError as error:
                 problem = problem or error
+                continue
+            log.info("%d outcomes restored", each.trust.learner.outcomes)
+            return each
         if problem is not None:
             lost = "learning and the count of the risk begin again"
-            log.warning("%s: what was learned %s; %s", self._file.path, problem, lost)
+            log.warning("%s: what was learned %s; %s", self._folder.path, problem, lost)
         return None
 
     def _with_serials(self, serials: Mapping[str, str]) -> KeptSession | None:
@@ -236,9 +232,7 @@ class SessionKeeper(SensorWatch):
 
     def _with_rest(self, rest: Rest, *, is_known: bool) -> KeptSession | None:
         is_known = is_known or (self._rest is None and not self._now().is_empty)
-        now = KeptSession(
-            self._fingers, self._serials, 0.0, None, rest=tuple(rest.ravel().tolist())
-        )
+        now = replace(self._now(), rest=tuple(rest.ravel().tolist()))
         for each in self._others:
             is_seed = is_of_unknown_sensors(each)
             if self._fits(each) if is_seed else not is_known and is_of_sensors(each, now):
@@ -265,18 +259,15 @@ class SessionKeeper(SensorWatch):
         """
         leaving = self._now()
         if not leaving.is_empty:
-            self._others = with_other(self._others, self._kept(leaving))
-        self._unused, self._rest = SavedState({}), None
+            self._others = tuple(newest_of_each([leaving, *self._others])[: KEPT_MAX - 1])
+        self._unused, self._rest = KeptSession(None, self._fingers, {}), None
         if former is None or not self._take_up(former, tared=tared):
             self._sensors_exchanged()
         self._save_due_ns = self._clock()
 
     def _take_up(self, former: KeptSession, *, tared: bool) -> bool:
         """Continue a session of the new sensors; return False if it cannot be used."""
-        trust: TrustState | None = None
-        if former.trust is not None:
-            with contextlib.suppress(ValueError):
-                trust = decode(former.trust)
+        trust = former.trust
         if trust is not None and self._trust is not None and not self._trust.fits(trust):
             trust = None
         learned = None if trust is None else trust.learner
@@ -287,11 +278,7 @@ class SessionKeeper(SensorWatch):
         except ValueError as error:
             log.warning("what was kept of these sensors %s; a new session begins", error)
             return False
-        self._unused = SavedState(
-            {},
-            former.statistics if self._session is None else None,
-            trust if self._trust is None else None,
-        )
+        self._unused = replace(former, trust=trust)
         self._serials, self._rest = numbers(former.serials), self._rest_of(former.rest)
         grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
         log.warning("these sensors were there before: their session%s goes on", grasps)
@@ -314,7 +301,11 @@ def is_of_sensors(one: KeptSession, other: KeptSession) -> bool:
     return not moved_fingers(*(rest.reshape(shape) for rest in rests))
 
 
-def with_other(others: Sequence[KeptSession], kept: KeptSession) -> list[KeptSession]:
-    """Return other sessions with one more, which replaces that of the same model and sensors."""
-    rest = [each for each in others if each.model != kept.model or not is_of_sensors(each, kept)]
-    return [replace(kept, others=()), *rest[: OTHERS_MAX - 1]]
+def newest_of_each(kept: Sequence[KeptSession]) -> list[KeptSession]:
+    """Return the first session of each set of fingers, model and sensors."""
+    newest: list[KeptSession] = []
+    for each in kept:
+        of_model = [one for one in newest if one.model == each.model]
+        if not any(is_of_sensors(one, each) for one in of_model):
+            newest.append(each)
+    return newest

@@ -110,7 +110,7 @@ class Soak:
 
     def run(self) -> Found:
         """Do it. Raises `RuntimeError` if the daemon does not start, with what it said."""
-        sections = f'{spi_section(self._folder)}[session]\nfile = "{self._folder}/session.json"\n'
+        sections = f'{spi_section(self._folder)}[session]\nfolder = "{self._folder}/session"\n'
         endpoint = f"ipc://{self._folder}/v"
         listener = [sys.executable, "-c", LISTENER, endpoint]
         topics = ("verdict.", "status.")

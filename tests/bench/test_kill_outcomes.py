@@ -20,14 +20,16 @@ from numpy.typing import NDArray
 from deploy.clients.python.graspd_client import Client, Outcome, Verdict
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
-from graspd.daemon.session.file import SessionFile, kept_now, load
+from graspd.daemon.session.file import KeptSession
+from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
-from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
 from tests.bench.live import Subscriber
 from tests.daemon.fakes import sound
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.daemon.session.learning import last_kept
 from tests.kit.messages import decode_tactile, decode_verdict
 
 RATE_HZ: Final = 50.0
@@ -45,7 +47,7 @@ class Reference:
 
     def __init__(self, wanted: scene.Scene) -> None:
         self._scene, self._model = wanted, assembly.load_model(wanted)
-        kept = load(wanted.session_path)
+        kept = last_kept(wanted.session_path)
         assert kept is not None
         assert kept.statistics is not None
         self._statistics = kept.statistics
@@ -82,7 +84,7 @@ class Bench:
         self._path.write_text(
             f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
             f"rate_hz = {RATE_HZ}\n[risk]\nmax_slip_when_stable = 0.2\n"
-            '[session]\nfile = "right.session.json"\nkeep = true\nlearn = false\n'
+            '[session]\nfolder = "right.session"\nkeep = true\nlearn = false\n'
             f'[publish]\nendpoint = "ipc://{folder}/graspd"\ntactile_hz = 10000\n'
             f'[ask]\nendpoint = "ipc://{folder}/ask"\n'
         )
@@ -110,8 +112,8 @@ class Bench:
         for row in read_rows(DEMO_TABLE, self._scene.hand.fingers):
             pipeline.judge(sound(row.counts, time.monotonic_ns()))
         assert pipeline.session is not None
-        with SessionFile(self._scene.session_path) as file:
-            file.save(kept_now(pipeline.session.state(), self._scene.hand.fingers, {}))
+        with SessionFolder(self._scene.session_path) as folder:
+            folder.save([KeptSession(pipeline.session.state(), self._scene.hand.fingers, {})])
 
     def run(self, outcomes: int, kills: int) -> None:
         """Tell that many outcomes, with as many kills; fail if an acknowledged one is lost."""
@@ -177,10 +179,10 @@ class Bench:
         )
 
     def _kept(self) -> TrustState:
-        kept = load(self._scene.session_path)
+        kept = last_kept(self._scene.session_path)
         assert kept is not None
         assert kept.trust is not None
-        return decode(kept.trust)
+        return kept.trust
 
     def _hear(self) -> None:
         """Note what was published."""

@@ -157,14 +157,14 @@ def test_a_graspd_that_fails_leaves_the_former_as_it_was(
 
 
 def test_an_uninstall_leaves_the_scenes_and_what_was_learned(staged: Path) -> None:
-    session = staged / "var/lib/graspd/right.session.json"
+    session = staged / "var/lib/graspd/right.session/1.session"
     session.parent.mkdir(parents=True)
     session.write_text("{}")
     done = installer("--root", staged, "--uninstall")
     assert done.returncode == 0, done.stderr
     assert set(content(staged)) == {
         "/etc/graspd/right.toml",
-        "/var/lib/graspd/right.session.json",
+        "/var/lib/graspd/right.session/1.session",
     }
     again = installer("--root", staged, "--uninstall")
     assert again.stdout.endswith("graspd: nothing to remove\n")

@@ -72,7 +72,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "models-no-file": "models absent.onnx",
     "session-seed": "session seed kept.toml table.csv",
     "session-show": "session show kept.toml",
-    "replay-session": "replay day.csv --session session.json --verbose",
+    "replay-session": "replay day.csv --session session/1.session --verbose",
     "session-reset": "session reset kept.toml",
     "session-none": "session show kept.toml",
     "keys-make": "keys make arm --dir keys",
@@ -114,7 +114,7 @@ SCENES: Final[Mapping[str, str]] = {
     "not-there": DEMO_SCENE.replace("stream.csv", "absent.csv"),
     "fingers": DEMO_SCENE + '[hand]\nfingers = ["th", "mf", "ff"]\n',
     "no-folder": DEMO_SCENE.replace("/graspd", "/absent/graspd"),
-    "kept": DEMO_SCENE + '[session]\nkeep = true\nfile = "session.json"\n',
+    "kept": DEMO_SCENE + '[session]\nkeep = true\nfolder = "session"\n',
 }
 
 _MASKS: Final = (

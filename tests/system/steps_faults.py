@@ -33,7 +33,7 @@ NO_SPACE: Final = "No space left on device"
 CANNOT_KEEP: Final = f"cannot keep the session: {NO_SPACE}"
 CANNOT_RECORD: Final = f"{NO_SPACE}; nothing is recorded"
 RECORDINGS: Final = "/var/lib/graspd/record/*.mcap"
-SESSION: Final = "/var/lib/graspd/serial.session.json"
+SESSION: Final = "/var/lib/graspd/serial.session/*.session"
 
 
 def killed(lab: Lab) -> Outcome:
@@ -131,7 +131,11 @@ def disk_full(lab: Lab) -> Outcome:
         lab.sh(f"touch -d @0 {SESSION}")
     finally:
         free_s = lab.deeds_s["room"] = lab.deed(f"rm -f {FILLER}.*")
-    lab.await_true(f"[ $(stat -c %Y {SESSION}) -gt 0 ]", "the session kept again", look_s=0.2)
+    lab.await_true(
+        f"[ $(stat -c %Y {SESSION} | sort -n | tail -n 1) -gt 0 ]",
+        "the session kept again",
+        look_s=0.2,
+    )
     kept_s = lab.now_s() - free_s
     first = f"$(ls {RECORDINGS} | head -n 1)"
     lab.sh(f"graspd replay --json {first} | grep -c '\"valid\":true'", REPLAY_TIMEOUT_S)

@@ -16,13 +16,15 @@ import numpy as np
 from graspd.daemon.assembly import assembly
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.scene import load as load_scene
-from graspd.daemon.session.file import SessionFile, kept_now, load
+from graspd.daemon.session.file import KeptSession
+from graspd.daemon.session.folder import SessionFolder
 from graspd.drivers.spi.messages import Hello
 from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
 from graspd.drivers.twins.spi import SpiTwin
 from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import PATIENCE_S, SEED, STOP_S, Subscriber, held_grasp, running, spi_section
+from tests.daemon.session.learning import last_kept
 from tests.ports import free_port
 from tests.threads import at_work
 
@@ -99,7 +101,7 @@ class MisreadTwin(SpiTwin):
         return replace(hello, serials=(first.replace("W", "V"), *others)) if is_wrong else hello
 
 
-def keep_grasps(folder: Path, text: str) -> SessionFile:
+def keep_grasps(folder: Path, text: str) -> SessionFolder:
     """A kept session of the twin's sensors, calibrated, as a daemon would have left it."""
     scene = folder / "before.toml"
     scene.write_text(text)
@@ -112,13 +114,13 @@ def keep_grasps(folder: Path, text: str) -> SessionFile:
     serials: dict[str, str] = {
         finger: f"BTSP-TWIN-{at}" for at, finger in enumerate(wanted.hand.fingers)
     }
-    with SessionFile(wanted.session_path) as file:
-        file.save(kept_now(session.state(), wanted.hand.fingers, serials))
-    return file
+    with SessionFolder(wanted.session_path) as kept:
+        kept.save([KeptSession(session.state(), wanted.hand.fingers, serials)])
+    return kept
 
 
-def kept_grasps(file: SessionFile) -> int:
-    kept = load(file.path)
+def kept_grasps(folder: SessionFolder) -> int:
+    kept = last_kept(folder.path)
     return 0 if kept is None or kept.statistics is None else kept.statistics.grasps
 
 
@@ -127,7 +129,7 @@ def misread_serial(plan: Plan) -> Outcome:
     wiped, tried = 0, 0
     for folder in plan.folders():
         tried += 1
-        sections = f'{spi_section(folder)}[session]\nfile = "{folder}/session.json"\n'
+        sections = f'{spi_section(folder)}[session]\nfolder = "{folder}/session"\n'
         file = keep_grasps(folder, sections)
         wrong = 1 + plan.random.randrange(8)
         with (

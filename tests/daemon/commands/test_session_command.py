@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.daemon.session.file import SessionFile, kept_now
+from graspd.daemon.session.file import KeptSession
+from graspd.daemon.session.folder import SessionFolder
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.models.session_statistics import SessionState
 from tests.kit.inside import graspd
@@ -35,7 +36,7 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
     assert document["calibrated"] is False  # a table does not say of which sensors it is
     assert document["session"]["statistics"]["grasps"] == grasps
     assert f"{grasps} grasps, not calibrated yet" in graspd("session", "show", scene).stdout
-    kept = ("--session", scene.parent / "right.json")
+    kept = ("--session", scene.parent / "right" / "1.session")
     replayed = graspd("replay", recording, "--model", "cnn1-session", *kept, "--json")
     assert replayed.returncode == 0, replayed.stderr
     first = json.loads(replayed.stdout.splitlines()[0])
@@ -46,18 +47,16 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
 
 
 @pytest.mark.parametrize("keep", [None, False, True])
-def test_check_says_that_the_file_of_a_session_that_is_not_kept_is_not_read(
-    keep: bool | None, tmp_path: Path
-) -> None:
+def test_check_says_that_the_folder_is_not_read(keep: bool | None, tmp_path: Path) -> None:
     said = "" if keep is None else f"keep = {str(keep).lower()}\n"
-    path = demo_scene(tmp_path, sections=f'[session]\nfile = "kept.json"\n{said}')
+    path = demo_scene(tmp_path, sections=f'[session]\nfolder = "kept"\n{said}')
     checked = graspd("check", path)
     assert checked.returncode == 0, checked.stderr
-    assert ("not kept and its file not read" in checked.stdout) is (keep is not True)
-    assert (f"kept in {tmp_path}/kept.json" in checked.stdout) is (keep is True)
+    assert ("not kept and its folder not read" in checked.stdout) is (keep is not True)
+    assert (f"kept in {tmp_path}/kept" in checked.stdout) is (keep is True)
 
 
-@pytest.mark.parametrize("section", ["", '[session]\nkeep = false\nfile = "kept.json"\n'])
+@pytest.mark.parametrize("section", ["", '[session]\nkeep = false\nfolder = "kept"\n'])
 def test_a_scene_that_keeps_no_session_touches_none(section: str, tmp_path: Path) -> None:
     path = demo_scene(tmp_path, sections=section)
     for refused in (graspd("session", "seed", path, DEMO_TABLE), graspd("session", "reset", path)):
@@ -85,9 +84,9 @@ def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3
 def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
     path = session_scene(tmp_path)
     fingers = ("ff", "mf", "th")
-    with SessionFile(tmp_path / "right.json") as file:
-        other = kept_now(None, fingers, {"ff": "BTSP-2", "th": "BTSP-3"})
-        file.save(kept_now(None, fingers, {"ff": "BTSP-1"}, others=(other,)))
+    with SessionFolder(tmp_path / "right") as folder:
+        other = KeptSession(None, fingers, {"ff": "BTSP-2", "th": "BTSP-3"})
+        folder.save([KeptSession(None, fingers, {"ff": "BTSP-1"}), other])
     shown = graspd("session", "show", path)
     assert "0 grasps of ff BTSP-2, mf ?, th BTSP-3" in shown.stdout
     (aside,) = json.loads(graspd("session", "show", path, "--json").stdout)["others"]
@@ -100,8 +99,8 @@ def test_a_session_that_the_daemon_cannot_use_is_not_shown_as_calibrated(tmp_pat
     shown = []
     for fingers in (("ff", "mf", "rf"), ("ff", "mf", "th")):
         odd = SessionState(30.0, 30, (4000.0,) * 150, (1e4,) * 150)
-        with SessionFile(tmp_path / "right.json") as file:
-            file.save(kept_now(odd, fingers, {"ff": "BTSP-1"}))
+        with SessionFolder(tmp_path / "right") as folder:
+            folder.save([KeptSession(odd, fingers, {"ff": "BTSP-1"})])
         program = graspd("session", "show", path, "--json")
         shown.append((json.loads(program.stdout)["calibrated"], program.stderr))
         assert "30 grasps, not calibrated yet" in graspd("session", "show", path).stdout
@@ -124,11 +123,10 @@ def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:
 
 
 def test_a_broken_session_file_is_one_line_in_a_replay(tmp_path: Path) -> None:
-    path = tmp_path / "kept.json"
-    with SessionFile(path) as file:
+    with SessionFolder(tmp_path) as folder:
         odd = SessionState(1.0, 1, (1.0,) * 10, (1.0,) * 10)
-        file.save(kept_now(odd, ("ff", "mf", "th"), {}))
-    result = graspd("replay", "--session", path)
+        folder.save([KeptSession(odd, ("ff", "mf", "th"), {})])
+    result = graspd("replay", "--session", tmp_path / "1.session")
     assert result.returncode == 2
     assert result.stderr == "graspd: the kept session is of 10 values, not of 150\n"
 

@@ -11,15 +11,16 @@ import numpy as np
 
 from graspd.daemon import scene as scenes
 from graspd.daemon.assembly import assembly
-from graspd.daemon.session.file import SessionFile, kept_now, load
+from graspd.daemon.session.file import KeptSession
+from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.trust.lift_book import GraspId
-from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import SLIPPED, electrode_columns, read_rows
 from graspd.drivers.twins.grasps.grasp_script import EndPoint
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
 from tests.daemon.record.test_export import Writer
-from tests.daemon.session.learning import SHORT
+from tests.daemon.session.learning import SHORT, last_kept
 from tests.kit.inside import graspd
 from tests.kit.scenes import session_scene, unlabelled_demo
 
@@ -31,9 +32,9 @@ def seed(path: Path, recording: Path) -> TrustState | None:
     """What is kept after seeding."""
     seeded = graspd("session", "seed", path, recording)
     assert seeded.returncode == 0, seeded.stderr
-    kept = load(path.with_name("right.json"))
+    kept = last_kept(path.with_name("right"))
     assert kept is not None
-    return None if kept.trust is None else decode(kept.trust)
+    return None if kept.trust is None else kept.trust
 
 
 def shown(path: Path) -> dict[str, Any]:
@@ -96,7 +97,7 @@ def test_a_seed_keeps_where_the_recorded_sensors_rest(tmp_path: Path) -> None:
             table.writerow([f"{row.t_s:.4f}", label, *row.counts.ravel().tolist()])
     path = session_scene(tmp_path, sections="[risk]\nmax_slip_when_stable = 0.1\nwarm_up = 5\n")
     learned = seed(path, recording)
-    kept = load(tmp_path / "right.json")
+    kept = last_kept(tmp_path / "right")
     assert learned is not None
     assert kept is not None
     assert kept.rest is not None
@@ -145,14 +146,15 @@ def test_seeding_where_nothing_learns_keeps_what_was_learned(tmp_path: Path) -> 
 
 
 def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
-    path, kept = session_scene(tmp_path), tmp_path / "right.json"
+    path, kept = session_scene(tmp_path), tmp_path / "right"
     seed(path, DEMO_TABLE)
-    with SessionFile(kept) as file:
-        first = file.load()
+    with SessionFolder(kept) as folder:
+        folder.load()
+        first = last_kept(kept)
         assert first is not None
-        file.save(kept_now(first.statistics, FINGERS, {}))
+        folder.save([KeptSession(first.statistics, FINGERS, {})])
     assert "  learned  nothing" in graspd("session", "show", path).stdout
-    with SessionFile(kept):
+    with SessionFolder(kept):
         for arguments in (("reset", path), ("seed", path, DEMO_TABLE)):
             refused = graspd("session", *arguments)
             assert (refused.returncode, "in use by another graspd" in refused.stderr) == (2, True)
@@ -164,14 +166,14 @@ def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
 def test_a_person_settles_announced_lifts(tmp_path: Path) -> None:
     """As their controller would have told them, and by the same rule."""
     sections = "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n"
-    path, kept = session_scene(tmp_path, "mlp", sections), tmp_path / "right.json"
+    path, kept = session_scene(tmp_path, "mlp", sections), tmp_path / "right"
     trust, boot = live_trust(path), "0123456789abcdef" * 2
     for number in range(1, 6):
         grasp = GraspId(boot, number)
         trust.note(grasp, trust.judge(grasp, 0.01, -5.0, np.zeros(0)), stable=True)
         trust.lifts.announce()
-    with SessionFile(kept) as file:
-        file.save(kept_now(None, FINGERS, {"ff": "A"}, trust.state()))
+    with SessionFolder(kept) as folder:
+        folder.save([KeptSession(None, FINGERS, {"ff": "A"}, trust.state())])
         refused = graspd("session", "settle", path)
         assert "in use by another graspd, stop that one first" in refused.stderr
     names = [f"01234567-{number}" for number in range(1, 6)]
@@ -182,18 +184,19 @@ def test_a_person_settles_announced_lifts(tmp_path: Path) -> None:
         assert graspd("session", "settle", path, *lifts, "--as", told).returncode == 0
     for number, slipped in ((1, True), (4, False), (5, False)):
         trust.outcome(GraspId(boot, number), slipped=slipped)
-    now, found = load(kept), live_trust(path)
+    now, found = last_kept(kept), live_trust(path)
     assert now is not None
     assert now.trust is not None
     assert now.serials == {"ff": "A"}
-    found.restore(decode(now.trust))
+    found.restore(now.trust)
     assert found.learner.state() == trust.learner.state()
     assert found.risk.state() == trust.risk.state()
     assert (found.lifts.announced, found.lifts.awaited) == (3, 0)
 
 
 def test_what_is_damaged_is_said(tmp_path: Path) -> None:
-    path, kept = session_scene(tmp_path, model="mlp"), tmp_path / "right.json"
+    path, kept = session_scene(tmp_path, model="mlp"), tmp_path / "right" / "1.session"
+    kept.parent.mkdir()
     kept.write_bytes(b"?")
     result = graspd("session", "show", path)
     assert f"{kept}: not a session" in result.stderr

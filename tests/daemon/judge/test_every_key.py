@@ -37,7 +37,7 @@ NAMES: Mapping[str, tuple[Any, ...]] = {
     "hand.name": ("left",),
     "model.name": (None,),  # follows from the fingers
     "model.path": (None,),
-    "session.file": (None,),
+    "session.folder": (None,),
 }
 """Values of the keys that are names and paths."""
 MOVED_COUNTS = 40.0

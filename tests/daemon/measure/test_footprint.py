@@ -55,7 +55,7 @@ JOINTS = ours("daemon.judge.joint_motion", "drivers.joints")
 HALL = ours("drivers.palm.calibration")
 GATE = ours(*(f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")))
 STATISTICS = ours("daemon.judge.calibration", "models.session_statistics")
-KEPT = ours("daemon.session.file", "daemon.session.keeper")
+KEPT = ours("daemon.session.file", "daemon.session.folder", "daemon.session.keeper")
 ASK = ours("daemon.publish.questions")
 
 FORBIDDEN = {
@@ -220,7 +220,7 @@ def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training(
 def test_what_is_measured_leaves_sockets_and_sessions_alone(tmp_path: Path) -> None:
     text = (
         '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9870"\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n[session]\nfile = "kept.json"\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n[session]\nfolder = "kept"\n'
     )
     measure(written(tmp_path, text))
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]

@@ -178,7 +178,7 @@ def test_a_killed_daemon_takes_the_outcome_after_its_restart(tmp_path: Path, pee
     path = tmp_path / "scene.toml"
     path.write_text(
         '[tactile]\ndriver = "replay"\nloop = true\nspeed = 2.0\n'
-        f'recordings = ["{DEMO_RECORDING}"]\n[session]\nkeep = true\nfile = "s.json"\n'
+        f'recordings = ["{DEMO_RECORDING}"]\n[session]\nkeep = true\nfolder = "s"\n'
         f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n[ask]\nendpoint = "ipc://{tmp_path}/ask"\n'
     )
     asker = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask", name=NAME)

@@ -50,7 +50,7 @@ PLACES: dict[str, tuple[list[Any], list[Any]]] = {
     "calibration": ([CALIBRATION], ["absent.toml"]),
     "name": (["mlp", "small-session"], ["absent"]),
     "path": ([str(zoo.find("svm"))], ["absent.onnx"]),
-    "file": (["F/kept.json"], ["F/absent/kept.json", "F/folder"]),
+    "folder": (["F/kept", "F/folder"], ["F/absent/kept", "F/a-file"]),
     "directory": (["F/record"], ["F/a-file", "/proc/absent"]),
     "group": (["root"], ["absent"]),
     "tell": (

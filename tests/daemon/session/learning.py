@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.calibration import Exchanged, SessionCalibration
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion, Requests
-from graspd.daemon.session.file import KeptSession, SessionFile
+from graspd.daemon.session.file import KeptSession
+from graspd.daemon.session.folder import SessionFolder, look
 from graspd.daemon.session.keeper import SessionKeeper
 from graspd.daemon.session.sensors import SensorWatch
 from graspd.daemon.trust.learner import sigmoid
@@ -73,9 +75,13 @@ def tell(part: Trust, grasp: int, boot: str = BOOT) -> OutcomeStatus:
     return part.outcome(GraspId(boot, grasp), slipped=grasp % 3 == 0)
 
 
-def grasps_of(kept: KeptSession | None) -> int:
-    """Of the kept statistics; 0 if there are none."""
-    return 0 if kept is None or kept.statistics is None else kept.statistics.grasps
+def kept_in(folder: Path) -> list[KeptSession]:
+    """The sessions in a folder, the last used first."""
+    return [each for each in look(folder).values() if isinstance(each, KeptSession)]
+
+
+def last_kept(folder: Path) -> KeptSession | None:
+    return next(iter(kept_in(folder)), None)
 
 
 class SensorDriver(FakeDriver):
@@ -127,13 +133,13 @@ class FakeJudge:
 def session_keeper(
     session: SessionCalibration | None,
     tactile: Driver,
-    file: SessionFile,
+    folder: SessionFolder,
     clock: Clock | None = None,
     part: Trust | None = None,
     read_rest: Callable[[], NDArray[np.float64]] | None = None,
 ) -> SessionKeeper:
     judge = cast(Pipeline, FakeJudge(session, part, read_rest))
-    return SessionKeeper(judge, FINGERS, tactile, file, clock or Clock())
+    return SessionKeeper(judge, FINGERS, tactile, folder, clock or Clock())
 
 
 def sensor_watch(

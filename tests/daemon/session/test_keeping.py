@@ -16,7 +16,8 @@ import pytest
 
 from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.session.file import SessionFile, kept_now, load
+from graspd.daemon.session.file import KeptSession
+from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.session.keeper import (
     BUSY,
     HANGS,
@@ -26,7 +27,7 @@ from graspd.daemon.session.keeper import (
     SessionKeeper,
 )
 from graspd.daemon.trust.lift_book import OutcomeStatus
-from graspd.daemon.trust.trust import Trust, TrustState, decode
+from graspd.daemon.trust.trust import Trust, TrustState
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
@@ -34,6 +35,8 @@ from tests.daemon.session.learning import (
     FakeJudge,
     calibration,
     judge,
+    kept_in,
+    last_kept,
     observe,
     read_once,
     sensors,
@@ -72,18 +75,18 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Iterator[SessionFile]:
-    with SessionFile(tmp_path / "right.json") as file:
-        yield file
+def folder(tmp_path: Path) -> Iterator[SessionFolder]:
+    with SessionFolder(tmp_path / "right") as folder:
+        yield folder
 
 
 @pytest.fixture
-def keeper_of(file: SessionFile) -> Iterator[Callable[..., SessionKeeper]]:
+def keeper_of(folder: SessionFolder) -> Iterator[Callable[..., SessionKeeper]]:
     """Makes keepers, and ends them."""
     made: list[SessionKeeper] = []
 
     def make(part: Trust, clock: Clock | None = None) -> SessionKeeper:
-        made.append(session_keeper(None, sensors(), file, clock or Clock(), part=part))
+        made.append(session_keeper(None, sensors(), folder, clock or Clock(), part=part))
         return made[-1]
 
     yield make
@@ -100,20 +103,20 @@ def go_round(keeper: SessionKeeper) -> None:
         keeper.before_wait(NOBODY)
 
 
-def kept_trust(file: SessionFile) -> TrustState | None:
-    kept = load(file.path)
-    return None if kept is None or kept.trust is None else decode(kept.trust)
+def kept_trust(folder: SessionFolder) -> TrustState | None:
+    kept = last_kept(folder.path)
+    return None if kept is None or kept.trust is None else kept.trust
 
 
-def outcomes(file: SessionFile) -> int:
-    kept = kept_trust(file)
+def outcomes(folder: SessionFolder) -> int:
+    kept = kept_trust(folder)
     return 0 if kept is None else kept.learner.outcomes
 
 
-def taught(file: SessionFile) -> tuple[SessionCalibration, Trust, SessionKeeper]:
+def taught(folder: SessionFolder) -> tuple[SessionCalibration, Trust, SessionKeeper]:
     """A session of 30 grasps, and what the outcomes of 20 have taught."""
     session, part = calibration(), trust()
-    keeper = session_keeper(session, sensors(), file, part=part)
+    keeper = session_keeper(session, sensors(), folder, part=part)
     observe(session, 30)
     for grasp in range(20):
         judge(part, grasp)
@@ -122,7 +125,7 @@ def taught(file: SessionFile) -> tuple[SessionCalibration, Trust, SessionKeeper]
 
 
 def test_an_outcome_is_answered_when_it_is_on_the_disk(
-    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
     found: list[tuple[str | None, TrustState | None]] = []
@@ -130,7 +133,7 @@ def test_an_outcome_is_answered_when_it_is_on_the_disk(
     judge(part, 1)
     tell(part, 1)
     disk.goes_on.clear()
-    keeper.keep(lambda why: found.append((why, kept_trust(file))))
+    keeper.keep(lambda why: found.append((why, kept_trust(folder))))
     for _ in range(3):
         read_once(keeper)
     assert found == []
@@ -140,14 +143,14 @@ def test_an_outcome_is_answered_when_it_is_on_the_disk(
 
 
 def test_outcomes_that_come_while_one_is_written_share_the_next_save(
-    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
     found: list[tuple[int, str | None, int]] = []
     keeper = keeper_of(part)
 
     def answer(grasp: int, why: str | None) -> None:
-        found.append((grasp, why, outcomes(file)))
+        found.append((grasp, why, outcomes(folder)))
 
     disk.goes_on.clear()
     for grasp in range(5):
@@ -163,7 +166,7 @@ def test_outcomes_that_come_while_one_is_written_share_the_next_save(
 
 
 def test_what_is_kept_already_is_answered_at_once(
-    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
     found: list[str | None] = []
@@ -178,7 +181,7 @@ def test_what_is_kept_already_is_answered_at_once(
 
 
 def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
-    file: SessionFile, disk: Disk, caplog: pytest.LogCaptureFixture, keeper_of: KeeperOf
+    folder: SessionFolder, disk: Disk, caplog: pytest.LogCaptureFixture, keeper_of: KeeperOf
 ) -> None:
     part: Trust = trust()
     found: list[str | None] = []
@@ -191,20 +194,20 @@ def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
     assert tell(part, 1) is OutcomeStatus.REPEATED
     keeper.keep(found.append)
     go_round(keeper)
-    where = f"{file.path}: cannot keep the session: No space left on device"
+    where = f"{folder.path}: cannot keep the session: No space left on device"
     assert found == [f"not kept: {where}"] * 2
     assert caplog.text.count("No space left on device") == 1
-    assert load(file.path) is None
+    assert last_kept(folder.path) is None
     disk.is_full = False
     assert tell(part, 1) is OutcomeStatus.REPEATED
     keeper.keep(found.append)
     go_round(keeper)
     assert found[2:] == [None]
-    assert kept_trust(file) == part.state()
+    assert kept_trust(folder) == part.state()
 
 
 def test_a_disk_that_hangs_holds_neither_the_loop_nor_too_many_answers(
-    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
     found: list[tuple[int, str | None]] = []
@@ -225,11 +228,11 @@ def test_a_disk_that_hangs_holds_neither_the_loop_nor_too_many_answers(
     go_round(keeper)
     assert found[6:] == [(grasp, None) for grasp in range(6, told)]
     assert disk.written == 2
-    assert kept_trust(file) == part.state()
+    assert kept_trust(folder) == part.state()
 
 
 def test_a_disk_that_hangs_does_not_hold_up_the_end(
-    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part: Trust = trust()
     found: list[str | None] = []
@@ -250,44 +253,44 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
 
 
 def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
-    file: SessionFile,
+    folder: SessionFolder,
 ) -> None:
     session, part = calibration(), trust()
     observe(session, 30)
-    file.save(kept_now(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None))
-    keeper = session_keeper(None, sensors(), file, part=part)
+    folder.save([KeptSession(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None)])
+    keeper = session_keeper(None, sensors(), folder, part=part)
     judge(part, 0)
     keeper.keep(lambda _: None)
     keeper.save()
-    kept = load(file.path)
+    kept = last_kept(folder.path)
     assert kept is not None
     assert (kept.fingers, kept.statistics, kept.serials) == (FINGERS, None, {})
 
 
-def test_a_start_with_other_fingers_destroys_nothing(file: SessionFile) -> None:
-    session, part, keeper = taught(file)
+def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> None:
+    session, part, keeper = taught(folder)
     keeper.save()
     other = trust("of two fingers", inputs=52)
     judged = cast(Pipeline, FakeJudge(None, other))
     for grasp in range(5):
-        keeper = SessionKeeper(judged, ("ff", "th"), sensors(), file, Clock())
+        keeper = SessionKeeper(judged, ("ff", "th"), sensors(), folder, Clock())
         judge(other, grasp)
         tell(other, grasp)
         keeper.save()
     again, back = calibration(), trust()
-    session_keeper(again, sensors(), file, part=back).save()
+    session_keeper(again, sensors(), folder, part=back).save()
     assert (again.state(), back.state()) == (session.state(), part.state())
     third = trust("of two fingers", inputs=52)
-    SessionKeeper(cast(Pipeline, FakeJudge(None, third)), ("ff", "th"), sensors(), file, Clock())
+    SessionKeeper(cast(Pipeline, FakeJudge(None, third)), ("ff", "th"), sensors(), folder, Clock())
     assert third.state() == other.state()
 
 
-def test_a_start_with_another_model_destroys_no_ledger(file: SessionFile) -> None:
+def test_a_start_with_another_model_destroys_no_ledger(folder: SessionFolder) -> None:
     parts = trust("a"), trust("b")
     for part in (*parts, *parts):
         for _ in range(3):
             restored = trust(part.state().model)
-            keeper = session_keeper(calibration(), sensors(), file, part=restored)
+            keeper = session_keeper(calibration(), sensors(), folder, part=restored)
             assert restored.state() == part.state()
             for each in (part, restored):
                 grasp = each.risk.proven
@@ -301,51 +304,47 @@ def test_what_cannot_be_kept_at_the_start_is_said_and_kept_later(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """As on a full or read-only disk, and in a folder that is gone."""
-    folder = tmp_path / "gone"
-    file, part, found = SessionFile(folder / "right.json"), trust(), list[str | None]()
-    keeper = session_keeper(None, sensors(), file, part=part)
+    gone = tmp_path / "gone"
+    folder, part, found = SessionFolder(gone / "right"), trust(), list[str | None]()
+    keeper = session_keeper(None, sensors(), folder, part=part)
     judge(part, 1)
     tell(part, 1)
     keeper.keep(found.append)
     go_round(keeper)
-    where = f"{folder}/right.json: cannot keep the session: No such file or directory"
+    where = f"{gone}/right: cannot keep the session: No such file or directory"
     assert found == [f"not kept: {where}"]
     assert caplog.text.count(where) == 1
-    folder.mkdir()
+    gone.mkdir()
     keeper.keep(found.append)
     go_round(keeper)
     assert found[1:] == [None]
-    assert kept_trust(file) == part.state()
+    assert kept_trust(folder) == part.state()
     keeper.save()
-    file.close()
+    folder.close()
 
 
 def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path) -> None:
-    path, mine, theirs, found = tmp_path / "right.json", trust(), trust(), list[str | None]()
-    with SessionFile(path) as other:
-        file = SessionFile(path)
-        keeper = session_keeper(None, sensors(), file, part=mine)
+    path, mine, theirs, found = tmp_path / "right", trust(), trust(), list[str | None]()
+    with SessionFolder(path) as other:
+        folder = SessionFolder(path)
+        keeper = session_keeper(None, sensors(), folder, part=mine)
         judge(mine, 1)
         tell(mine, 1)
         keeper.keep(found.append)
         go_round(keeper)
         judge(theirs, 2)
-        other.save(kept_now(None, FINGERS, {}, theirs.state()))
+        other.save([KeptSession(None, FINGERS, {}, theirs.state())])
     keeper.keep(found.append)
     go_round(keeper)
     keeper.save()
-    file.close()
+    folder.close()
     assert found == [f"not kept: {path}: in use by another graspd, stop that one first", None]
-    (aside,) = tmp_path.glob("right.json.aside-?")
-    kept = load(aside)
-    assert kept is not None
-    assert kept.trust is not None
-    assert decode(kept.trust) == theirs.state()
-    assert kept_trust(file) == mine.state()
+    of_each = [kept.trust for kept in kept_in(path) if kept.trust is not None]
+    assert of_each == [mine.state(), theirs.state()]
 
 
 def test_announced_lifts_are_on_the_disk_when_that_is_answered(
-    file: SessionFile, keeper_of: KeeperOf
+    folder: SessionFolder, keeper_of: KeeperOf
 ) -> None:
     part, announced = trust(), list[int]()
     keeper = keeper_of(part)
@@ -354,7 +353,7 @@ def test_announced_lifts_are_on_the_disk_when_that_is_answered(
     part.lifts.announce()
 
     def answer(_why: str | None) -> None:
-        kept = kept_trust(file)
+        kept = kept_trust(folder)
         assert kept is not None
         announced.append(sum(lift.is_awaited for lift in kept.lifts.records))
 
@@ -364,78 +363,78 @@ def test_announced_lifts_are_on_the_disk_when_that_is_answered(
 
 
 def test_whoever_waits_is_answered_whatever_ends_the_writing(
-    file: SessionFile, monkeypatch: pytest.MonkeyPatch
+    folder: SessionFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part, found = trust(), list[str | None]()
-    keeper = session_keeper(None, sensors(), file, part=part)
-    save = file.save
-    monkeypatch.setattr(file, "save", lambda *_: 1 // 0)
+    keeper = session_keeper(None, sensors(), folder, part=part)
+    save = folder.save
+    monkeypatch.setattr(folder, "save", lambda *_: 1 // 0)
     judge(part, 0)
     keeper.keep(found.append)
     keeper.wait(WAIT_S)
     assert found == ["not kept: it could not be written"]
-    monkeypatch.setattr(file, "save", save)
+    monkeypatch.setattr(folder, "save", save)
     keeper.keep(found.append)
     keeper.save()
     assert found[1:] == [None]
 
 
-def test_session_and_what_was_learned_are_restored_together(file: SessionFile) -> None:
-    session, part, keeper = taught(file)
+def test_session_and_what_was_learned_are_restored_together(folder: SessionFolder) -> None:
+    session, part, keeper = taught(folder)
     judge(part, 20)
     keeper.save()
     again, other = calibration(), trust()
-    session_keeper(again, sensors(), file, part=other)
+    session_keeper(again, sensors(), folder, part=other)
     assert (again.state(), other.state()) == (session.state(), part.state())
     assert tell(other, 20) is OutcomeStatus.TAKEN  # of a grasp of the former start
     assert tell(other, 3) is OutcomeStatus.REPEATED
 
 
 def test_with_another_model_the_session_stays_and_learning_begins_anew(
-    file: SessionFile, caplog: pytest.LogCaptureFixture
+    folder: SessionFolder, caplog: pytest.LogCaptureFixture
 ) -> None:
     session, part = calibration(), trust("a")
     observe(session, 30)
     judge(part, 1)
     tell(part, 1)
-    file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
+    folder.save([KeptSession(session.state(), FINGERS, {"ff": "A"}, part.state())])
     again, other = calibration(), trust("b")
-    session_keeper(again, sensors(), file, part=other)
+    session_keeper(again, sensors(), folder, part=other)
     assert again.state() == session.state()
     assert other.state() == trust("b").state()
     said = "what was learned is of another model; learning and the count of the risk begin again"
     assert caplog.text.count(said) == 1
 
 
-def test_what_a_run_has_no_use_for_is_kept_as_it_is(file: SessionFile) -> None:
+def test_what_a_run_has_no_use_for_is_kept_as_it_is(folder: SessionFolder) -> None:
     session, part = calibration(), trust()
     observe(session, 30)
     judge(part, 1)
     tell(part, 1)
-    file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
+    folder.save([KeptSession(session.state(), FINGERS, {"ff": "A"}, part.state())])
     image = trust("of images", inputs=0)
-    keeper = session_keeper(None, sensors(), file, part=image)  # a model without session
+    keeper = session_keeper(None, sensors(), folder, part=image)  # a model without session
     judge(image, 2)
     tell(image, 2)
     keeper.save()
-    kept = file.load()
+    kept = last_kept(folder.path)
     assert kept is not None
     assert kept.statistics == session.state()
-    assert kept_trust(file) == image.state()
+    assert kept_trust(folder) == image.state()
     off = calibration()
-    keeper = session_keeper(off, sensors(), file)  # learning is switched off
+    keeper = session_keeper(off, sensors(), folder)  # learning is switched off
     observe(off, 1, seed=5)
     keeper.save()
-    assert kept_trust(file) == image.state()
-    keeper = session_keeper(off, sensors(ff="B"), file)
+    assert kept_trust(folder) == image.state()
+    keeper = session_keeper(off, sensors(ff="B"), folder)
     read_once(keeper)  # it has another sensor: what was learned must go
     keeper.save()
-    assert (off.grasps, kept_trust(file)) == (0, None)
+    assert (off.grasps, kept_trust(folder)) == (0, None)
 
 
-def test_an_exchanged_sensor_ends_what_was_learned(file: SessionFile) -> None:
+def test_an_exchanged_sensor_ends_what_was_learned(folder: SessionFolder) -> None:
     session, part, driver = calibration(), trust(), sensors(ff="A")
-    keeper = session_keeper(session, driver, file, part=part)
+    keeper = session_keeper(session, driver, folder, part=part)
     read_once(keeper)
     observe(session, 30)
     for grasp in range(20):
@@ -446,16 +445,16 @@ def test_an_exchanged_sensor_ends_what_was_learned(file: SessionFile) -> None:
     read_once(keeper)
     keeper.save()
     again, other = calibration(), trust()
-    session_keeper(again, driver, file, part=other)
+    session_keeper(again, driver, folder, part=other)
     assert (again.grasps, other.learner.outcomes, other.risk.proven) == (0, 0, 0)
     assert other.risk.lifts == lifts > 0  # slips that were counted stay counted
 
 
 def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
-    file: SessionFile,
+    folder: SessionFolder,
 ) -> None:
     driver, part = sensors(ff="A"), trust()
-    keeper = session_keeper(None, driver, file, part=part)
+    keeper = session_keeper(None, driver, folder, part=part)
     read_once(keeper)
     for first, sensor in ((0, "B"), (20, "A")):
         for grasp in range(first, first + 20):
@@ -475,7 +474,7 @@ def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
 
 
 def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
-    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part, clock = trust(), Clock()
     keeper = keeper_of(part, clock)
@@ -487,4 +486,4 @@ def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
         read_once(keeper)
         go_round(keeper)
     assert disk.written == 1  # nothing is written where nothing is new
-    assert kept_trust(file) == part.state()
+    assert kept_trust(folder) == part.state()

@@ -19,7 +19,8 @@ from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.session.file import SessionFile, kept_now, load
+from graspd.daemon.session.file import KeptSession
+from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.session.keeper import SessionKeeper
 from graspd.daemon.session.sensors import FIT_GRASPS, LOOK_EVERY, moved_fingers
 from graspd.daemon.trust.trust import Trust
@@ -35,6 +36,7 @@ from tests.daemon.session.learning import (
     SHORT,
     calibration,
     judge,
+    kept_in,
     observe,
     read_once,
     sensor_watch,
@@ -77,7 +79,7 @@ def test_tare_and_grasp_are_forgotten_whether_or_not_a_session_is_kept(
     path = tmp_path / "scene.toml"
     path.write_text(
         f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9"\n[session]\nkeep = {keep}\n'
-        f'file = "{tmp_path}/session.json"\n'
+        f'folder = "{tmp_path}/session"\n'
     )
     forgotten: list[Pipeline] = []
     monkeypatch.setattr(
@@ -153,12 +155,12 @@ class Robot:
             self.clock,
             hand=HandLimits(),
         )
-        self.file = SessionFile(self.folder / "right.json")
-        self.keeper = SessionKeeper(self.pipeline, FINGERS, sensors(), self.file, self.clock)
+        self.kept = SessionFolder(self.folder / "right")
+        self.keeper = SessionKeeper(self.pipeline, FINGERS, sensors(), self.kept, self.clock)
 
     def stop(self) -> None:
         self.keeper.save()
-        self.file.close()
+        self.kept.close()
 
     def restart(self) -> None:
         self.stop()
@@ -235,9 +237,7 @@ def test_an_exchange_without_serial_numbers_ends_the_session(
     assert len(slips) == 20
     assert slips.count(Decision.STABLE) <= 2
     assert "taken for other sensors" in caplog.text
-    kept = load(tmp_path / "right.json")
-    assert kept is not None
-    (former,) = kept.others
+    kept, former = kept_in(tmp_path / "right")
     assert former.statistics is not None
     assert former.statistics.grasps >= 100
     assert kept.statistics is not None
@@ -248,8 +248,8 @@ def test_a_hand_that_is_tared_while_it_holds_is_itself_again_once_it_opens(tmp_p
     """A start is no exchange for good, where it was taken for one."""
     session, now = calibration(), [np.full((3, 24), 2000.0)]
     observe(session, 30)
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, sensors(), file, read_rest=lambda: now[0])
+    with SessionFolder(tmp_path / "right") as folder:
+        keeper = session_keeper(session, sensors(), folder, read_rest=lambda: now[0])
         opened = now[0]
         held = opened - np.linspace(0.0, 400.0, 24)
         grasps = []
@@ -284,14 +284,14 @@ def taught() -> tuple[SessionCalibration, Trust]:
 
 def test_a_hand_that_held_at_the_start_has_its_warm_up_back(tmp_path: Path) -> None:
     now, (session, part) = [PATTERN], taught()
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, sensors(), file, part=part, read_rest=lambda: now[0])
+    with SessionFolder(tmp_path / "right") as folder:
+        keeper = session_keeper(session, sensors(), folder, part=part, read_rest=lambda: now[0])
         look(keeper)
         keeper.save()
         learned = part.learner.state()
         again, later = calibration(), trust()
         now[0] = HELD
-        keeper = session_keeper(again, sensors(), file, part=later, read_rest=lambda: now[0])
+        keeper = session_keeper(again, sensors(), folder, part=later, read_rest=lambda: now[0])
         look(keeper)
         assert (again.grasps, later.learner.outcomes, later.risk.proven) == (0, 0, 0)
         keeper.save()
@@ -306,8 +306,8 @@ def test_a_relay_that_restarts_is_no_exchange(tmp_path: Path) -> None:
     """Its sensors rest as before, whatever port it sends from."""
     now, (session, part) = [PATTERN], taught()
     driver = sensors(**dict.fromkeys(FINGERS, "udp://192.0.2.1:4001"))
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, driver, file, part=part, read_rest=lambda: now[0])
+    with SessionFolder(tmp_path / "right") as folder:
+        keeper = session_keeper(session, driver, folder, part=part, read_rest=lambda: now[0])
         look(keeper)
         driver.known = dict.fromkeys(FINGERS, "udp://192.0.2.1:4002")
         now[0] = np.zeros((3, 24))
@@ -329,8 +329,8 @@ def test_sensors_without_numbers_have_each_their_session(tmp_path: Path) -> None
     """Three hands in turn: the session of each is there when it is back."""
     hands = [PATTERN, HELD, PATTERN - np.linspace(400.0, 0.0, 24)]
     now, session = [hands[0]], calibration()
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, sensors(), file, read_rest=lambda: now[0])
+    with SessionFolder(tmp_path / "right") as folder:
+        keeper = session_keeper(session, sensors(), folder, read_rest=lambda: now[0])
         found = []
         for number, rest in enumerate((*hands, *hands)):
             for now[0] in (np.zeros((3, 24)), rest):
@@ -347,9 +347,9 @@ def seed(robot: Robot, day: Day) -> None:
     robot.stop()
     recorded = calibration_of(robot.pipeline)
     day.teach(recorded, 300)
-    with SessionFile(robot.folder / "right.json") as file:
-        file.load()
-        file.save(kept_now(recorded.state(), FINGERS, {}))
+    with SessionFolder(robot.folder / "right") as folder:
+        folder.load()
+        folder.save([KeptSession(recorded.state(), FINGERS, {})])
     robot.start()
 
 

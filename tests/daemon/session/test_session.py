@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.session.file import SessionFile, SessionFileError, kept_now, load
+from graspd.daemon.session.file import KeptSession, SessionFileError
+from graspd.daemon.session.folder import KEPT_MAX, SessionFolder
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -25,7 +26,8 @@ from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
     calibration,
-    grasps_of,
+    kept_in,
+    last_kept,
     observe,
     read_once,
     sensors,
@@ -35,8 +37,8 @@ from tests.daemon.session.learning import (
 
 def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
     clock, session, driver = Clock(), calibration(), sensors(ff="A", mf="B")
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, driver, file, clock)
+    with SessionFolder(tmp_path / "right") as folder:
+        keeper = session_keeper(session, driver, folder, clock)
         read_once(keeper)
         observe(session, 30)
         known = session.state()
@@ -53,8 +55,8 @@ def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
         keeper.save()
     again = calibration()
     driver.known = {"ff": "A", "mf": "X"}  # between two starts
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(again, driver, file, clock)
+    with SessionFolder(tmp_path / "right") as folder:
+        keeper = session_keeper(again, driver, folder, clock)
         assert again.grasps == 31
         read_once(keeper)
         assert again.grasps == 7
@@ -64,10 +66,10 @@ def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
         keeper.save()
 
 
-def test_of_other_sensors_the_newest_four_are_kept(tmp_path: Path) -> None:
+def test_of_other_sensors_the_last_four_are_kept(tmp_path: Path) -> None:
     session, driver = calibration(), sensors(ff="0")
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, driver, file, Clock())
+    with SessionFolder(tmp_path / "right") as folder:
+        keeper = session_keeper(session, driver, folder, Clock())
         read_once(keeper)
         for number in range(1, 8):
             observe(session, 30 + number, seed=number)
@@ -75,18 +77,16 @@ def test_of_other_sensors_the_newest_four_are_kept(tmp_path: Path) -> None:
             read_once(keeper)
             keeper.save()
             assert session.grasps == 0
-        newest = file.load()
-        assert newest is not None
-        kept = [(each.serials["ff"], grasps_of(each)) for each in newest.others]
-        assert kept == [(str(6 - at), 37 - at) for at in range(4)]
+        kept = [(each.serials["ff"], each.grasps) for each in kept_in(folder.path)]
+        assert kept == [("7", 0), *((str(6 - at), 37 - at) for at in range(4))]
         for number in (2, 6):
             driver.known = {"ff": str(number)}
             read_once(keeper)
             assert session.grasps == (37 if number == 6 else 0)
         keeper.save()
-        assert len(list(tmp_path.iterdir())) == 2  # the session and the lock
-        assert file.remove()
-        assert [path.name for path in tmp_path.iterdir()] == ["right.json.lock"]
+        assert len(list(folder.path.iterdir())) == KEPT_MAX + 1  # with the lock
+        assert folder.remove()
+        assert [path.name for path in folder.path.iterdir()] == ["lock"]
 
 
 def test_a_session_of_another_model_that_is_back_is_a_new_one(
@@ -96,10 +96,10 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
     observe(session, 30)
     state = session.state()
     odd = msgspec.structs.replace(state, mean=state.mean[:-1], squares=state.squares[:-1])
-    with SessionFile(tmp_path / "right.json") as file:
-        other = kept_now(odd, FINGERS, {"ff": "B"})
-        file.save(kept_now(state, FINGERS, {"ff": "A"}, others=(other,)))
-        keeper = session_keeper(session, driver, file, Clock())
+    with SessionFolder(tmp_path / "right") as folder:
+        other = KeptSession(odd, FINGERS, {"ff": "B"})
+        folder.save([KeptSession(state, FINGERS, {"ff": "A"}), other])
+        keeper = session_keeper(session, driver, folder, Clock())
         read_once(keeper)
         driver.known = {"ff": "B"}
         read_once(keeper)
@@ -115,15 +115,15 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
 def test_what_is_no_session_is_one_line_and_a_new_session(
     tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = tmp_path / "right.json"
+    path = tmp_path / "7.session"
     path.write_bytes(content)
-    with pytest.raises(SessionFileError) as error:
-        load(path)
-    assert str(error.value).startswith(f"{path}: ")
-    assert "\n" not in str(error.value)
     session = calibration()
-    with SessionFile(path) as file:
-        session_keeper(session, sensors(), file)
+    with SessionFolder(tmp_path) as folder:
+        (error,) = folder.load()
+        assert isinstance(error, SessionFileError)
+        assert str(error).startswith(f"{path}: ")
+        assert "\n" not in str(error)
+        session_keeper(session, sensors(), folder)
     assert session.grasps == 0
     assert "a new session begins" in caplog.text
 
@@ -133,9 +133,9 @@ def test_a_session_of_other_fingers_begins_anew(
 ) -> None:
     other, session = calibration(), calibration()
     observe(other, 9)
-    with SessionFile(tmp_path / "right.json") as file:
-        file.save(kept_now(other.state(), ("ff", "mf"), {}))
-        session_keeper(session, sensors(), file)
+    with SessionFolder(tmp_path / "right") as folder:
+        folder.save([KeptSession(other.state(), ("ff", "mf"), {})])
+        session_keeper(session, sensors(), folder)
     assert "is of the fingers ff, mf, the hand has" in caplog.text
     assert session.grasps == 0
 
@@ -246,16 +246,16 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
     clock = Clock()
     seeded = calibration()
     observe(seeded, 30)
-    with SessionFile(tmp_path / "right.json") as file:
-        file.save(kept_now(seeded.state(), FINGERS, {}))
-        keeper = session_keeper(calibration(), sensors(ff="A", mf="B", th="C"), file, clock)
+    with SessionFolder(tmp_path / "right") as folder:
+        folder.save([KeptSession(seeded.state(), FINGERS, {})])
+        keeper = session_keeper(calibration(), sensors(ff="A", mf="B", th="C"), folder, clock)
         read_once(keeper)
         keeper.save()
-        kept = file.load()
+        kept = last_kept(folder.path)
         assert kept is not None
         assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
         later = calibration()
-        keeper = session_keeper(later, sensors(mf="X"), file, clock)
+        keeper = session_keeper(later, sensors(mf="X"), folder, clock)
         read_once(keeper)
         keeper.save()
     assert later.grasps == 0

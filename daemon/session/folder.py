@@ -1,0 +1,171 @@
+"""The kept sessions of a hand: a folder with a file for each set of fingers, model and sensors."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, Self
+
+from graspd.daemon.process.files import sync_folder
+from graspd.daemon.session.file import KeptSession, SessionFileError, load, write
+
+log = logging.getLogger("graspd")
+
+KEPT_MAX: Final = 5
+"""Most sessions that are kept; the one that was used longest ago goes."""
+DAMAGED_MAX: Final = 16
+"""Most files that cannot be read and stay; the oldest goes."""
+LOCK: Final = "lock"
+"""Name of the file that is locked."""
+ENDING: Final = ".session"
+"""End of the names of the others; before it is a number."""
+
+Found = dict[int, KeptSession | SessionFileError]
+"""Content of each file, or why it cannot be read, by its number, the last used first."""
+
+
+class SessionFolder:
+    """One hand's folder, locked while it is open. Only files that were saved here are replaced.
+
+    The files are numbered in the order in which their sessions were last used.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Nothing is locked yet: see `lock`."""
+        self.path = path
+        self._kept: dict[int, KeptSession] = {}
+        """Sessions that were loaded or saved, by the number of their file."""
+        self._damaged: list[int] = []
+        """Numbers of the files that cannot be read, the newest first."""
+        self._running: int | None = None
+        """Number of the file of the session that runs; None: not saved yet."""
+        self._lock: int | None = None
+
+    def lock(self) -> None:
+        """Make and lock the folder, once. Raises `SessionFileError` if it is in use."""
+        if self._lock is not None:
+            return
+        try:
+            if not self.path.is_dir():
+                self.path.mkdir()
+                sync_folder(self.path.parent)
+                _warn_of_former(self.path)
+            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+            self._lock = os.open(self.path / LOCK, flags, 0o644)
+        except OSError as error:
+            raise _not_kept(self.path, error) from error
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self.close()
+            raise SessionFileError(
+                f"{self.path}: in use by another graspd, stop that one first"
+            ) from error
+        for part in self.path.glob(f"*{ENDING}.{'[0-9a-f]' * 8}"):
+            with suppress(OSError):  # left by a daemon that was killed while it wrote
+                part.unlink()
+
+    def close(self) -> None:
+        """Unlock the folder. May be called more than once."""
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            os.close(lock)
+
+    def __enter__(self) -> Self:
+        self.lock()
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()
+
+    def load(self) -> list[KeptSession | SessionFileError]:
+        """Return what `look` finds, the last used first. Raises `SessionFileError`."""
+        found = look(self.path)
+        self._kept, self._damaged, self._running = {}, [], None
+        if self._lock is not None:  # else another graspd may write these
+            self._kept = {
+                number: kept for number, kept in found.items() if isinstance(kept, KeptSession)
+            }
+            self._damaged = [number for number in found if number not in self._kept]
+        return list(found.values())
+
+    def save(self, sessions: Sequence[KeptSession]) -> None:
+        """Keep these sessions, first the one that runs, in place of those that were loaded.
+
+        Raises `SessionFileError`, after which the sessions on the disk are whole.
+        """
+        self.lock()
+        running, *others = sessions = sessions[:KEPT_MAX]
+        try:
+            for each in reversed(others):
+                if each not in self._kept.values():
+                    self._running = None  # its file must have a higher number
+                    self._write(self._free(), each)
+            if self._running is None:
+                self._running = self._free()
+            self._write(self._running, running)
+            gone = [number for number, each in self._kept.items() if each not in sessions]
+            for number in gone + self._damaged[DAMAGED_MAX:]:
+                _path(self.path, number).unlink(missing_ok=True)
+                self._kept.pop(number, None)
+            del self._damaged[DAMAGED_MAX:]
+        except OSError as error:
+            raise _not_kept(self.path, error) from error
+
+    def remove(self) -> bool:
+        """Delete all that was kept; return False if that is nothing. Raises `SessionFileError`."""
+        numbers = _numbers(self.path)
+        try:
+            for number in numbers:
+                _path(self.path, number).unlink(missing_ok=True)
+        except OSError as error:
+            raise SessionFileError(f"{self.path}: cannot remove: {error.strerror}") from error
+        return bool(numbers)
+
+    def _write(self, number: int, kept: KeptSession) -> None:
+        write(_path(self.path, number), kept)
+        self._kept[number] = kept
+
+    def _free(self) -> int:
+        return max(_numbers(self.path), default=0) + 1
+
+
+def look(folder: Path) -> Found:
+    """Return what each file in a folder holds. Raises `SessionFileError`."""
+    found: Found = {}
+    for number in _numbers(folder):
+        try:
+            found[number] = load(_path(folder, number))
+        except SessionFileError as error:
+            found[number] = error
+    return found
+
+
+def _numbers(folder: Path) -> list[int]:
+    """Return the numbers of the files, the highest first. Raises `SessionFileError`."""
+    try:
+        files = [name for name in os.listdir(folder) if name.endswith(ENDING)]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise SessionFileError(f"{folder}: cannot read the session: {error.strerror}") from error
+    names = [name.removesuffix(ENDING) for name in files]
+    return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
+
+
+def _path(folder: Path, number: int) -> Path:
+    return folder / f"{number}{ENDING}"
+
+
+def _not_kept(folder: Path, error: OSError) -> SessionFileError:
+    return SessionFileError(f"{folder}: cannot keep the session: {error.strerror}")
+
+
+def _warn_of_former(folder: Path) -> None:
+    former = folder.with_name(f"{folder.name}.json")
+    if former.exists():
+        log.warning("%s has a former format: it stays, and is not read", former)

@@ -1,0 +1,259 @@
+"""The folder of sessions: whole whenever it is cut off, and damage found."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import os
+import random
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from unittest import mock
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from graspd.daemon.session.file import KeptSession, SessionFileError, load
+from graspd.daemon.session.folder import SessionFolder
+from graspd.daemon.trust.lift_book import LIFTS_MAX
+from graspd.models.session_statistics import SessionState
+from tests.daemon.session.learning import (
+    FINGERS,
+    calibration,
+    judge,
+    kept_in,
+    observe,
+    tell,
+    trust,
+)
+
+STEPS = ("open", "fchmod", "fsync", "replace", "unlink")
+"""Functions of `os` by which a file is written; a kill comes before or after a call of one."""
+CALLS = 6
+"""Of these in a save: open, fchmod and fsync of the part, the replacement, the folder's two."""
+CALLS_OF_TWO = 2 * CALLS + 1
+"""Of these in the first save of two sessions: then the former file goes."""
+
+
+class Killed(BaseException):
+    """Ends a save as a kill does: nothing is tidied up."""
+
+
+@contextmanager
+def killed(call: int, *, after: bool) -> Iterator[None]:
+    """Kill what runs inside before or after so many calls."""
+    left = itertools.count(-call)
+
+    def deadly(real: Callable[..., object]) -> Callable[..., object]:
+        def run(*arguments: object) -> object:
+            dies = next(left) == 0
+            if dies and not after:
+                raise Killed
+            result = real(*arguments)
+            if dies:
+                if isinstance(result, int):
+                    os.close(result)
+                raise Killed
+            return result
+
+        return run
+
+    with ExitStack() as stack:
+        for name in STEPS:
+            stack.enter_context(mock.patch.object(os, name, deadly(getattr(os, name))))
+        yield
+
+
+def state(grasps: int) -> SessionState:
+    """Statistics that can be told from all others."""
+    return SessionState(float(grasps), grasps, (float(grasps),), (1.0,))
+
+
+def save(folder: SessionFolder, grasps: int) -> None:
+    folder.save([KeptSession(state(grasps), FINGERS, {})])
+
+
+def kept_grasps(path: Path) -> list[int]:
+    return [each.grasps for each in kept_in(path)]
+
+
+def test_a_kill_at_any_step_loses_no_session(tmp_path: Path) -> None:
+    """Sensors are exchanged after a start: their session is saved, and the new one."""
+    found = set()
+    for call, after in itertools.product(range(CALLS_OF_TWO + 1), (False, True)):
+        path = tmp_path / f"{call}{after}"
+        with SessionFolder(path) as folder:
+            save(folder, 1)
+            save(folder, 2)
+        with SessionFolder(path) as folder:
+            folder.load()
+            sessions = [KeptSession(state(10 + n), FINGERS, {"ff": str(n)}) for n in (4, 3)]
+            with suppress(Killed), killed(call, after=after):
+                folder.save(sessions)
+                assert call == CALLS_OF_TWO  # there are no more calls
+        found.add(tuple(kept_grasps(path)))
+        with SessionFolder(path) as folder:
+            folder.load()
+            save(folder, 9)
+        assert kept_grasps(path) == [9]
+        assert len(list(path.iterdir())) == 2
+    assert found == {(2,), (13, 2), (14, 13, 2), (14, 13)}
+
+
+Plan = list[tuple[int | None, bool]]
+"""Of each life of a daemon: at which call its last save is killed, before or after."""
+PLANS = st.lists(
+    st.tuples(st.none() | st.integers(0, CALLS - 1), st.booleans()), min_size=1, max_size=8
+)
+
+
+@settings(max_examples=60)
+@given(PLANS)
+def test_whenever_it_is_killed_nothing_that_was_kept_is_lost(
+    tmp_path_factory: pytest.TempPathFactory, plan: Plan
+) -> None:
+    path = tmp_path_factory.mktemp("session") / "right"
+    written, kept = 0, 0
+    for call, after in plan:
+        with SessionFolder(path) as folder:
+            folder.load()
+            assert kept <= max(kept_grasps(path), default=0) <= written
+            for _ in range(2):
+                written += 1
+                save(folder, written)
+            kept = written
+            with suppress(Killed), killed(CALLS if call is None else call, after=after):
+                written += 1
+                save(folder, written)
+                kept = written
+    assert kept <= max(kept_grasps(path), default=0) <= written
+
+
+def learned(path: Path) -> bytes:
+    """A file as it is after a day, with grasps whose outcome is still out."""
+    session, part = calibration(), trust()
+    observe(session, 30)
+    for grasp in range(40):
+        judge(part, grasp)
+        if grasp % 4:
+            tell(part, grasp)
+    with SessionFolder(path) as folder:
+        folder.save([KeptSession(session.state(), FINGERS, {"ff": "A"}, part.state())])
+    return (path / "1.session").read_bytes()
+
+
+def damage(data: bytes, choose: random.Random) -> bytes:
+    """Flip bits, cut, overwrite, repeat or leave out."""
+    place, length = choose.randrange(len(data)), choose.choice((1, 8, 512, 4096))
+    kind = choose.randrange(6)
+    if kind <= 1:
+        flipped = bytearray(data)
+        for _ in range(choose.choice((1, 1, 2, 50))):
+            flipped[choose.randrange(len(data))] ^= 1 << choose.randrange(8)
+        return bytes(flipped)
+    return (
+        data[:place],
+        data[:place] + bytes(length) + data[place + length :],
+        data[:place] + data[place : place + length] + data[place:],
+        data[:place] + data[place + length :],
+    )[kind - 2]
+
+
+def test_a_thousand_damaged_files_never_become_a_state_that_was_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "1.session"
+    data = learned(tmp_path)
+    written, choose, refused = load(path), random.Random(16), 0
+    for _ in range(1000):
+        damaged = damage(data, choose)
+        path.write_bytes(damaged)
+        try:
+            assert load(path) == written, damaged
+        except SessionFileError:
+            refused += 1
+        else:
+            assert damaged == data
+    assert refused > 990
+
+
+def sealed(plain: bytes) -> bytes:
+    """A file with this content and a right checksum."""
+    content = zlib.compress(plain)
+    return hashlib.sha256(content).digest() + content
+
+
+@pytest.mark.parametrize(
+    "spoil", ["cut", "flip", "empty", "nested", "huge", "former", "no session"]
+)
+def test_a_file_that_cannot_be_read_is_never_replaced(tmp_path: Path, spoil: str) -> None:
+    path = tmp_path / "1.session"
+    with SessionFolder(tmp_path) as folder:
+        save(folder, 2)
+    data = path.read_bytes()
+    spoiled = {
+        "cut": data[:-9],
+        "flip": data[:50] + bytes([data[50] ^ 1]) + data[51:],
+        "empty": b"",
+        "nested": sealed(b"\x91" * 100_000),
+        "huge": sealed(bytes(16 << 20)),
+        "former": sealed(msgspec.msgpack.encode({"version": 2})),
+        "no session": sealed(msgspec.msgpack.encode({"version": 3, "grasps": 1})),
+    }[spoil]
+    path.write_bytes(spoiled)
+    with SessionFolder(tmp_path) as folder:
+        (problem,) = folder.load()
+        assert str(problem).startswith(f"{path}: not a session")
+        for grasps in (3, 4):
+            save(folder, grasps)
+        assert path.read_bytes() == spoiled
+        assert kept_grasps(tmp_path) == [4]
+        assert folder.remove()
+        assert not folder.remove()
+    assert [each.name for each in tmp_path.iterdir()] == ["lock"]
+
+
+def test_of_files_that_cannot_be_read_sixteen_stay(tmp_path: Path) -> None:
+    for number in range(1, 41):
+        (tmp_path / f"{number}.session").write_bytes(b"?")
+    with SessionFolder(tmp_path) as folder:
+        folder.load()
+        save(folder, 1)
+    left = {int(path.stem) for path in tmp_path.glob("*.session")}
+    assert left == {*range(25, 41), 41}
+
+
+def test_a_file_of_the_former_format_stays(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    former = tmp_path / "right.session.json"
+    former.write_bytes(b"{}")
+    for _ in range(2):
+        with SessionFolder(tmp_path / "right.session") as folder:
+            save(folder, 1)
+    assert former.read_bytes() == b"{}"
+    assert caplog.text.count(f"{former} has a former format") == 1
+
+
+def test_a_file_in_place_of_the_folder_stays(tmp_path: Path) -> None:
+    path = tmp_path / "right"
+    path.write_bytes(b"?")
+    folder = SessionFolder(path)
+    for use in (folder.load, lambda: save(folder, 1), folder.remove):
+        with pytest.raises(SessionFileError, match=r"right: cannot (keep|read) the session"):
+            use()
+    assert path.read_bytes() == b"?"
+
+
+def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_path: Path) -> None:
+    part = trust(inputs=5 * 26)
+    for grasp in range(LIFTS_MAX + 1):
+        judge(part, grasp)
+    with SessionFolder(tmp_path / "right") as folder:
+        folder.save([KeptSession(calibration().state(), FINGERS, {}, part.state())])
+    (kept,) = kept_in(folder.path)
+    assert kept.trust is not None
+    assert kept.trust == part.state()
+    assert (folder.path / "1.session").stat().st_size < 1 << 20
