@@ -225,38 +225,3 @@ def test_losses_of_a_sweep_in_a_rhythm_are_not_taken_for_a_longer_period(
     for reading in feed(sweeps, kept):
         assert_of_one_sweep(reading)
     assert sweeps.period_ns == length * SLOT_NS
-
-
-@pytest.mark.parametrize("electrode", [22, 23, 24])
-def test_a_copy_of_a_last_sample_is_none_of_the_sweep_that_has_begun(electrode: int) -> None:
-    sweeps, counters = assembler()
-    stream = concatenated([samples(n) for n in range(8)])
-    begun = 7 * 24 + electrode - 22 + 1
-    at_ns = stream[begun - 1][2]
-    copy = (*stream[7 * 24 - 25 + electrode][:2], at_ns)
-    readings = feed(sweeps, [*stream[:begun], copy, *stream[begun:]])
-    for sweep, reading in enumerate(readings):
-        assert_true(reading, sweep)
-        assert not reading.faults.any()
-    assert (len(readings), counters.duplicate_frames) == (8, 1)
-
-
-def test_a_late_sample_that_a_sweep_lacked_is_none_of_the_next_one_whatever_its_time() -> None:
-    sweeps, counters = assembler()
-    late, (first, *_) = samples(8)[23], samples(9)
-    feed(sweeps, concatenated([*(samples(n) for n in range(8)), samples(8)[:23], [first]]))
-    assert sweeps.push(*late[:2], first[2], first[2] + 17 * SLOT_NS) == ()
-    assert counters.late_frames == 1
-
-
-def test_a_late_sample_of_a_lost_sweep_is_none_of_the_next_one() -> None:
-    """The sweep before that had this electrode; time alone says that it cannot be of this one."""
-    sweeps, counters = assembler()
-    stream = concatenated([samples(n) for n in range(12)])
-    begun = 9 * 24 + 2  # after sweep 8 was lost as a whole but for one that comes late
-    late = (*stream[9 * 24 - 1][:2], stream[begun - 1][2])
-    readings = feed(sweeps, [*stream[: 8 * 24], *stream[9 * 24 : begun], late, *stream[begun:]])
-    for reading in readings:
-        assert_true(reading, reading.seq)
-        assert not reading.faults.any()
-    assert (len(readings), counters.late_frames) == (11, 1)

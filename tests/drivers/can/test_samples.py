@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.biotac import PAC, SEQUENCES
-from graspd.drivers.can.samples import SweepPeriod
+from graspd.drivers.can.sweep_clock import SweepClock
 from tests.drivers.can.can_words import (
     FINGERS,
     SLOT_NS,
@@ -166,22 +168,24 @@ MS = 1_000_000
 PERIOD_NS = 24 * SLOT_NS
 
 
+def periods(gaps_ns: Sequence[int]) -> list[int | None]:
+    """The period after each of these times between the ends of sweeps."""
+    clock, end_ns, known = SweepClock(range(24), 24), 10**12, []
+    clock.learn_end(end_ns)
+    for gap_ns in gaps_ns:
+        end_ns += gap_ns
+        clock.learn_end(end_ns)
+        known.append(clock.period_ns)
+    return known
+
+
 def test_a_period_is_the_median_of_the_last_fifteen_and_known_after_five() -> None:
-    made, known = SweepPeriod(), []
-    for gap_ns in [10] * 15 + [20] * 9:
-        made.learn(gap_ns)
-        known.append(made.period_ns)
-    assert known == [None] * 4 + [10] * 11 + [10] * 7 + [20] * 2
+    assert periods([10] * 15 + [20] * 9) == [None] * 4 + [10] * 11 + [10] * 7 + [20] * 2
 
 
-def test_a_period_is_of_two_seconds_at_most_and_of_no_sweeps_at_one_time() -> None:
-    made = SweepPeriod()
-    for gap_ns in (0, -1, 2_000 * MS + 1) * 5:
-        made.learn(gap_ns)
-    assert made.period_ns is None
-    for _ in range(5):
-        made.learn(2_000 * MS)
-    assert made.period_ns == 2_000 * MS
+def test_a_period_is_two_seconds_at_most() -> None:
+    assert periods([0, -1, 2_000 * MS + 1] * 5) == [None] * 15
+    assert periods([2_000 * MS] * 5)[-1] == 2_000 * MS
 
 
 def missed_when_late(number: int, late_ns: int) -> int:
@@ -208,16 +212,6 @@ def test_an_outage_of_more_than_two_seconds_counts_as_one_missed_sweep(
     gap_ns: int, missed: int
 ) -> None:
     assert missed_when_late(9, gap_ns - PERIOD_NS) == missed
-
-
-@pytest.mark.parametrize(("distance", "readings"), [(3, 9), (4, 10)])
-def test_a_sample_four_after_its_place_is_of_another_sweep(distance: int, readings: int) -> None:
-    made, counters = assembler()
-    stream = concatenated([samples(n) for n in range(9)])
-    here = 6 * 24 + 8
-    stream.insert(here + distance, stream.pop(here))
-    assert sum(len(made.push(*sample)) for sample in stream) == readings
-    assert counters.reordered_frames == (distance == 3)
 
 
 @pytest.mark.parametrize(

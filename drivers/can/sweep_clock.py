@@ -1,0 +1,173 @@
+"""Measure the time between sweeps, and tell by its time whether a sample fits the current sweep.
+
+A sample is a place among the electrodes of a sequence, 0 to 23, and a time, ns.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Sequence
+from enum import Enum, auto
+from typing import Final
+
+from graspd.drivers.base import ELECTRODES
+from graspd.drivers.link import OUTAGE_NS
+
+NEXT_SWEEP_PERIODS: Final = 0.75
+"""Delay, in periods, from which a sample belongs to another sweep.
+
+A loss of whole sweeps delays a sample by one period or more. A lower limit is the safe side: a
+sweep cut without need is flagged, two sweeps mixed in one reading would not be.
+"""
+SLOT_MIN_NS: Final = 100_000
+"""Shortest time between samples, ns: 103 bits at 1 Mbit/s, as on the fastest board."""
+ARRIVAL_JITTER_NS: Final = 5_000_000
+"""Delay of a sweep, ns, up to which no sweep counts as missed."""
+EVEN_SHARE: Final = 1 / 3
+"""Largest gap between two samples without a lost sweep, in periods; a lost one takes half."""
+PERIODS_KEPT: Final = 15
+PERIODS_NEEDED: Final = 5
+"""Measured periods after which the period is known; it is the median of the last 15."""
+
+
+class Timing(Enum):
+    """What the time of a sample says of its sweep."""
+
+    EARLY = auto()
+    """Too early for the current sweep."""
+    FITS = auto()
+    LATE = auto()
+    """It may be too late for the current sweep."""
+
+
+class SweepClock:
+    """Times of the sweeps of one board; `period_ns` is None until it is known."""
+
+    def __init__(self, slots: Sequence[int], samples: int) -> None:
+        """`slots`: slot of each place in a sweep of `samples` slots, rising."""
+        self.period_ns: int | None = None
+        self.t_ns = 0
+        """Time of the last sample of the current sweep."""
+        self._position = [slot / samples for slot in slots]
+        self._shortest_ns = samples * SLOT_MIN_NS
+        self._late_ns = NEXT_SWEEP_PERIODS * self._shortest_ns
+        """Delay from which a sample belongs to another sweep."""
+        self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self._origin_ns = 0.0
+        """Start of the current sweep, by its most punctual sample."""
+        self._start_ns: int | None = None
+        """Start of the sweep before."""
+        self._end_ns: int | None = None
+        self._at_ns = 0
+        self._widest_ns = 0
+        """Widest time between two samples since the sweep before."""
+        self._is_torn = False
+        """True if a sweep without its last sample was ended since."""
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Forget the pace of the board. Call after the link broke."""
+        self._is_steady = False
+        """True if the board sweeps without a pause."""
+        self.cut()
+
+    def cut(self) -> None:
+        """Forget which sample was last. Call after a known loss."""
+        self._seen = -1
+        self._run = 0
+        """Number of samples in a row without a gap in their order."""
+
+    def follow(self, place: int, t_ns: int) -> bool:
+        """Take note of any sample; return True if a sweep begins with it or after the last one."""
+        begins = place == 0 or place < self._seen
+        if place != self._seen:
+            follows = place == (self._seen + 1) % ELECTRODES
+            self._run = self._run + 1 if follows else 1
+            self._seen = place
+        self._widest_ns = max(self._widest_ns, t_ns - self._at_ns)
+        self._at_ns = t_ns
+        return begins
+
+    def is_vague(self, t_ns: int, until_ns: int) -> bool:
+        """Return True if a sample that arrived in this range may be of two sweeps."""
+        return until_ns - t_ns >= self._late_ns
+
+    def timing(self, place: int, last: int, until_ns: int) -> Timing:
+        """Compare a sample with the current sweep; `last`: its furthest place, -1 for none."""
+        if last < 0:
+            return Timing.FITS
+        if self.period_ns is None:
+            late_ns: float = until_ns - self.t_ns - max(place - last, 0) * SLOT_MIN_NS
+            is_early = late_ns < 0
+        else:
+            late_ns = until_ns - (self._origin_ns + self._position[place] * self.period_ns)
+            is_early = -late_ns >= self._late_ns
+        if late_ns >= self._late_ns:
+            return Timing.LATE
+        return Timing.EARLY if is_early else Timing.FITS
+
+    def advance(self, place: int, t_ns: int, *, begins: bool) -> None:
+        """Take the time of a sample at the furthest place of the current sweep so far."""
+        origin_ns = t_ns - self._position[place] * (self.period_ns or 0)
+        self._origin_ns = origin_ns if begins else min(self._origin_ns, origin_ns)
+        self.t_ns = t_ns
+
+    def next_end_ns(self, last: int, *, is_over: bool) -> int | None:
+        """Return when the next reading should be complete; None: not known yet."""
+        if self.period_ns is None or last < 0:
+            return None
+        left = 1.0 if is_over else self._position[-1] - self._position[last]
+        return self.t_ns + round(left * self.period_ns)
+
+    def end(self, last: int) -> int:
+        """End a sweep whose furthest place is `last`; return the number of sweeps missed before it.
+
+        The period is learned from two complete sweeps in a row.
+        """
+        missed = 0
+        period_ns = self.period_ns
+        start_ns = self.t_ns - round(self._position[last] * (period_ns or 0))
+        if self._start_ns is not None:
+            gap_ns = start_ns - self._start_ns
+            if gap_ns > OUTAGE_NS:
+                missed = 1
+            elif period_ns and gap_ns - period_ns >= max(self._late_ns, ARRIVAL_JITTER_NS):
+                missed = round(gap_ns / period_ns) - 1
+        self._start_ns = start_ns
+        if last == ELECTRODES - 1:
+            self.learn_end(self.t_ns)
+        else:
+            self._is_torn = True
+        return missed
+
+    def learn_end(self, end_ns: int) -> None:
+        """Learn the period from the ends of this sweep and of the one before.
+
+        Samples without a gap in their order count even if the time between them cut the sweep.
+        Otherwise a wrong period that cuts every sweep would never be corrected. If the widest gap
+        has room for a whole sweep, only a board that always pauses there teaches the period.
+        """
+        is_usable = not self._is_torn or self._run > ELECTRODES
+        if is_usable and self._end_ns is not None:
+            gap_ns = end_ns - self._end_ns
+            is_even = self._widest_ns < EVEN_SHARE * gap_ns
+            if is_even and not self._is_steady:
+                self._is_steady = True
+                self._learn(None)
+            if is_even or not (self._is_torn or self._is_steady):
+                self._learn(gap_ns)
+        self._is_torn = False
+        self._widest_ns = 0
+        self._end_ns = end_ns
+
+    def _learn(self, gap_ns: int | None) -> None:
+        """Add the time between two sweeps in a row, unless it is an outage; None forgets all."""
+        if gap_ns is None:
+            self._gaps_ns.clear()
+            self.period_ns = None
+        elif 0 < gap_ns <= OUTAGE_NS:
+            self._gaps_ns.append(gap_ns)
+        if len(self._gaps_ns) >= PERIODS_NEEDED:
+            self.period_ns = round(statistics.median(self._gaps_ns))
+        self._late_ns = NEXT_SWEEP_PERIODS * (self.period_ns or self._shortest_ns)
