@@ -24,7 +24,6 @@ from graspd.drivers.can.frames import (
     CAN_FRAME,
     ERROR,
     EXTENDED,
-    FD,
     LOST,
     REMOTE,
     CanCounters,
@@ -237,15 +236,20 @@ class CanBus:
         for _ in range(FRAMES_PER_DRAIN):
             before_ns = self._clock()
             message = bus.recv(timeout=0)
-            if message is not None and self._stamped:
+            if message is None:
+                # slcan returns no frame for an adapter's answer, although frames wait behind it.
+                if self.descriptor is None or not is_ready(self.descriptor):
+                    self._idle_ns = before_ns
+                    return
+                continue
+            frame = _frame_of(message)
+            if frame is None:
+                self.counters.malformed_frames += 1
+            elif self._stamped:
                 t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
-                frames.append((_frame_of(message), t_ns, t_ns))
-            elif message is not None:
-                frames.append((_frame_of(message), since_ns, self._clock()))
-            # slcan returns no frame for an adapter's answer, although frames wait behind it.
-            elif self.descriptor is None or not is_ready(self.descriptor):
-                self._idle_ns = before_ns
-                return
+                frames.append((frame, t_ns, t_ns))
+            else:
+                frames.append((frame, since_ns, self._clock()))
 
 
 def _fileno(bus: can.BusABC) -> int | None:
@@ -283,9 +287,11 @@ def _enlarge_buffer(descriptor: int) -> None:
         same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
 
 
-def _frame_of(message: can.Message) -> CanFrame:
+def _frame_of(message: can.Message) -> CanFrame | None:
+    """Return a classic frame; None for one of CAN FD."""
+    if message.is_fd:
+        return None
     flags = EXTENDED if message.is_extended_id else 0
     flags |= REMOTE if message.is_remote_frame else 0
     flags |= ERROR if message.is_error_frame else 0
-    flags |= FD if message.is_fd else 0
     return CanFrame(message.arbitration_id, bytes(message.data or b""), flags)

@@ -21,7 +21,6 @@ from graspd.drivers.biotac import channel_of, sample_command
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
 CLASSIC_DATA_MAX: Final = 8
-FD_DATA_MAX: Final = 64
 WORD_BYTES: Final = 2
 
 EFF_FLAG: Final = 0x80000000
@@ -54,9 +53,7 @@ EXTENDED: Final = 1
 REMOTE: Final = 2
 ERROR: Final = 4
 """Error frame, made by the controller: the id holds error classes."""
-FD: Final = 8
-"""Frame of CAN FD, of another device on the bus."""
-LOST: Final = 16
+LOST: Final = 8
 """Marker instead of a frame: frames were lost here."""
 
 
@@ -67,7 +64,7 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
     """Id without the flag bits of Linux; the error classes of an error frame."""
     data: bytes
     flags: int = 0
-    """Sum of `EXTENDED`, `REMOTE`, `ERROR`, `FD` and `LOST`."""
+    """Sum of `EXTENDED`, `REMOTE`, `ERROR` and `LOST`."""
 
 
 Stamped = tuple[CanFrame, int, int]
@@ -79,7 +76,6 @@ class Reject(StrEnum):
 
     LENGTH = "wrong_length_frames"
     COMMAND = "unknown_commands"
-    CONTENT = "malformed_frames"
 
 
 @dataclass(slots=True)
@@ -119,7 +115,7 @@ class CanCounters(DriverCounters):
     unknown_commands: int = 0
     """Frames with the right id whose first byte samples no channel."""
     malformed_frames: int = 0
-    """Frames of CAN FD with the right id, and records that hold no frame."""
+    """Records that hold no classic frame; one of CAN FD is of another device."""
     controller_overflows: int = 0
     """Error frames that say that the controller's receive buffer overflowed."""
     kernel_drops: int = 0
@@ -172,8 +168,6 @@ def encode_sample(channel: int, words: bytes) -> bytes:
 
 def parse_sample(frame: CanFrame, sensors: int, length: int) -> tuple[int, bytes] | Reject:
     """Return channel and response words of a frame of `length` bytes, padding included."""
-    if frame.flags & FD:
-        return Reject.CONTENT
     if len(frame.data) != length:
         return Reject.LENGTH
     channel = channel_of(frame.data[0])

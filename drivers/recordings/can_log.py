@@ -1,8 +1,9 @@
 """The link log of a CAN bus: text as `candump -L` writes and `canplayer` reads it.
 
-A line is `(1436509052.249713) can0 100#0D3A1F`: seconds, interface, id of three or eight digits,
-data. CAN FD has `##` and a digit of flags before its data. A remote frame has `R` instead of data.
-Bit 29 of an id marks an error frame (can-utils, lib.c and linux/can.h).
+A line is `(1436509052.249713) can0 100#0D3A1F`: seconds, bus, id of three or eight digits, data. A
+remote frame has `R` instead of data. Bit 29 of an id marks an error frame (can-utils, lib.c and
+linux/can.h). python-can's own reader drops the classes of an error frame, reads most as data, takes
+half a byte for a whole one, and ends at the first line that is none.
 """
 
 from __future__ import annotations
@@ -13,15 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, Unpack
 
-from graspd.drivers.base import Reading
+from graspd.drivers.base import Reading, RecordingError
 from graspd.drivers.can.frames import (
-    CLASSIC_DATA_MAX,
     ERR_FLAG,
     ERROR,
     EXTENDED,
     EXTENDED_ID_MAX,
-    FD,
-    FD_DATA_MAX,
     LOST,
     REMOTE,
     STANDARD_ID_MAX,
@@ -29,16 +27,14 @@ from graspd.drivers.can.frames import (
     Stamped,
 )
 from graspd.drivers.can.stream import BoardOptions, CanStream
-from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.csv_rows import open_recording, read_lines
 from graspd.drivers.recordings.player import LinkLogDriver
 
-LINE_MAX: Final = 256
-"""Longest line, characters; a frame of CAN FD takes 170."""
 NS_PER_US: Final = 1000
 
 _LINE: Final = re.compile(
     r"\(([0-9]{1,11})\.([0-9]{6})\) (\S{1,64}) ([0-9A-F]{3}|[0-9A-F]{8})#"
-    r"(?:(#[0-9A-F])?((?:[0-9A-F]{2})*)|(R[0-9A-F]?))(?: [RT])?\s*",
+    r"(?:((?:[0-9A-F]{2}){0,8})|(R[0-9A-F]?))(?: [RT])?\s*",
     re.IGNORECASE | re.ASCII,
 )
 
@@ -52,8 +48,6 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
     else:
         identifier = f"{word:08X}" if frame.flags & EXTENDED else f"{word:03X}"
     data = "R" if frame.flags & REMOTE else frame.data.hex().upper()
-    if frame.flags & FD:
-        data = f"#0{data}"
     return f"({seconds}.{rest_ns // NS_PER_US:06}) {channel} {identifier}#{data}\n"
 
 
@@ -67,22 +61,19 @@ def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> by
     return "".join(lines).encode()
 
 
-def frame_of(line: str) -> tuple[int, CanFrame] | None:
-    """Return a line's time, ns since 1970, and frame; None if it is no such line."""
-    match = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
+def frame_of(line: str) -> tuple[int, str, CanFrame] | None:
+    """Return a line's time, ns since 1970, bus and frame; None if it is no such line."""
+    match = _LINE.fullmatch(line)
     if match is None:
         return None
     wall_ns = int(match[1]) * 1_000_000_000 + int(match[2]) * NS_PER_US
-    word, data = int(match[4], 16), bytes.fromhex(match[6] or "")
-    flags = FD if match[5] else 0
-    if len(data) > (FD_DATA_MAX if flags else CLASSIC_DATA_MAX):
+    word, data = int(match[4], 16), bytes.fromhex(match[5] or "")
+    flags = REMOTE if match[6] else 0
+    if len(match[4]) == 8:
+        flags |= ERROR if word & ERR_FLAG else EXTENDED
+    elif word > STANDARD_ID_MAX:
         return None
-    if match[7]:
-        flags |= REMOTE
-    if len(match[4]) == 3:
-        return (wall_ns, CanFrame(word, data, flags)) if word <= STANDARD_ID_MAX else None
-    flags |= ERROR if word & ERR_FLAG else EXTENDED
-    return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags)
+    return wall_ns, match[3], CanFrame(word & EXTENDED_ID_MAX, data, flags)
 
 
 class CanLog(LinkLogDriver[CanFrame]):
@@ -106,12 +97,19 @@ class CanLog(LinkLogDriver[CanFrame]):
 
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
         with open_recording(path) as stream:
-            while line := stream.readline(LINE_MAX + 1):
+            for number, line in enumerate(read_lines(path, stream), 1):
                 timed_frame = frame_of(line.decode("ascii", "replace"))
-                if timed_frame is not None:
-                    yield timed_frame
+                if timed_frame is None:
+                    continue
+                wall_ns, bus, frame = timed_frame
+                if bus != self._bus and self._bus is not None:
+                    problem = f"is of bus {bus!r}, those before of {self._bus!r}; play one alone"
+                    raise RecordingError(path, problem, line=number)
+                self._bus = bus
+                yield wall_ns, frame
 
     def begin(self) -> None:
+        self._bus: str | None = None
         self.stream = CanStream("link log", self._fingers, **self._board)
         self.stream.link.greeting()
 

@@ -89,7 +89,8 @@ def bus_log(_first: int) -> Feed:
         frame = sample(unit, SEQUENCES["electrodes"])
         logged = frame_of(line_of(frame, unit.at * SLOT_NS, "can0"))
         assert logged is not None
-        return log.feed(*logged)
+        t_ns, _, frame = logged
+        return log.feed(t_ns, frame)
 
     return feed
 
