@@ -33,12 +33,8 @@ GREETING_TRIES = 4
 
 One more is sent if the serial numbers of the last answer are not confirmed yet.
 """
-PING_PERIOD_NS = 1_000_000_000
-"""Time between PINGs, ns, after the first `PINGS_FIRST`."""
-PING_FIRST_NS = 50_000_000
-"""Time between the first PINGs, ns: short, so that the clock is known soon."""
-PINGS_FIRST = 8
-"""Number of PINGs that are sent at the shorter interval."""
+PING_PERIOD_NS = 247_000_000
+"""Time between PINGs, ns. It is no multiple of usual periods: a sweep may delay a PING."""
 NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """Most PINGs that may wait for an answer; the oldest is given up."""
@@ -140,8 +136,7 @@ class Conversation:
         elif now_ns < self._ping_due_ns:
             return frames
         elif self._sweeps is not None:
-            is_first = self._pings_sent + 1 < PINGS_FIRST
-            self._ping_due_ns = now_ns + (PING_FIRST_NS if is_first else PING_PERIOD_NS)
+            self._ping_due_ns = now_ns + PING_PERIOD_NS
             return [*frames, self._next_ping()]
         elif self._pings_sent < GREETING_TRIES + (self._unconfirmed is not None):
             self._ping_due_ns = now_ns + GREETING_NS
@@ -267,8 +262,7 @@ class Conversation:
         else:
             self._take(hello)
             self._starts = True
-            self._pings_sent = 1
-            self._ping_due_ns = now_ns + PING_FIRST_NS
+            self._ping_due_ns = now_ns + PING_PERIOD_NS
             self._silence_ns = longest_silence_ns(hello.period_ns)
             self._silent_at_ns = now_ns + self._silence_ns
             self._sweeps = SweepDecoder(hello, self._sensors, self.counters)
@@ -328,10 +322,6 @@ def _about_time(sweeps: SweepDecoder) -> dict[str, Fact]:
     clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
     trust = Fact("trusted") if clock.trusted else Fact("not trusted", DeviceFault.CLOCK_NOT_TRUSTED)
     facts = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}
-    if clock.drift_ppm is not None:
-        facts["clock drift"] = Fact(f"{clock.drift_ppm:+.1f} ppm")
-    elif clock.rate_limits_ppm is not None:
-        facts["clock drift"] = Fact("{:+.0f} to {:+.0f} ppm".format(*clock.rate_limits_ppm))
     if clock.round_trip_ns is not None:
         facts["round trip"] = Fact(f"{clock.round_trip_ns / 1e6:.2f} ms")
     if sweeps.longest_ticks:

@@ -142,7 +142,8 @@ def answer(conversation: Conversation, about: Hello, now_ns: int = T0) -> None:
 
 def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> None:
     """Let a HELLO of these sensors answer; if the link is lost, it is opened again."""
-    answer(conversation, dataclasses.replace(hello(0), serials=serials), now_ns)
+    about = dataclasses.replace(hello(0, period_ms=50), serials=serials)
+    answer(conversation, about, now_ns)
     if conversation.link.state is LinkState.WAITING:
         conversation.opened(now_ns)
 

@@ -64,14 +64,13 @@ def test_a_nonce_is_never_that_of_a_reset() -> None:
     assert pings == [Ping((1 << 32) - 1), Ping(1), Ping(2)]
 
 
-def test_eight_pings_come_each_50_ms_and_then_one_a_second() -> None:
-    conversation, sent_ms = greeted(hello(0, period_ms=1000)), [0]
+def test_a_ping_is_sent_every_247_milliseconds() -> None:
+    conversation = greeted(hello(0, period_ms=1000))
     assert said(conversation, T0) == [Start()]
     for number in range(10):
         now_ns = conversation.due_ns
         assert said(conversation, now_ns) == [Ping(43 + number)]
-        sent_ms.append((now_ns - T0) // MS)
-    assert sent_ms == [0, 50, 100, 150, 200, 250, 300, 350, 1350, 2350, 3350]
+        assert now_ns == T0 + 247 * MS * (number + 1)
 
 
 @pytest.mark.parametrize(
@@ -123,8 +122,9 @@ def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again() -> None:
 
 
 def test_a_bridge_that_changes_its_sampling_is_greeted_again() -> None:
-    conversation = greeted()
-    answer(conversation, hello(0, channels=SEQUENCES["all"]), T0 + 50 * MS)
+    conversation = greeted(hello(0, period_ms=50))
+    changed = hello(0, period_ms=50, channels=SEQUENCES["all"])
+    answer(conversation, changed, T0 + 247 * MS)
     assert conversation.link.reason == "the bridge changed what it samples"
 
 
@@ -230,8 +230,6 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
     described = words_of(conversation)
     assert described["clock rate"] == "1000000 Hz"
     assert described["spi errors"] == "0, 7, 24"
-    # 1000100 +- 1 us by its clock are between 1000 and 1001 ms by ours.
-    assert described["clock drift"] == "-900 to +101 ppm"
 
 
 @pytest.mark.parametrize(
@@ -346,7 +344,7 @@ def test_another_serial_number_stops_readings_until_it_is_told_again(
     for _ in range(2):
         told(conversation, SERIALS, T0)
     assert len(hear(conversation, sweep(0, 10**9), T0)) == 1
-    now_ns = T0 + 50 * MS
+    now_ns = T0 + 247 * MS
     told(conversation, OTHERS, now_ns)
     assert conversation.counters.link_losses == 1
     for at, each in enumerate((second, *(() if third is None else (third, third)))):
@@ -363,7 +361,7 @@ def test_a_sensor_that_does_not_answer_is_none_that_was_exchanged() -> None:
         told(conversation, SERIALS, T0)
     now_ns = T0
     for serials in (("A", "", "C"), SERIALS):
-        now_ns += 50 * MS
+        now_ns += 247 * MS
         assert len(hear(conversation, sweep(now_ns // MS % 1000, now_ns), now_ns)) == 1
         told(conversation, serials, now_ns)
         assert conversation.counters.link_losses == 0
