@@ -93,6 +93,7 @@ class CanLog(LinkLogDriver[CanFrame]):
         """Take the arguments of `RecordedDriver` and `CanStream`. Raises `ValueError`."""
         super().__init__(paths, speed, clock)
         self._fingers, self._board = fingers, board
+        self._bus: str | None = None
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
@@ -109,7 +110,7 @@ class CanLog(LinkLogDriver[CanFrame]):
                 yield wall_ns, frame
 
     def begin(self) -> None:
-        self._bus: str | None = None
+        self._bus = None
         self.stream = CanStream("link log", self._fingers, **self._board)
         self.stream.link.greeting()
 
