@@ -24,7 +24,7 @@ _ALL: Final = (1 << ELECTRODES) - 1
 
 
 class Held(Enum):
-    """What a sample's place holds: of the current sweep, or, ahead of it, of the one before."""
+    """Content of a sample's place: in the current sweep, or, ahead of it, in the one before."""
 
     NOTHING = auto()
     SAME = auto()
@@ -33,7 +33,7 @@ class Held(Enum):
 
 
 class Fate(Enum):
-    """What becomes of a sample."""
+    """Fate of a sample."""
 
     BEGINS = auto()
     """It ends the current sweep and begins another."""

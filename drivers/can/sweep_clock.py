@@ -32,7 +32,7 @@ PERIODS_NEEDED: Final = 5
 
 
 class Timing(Enum):
-    """What the time of a sample says of its sweep."""
+    """Relation of a sample's time to the current sweep."""
 
     EARLY = auto()
     """Too early for the current sweep."""
