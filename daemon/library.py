@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graspd.biotac import COUNT_MAX, ELECTRODES, Finger, electrode_columns
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.sources import Source, Tables
@@ -22,8 +23,7 @@ from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
 from graspd.daemon.judge.network import Network, Opinion, Plausibility
 from graspd.daemon.session import file as session_file
-from graspd.drivers.base import COUNT_MAX, ELECTRODES, JointReading
-from graspd.drivers.recordings.csv_rows import electrode_columns
+from graspd.drivers.base import JointReading
 from graspd.models import own, trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.electrodes import Electrodes
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from graspd.daemon.judge.calibration import Calibration
     from graspd.daemon.publish.messages import Verdict
-    from graspd.models.contract import Finger
 
 
 class GraspModel:

@@ -14,12 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-FINGERS = ("ff", "mf", "rf", "lf", "th")
-"""Finger names in the order of the Shadow hand: first, middle, ring, little, thumb."""
-ELECTRODES = 24
-"""Electrodes of one BioTac SP (manual section 5)."""
-COUNT_MAX = 4095
-"""Largest 12-bit reading of an electrode (manual section 5.1)."""
+from graspd.biotac import ELECTRODES
+
 JOINTS = (
     *(f"{finger}J{joint}" for finger in ("FF", "MF", "RF") for joint in (1, 2, 3, 4)),
     *("LFJ1", "LFJ2", "LFJ3", "LFJ4", "LFJ5", "THJ1", "THJ2", "THJ3", "THJ4", "THJ5"),

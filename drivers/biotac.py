@@ -11,7 +11,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
+from graspd.biotac import COUNT_MAX, ELECTRODES
+from graspd.drivers.base import ElectrodeFault, TactileReading
 
 PAC, PDC, TAC, TDC = 0, 1, 2, 3
 """Channels of pressure (AC, DC) and temperature (AC, DC) (manual table 7)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,5 +54,3 @@ WHOLE = ("palm_down", "palm_side")
 """Tables of the published figures: 2549 grasps of 41 objects."""
 NEW_SESSION = "palm_45"
 """Table of another day and another pose."""
-FINGERS: Final = ("ff", "mf", "th")
-"""Fingers in the order of the columns: first, middle, thumb."""

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.models.layout import ELECTRODES
+from graspd.biotac import COUNT_MAX, ELECTRODES, Finger
 
 METADATA_KEY = "graspd"
 CLASSES = ("stable", "slip")
@@ -21,10 +21,8 @@ OUTPUT_NAME = "probability"
 FEATURES_PER_FINGER = ELECTRODES + 2
 """Features of a finger in a session model: 24 z-values, mean and spread."""
 
-Finger = Literal["ff", "mf", "rf", "lf", "th"]
-"""Name of a finger: first, middle, ring, little, thumb."""
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-Count = Annotated[int, msgspec.Meta(ge=0, le=4095)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=COUNT_MAX)]
 
 
 class ModelError(Exception):

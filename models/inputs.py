@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.models.contract import (
     FEATURES_PER_FINGER,
     CountsInput,
@@ -14,7 +15,7 @@ from graspd.models.contract import (
     SessionInput,
     VectorInput,
 )
-from graspd.models.layout import ELECTRODES, LAYOUTS
+from graspd.models.layout import LAYOUTS
 
 Floats = NDArray[np.float64]
 SPREAD_FLOOR_COUNTS = 1.0

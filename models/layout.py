@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-ELECTRODES = 24
-
 
 @dataclass(frozen=True, slots=True)
 class Layout:

@@ -11,7 +11,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.models.layout import D1, ELECTRODES
+from graspd.biotac import ELECTRODES
+from graspd.models.layout import D1
 from graspd.models.tactile_image import Fill, fill_matrix
 
 HEIGHT, WIDTH = D1.shape

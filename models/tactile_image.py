@@ -12,8 +12,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.models.inputs import InputBuilder, scale_of
-from graspd.models.layout import D1, ELECTRODES, Layout
+from graspd.models.layout import D1, Layout
 
 
 class Fill(StrEnum):

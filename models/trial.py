@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from graspd.biotac import COUNT_MAX
 from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import ModelFile, TactileModel, check_operators, read
@@ -26,7 +27,6 @@ MEMORY_MAX_BYTES = 640 << 20
 """Most memory of the trial's process, bytes; the service has a gigabyte."""
 VARIED = 20
 """Number of readings of the trial of any counts, and of those like the training's."""
-COUNT_MAX = 4095
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
 """Option of prctl(2): a signal for this process when its parent ends."""

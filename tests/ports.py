@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import socket
 
-from graspd.drivers.base import FINGERS
+from graspd.biotac import FINGERS
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:

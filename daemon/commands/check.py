@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 
+from graspd.biotac import Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.commands.models import f1_percent
@@ -34,7 +35,7 @@ from graspd.daemon.scene.scene import Realtime, Record, RiskSection
 from graspd.drivers.base import DriverError
 from graspd.drivers.udp import Endpoint
 from graspd.models import zoo
-from graspd.models.contract import Finger, ModelError, SessionInput
+from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from graspd.biotac import TABLE_FINGERS
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
@@ -37,7 +38,7 @@ from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_DAY
 from graspd.drivers.recordings.csv_rows import SLIPPED, columns_of
 from graspd.models import zoo
-from graspd.models.bts3 import FINGERS, TABLES
+from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 
@@ -220,7 +221,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:
     """Return True if each reading is a grasp whose outcome both methods can be held against."""
     fingers = parts.model.contract.fingers
-    if args.json or args.verbose or not isinstance(source, Tables) or fingers != FINGERS:
+    if args.json or args.verbose or not isinstance(source, Tables) or fingers != TABLE_FINGERS:
         return False
     if assembly.gate_mode(parts.scene) != "every":
         return False

@@ -10,14 +10,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 
+from graspd.biotac import ELECTRODES, TABLE_FINGERS
 from graspd.daemon.process.signals import STOPPING
 from graspd.daemon.process.text import complain, write_json
-from graspd.drivers.base import ELECTRODES, DriverError
+from graspd.drivers.base import DriverError
 from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, synthetic_grasps
-from graspd.models.bts3 import FINGERS
 
 log = logging.getLogger("graspd")
 
@@ -141,7 +141,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
         dest="unplugged_fingers",
         action="append",
         default=[],
-        choices=FINGERS,
+        choices=TABLE_FINGERS,
         help="finger whose line nothing drives; may be given several times",
     )
     faults.add_argument(
@@ -180,15 +180,19 @@ def _faults(args: argparse.Namespace) -> LinkFaults:
     options = vars(args)
     values = {field.name: options[field.name] for field in fields(LinkFaults)}
     values["dead_electrodes"] = tuple(map(_electrode, args.dead_electrodes))
-    values["unplugged_fingers"] = tuple(map(FINGERS.index, args.unplugged_fingers))
+    values["unplugged_fingers"] = tuple(map(TABLE_FINGERS.index, args.unplugged_fingers))
     return LinkFaults(**values)
 
 
 def _electrode(text: str) -> tuple[int, int]:
     finger, _, electrode = text.partition("_")
-    if finger not in FINGERS or not electrode.isdecimal() or not 1 <= int(electrode) <= ELECTRODES:
+    if (
+        finger not in TABLE_FINGERS
+        or not electrode.isdecimal()
+        or not 1 <= int(electrode) <= ELECTRODES
+    ):
         raise ValueError(f"{text!r} is no electrode; th_24 would be one")
-    return FINGERS.index(finger), int(electrode) - 1
+    return TABLE_FINGERS.index(finger), int(electrode) - 1
 
 
 def _serve_spi(

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, fine
-from graspd.drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
+from graspd.drivers.base import ElectrodeFault, TactileReading
 
 RAIL_COUNTS = 20
 """Largest distance of a mean from 0 or 4095 that is a rail; 0.3 % of loaded electrodes come

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX
 from graspd.daemon.trust.learner import LearnerState
 from graspd.daemon.trust.risk import Count
-from graspd.drivers.base import COUNT_MAX
 from graspd.models.contract import SessionInput
 from graspd.models.inputs import raw_features
 from graspd.models.session_statistics import SessionState, SessionStatistics, is_odd

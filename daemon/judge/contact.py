@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.daemon.judge.decision import ContactLimits
 from graspd.daemon.judge.health import Number
-from graspd.drivers.base import COUNT_MAX, ELECTRODES
 
 WINDOW = 100
 """Untouched sweeps whose median is a baseline: one second at 100 Hz."""

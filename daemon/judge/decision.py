@@ -10,9 +10,9 @@ from typing import Final
 
 import msgspec
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.reasons import Decision, Moment, Reason
 from graspd.daemon.trust.risk import Permission
-from graspd.models.contract import Finger
 
 MEDIAN_SWEEPS: Final = 3
 WITHHELD: Final = {

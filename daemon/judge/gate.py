@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES, Finger
 from graspd.daemon.judge.decision import HandLimits
 from graspd.daemon.judge.reasons import (
     FingerState,
@@ -33,8 +34,6 @@ from graspd.daemon.judge.reasons import (
 )
 from graspd.daemon.judge.stillness import ONES, Motion, MotionLimits
 from graspd.daemon.judge.windows import LONG_NS, SHORT_NS
-from graspd.drivers.base import ELECTRODES
-from graspd.models.contract import Finger
 
 REFRESH_NS = 50_000_000
 """Age at which a verdict is refreshed, ns: half of `STANDS_NS`, so that it never grows older,

@@ -16,14 +16,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES, Finger
 from graspd.daemon.judge.contact import Contact
 from graspd.daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from graspd.daemon.judge.gate import Gate
 from graspd.daemon.judge.health import NO_COUNT, Checked
 from graspd.daemon.judge.reasons import FingerState, Moment, Reason
 from graspd.daemon.judge.stillness import Motion
-from graspd.drivers.base import ELECTRODES, JointReading
-from graspd.models.contract import Finger
+from graspd.drivers.base import JointReading
 
 if TYPE_CHECKING:
     from graspd.daemon.judge.joint_motion import JointMotion

@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.daemon.judge.reasons import Reason
-from graspd.drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
+from graspd.drivers.base import ElectrodeFault, TactileReading
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 """A count of readings or grasps; bounded, because a part's memory may come from a recording."""

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX, ELECTRODES, Finger, electrode_name
 from graspd.daemon.judge.health import any_of, too_many
 from graspd.daemon.judge.reasons import Reason
-from graspd.drivers.base import COUNT_MAX, ELECTRODES
-from graspd.models.contract import Finger, ModelError
+from graspd.models.contract import ModelError
 from graspd.models.electrodes import Electrodes
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
 from graspd.models.runtime import TactileModel
@@ -152,11 +152,6 @@ class Network:
             log_odds = self._threshold + (margin - self._threshold) / session.temperature
             p_slip = 1.0 / (1.0 + math.exp(-log_odds))
         return Opinion(p_slip, (), repaired, margin)
-
-
-def electrode_name(finger: Finger, place: int) -> str:
-    """Return the name of an electrode, counted from 1: `ff_7` for finger `ff` and place 6."""
-    return f"{finger}_{place + 1}"
 
 
 def _as_read(

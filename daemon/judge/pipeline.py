@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import Finger, electrode_name
 from graspd.daemon.judge.decision import (
     HELD,
     NO_RECENT_VERDICT,
@@ -20,12 +21,12 @@ from graspd.daemon.judge.decision import (
     decide,
 )
 from graspd.daemon.judge.health import Health, Number
-from graspd.daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
+from graspd.daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility
 from graspd.daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
 from graspd.daemon.trust.trust import Assessment
 from graspd.drivers.base import JointReading, TactileReading
-from graspd.models.contract import Finger, ModelError, SessionInput
+from graspd.models.contract import ModelError, SessionInput
 from graspd.models.electrodes import Electrodes
 from graspd.models.runtime import TactileModel
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from graspd.models.contract import Finger
+from graspd.biotac import Finger
 
 
 class Decision(StrEnum):

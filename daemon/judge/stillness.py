@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.windows import (
     APART,
     BLOCK_STEPS,
@@ -25,7 +26,6 @@ from graspd.daemon.judge.windows import (
     MotionMemory,
     Noise,
 )
-from graspd.drivers.base import ELECTRODES
 
 SPIKE_COUNTS = 20.0
 """A value that jumps further is believed once the next one does too. Spikes last for one sweep:

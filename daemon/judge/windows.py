@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.health import Number
-from graspd.drivers.base import ELECTRODES
 
 STEP_NS = 5_000_000
 """Shortest step of a window, ns. Faster sweeps are averaged within a step."""

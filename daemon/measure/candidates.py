@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from graspd.biotac import TABLE_FINGERS
 from graspd.daemon.process.text import progress
-from graspd.models.bts3 import FINGERS
 from graspd.models.contract import ModelError
 from graspd.models.layout import D1
 from graspd.models.runtime import TactileModel
@@ -55,7 +55,7 @@ def candidates(folders: Sequence[Path], grasps: Grasps) -> list[Candidate]:
     published: Row = {
         "name": "published: loops, Keras predict",
         "kind": "peer",
-        "fingers": FINGERS,
+        "fingers": TABLE_FINGERS,
         "error": next((row["error"] for row, _ in models if row["name"] == "cnn1"), {}),
     }
     return [*models, (published, _published(grasps.counts))]

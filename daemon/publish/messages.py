@@ -12,10 +12,10 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec.structs import replace
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.reasons import Decision, FingerState, GateCause, GateState, Reason
 from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.risk import RiskReport
-from graspd.models.contract import Finger
 
 WIRE_VERSION: Final = 1
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import onnxruntime
 
+from graspd.biotac import Finger
 from graspd.daemon import __version__
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateChange, Moment, Reason
@@ -29,7 +30,6 @@ from graspd.daemon.publish.messages import (
 )
 from graspd.daemon.trust.lift_book import Report
 from graspd.drivers.base import JointReading, TactileReading
-from graspd.models.contract import Finger
 
 if TYPE_CHECKING:
     from graspd.daemon.trust.trust import Trust

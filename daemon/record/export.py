@@ -11,12 +11,13 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES, electrode_columns
 from graspd.daemon.publish.messages import decode_outcome
 from graspd.daemon.record.mcap import McapReader, RecordedMessage
 from graspd.daemon.record.topics import Judged, Topic, decode_judged
 from graspd.daemon.trust.lift_book import GraspId
-from graspd.drivers.base import ELECTRODES, RecordingError
-from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, electrode_columns, open_recording
+from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, open_recording
 
 
 @dataclass(frozen=True, slots=True, eq=False)

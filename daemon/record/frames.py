@@ -11,17 +11,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from graspd.biotac import electrode_columns
 from graspd.drivers.base import JointReading, RecordingError, TactileReading
 from graspd.drivers.recordings.csv_player import ReplayDriver
-from graspd.drivers.recordings.csv_rows import (
-    OBJECT,
-    SLIPPED,
-    TIME,
-    Row,
-    columns_of,
-    electrode_columns,
-    read_rows,
-)
+from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, Row, columns_of, read_rows
 from graspd.extras import require
 
 if TYPE_CHECKING:

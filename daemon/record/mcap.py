@@ -22,8 +22,9 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 
+from graspd.biotac import FINGERS
 from graspd.daemon.record.topics import schemas
-from graspd.drivers.base import FINGERS, RecordingError
+from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_rows import open_recording
 from graspd.models.session_statistics import SessionState
 

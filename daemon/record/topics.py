@@ -16,12 +16,13 @@ import msgspec
 import numpy as np
 from msgspec import inspect
 
+from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.calibration import Exchanged
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.publish import messages
 from graspd.daemon.publish.messages import WIRE_VERSION, Count, Tactile
 from graspd.daemon.record.viewers import Log, RawImage
-from graspd.drivers.base import ELECTRODES, JOINTS, JointReading, TactileReading
+from graspd.drivers.base import JOINTS, JointReading, TactileReading
 
 JsonSchema = dict[str, Any]
 TABLE: Final = (

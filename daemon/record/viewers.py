@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.reasons import ADVICE, Decision, GateState, Reason, to_act_on
 from graspd.daemon.publish.messages import (
     MESSAGES,
@@ -21,7 +22,6 @@ from graspd.daemon.publish.messages import (
     Tactile,
     Verdict,
 )
-from graspd.drivers.base import ELECTRODES
 from graspd.models.levels import FULL, HEIGHT, PIXELS, WIDTH, RestCounts, fall_of, levels_of
 
 INFO: Final = 2

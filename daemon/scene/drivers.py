@@ -1,21 +1,13 @@
 """Sections of a scene that name a driver: `[tactile]` and `[joints]`."""
 
 # Without postponed annotations, which pydantic would evaluate at every start.
-
 import ipaddress
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
-from graspd.drivers.base import COUNT_MAX, ELECTRODES
-from graspd.models.contract import Finger
+from graspd.biotac import COUNT_MAX, ELECTRODES, Finger
 
 StrOrPath = TypeVar("StrOrPath", str, Path)
 

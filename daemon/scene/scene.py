@@ -1,19 +1,13 @@
 """The scene: one TOML file that describes a hand, and how to judge its grasps."""
 
 # Without postponed annotations, as in `graspd.daemon.scene.drivers`.
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
+from graspd.biotac import TABLE_FINGERS, Finger
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, JointLimits, Limits
 from graspd.daemon.process.files import SceneError, read_regular
 from graspd.daemon.process.text import printable
@@ -33,7 +27,6 @@ from graspd.daemon.scene.drivers import (
 )
 from graspd.daemon.scene.endpoints import check_endpoint, clash, is_private
 from graspd.drivers import toml
-from graspd.models.contract import Finger
 
 SCENE_MAX_BYTES = 128 << 10
 """Largest scene file, bytes; one that names a thousand recordings has 100 kB."""
@@ -47,7 +40,7 @@ class Hand(Section):
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]{1,32}$")] = "right"
     """Name in the topics and in the default socket."""
-    fingers: Fingers = ("ff", "mf", "th")
+    fingers: Fingers = TABLE_FINGERS
     """Fingers with a sensor, in the order of the model."""
 
     @field_validator("fingers")

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 from msgspec.structs import replace
 
+from graspd.biotac import COUNT_MAX
 from graspd.daemon.process.files import read_regular, write_atomically
 from graspd.daemon.trust.trust import VERSION, TrustState
-from graspd.drivers.base import COUNT_MAX
 from graspd.models.session_statistics import SessionState
 
 if TYPE_CHECKING:

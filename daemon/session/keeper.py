@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
+from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.calibration import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.worker import Worker
@@ -31,7 +32,7 @@ from graspd.daemon.session.sensors import (
     moved_fingers,
     numbers,
 )
-from graspd.drivers.base import ELECTRODES, Driver
+from graspd.drivers.base import Driver
 
 log = logging.getLogger("graspd")
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
-from graspd.drivers.base import ELECTRODES, Driver, Reading
+from graspd.drivers.base import Driver, Reading
 
 if TYPE_CHECKING:
     from graspd.daemon.session.file import KeptSession

@@ -7,12 +7,11 @@ from collections.abc import Collection
 
 import numpy as np
 
+from graspd.biotac import ELECTRODES, Finger
 from graspd.daemon.judge.reasons import Decision, GateState
 from graspd.daemon.publish.messages import OutcomeMessage, Tactile, Verdict
 from graspd.daemon.watch.figures import lift
 from graspd.daemon.watch.snapshot import FingerImage, FingerMotion, JudgedGrasp
-from graspd.models.contract import Finger
-from graspd.models.layout import ELECTRODES
 from graspd.models.levels import PIXELS, RestCounts, fall_of, levels_of
 
 OLD_NS = 1_000_000_000

@@ -13,7 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from graspd.drivers.base import ELECTRODES, ElectrodeFault, TactileReading
+from graspd.biotac import ELECTRODES
+from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.biotac import E1, E24, make_reading
 from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.can.sweep_clock import SweepClock, Timing

@@ -28,8 +28,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX
 from graspd.drivers import toml
-from graspd.drivers.base import COUNT_MAX, JOINTS, DriverError
+from graspd.drivers.base import JOINTS, DriverError
 
 HALL_SENSORS: Final = {
     **{joint: (word,) for word, joint in enumerate(JOINTS[:21])},

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from graspd.drivers.base import ELECTRODES
+from graspd.biotac import ELECTRODES
 from graspd.drivers.udp import DatagramCounters
 
 CYCLE_NS = 1_000_000
@@ -23,7 +23,7 @@ SENSORS = 37
 MOTOR_BYTES: Final = 8 + 10 * 4
 """Bytes behind `which_motors`: two masks, and records of the even or odd ones of 20 motors."""
 TACTILE_FINGERS = 5
-"""Number of tactile slots, in the order of `graspd.drivers.base.FINGERS`."""
+"""Number of tactile slots, in the order of `graspd.biotac.FINGERS`."""
 
 COMMAND_EMPTY: Final = 0
 """`command` of a packet that the palm was too late to fill; all its bytes are zero."""
@@ -100,7 +100,7 @@ class PalmPacket:
     tactile_valid: int
     """Bit i is set if slot i is valid: 0 first finger ... 4 thumb."""
     tactile: tuple[TactileSlot, ...]
-    """Five slots, in the order of `graspd.drivers.base.FINGERS`."""
+    """Five slots, in the order of `graspd.biotac.FINGERS`."""
 
     def to_bytes(self) -> bytes:
         """Return the packet as bytes; skipped fields are zero."""

@@ -25,16 +25,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import (
-    COUNT_MAX,
-    ELECTRODES,
-    FINGERS,
-    JOINTS,
-    ElectrodeFault,
-    JointReading,
-    Reading,
-    TactileReading,
-)
+from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS
+from graspd.drivers.base import JOINTS, ElectrodeFault, JointReading, Reading, TactileReading
 from graspd.drivers.link import OUTAGE_NS, LinkState, longest_silence_ns
 from graspd.drivers.palm.packet import (
     CHANNELS,

@@ -20,15 +20,8 @@ from typing import BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import (
-    COUNT_MAX,
-    ELECTRODES,
-    FINGERS,
-    Annotation,
-    ElectrodeFault,
-    RecordingError,
-    joint_name,
-)
+from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS, electrode_columns
+from graspd.drivers.base import Annotation, ElectrodeFault, RecordingError, joint_name
 
 TIME = "t"
 """Column of seconds, with any zero. Files with it are streams, files without it grasp tables."""
@@ -46,11 +39,6 @@ _LABELS = {"0": False, "1": True}
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 # Counts by their usual text: a look-up is ten times as fast as parsing.
 _COUNT_OF_TEXT = {str(count): count for count in range(COUNT_MAX + 1)}
-
-
-def electrode_columns(finger: str) -> list[str]:
-    """Return the columns of a finger, E1 first, named as in the BioTac SP Stability Set."""
-    return [f"{finger}_biotac_{electrode}" for electrode in range(1, ELECTRODES + 1)]
 
 
 @dataclass(frozen=True, slots=True)

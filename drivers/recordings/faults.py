@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import COUNT_MAX, ELECTRODES, DriverCounters, ElectrodeFault
+from graspd.biotac import COUNT_MAX, ELECTRODES
+from graspd.drivers.base import DriverCounters, ElectrodeFault
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import ELECTRODES, ElectrodeFault, TactileReading
+from graspd.biotac import ELECTRODES
+from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.biotac import E1, E24, channel_of, make_reading
 from graspd.drivers.spi.messages import FrameCounters, Hello, Sweep
 

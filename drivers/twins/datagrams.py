@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from graspd.drivers.base import FINGERS
+from graspd.biotac import FINGERS
 from graspd.drivers.joints import JointMessage
 from graspd.drivers.palm.packet import (
     CHANNELS,

@@ -8,7 +8,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
 
-from graspd.models.contract import Finger, ModelError
+from graspd.biotac import Finger
+from graspd.models.contract import ModelError
 
 ZOO = Path(__file__).resolve().parent
 CARD_MAX_BYTES = 16 << 20

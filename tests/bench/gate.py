@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.decision import HandLimits
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import FingerState
 from graspd.daemon.process.text import markdown_table
-from graspd.drivers.base import ELECTRODES
 from graspd.drivers.twins.grasps.whole_grasps import Sampler
 from tests.daemon.fakes import FINGERS
 from tests.drivers.twins.slides import SLIDE_SPREAD, HeldNoise, Hold

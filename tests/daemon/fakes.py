@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
@@ -16,7 +17,6 @@ from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import DriverCounters, DriverError, Fact, Reading, TactileReading
 from graspd.models.contract import (
     Dataset,
-    Finger,
     ImageInput,
     MeasuredError,
     ModelContract,

@@ -13,7 +13,8 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from graspd.drivers.base import ELECTRODES, Reading, TactileReading
+from graspd.biotac import ELECTRODES
+from graspd.drivers.base import Reading, TactileReading
 
 FIRST, NUMBERS = 50, 4000
 """The count of sweep 0, and how many sweeps there are before a count comes again."""

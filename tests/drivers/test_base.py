@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES, FINGERS
 from graspd.drivers.base import (
-    ELECTRODES,
-    FINGERS,
     Driver,
     DriverCounters,
     ElectrodeFault,

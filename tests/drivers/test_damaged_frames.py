@@ -7,7 +7,8 @@ import itertools
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd.drivers.base import COUNT_MAX, FINGERS, TactileReading
+from graspd.biotac import COUNT_MAX, FINGERS
+from graspd.drivers.base import TactileReading
 from graspd.drivers.can.frames import ERROR, REMOTE, unpack_frame
 from graspd.drivers.palm.packet import CAN_RECORD_BYTES, Palm, parse_packet
 from graspd.drivers.palm.stream import PalmStream

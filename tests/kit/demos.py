@@ -9,14 +9,14 @@ from typing import TextIO
 
 import numpy as np
 
-from graspd.drivers.base import COUNT_MAX
+from graspd.biotac import COUNT_MAX, TABLE_FINGERS, electrode_columns
 from graspd.drivers.recordings.csv_player import (
     DEMO_DAY,
     DEMO_RECORDING,
     DEMO_TABLE,
     SHOW_RECORDING,
 )
-from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
+from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME
 from graspd.drivers.twins.grasps import synthetic
 from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES, Durations
 from graspd.drivers.twins.grasps.synthetic import COUNTS, GraspMixtures, SyntheticGrasps
@@ -68,7 +68,7 @@ def draw_day(model: GraspMixtures, rng: np.random.Generator, grasps: int) -> Syn
 
 def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
     """Write a grasp table in the layout of the BioTac SP Stability Set."""
-    electrodes = [name for finger in synthetic.FINGERS for name in electrode_columns(finger)]
+    electrodes = [name for finger in TABLE_FINGERS for name in electrode_columns(finger)]
     file.write(",".join([OBJECT, SLIPPED, *electrodes]) + "\n")
     rows = zip(grasps.component, grasps.slipped, grasps.counts, strict=True)
     for component, slipped, counts in rows:
@@ -78,7 +78,7 @@ def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
 
 def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
     """Write a stream of ff, mf, th; the label is 0 before the first grasp."""
-    electrodes = [name for finger in synthetic.FINGERS for name in electrode_columns(finger)]
+    electrodes = [name for finger in TABLE_FINGERS for name in electrode_columns(finger)]
     file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")
     for row in rows:
         cells = [f"{row.t_s:.{t_decimals}f}", row.object_name or ""]

@@ -11,6 +11,7 @@ from typing import BinaryIO, Final
 
 import numpy as np
 
+from graspd.biotac import Finger
 from graspd.drivers.base import Reading
 from graspd.drivers.biotac import SEQUENCES, encode_word, sample_command
 from graspd.drivers.can.frames import CanFrame
@@ -36,7 +37,6 @@ from graspd.drivers.twins.can import CanTwin
 from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
-from graspd.models.contract import Finger
 from tests.kit.clock import Clock
 
 CHECKOUT: Final = Path(__file__).parents[2]

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.decision import HandLimits
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.palm.calibration import CoupledTable, Table, parse_calibration
-from graspd.models.contract import Finger
 
 Note = Callable[..., None]
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

@@ -15,10 +15,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import ELECTRODES
+from graspd.biotac import ELECTRODES, TABLE_FINGERS
 
-FINGERS = ("ff", "mf", "th")
-COUNTS = len(FINGERS) * ELECTRODES
+COUNTS = len(TABLE_FINGERS) * ELECTRODES
 MODEL = Path(__file__).with_name("grasp_classes.json")
 OBJECT_PREFIX = "synthetic"
 

@@ -13,7 +13,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import COUNT_MAX, ELECTRODES
+from graspd.biotac import COUNT_MAX, ELECTRODES, TABLE_FINGERS
 from graspd.drivers.twins.grasps import synthetic
 from graspd.drivers.twins.grasps.grasp_script import (
     JOINT_NAMES,
@@ -240,7 +240,7 @@ def synthetic_grasps(
     """Return a stream of synthetic grasps, half of them slips. Raises `ValueError`."""
     model = synthetic.read_model()
     rng = np.random.default_rng([seed, 2])
-    shape = (-1, len(synthetic.FINGERS), ELECTRODES)
+    shape = (-1, len(TABLE_FINGERS), ELECTRODES)
     rest = rest_above(synthetic.draw(model, rng, REST_DRAWS).counts.reshape(shape))
     drawn = synthetic.draw(model, rng, grasps)
     end_points = [

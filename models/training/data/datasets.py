@@ -17,13 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.models.bts3 import FINGERS, NEW_SESSION, TABLES, WHOLE
+from graspd.biotac import COUNT_MAX, ELECTRODES, TABLE_FINGERS, electrode_columns
+from graspd.models.bts3 import NEW_SESSION, TABLES, WHOLE
 from graspd.models.contract import Dataset
-from graspd.models.layout import ELECTRODES
 from graspd.models.training.arrays import Bools, Ints
 
-COUNT_MAX = 4095
-"""Largest 12-bit count."""
 MAX_TABLE_BYTES = 64 * 2**20
 """Largest table that is read, bytes. 2133 grasps take 0.8 MB."""
 FEWEST_GRASPS = 20
@@ -34,9 +32,7 @@ ENOUGH_GRASPS = 200
 Trained on 20 grasps of palm_45, the daemon refuses 98 % of the others as unlike the training; on
 100 grasps 20 %, on 200 6 %, on 500 2.5 %.
 """
-COUNT_COLUMNS = tuple(
-    f"{finger}_biotac_{electrode}" for finger in FINGERS for electrode in range(1, ELECTRODES + 1)
-)
+COUNT_COLUMNS = tuple(name for finger in TABLE_FINGERS for name in electrode_columns(finger))
 
 
 class DatasetError(Exception):
@@ -95,9 +91,9 @@ class Grasps:
     def of_fingers(self, fingers: Sequence[str]) -> Grasps:
         """Return the grasps with these fingers alone, in this order.
         Raises `ValueError` for a finger that a table lacks, or if fingers are missing already."""
-        if self.counts.shape[1] != len(FINGERS) or not set(fingers) <= set(FINGERS):
+        if self.counts.shape[1] != len(TABLE_FINGERS) or not set(fingers) <= set(TABLE_FINGERS):
             raise ValueError(f"the grasps have not the fingers {', '.join(fingers)}")
-        chosen = [FINGERS.index(finger) for finger in fingers]
+        chosen = [TABLE_FINGERS.index(finger) for finger in fingers]
         return dataclasses.replace(self, counts=np.ascontiguousarray(self.counts[:, chosen]))
 
     def digest(self) -> str:
@@ -131,7 +127,7 @@ def read_table(path: Path) -> Grasps:
         raise DatasetError(path, "has no grasps")
     objects, slipped, counts = zip(*grasps, strict=True)
     return Grasps(
-        np.array(counts, dtype=np.uint16).reshape(-1, len(FINGERS), ELECTRODES),
+        np.array(counts, dtype=np.uint16).reshape(-1, len(TABLE_FINGERS), ELECTRODES),
         np.array(slipped, dtype=np.bool_),
         objects,
         (Dataset(path.stem, hashlib.sha256(data).hexdigest(), len(grasps)),),

@@ -12,8 +12,9 @@ from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
+from graspd.biotac import ELECTRODES
 from graspd.models.contract import FEATURES_PER_FINGER
-from graspd.models.layout import D1, ELECTRODES
+from graspd.models.layout import D1
 from graspd.models.tactile_image import Fill, fill_matrix
 from graspd.models.training.arrays import Bools, Floats, Floats32
 from graspd.models.training.estimators.configs import (

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.metrics import f1_score
 
+from graspd.biotac import COUNT_MAX
 from graspd.models.electrodes import Electrodes
 from graspd.models.training.arrays import Bools, Numbers
-from graspd.models.training.data.datasets import COUNT_MAX, Grasps
+from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import fold_seed, folds_of
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import System

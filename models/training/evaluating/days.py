@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX
 from graspd.models.electrodes import Electrodes
 from graspd.models.inputs import builder, raw_features
 from graspd.models.session_statistics import SessionStatistics, is_odd
 from graspd.models.training.arrays import Bools, Floats, Ints, Numbers
-from graspd.models.training.data.datasets import COUNT_MAX, Grasps
+from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED, Standards
 from graspd.models.training.fitting.standards import PRIOR_GRASPS as PRIOR
 from graspd.models.training.fitting.trained import Trained

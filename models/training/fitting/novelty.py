@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from graspd.biotac import COUNT_MAX
 from graspd.models.contract import SeenCounts
 from graspd.models.electrodes import Electrodes
 from graspd.models.training.arrays import Numbers
-from graspd.models.training.data.datasets import COUNT_MAX
 
 MARGIN_COUNTS = 100
 """Margin around the training range, counts, within which a count still passes as seen.

@@ -11,8 +11,9 @@ from typing import Any
 
 import msgspec
 
-from graspd.models.bts3 import FINGERS, NEW_SESSION, WHOLE
-from graspd.models.contract import CountsInput, Finger, ImageInput, VectorInput
+from graspd.biotac import TABLE_FINGERS, Finger
+from graspd.models.bts3 import NEW_SESSION, WHOLE
+from graspd.models.contract import CountsInput, ImageInput, VectorInput
 from graspd.models.layout import D1, D2A, D2B, D3
 from graspd.models.tactile_image import Composition, Fill, Normalisation
 from graspd.models.training.data.protocols import EvalProtocol
@@ -94,7 +95,7 @@ class System:
     augmentation: Augmentation | None = None
     standardise: bool = False
     """True: the model standardises each input value by its training mean and spread."""
-    fingers: tuple[Finger, ...] = FINGERS
+    fingers: tuple[Finger, ...] = TABLE_FINGERS
     tables: tuple[str, ...] = WHOLE
     """Training tables of the kept model; protocols have their own."""
     published: tuple[PaperFigure, ...] = ()
@@ -109,7 +110,7 @@ def digest(system: System) -> str:
 
 def configuration(system: System, *fields: str) -> dict[str, Any]:
     """Return these fields of a system, JSON-ready, and its fingers if they are not all three."""
-    names = fields if system.fingers == FINGERS else (*fields, "fingers")
+    names = fields if system.fingers == TABLE_FINGERS else (*fields, "fingers")
     return {name: _plain(getattr(system, name)) for name in names}
 
 
@@ -344,7 +345,7 @@ _SESSION = (
     ),
 )
 
-_HAND: tuple[Finger, ...] = FINGERS
+_HAND: tuple[Finger, ...] = TABLE_FINGERS
 _FEWER_FINGERS = tuple(
     replace(
         _SESSION[-1],

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
+from graspd.biotac import COUNT_MAX
+from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.palm.packet import ROUND
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.hand import FingerMemory, HandTracker
 from graspd.daemon.judge.health import Checked
@@ -14,7 +15,6 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import FingerState, GateState, Reason
 from graspd.drivers.base import ElectrodeFault
 from graspd.models import zoo
-from graspd.models.contract import Finger
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, sound
 from tests.daemon.judge.test_gate import ALL, LIMITS, Scenario, readings

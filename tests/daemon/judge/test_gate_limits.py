@@ -9,13 +9,13 @@ from itertools import compress
 import numpy as np
 import pytest
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits
 from graspd.daemon.judge.gate import Gate
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from graspd.daemon.judge.stillness import Motion
-from graspd.models.contract import Finger
 from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.test_gate import (
     ALL,

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from graspd.biotac import Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.judge.memory import encode, recall, remember
@@ -22,7 +23,6 @@ from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.trust import trust
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
-from graspd.models.contract import Finger
 from graspd.models.runtime import TactileModel
 from graspd.models.session_statistics import SessionState
 

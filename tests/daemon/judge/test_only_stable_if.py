@@ -19,11 +19,11 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision
 from graspd.drivers.base import JointReading, TactileReading
-from graspd.models.contract import Finger
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeModel, pipeline
 from tests.daemon.judge.necessity import (
     AGE_MAX_MS,

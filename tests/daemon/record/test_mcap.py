@@ -21,6 +21,7 @@ from mcap.records import Chunk
 from mcap.writer import Writer
 from msgspec.structs import replace
 
+from graspd.biotac import FINGERS
 from graspd.daemon.publish.messages import Tactile, encode
 from graspd.daemon.record.mcap import (
     CHUNK_MAX_BYTES,
@@ -34,7 +35,7 @@ from graspd.daemon.record.mcap import (
 )
 from graspd.daemon.record.player import McapReplayDriver
 from graspd.daemon.record.topics import Joints
-from graspd.drivers.base import FINGERS, JointReading, RecordingError, TactileReading
+from graspd.drivers.base import JointReading, RecordingError, TactileReading
 from graspd.models.session_statistics import SessionState
 from tests.daemon.record.recorded import BOOT, HEADER
 

@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import Finger
 from graspd.daemon.judge.calibration import Exchanged, SessionCalibration
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion, Requests
@@ -22,7 +23,7 @@ from graspd.daemon.trust.risk import Permission, RiskLimits
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver
 from graspd.drivers.twins.grasps.grasp_script import Durations
-from graspd.models.contract import Finger, SessionInput, Sharpness
+from graspd.models.contract import SessionInput, Sharpness
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

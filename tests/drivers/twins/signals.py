@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import COUNT_MAX, ELECTRODES
+from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.grasps import Counts

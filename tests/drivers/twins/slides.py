@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import ELECTRODES
+from graspd.biotac import ELECTRODES
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, Sampler
 
