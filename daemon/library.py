@@ -18,20 +18,17 @@ from graspd.biotac import COUNT_MAX, ELECTRODES, Finger, electrode_columns
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.sources import Source, Tables
-from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
-from graspd.daemon.judge.network import Network, Opinion, Plausibility
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
 from graspd.models import own, trial, zoo
 from graspd.models.contract import ModelError, SessionInput
-from graspd.models.electrodes import Electrodes
+from graspd.models.judge.grasp_judge import GraspJudge, Opinion
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from graspd.daemon.judge.calibration import Calibration
     from graspd.daemon.publish.messages import Verdict
 
 
@@ -44,16 +41,13 @@ class GraspModel:
     def __init__(self, path: Path) -> None:
         """Load an ONNX file. Raises `ModelError`."""
         model = trial.load(path)
-        contract = model.contract
-        self.name: str = contract.name
-        self.fingers: tuple[Finger, ...] = contract.fingers
+        self._takes = model.contract.input
+        self.name: str = model.contract.name
+        self.fingers: tuple[Finger, ...] = model.contract.fingers
         """Order of the fingers in the counts."""
-        self._contract = contract
-        self._electrodes = Electrodes(contract.seen)
-        self._plausibility = Plausibility(self.fingers, self._electrodes)
-        self._network = Network(model, Limits.slip_threshold)
+        self._judge = GraspJudge.of(model, Limits.slip_threshold)
         self._turn = threading.Lock()
-        """Held while the network judges: its input and output are buffers."""
+        """Held while it judges: it has one session, and the network one input."""
 
     def predict_proba(
         self,
@@ -72,52 +66,41 @@ class GraspModel:
         Raises `ValueError`, `ModelError` or `SessionFileError` for what does not fit.
         """
         judged = self._counts(counts)
-        now = self._calibration(session)
         probabilities = np.full((len(judged), 2), np.nan)
-        for row, values in enumerate(judged):
-            p_slip = self._opinion(values, now)[0].p_slip
-            if p_slip is not None:
-                probabilities[row] = 1.0 - p_slip, p_slip
+        with self._turn:
+            self._begin(session)
+            for row, values in enumerate(judged):
+                p_slip = self._opinion(values).p_slip
+                if p_slip is not None:
+                    probabilities[row] = 1.0 - p_slip, p_slip
         return probabilities
 
-    def _opinion(
-        self, values: NDArray[np.float64], now: Calibration | None
-    ) -> tuple[Opinion, NDArray[np.generic] | None]:
-        """Return what the network says, and the counts that a session may take in."""
+    def _opinion(self, values: NDArray[np.float64]) -> Opinion:
         counts = np.where(np.isnan(values), 0.0, values).astype(np.uint16)
         broken = at_rail(counts)  # as is a NaN, which is 0 there
-        with self._turn:
-            examined = self._plausibility.examine(counts, broken if broken.any() else None, now)
-            return self._network.judge(examined, now), examined.grasp
+        return self._judge.judge(counts, broken if broken.any() else None)
 
-    def _calibration(
-        self, session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None
-    ) -> Calibration | None:
-        """Return what is known of today's sensors; None for a model that needs no session."""
-        wanted, electrodes = self._contract.input, self._electrodes
-        if not isinstance(wanted, SessionInput):
+    def _begin(self, session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None) -> None:
+        """Begin a session of today's sensors."""
+        calibration = self._judge.session
+        if calibration is None or not isinstance(self._takes, SessionInput):
             if session is not None:
                 raise ModelError(f"the model {self.name} keeps no session")
-            return None
-        calibration = SessionCalibration(wanted, electrodes.centre, electrodes.spread)
+            return
+        calibration.reset()
         if isinstance(session, str | os.PathLike):
             session_file.restore(Path(session), self.fingers, calibration)
         elif session is not None:
             for values in self._counts(session):
-                opinion, grasp = self._opinion(values, calibration.now)
-                if grasp is not None:
-                    p_slip = opinion.p_slip
-                    slip = None if p_slip is None else p_slip >= Limits.slip_threshold
-                    calibration.observe(grasp.astype(np.float64), slip=slip)
+                self._judge.observe(self._opinion(values))
         if not calibration.now.calibrated:
             warnings.warn(
                 f"{self.name} does not know the sensors of this day: its probabilities mean little "
                 "on any day but those of its training. Give session= "
-                f"{wanted.calibrated_from:g} grasps or more of the same sensors; outcomes are not "
-                "needed.",
+                f"{self._takes.calibrated_from:g} grasps or more of the same sensors; outcomes are "
+                "not needed.",
                 stacklevel=3,
             )
-        return calibration.now
 
     def _counts(self, given: ArrayLike | pd.DataFrame) -> NDArray[np.float64]:
         """Return counts of shape (n, fingers, 24). Raises `ValueError`."""

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.assembly.sources import Source
-from graspd.daemon.judge.calibration import Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.memory import recall
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion

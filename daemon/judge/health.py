@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.models.electrodes import any_of, too_many
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 """A count of readings or grasps; bounded, because a part's memory may come from a recording."""
@@ -33,18 +34,6 @@ REPAIRABLE = int(
 )
 """Bits of faults that concern one electrode. Any other bit makes the whole reading unusable."""
 
-BROKEN_MAX = 12
-"""Most broken electrodes of a hand that are repaired.
-
-Twelve at random cost `cnn1` 1.2 +- 0.3 points of F1 and `small-session` 0.6 +- 0.2; eighteen cost
-2.1 and 1.3 (protocol `cv`).
-"""
-BROKEN_FINGER_MAX = 8
-"""Most broken electrodes of one finger that are repaired.
-
-Eight neighbours of the first finger, the worst place, cost 2.4 +- 0.8 and 1.4 +- 0.5 points; twelve
-cost 4.3 and 2.8. Eight of another finger cost at most 0.6.
-"""
 UNCHANGED_MAX = 16
 """Readings in a row with the same count after which an electrode counts as dead.
 
@@ -243,19 +232,6 @@ class Health:
         if memory.has_jumped:
             worn_out |= memory.jumps > JUMPS_MAX
         return worn_out
-
-
-def any_of(which: NDArray[np.bool_]) -> bool:
-    """Return True if any is true, in a tenth of the time of `any()`."""
-    return 1 in which.tobytes()
-
-
-def too_many(broken: NDArray[np.bool_]) -> bool:
-    """Return True if over 12 electrodes of the hand, or over 8 of one finger, are broken."""
-    if np.count_nonzero(broken) <= BROKEN_FINGER_MAX:
-        return False
-    per_finger = broken.sum(axis=1)
-    return bool(per_finger.sum() > BROKEN_MAX or per_finger.max() > BROKEN_FINGER_MAX)
 
 
 def at_rail(counts: NDArray[np.uint16]) -> NDArray[np.bool_]:

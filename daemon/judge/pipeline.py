@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import Finger, electrode_name
+from graspd.biotac import ELECTRODES, Finger, electrode_name
 from graspd.daemon.judge.decision import (
     HELD,
     NO_RECENT_VERDICT,
@@ -21,19 +21,19 @@ from graspd.daemon.judge.decision import (
     decide,
 )
 from graspd.daemon.judge.health import Health, Number
-from graspd.daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility
 from graspd.daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
 from graspd.daemon.trust.trust import Assessment
 from graspd.drivers.base import JointReading, TactileReading
-from graspd.models.contract import ModelError, SessionInput
-from graspd.models.electrodes import Electrodes
+from graspd.models.contract import ModelError
+from graspd.models.judge.grasp_judge import NO_OPINION, GraspJudge, Opinion, Refusal
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from graspd.daemon.judge.calibration import Exchanged, SessionCalibration
+    from graspd.daemon.judge.exchange import Exchanged
     from graspd.daemon.judge.hand import HandTracker
     from graspd.daemon.trust.trust import Trust
+    from graspd.models.judge.session import SessionCalibration
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False):
@@ -106,21 +106,14 @@ class Pipeline:
                 f"{model.path}: judges the fingers {', '.join(model.contract.fingers)} "
                 f"in this order, the hand has {', '.join(fingers)}"
             )
-        contract = model.contract
-        electrodes = Electrodes(contract.seen)
-        self._session: SessionCalibration | None = None
-        if isinstance(contract.input, SessionInput):
-            from graspd.daemon.judge.calibration import SessionCalibration
-
-            self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
+        self._judge = GraspJudge.of(model, limits.slip_threshold)
+        self._session = self._judge.session
         self._limits = limits
         self.clock = clock
         self._learns = learns
         self._needs_session = needs_session
-        self._fingers = contract.fingers
+        self._fingers = model.contract.fingers
         self._health = Health(len(fingers))
-        self._plausibility = Plausibility(fingers, electrodes)
-        self._network = Network(model, limits.slip_threshold)
         self.trust = trust
         """Learning and risk; None: without learning and without a risk."""
         self.lifts = LiftBook() if trust is None else trust.lifts
@@ -135,7 +128,7 @@ class Pipeline:
             from graspd.daemon.judge.hand import HandTracker  # only where it is needed
 
             self.hand, self.on_request = HandTracker(fingers, hand), hand.on_request
-        self.memory = PipelineMemory(np.zeros(electrodes.centre.shape))
+        self.memory = PipelineMemory(np.zeros((len(fingers), ELECTRODES)))
         self._latest_ns = 0, 0
         """Times `t_ns` and `made_ns` of the last reading."""
         self.on_exchange: Callable[[Exchanged | None], None] | None = None
@@ -238,10 +231,8 @@ class Pipeline:
             moment, counts = self.hand.step(made_ns, reading.counts, checked, in_time=in_time)
         grasp = None
         if counts is not None:
-            session = None if self._session is None else self._session.now
-            examined = self._plausibility.examine(counts, checked.broken, session)
-            grasp = examined.grasp
-            memory.opinion, memory.assessment = self._network.judge(examined, session), None
+            memory.opinion, memory.assessment = self._judge.judge(counts, checked.broken), None
+            grasp = memory.opinion.grasp
             if checked.broken is not None:
                 counts = None
         elif moment.state is not GateState.JUDGED:
@@ -282,7 +273,7 @@ class Pipeline:
             findings[electrode_name(self._fingers[finger], place)] = reason
         if self.hand is not None:
             findings |= self.hand.health()
-        if Reason.MODEL_FAILED in opinion.reasons:
+        if opinion.refusal is Refusal.MODEL_FAILED:
             findings["model"] = Reason.MODEL_FAILED
         if self._session is not None and not self._session.now.calibrated:
             findings["session"] = Reason.NOT_CALIBRATED
@@ -314,10 +305,10 @@ class Pipeline:
             return trust.review(grasp, memory.assessment)
         try:
             memory.assessment = trust.judge(
-                grasp, opinion.p_slip, opinion.margin, self._network.features
+                grasp, opinion.p_slip, opinion.margin, self._judge.features
             )
         except ValueError:
-            memory.opinion = Opinion(None, (Reason.MODEL_FAILED,), opinion.repaired)
+            memory.opinion = Opinion(None, Refusal.MODEL_FAILED, opinion.repaired)
             return trust.review(grasp, None)
         return memory.assessment
 
@@ -350,7 +341,9 @@ class Pipeline:
     ) -> Judgement:
         """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
         calibrated = None if self._session is None else self._session.now.calibrated
-        objections = (*unusable, *opinion.reasons)
+        objections = unusable
+        if opinion.refusal is not None:
+            objections = (*unusable, Reason(opinion.refusal))
         if self._is_told(moment):
             objections = (*objections, Reason.OUTCOME_TOLD)
         if calibrated is False and (self._needs_session or self.memory.needs_session):

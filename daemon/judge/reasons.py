@@ -2,8 +2,8 @@
 
 A new reason needs a member of `Reason`, a line of `ADVICE`, a line in deploy/wire/README.md, and
 `graspd schema > deploy/wire/messages.schema.json`. The part that notices it adds it to the
-`reasons` of its `Checked`, `Moment`, `Examined` or `Opinion`. Any reason there makes the verdict
-`unknown`.
+`reasons` of its `Checked` or `Moment`; a `Refusal` of `GraspJudge` has the same text here. Any of
+them makes the verdict `unknown`.
 """
 
 from __future__ import annotations

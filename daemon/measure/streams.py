@@ -22,7 +22,7 @@ from graspd.daemon.trust.trust import Trust
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
-from graspd.models.training.evaluating.days import SessionDay, by_object
+from graspd.models.training.evaluating.days import Day, by_object
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS, with_recipes
 
@@ -105,12 +105,12 @@ def judged(
     trained: Trained, grasps: Grasps, rows: Ints
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]:
     """Judge rows as one session; return margins (N,), inputs (N, features) and what is refused."""
-    day = SessionDay(trained)
+    day = Day(trained)
     margins, refused = np.empty(len(rows)), np.empty(len(rows), np.bool_)
-    inputs = np.empty((len(rows), len(day.inputs)), np.float32)
+    inputs = np.empty((len(rows), *day.network.input.shape), np.float32)
     for index, counts in enumerate(grasps.counts[rows]):
         margins[index], refused[index] = day.judge(counts)
-        inputs[index] = day.inputs
+        inputs[index] = day.network.input
     return margins, inputs, refused
 
 

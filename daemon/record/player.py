@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from graspd.daemon.judge.calibration import Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome
 from graspd.daemon.record.mcap import McapReader, RecordedMessage, header_of
 from graspd.daemon.record.topics import (

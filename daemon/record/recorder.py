@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, cast
 import msgspec
 from msgspec.structs import replace
 
-from graspd.daemon.judge.calibration import Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
 from graspd.daemon.record.mcap import McapWriter, RecordingFile, RecordingHeader

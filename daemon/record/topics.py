@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import inspect
 
 from graspd.biotac import ELECTRODES
-from graspd.daemon.judge.calibration import Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.publish import messages
 from graspd.daemon.publish.messages import WIRE_VERSION, Count, Tactile

@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from graspd.daemon.judge.network import Examined, Network
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.process.text import Colour, coloured, write_lines
 from graspd.daemon.publish.companion import Companion, PublishedVerdict
 from graspd.daemon.run.summary import Tally
 from graspd.daemon.trust.trust import Trust
+from graspd.models.judge.grasp_judge import Examined, GraspJudge
 from graspd.models.runtime import TactileModel
 
 GRASPS = 25
@@ -30,7 +30,7 @@ class DayTable(Companion):
 
         `model`: name of graspd's model. `warnings`: lines to write at the end.
         """
-        self._published = Network(published, 0.5)
+        self._published = GraspJudge.of(published)
         self._warnings = warnings
         self._part = Tally(), Tally()
         self._whole = Tally(), Tally()
@@ -49,7 +49,7 @@ class DayTable(Companion):
         note = None if reading is None else reading.annotation
         if reading is None or note is None or note.slipped is None:
             return
-        p_slip = self._published.judge(Examined((), reading.counts)).p_slip
+        p_slip = self._published.weigh(Examined(reading.counts)).p_slip
         if p_slip is None:
             said = Decision.UNKNOWN
         else:

@@ -18,7 +18,7 @@ from graspd.daemon.trust.trust import VERSION, TrustState
 from graspd.models.session_statistics import SessionState
 
 if TYPE_CHECKING:
-    from graspd.daemon.judge.calibration import SessionCalibration
+    from graspd.models.judge.session import SessionCalibration
 
 MAX_BYTES: Final = 2 << 20
 """Largest content, bytes; a session has 5 kB, learning from outcomes up to 620 kB."""

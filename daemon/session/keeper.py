@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from graspd.biotac import ELECTRODES
-from graspd.daemon.judge.calibration import Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Answer, Requests

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.decision import HELD, Limits, decide
-from graspd.daemon.judge.network import Examined, Network
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.drivers.base import TactileReading
@@ -19,6 +18,7 @@ from graspd.models import zoo
 from graspd.models.contract import ModelContract, SessionInput
 from graspd.models.electrodes import Electrodes
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
+from graspd.models.judge.grasp_judge import Examined, GraspJudge
 from graspd.models.runtime import TactileModel
 from graspd.models.session_statistics import HORIZON_GRASPS, SessionState
 from tests.stability.exact import (
@@ -235,10 +235,13 @@ class Comparison:
 
     def _judge_floats(self, counts: Counts, said: _Verdicts) -> None:
         """Hand to the network what no driver can hand over, as repaired counts are."""
-        network = Network(self.model, LIMITS.slip_threshold)
+        judge = GraspJudge.of(self.model, LIMITS.slip_threshold)
+        if judge.session is not None and self._state is not None:
+            judge.session.restore(self._state)
         for reading in counts:
-            found = network.judge(Examined((), reading), self._session)
-            decision, reasons = decide(found.p_slip, found.reasons, HELD, 0, LIMITS)
+            found = judge.weigh(Examined(reading))
+            refused = () if found.refusal is None else (Reason(found.refusal),)
+            decision, reasons = decide(found.p_slip, refused, HELD, 0, LIMITS)
             said.add(decision, found.p_slip, reasons, self.model)
 
 

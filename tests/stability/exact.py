@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from graspd.daemon.judge.network import TINY
 from graspd.models.contract import (
     OUTPUT_NAME,
     CountsInput,
@@ -24,6 +23,7 @@ from graspd.models.contract import (
     SessionInput,
 )
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS
+from graspd.models.judge.grasp_judge import TINY
 from graspd.models.layout import LAYOUTS, Layout
 from graspd.models.session_statistics import SessionState
 from graspd.models.tactile_image import Composition, Fill, Normalisation

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 pytest.importorskip("onnx", reason="needs the extra `train`")
 
-from graspd.daemon.judge.network import Examined, Network
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.models import zoo
 from graspd.models.inputs import builder
+from graspd.models.judge.grasp_judge import Examined, GraspJudge
 from graspd.models.runtime import TactileModel
 from tests.stability.comparison import (
     INPUT_RELATIVE_MAX,
@@ -172,9 +172,11 @@ def test_inputs_and_probabilities_keep_their_bounds_over_the_12_bit_space(
     if min(abs(exact_spread - 1.0)) > 1e-9:  # else either side may be right
         assert np.abs(out - exact).max() <= INPUT_RELATIVE_MAX * np.abs(exact).max()
 
-    said = Network(model, 0.5).judge(Examined((), counts))
+    judge = GraspJudge.of(model)
+    judge.session = None  # no softening
+    said = judge.weigh(Examined(counts))
     if said.p_slip is None:
-        assert said.reasons
+        assert said.refusal
         assert min(exact_spread) < 1.0 + 1e-9
         return
     wanted = reference.probabilities(exact[np.newaxis])[0, 1]

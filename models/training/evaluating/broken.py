@@ -9,7 +9,7 @@ import numpy as np
 from sklearn.metrics import f1_score
 
 from graspd.biotac import COUNT_MAX
-from graspd.models.electrodes import Electrodes
+from graspd.models.electrodes import BROKEN_MAX, Electrodes
 from graspd.models.training.arrays import Bools, Numbers
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import fold_seed, folds_of
@@ -19,7 +19,7 @@ from graspd.models.training.systems.registry import System
 FOLDS, JUDGED_FOLDS = 10, 3
 """Number of stratified folds, and of those judged; three show a difference of a few points."""
 NUMBERS = (1, 2, 4, 8, 12)
-LOOKED_FOR_MAX = 13
+LOOKED_FOR_MAX = BROKEN_MAX + 1
 """Most broken electrodes that are searched: one more than the daemon repairs in a reading."""
 
 Breakage = Callable[[Numbers, np.random.Generator], Numbers]

@@ -11,6 +11,8 @@ from graspd.models.training.arrays import Floats, Floats32, Ints
 
 PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""
+CALIBRATED_FROM = 20.0
+"""Grasps from which a session counts as calibrated; more gain at most two points."""
 NONE, TRAINING, ALL = "none", "training", "all"
 """Variants of calibration: none; training rows of the same table; the whole pool."""
 RUNNING, RUNNING_SORTED = "running", "running-sorted"

@@ -10,7 +10,7 @@ import onnx
 from scipy.ndimage import rotate
 from torch import nn
 
-from graspd.models.contract import OUTPUT_NAME, SeenCounts
+from graspd.models.contract import OUTPUT_NAME, Input, SeenCounts, SessionInput, Sharpness
 from graspd.models.inputs import builder, raw_features
 from graspd.models.training.arrays import Bools, Floats, Floats32, Ints, Numbers
 from graspd.models.training.data.datasets import Grasps
@@ -30,7 +30,12 @@ from graspd.models.training.estimators.networks import (
     train_network,
 )
 from graspd.models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS, seen_counts
-from graspd.models.training.fitting.standards import Standards, TrainingStandards
+from graspd.models.training.fitting.standards import (
+    CALIBRATED_FROM,
+    PRIOR_GRASPS,
+    Standards,
+    TrainingStandards,
+)
 from graspd.models.training.systems.registry import BlendConfig, SessionFeatures, System
 
 
@@ -66,6 +71,21 @@ class Trained:
         if self.sensors is None:
             return values
         return _moved(values, self.sensors.prior, self.sensors.each(table_of))
+
+    def takes(self, sharpness: Sequence[Sharpness] = (Sharpness(0.0, 1.0),)) -> Input:
+        """Return the input as a contract has it; `sharpness` is of a session system alone."""
+        if not isinstance(self.system.input, SessionFeatures):
+            return self.system.input
+        if self.standards is None:
+            raise ValueError("a session system was trained without standards")
+        return SessionInput(
+            mean=tuple(self.standards.prior.mean.tolist()),
+            spread=tuple(self.standards.prior.spread.tolist()),
+            clip=self.system.input.clip,
+            prior_grasps=PRIOR_GRASPS,
+            calibrated_from=CALIBRATED_FROM,
+            sharpness=tuple(sharpness),
+        )
 
     def seen(self) -> SeenCounts:
         """Description of the training counts, to find readings unlike them."""

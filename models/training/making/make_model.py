@@ -15,26 +15,23 @@ from graspd.models.contract import (
     CLASSES,
     ConfidenceStep,
     Dataset,
-    Input,
     MeasuredError,
     ModelContract,
-    SessionInput,
     Sharpness,
 )
 from graspd.models.training.data.datasets import ENOUGH_GRASPS, Grasps, lab_table_names, unpublished
 from graspd.models.training.estimators.graphs import OPSET
 from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.broken import broken_study
-from graspd.models.training.evaluating.days import CALIBRATED_FROM
 from graspd.models.training.evaluating.files import to_json, write_whole
 from graspd.models.training.evaluating.metrics import FEWEST_JUDGED
 from graspd.models.training.evaluating.summaries import SystemSummary, made_with, summarise
 from graspd.models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
-from graspd.models.training.fitting.standards import PRIOR_GRASPS, RUNNING
+from graspd.models.training.fitting.standards import RUNNING
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.making.export import export
 from graspd.models.training.making.plan import TrainingPlan
-from graspd.models.training.systems.registry import SessionFeatures, System, configuration
+from graspd.models.training.systems.registry import configuration
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 EXTRA_TRAININGS = 2
@@ -124,7 +121,7 @@ def _contract(
     return ModelContract(
         version=2,
         name=plan.model,
-        input=_input(plan.system, trained, summaries),
+        input=trained.takes(_sharpness(summaries)),
         fingers=plan.system.fingers,
         classes=CLASSES,
         seed=plan.seed,
@@ -152,27 +149,11 @@ def _measured(summary: SystemSummary) -> MeasuredError:
     )
 
 
-def _input(system: System, trained: Trained, summaries: list[SystemSummary]) -> Input:
-    if not isinstance(system.input, SessionFeatures):
-        return system.input
-    if trained.standards is None:
-        raise ValueError("a session system was trained without standards")
-    prior = trained.standards.prior
-    return SessionInput(
-        mean=tuple(prior.mean.tolist()),
-        spread=tuple(prior.spread.tolist()),
-        clip=system.input.clip,
-        prior_grasps=PRIOR_GRASPS,
-        calibrated_from=float(CALIBRATED_FROM),
-        sharpness=_sharpness(summaries),
-    )
-
-
 def _sharpness(summaries: list[SystemSummary]) -> tuple[Sharpness, ...]:
     """Return the temperatures of a young session, which is never surer than a calibrated one."""
     base = _calibrator(summaries).main.temperature
     later = next((s for s in summaries if s.protocol == "days"), None)
-    if later is None:
+    if later is None or RUNNING not in later.variants:
         return (Sharpness(0.0, 1.0),)
     steps: list[Sharpness] = []
     for age in reversed(later.variants[RUNNING].ages):

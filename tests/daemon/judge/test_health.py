@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.health import Checked, Health, too_many
+from graspd.daemon.judge.health import Checked, Health
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.models.electrodes import too_many
 from tests.daemon.fakes import sound
 
 FINGERS = 3

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.drivers.twins.grasps import synthetic
 from graspd.models import zoo
+from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import sound
 

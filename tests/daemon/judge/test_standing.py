@@ -12,7 +12,6 @@ import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
@@ -23,6 +22,7 @@ from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.models import zoo
+from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from tests.bench.attacks.standing import drifting
 from tests.daemon.fakes import MS, Clock, sound

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import GateState, Moment, Reason
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.models import zoo
+from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from tests.daemon.judge.test_gate_limits import Steps
 from tests.daemon.judge.test_learning import grasps, judge

@@ -54,7 +54,7 @@ BUSES = {
 JOINTS = ours("daemon.judge.joint_motion", "drivers.joints")
 HALL = ours("drivers.palm.calibration")
 GATE = ours(*(f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")))
-STATISTICS = ours("daemon.judge.calibration", "models.session_statistics")
+STATISTICS = ours("models.judge.session", "models.session_statistics")
 KEPT = ours("daemon.session.file", "daemon.session.folder", "daemon.session.keeper")
 ASK = ours("daemon.publish.questions")
 

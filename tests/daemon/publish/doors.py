@@ -16,7 +16,6 @@ import zmq
 from msgspec.structs import replace
 
 from graspd.daemon import scene
-from graspd.daemon.judge.network import Opinion
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import Moment
 from graspd.daemon.publish.companion import Answer, PublishedVerdict, at_once
@@ -25,6 +24,7 @@ from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
+from graspd.models.judge.grasp_judge import Opinion
 from tests.kit.messages import GOLDEN, decode_verdict
 from tests.kit.waiting import wait_until
 from tests.ports import free_port
@@ -49,7 +49,7 @@ def published(
 ) -> PublishedVerdict:
     """The golden verdict of that name, with changes, on a grasp of the book."""
     verdict = replace(decode_verdict((GOLDEN / f"verdict_{name}.json").read_bytes()), **changes)
-    judgement = Judgement(0, verdict.verdict, (), 0.1, Moment(grasp), Opinion(0.1, ()))
+    judgement = Judgement(0, verdict.verdict, (), 0.1, Moment(grasp), Opinion(0.1))
     about = GraspId("0" * 32, grasp), LiftBook() if lifts is None else lifts, keep
     return PublishedVerdict(judgement, verdict, payload, None, True, *about)
 

@@ -18,7 +18,7 @@ from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import build_recorder
 from graspd.daemon.assembly.recordings import RecordedRun
-from graspd.daemon.judge.calibration import Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import GateCause
 from graspd.daemon.publish.companion import LoopEvent, PublishedVerdict

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.calibration import Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.publish.messages import State

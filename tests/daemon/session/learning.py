@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import Finger
-from graspd.daemon.judge.calibration import Exchanged, SessionCalibration
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion, Requests
 from graspd.daemon.session.file import KeptSession
@@ -24,6 +24,7 @@ from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.models.contract import SessionInput, Sharpness
+from graspd.models.judge.session import SessionCalibration
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

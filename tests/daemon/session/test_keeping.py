@@ -14,7 +14,6 @@ from typing import cast
 
 import pytest
 
-from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
@@ -28,6 +27,7 @@ from graspd.daemon.session.keeper import (
 )
 from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.trust import Trust, TrustState
+from graspd.models.judge.session import SessionCalibration
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
-from graspd.daemon.judge.calibration import SessionCalibration
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
@@ -29,6 +28,7 @@ from graspd.drivers.twins.grasps.grasp_script import EndPoint
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
 from graspd.models import zoo
+from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, Clock, reading
 from tests.daemon.session.learning import (

@@ -21,10 +21,3 @@ def test_dead_electrodes_cost_less_once_they_are_repaired(name: str) -> None:
     dead = next(b for b in study.broken if b.reads == "at 0" and b.number == 12)
     assert dead.unnoticed < dead.known
     assert dead.known > study.sound - 0.05
-
-
-def test_the_study_looks_for_one_more_broken_electrode_than_the_daemon_repairs() -> None:
-    from graspd.daemon.judge.health import BROKEN_MAX
-    from graspd.models.training.evaluating.broken import LOOKED_FOR_MAX
-
-    assert LOOKED_FOR_MAX == BROKEN_MAX + 1

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.calibration import Calibration, SessionCalibration
 from graspd.models.contract import SessionInput, Sharpness
+from graspd.models.judge.session import Calibration, SessionCalibration
 
 MEAN, SPREAD = 2000.0, 100.0
 """Of every electrode in the training, counts."""

@@ -4,27 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import COUNT_MAX
-from graspd.daemon.trust.learner import LearnerState
-from graspd.daemon.trust.risk import Count
 from graspd.models.contract import SessionInput
 from graspd.models.inputs import raw_features
 from graspd.models.session_statistics import SessionState, SessionStatistics, is_odd
-
-
-class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An exchange of sensors, with what is known of those that are there now."""
-
-    session: SessionState | None = None
-    learned: LearnerState | None = None
-    proven: Count = 0
-    """Outcomes that count for their warm-up."""
-    tared: bool = False
-    """True if the tare that is known is theirs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,22 +53,22 @@ class SessionCalibration:
 
     def __init__(
         self,
-        wanted: SessionInput,
+        takes: SessionInput,
         counts_mean: NDArray[np.float64],
         counts_spread: NDArray[np.float64],
     ) -> None:
         """Start with the statistics of the training.
 
-        `wanted`: the model's input, with those of its features. `counts_mean`, `counts_spread`:
+        `takes`: the model's input, with those of its features. `counts_mean`, `counts_spread`:
         mean and standard deviation of each electrode, counts, shape (fingers, 24).
         """
-        self._wanted = wanted
+        self._takes = takes
         self._training_mean = counts_mean
         self._training_spread = counts_spread
         self._statistics = SessionStatistics(
-            np.concatenate((wanted.mean, counts_mean.ravel())),
-            np.concatenate((wanted.spread, counts_spread.ravel())),
-            wanted.prior_grasps,
+            np.concatenate((takes.mean, counts_mean.ravel())),
+            np.concatenate((takes.spread, counts_spread.ravel())),
+            takes.prior_grasps,
         )
         self.now = self._calibration()
 
@@ -111,21 +97,21 @@ class SessionCalibration:
 
     def restore(self, state: SessionState) -> None:
         """Continue a kept session. Raises `ValueError` if it does not fit model and counts."""
-        counts = np.array(state.mean[len(self._wanted.mean) :])
+        counts = np.array(state.mean[len(self._takes.mean) :])
         if ((counts < 0.0) | (counts > COUNT_MAX)).any():
             raise ValueError("holds means that no counts have")
         self._statistics.restore(state)
         self.now = self._calibration()
 
     def _calibration(self) -> Calibration:
-        features, shape = len(self._wanted.mean), self._training_mean.shape
+        features, shape = len(self._takes.mean), self._training_mean.shape
         mean, spread = self._statistics.mean, self._statistics.spread
         counts_mean = mean[features:].reshape(shape)
         counts_spread = spread[features:].reshape(shape)
-        enough = self.grasps >= self._wanted.calibrated_from
+        enough = self.grasps >= self._takes.calibrated_from
         training = self._training_mean, self._training_spread
         odd = is_odd(counts_mean, counts_spread, *training, enough=enough)
-        steps, grasps = self._wanted.sharpness, 0 if odd else self.grasps
+        steps, grasps = self._takes.sharpness, 0 if odd else self.grasps
         return Calibration(
             features_mean=mean[:features],
             features_spread=spread[:features],

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.calibration import Calibration
-from graspd.daemon.judge.network import Plausibility
-from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.twins.grasps import synthetic
 from graspd.models import zoo
 from graspd.models.contract import SeenCounts
-from graspd.models.electrodes import Electrodes
+from graspd.models.judge.grasp_judge import GraspJudge, Refusal
+from graspd.models.judge.session import Calibration
 from graspd.models.runtime import TactileModel
 
 NOTHING = np.zeros((3, 24), dtype=np.bool_)
@@ -24,18 +22,17 @@ BROKEN = ((0, 14), (1, 20))
 
 
 @pytest.fixture(scope="module")
-def plausibility() -> Plausibility:
-    contract = TactileModel(zoo.find("cnn1")).contract
-    return Plausibility(contract.fingers, Electrodes(contract.seen))
+def cnn1() -> GraspJudge:
+    return GraspJudge.of(TactileModel(zoo.find("cnn1")))
 
 
 @pytest.fixture(scope="module")
-def grasp(plausibility: Plausibility) -> NDArray[np.uint16]:
+def grasp(cnn1: GraspJudge) -> NDArray[np.uint16]:
     """One that is judged as it is: shape (3, 24)."""
     drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(1), 50)
     for counts in drawn.counts.reshape(50, 3, 24):
-        found = plausibility.examine(counts, NOTHING)
-        if not found.reasons and not found.repaired:
+        found = cnn1.examine(counts, NOTHING)
+        if found.refusal is None and not found.repaired:
             return np.asarray(counts, dtype=np.uint16)
     raise AssertionError("no grasp is like those of the training")
 
@@ -43,7 +40,7 @@ def grasp(plausibility: Plausibility) -> NDArray[np.uint16]:
 @pytest.mark.parametrize("known", [0, 1, 2])
 @pytest.mark.parametrize(("wrong", "judged"), [(0, True), (1, True), (2, True), (3, False)])
 def test_two_electrodes_may_contradict_besides_those_known_to_be_broken(
-    plausibility: Plausibility, grasp: NDArray[np.uint16], known: int, wrong: int, judged: bool
+    cnn1: GraspJudge, grasp: NDArray[np.uint16], known: int, wrong: int, judged: bool
 ) -> None:
     counts, broken = grasp.copy(), NOTHING.copy()
     for place in WRONG[:wrong]:
@@ -51,8 +48,8 @@ def test_two_electrodes_may_contradict_besides_those_known_to_be_broken(
     for place in BROKEN[:known]:
         counts[place] = 0
         broken[place] = True
-    found = plausibility.examine(counts, broken)
-    assert found.reasons == (() if judged else (Reason.NEVER_SEEN,))
+    found = cnn1.examine(counts, broken)
+    assert found.refusal == (None if judged else Refusal.NEVER_SEEN)
     if judged:
         names = {f"{('ff', 'mf', 'th')[f]}_{e + 1}" for f, e in (*WRONG[:wrong], *BROKEN[:known])}
         assert set(found.repaired) == names
@@ -71,9 +68,8 @@ def seen_by_sessions() -> SeenCounts:
 
 
 @pytest.fixture(scope="module")
-def of_sessions() -> Plausibility:
-    seen = seen_by_sessions()
-    return Plausibility(("ff", "mf", "th"), Electrodes(seen))
+def of_sessions() -> GraspJudge:
+    return GraspJudge.of(TactileModel(zoo.find("small-session")))
 
 
 def same_sensors(centre: NDArray[np.float64], **known: bool) -> Calibration:
@@ -98,7 +94,7 @@ def same_sensors(centre: NDArray[np.float64], **known: bool) -> Calibration:
     ],
 )
 def test_a_session_judges_what_is_near_and_learns_from_what_is_twice_as_far(
-    of_sessions: Plausibility,
+    of_sessions: GraspJudge,
     stretched: float,
     known: dict[str, bool],
     judged: bool,
@@ -111,7 +107,8 @@ def test_a_session_judges_what_is_near_and_learns_from_what_is_twice_as_far(
     direction = np.random.default_rng(2).normal(size=72)
     direction *= 0.9 * seen.distance_max * np.sqrt(72) / np.linalg.norm(direction)
     counts = np.clip(centre + stretched * (direction @ spread.T).reshape(3, 24), 1, 4094)
-    session = same_sensors(centre, **known)
-    found = of_sessions.examine(np.rint(counts).astype(np.uint16), NOTHING, session)
-    assert found.reasons == (() if judged else (Reason.NEVER_SEEN,))
+    assert of_sessions.session is not None
+    of_sessions.session.now = same_sensors(centre, **known)
+    found = of_sessions.examine(np.rint(counts).astype(np.uint16), NOTHING)
+    assert found.refusal == (None if judged else Refusal.NEVER_SEEN)
     assert (found.grasp is not None) == learned

@@ -8,13 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from graspd.daemon.judge.calibration import Calibration
-from graspd.daemon.judge.network import Examined, Network, Plausibility
-from graspd.daemon.judge.reasons import Reason
 from graspd.models import zoo
-from graspd.models.electrodes import Electrodes
+from graspd.models.contract import SessionInput, Sharpness
+from graspd.models.judge.grasp_judge import Examined, GraspJudge, Refusal
+from graspd.models.judge.session import Calibration, SessionCalibration
 from graspd.models.runtime import TactileModel
-from tests.daemon.fakes import FINGERS, FakeModel, seen_box
+from tests.daemon.fakes import FakeModel
 
 COUNTS = np.random.default_rng(1).integers(1000, 3000, (3, 24)).astype(np.uint16)
 
@@ -34,7 +33,19 @@ class Answers(FakeModel):
         return self.both
 
 
-def session(temperature: float) -> Calibration:
+def judge_of(model: FakeModel, threshold: float = 0.5) -> GraspJudge:
+    return GraspJudge.of(model, threshold)  # type: ignore[arg-type]
+
+
+def session(now: Calibration) -> SessionCalibration:
+    """A session that is calibrated like this."""
+    takes = SessionInput((0.0,) * 78, (1.0,) * 78, 5.0, 1.0, 20.0, (Sharpness(0.0, 1.0),))
+    made = SessionCalibration(takes, np.ones((3, 24)), np.ones((3, 24)))
+    made.now = now
+    return made
+
+
+def calibration(temperature: float) -> Calibration:
     nothing, shape = np.zeros(0), np.ones((3, 24))
     return Calibration(
         *(nothing, nothing, shape, shape, shape, shape),
@@ -46,8 +57,8 @@ def session(temperature: float) -> Calibration:
 
 @pytest.mark.parametrize("p_slip", [0.01, 0.2, 0.5, 0.8, 0.99])
 def test_a_margin_is_the_log_odds_of_slip(p_slip: float) -> None:
-    opinion = Network(FakeModel(p_slip), 0.5).judge(Examined((), COUNTS))  # type: ignore[arg-type]
-    assert (opinion.p_slip, opinion.reasons) == (p_slip, ())
+    opinion = judge_of(FakeModel(p_slip)).weigh(Examined(COUNTS))
+    assert (opinion.p_slip, opinion.refusal) == (p_slip, None)
     assert opinion.margin == pytest.approx(logit(p_slip))
 
 
@@ -55,7 +66,7 @@ def test_a_margin_is_the_log_odds_of_slip(p_slip: float) -> None:
 def test_a_sure_answer_has_the_margin_of_one_in_a_million_millions(
     p_slip: float, sign: int
 ) -> None:
-    opinion = Network(FakeModel(p_slip), 0.5).judge(Examined((), COUNTS))  # type: ignore[arg-type]
+    opinion = judge_of(FakeModel(p_slip)).weigh(Examined(COUNTS))
     assert opinion.p_slip == p_slip
     assert opinion.margin == pytest.approx(sign * 12 * math.log(10))
 
@@ -80,10 +91,9 @@ def test_a_sure_answer_has_the_margin_of_one_in_a_million_millions(
 def test_probabilities_are_in_0_to_1_and_sum_to_one(
     p_stable: float, p_slip: float, sound: bool
 ) -> None:
-    network = Network(Answers(p_stable, p_slip), 0.5)  # type: ignore[arg-type]
-    opinion = network.judge(Examined((), COUNTS))
+    opinion = judge_of(Answers(p_stable, p_slip)).weigh(Examined(COUNTS))
     assert opinion.p_slip == (p_slip if sound else None)
-    assert opinion.reasons == (() if sound else (Reason.MODEL_FAILED,))
+    assert opinion.refusal == (None if sound else Refusal.MODEL_FAILED)
 
 
 @pytest.mark.parametrize("threshold", [0.3, 0.5, 0.8])
@@ -92,8 +102,9 @@ def test_probabilities_are_in_0_to_1_and_sum_to_one(
 def test_a_young_session_is_less_sure_and_on_the_same_side(
     threshold: float, p_slip: float, temperature: float
 ) -> None:
-    network = Network(FakeModel(p_slip), threshold)  # type: ignore[arg-type]
-    opinion = network.judge(Examined((), COUNTS), session(temperature))
+    judge = judge_of(FakeModel(p_slip), threshold)
+    judge.session = session(calibration(temperature))
+    opinion = judge.weigh(Examined(COUNTS))
     assert opinion.p_slip is not None
     expected = logit(threshold) + (logit(p_slip) - logit(threshold)) / temperature
     assert logit(opinion.p_slip) == pytest.approx(expected)
@@ -101,13 +112,14 @@ def test_a_young_session_is_less_sure_and_on_the_same_side(
     assert opinion.margin == pytest.approx(logit(p_slip)), "the margin is that of the network"
 
 
-def test_what_speaks_against_a_reading_keeps_it_from_the_network() -> None:
+def test_a_refused_grasp_is_kept_from_the_network() -> None:
     model = FakeModel()
-    opinion = Network(model, 0.5).judge(Examined((Reason.SATURATED,), COUNTS, ("ff_1",)))  # type: ignore[arg-type]
-    assert (opinion.p_slip, opinion.reasons, opinion.repaired) == (
-        *(None, (Reason.SATURATED,)),
+    opinion = judge_of(model).weigh(Examined(COUNTS, Refusal.NEVER_SEEN, ("ff_1",), COUNTS))
+    assert (opinion.p_slip, opinion.refusal, opinion.repaired) == (
+        *(None, Refusal.NEVER_SEEN),
         ("ff_1",),
     )
+    assert opinion.grasp is COUNTS, "a session may learn from it all the same"
     assert model.runs == 0
 
 
@@ -123,9 +135,7 @@ def test_a_finger_that_reads_about_the_same_everywhere_is_flat(
     counts[finger] = 2000 + swing * (-1) ** np.arange(24)
     counts[finger, :broken] = 0
     mask[finger, :broken] = True
-    seen = seen_box(3)
-    found = Plausibility(FINGERS, Electrodes(seen)).examine(counts, mask)
-    assert (Reason.FLAT in found.reasons) == flat
+    assert (judge_of(FakeModel()).judge(counts, mask).refusal is Refusal.FLAT) == flat
 
 
 @pytest.mark.parametrize(("swing", "flat"), [(0, True), (2, False)])
@@ -133,23 +143,27 @@ def test_a_finger_without_an_image_is_not_judged(swing: int, flat: bool) -> None
     """Its electrodes differ by less than a count (standard deviation)."""
     counts, model = COUNTS.copy(), FakeModel(0.2)
     counts[1] = 2000 + swing * (-1) ** np.arange(24)
-    opinion = Network(model, 0.5).judge(Examined((), counts))  # type: ignore[arg-type]
-    assert (opinion.p_slip, opinion.reasons) == ((None, (Reason.FLAT,)) if flat else (0.2, ()))
+    opinion = judge_of(model).weigh(Examined(counts))
+    assert (opinion.p_slip, opinion.refusal) == ((None, Refusal.FLAT) if flat else (0.2, None))
     assert model.runs == (0 if flat else 1)
 
 
 def test_a_session_model_is_asked_about_what_its_session_standardises() -> None:
-    network = Network(TactileModel(zoo.find("small-session")), 0.5)
-    known = dataclasses.replace(
-        session(1.0), features_mean=np.arange(78.0), features_spread=np.linspace(1.0, 900.0, 78)
+    judge = GraspJudge.of(TactileModel(zoo.find("small-session")))
+    judge.session = session(
+        dataclasses.replace(
+            calibration(1.0),
+            features_mean=np.arange(78.0),
+            features_spread=np.linspace(1.0, 900.0, 78),
+        )
     )
-    assert network.judge(Examined((), COUNTS), known).p_slip is not None
+    assert judge.weigh(Examined(COUNTS)).p_slip is not None
     z = (COUNTS - COUNTS.mean(axis=1, keepdims=True)) / COUNTS.std(axis=1, keepdims=True)
     features = np.concatenate((z.ravel(), COUNTS.mean(axis=1), COUNTS.std(axis=1)))
     expected = (features - np.arange(78.0)) / np.linspace(1.0, 900.0, 78)
-    asked = network.features
+    asked = judge.features
     assert asked.shape == (78,)
     clip = np.abs(asked).max()  # as the model's card says
     np.testing.assert_allclose(asked, np.clip(expected, -clip, clip), rtol=1e-5, atol=1e-6)
     assert (np.abs(expected) < clip).sum() > 60
-    assert Network(FakeModel(), 0.5).features.shape == (0,)  # type: ignore[arg-type]
+    assert judge_of(FakeModel()).features.shape == (0,)

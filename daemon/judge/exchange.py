@@ -1,0 +1,20 @@
+"""What is known of sensors that take the place of others."""
+
+from __future__ import annotations
+
+import msgspec
+
+from graspd.daemon.trust.learner import LearnerState
+from graspd.daemon.trust.risk import Count
+from graspd.models.session_statistics import SessionState
+
+
+class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
+    """An exchange of sensors, with what is known of those that are there now."""
+
+    session: SessionState | None = None
+    learned: LearnerState | None = None
+    proven: Count = 0
+    """Outcomes that count for their warm-up."""
+    tared: bool = False
+    """True if the tare that is known is theirs."""
