@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from graspd.daemon.trust.learner import SCALE
 from graspd.models import zoo
+from graspd.models.trust.learner import SCALE
 from tests.conftest import ROOT
 
 WORTH: Mapping[str, Any] = zoo.card("small-session")["worth"]
@@ -18,7 +18,7 @@ README, MEASURED, CHOOSING, LEARNER = (
         "README.md",
         "deploy/MEASURED.md",
         "deploy/CHOOSING.md",
-        "daemon/trust/learner.py",
+        "models/trust/learner.py",
     )
 )
 TABLE = r"^\| {title}.*\n\|[-| :]*\n((?:\|.*\n)+)"

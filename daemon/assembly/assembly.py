@@ -24,13 +24,13 @@ from graspd.daemon.scene.drivers import (
     StreamJoints,
 )
 from graspd.daemon.scene.scene import GateMode
-from graspd.daemon.trust.risk import RiskLimits
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver, DriverError, LinkError
 from graspd.extras import require
 from graspd.models import own, trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
+from graspd.models.trust.risk import RiskLimits
 
 if TYPE_CHECKING:
     from graspd.drivers.recordings.csv_rows import Columns

@@ -12,7 +12,7 @@ import msgspec
 
 from graspd.biotac import Finger
 from graspd.daemon.judge.reasons import Decision, Moment, Reason
-from graspd.daemon.trust.risk import Permission
+from graspd.models.trust.risk import Permission
 
 MEDIAN_SWEEPS: Final = 3
 WITHHELD: Final = {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import msgspec
 
-from graspd.daemon.trust.learner import LearnerState
-from graspd.daemon.trust.risk import Count
 from graspd.models.session_statistics import SessionState
+from graspd.models.trust.learner import LearnerState
+from graspd.models.trust.risk import Count
 
 
 class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):

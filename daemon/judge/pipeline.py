@@ -23,11 +23,12 @@ from graspd.daemon.judge.decision import (
 from graspd.daemon.judge.health import Health, Number
 from graspd.daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
-from graspd.daemon.trust.trust import Assessment
+from graspd.daemon.trust.trust import RiskReport
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.models.contract import ModelError
 from graspd.models.judge.grasp_judge import NO_OPINION, GraspJudge, Opinion, Refusal
 from graspd.models.runtime import TactileModel
+from graspd.models.trust.assessment import Assessment
 
 if TYPE_CHECKING:
     from graspd.daemon.judge.exchange import Exchanged
@@ -51,6 +52,8 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
     """Answer of the network for the grasp, maybe of an earlier reading."""
     assessment: Assessment | None = None
     """Worth of `opinion` now; None: without learning and without a risk."""
+    risk: RiskReport | None = None
+    """Outcomes of `stable` lifts before this verdict; None like `assessment`."""
     supervised: bool = False
     """True if its lift, watched, would teach what is not known: ask for it."""
     session_calibrated: bool | None = None
@@ -371,6 +374,7 @@ class Pipeline:
             moment=moment,
             opinion=opinion,
             assessment=assessment,
+            risk=None if self.trust is None else self.trust.report(),
             supervised=supervised and WATCHED_LIFT.issuperset(reasons),
             session_calibrated=calibrated,
             judged_counts=counts,

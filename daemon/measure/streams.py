@@ -15,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.process.text import progress
-from graspd.daemon.trust.learner import SCALE, sigmoid
-from graspd.daemon.trust.lift_book import GraspId
-from graspd.daemon.trust.risk import Permission, RiskLimits
-from graspd.daemon.trust.trust import Trust
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
 from graspd.models.training.evaluating.days import Day, by_object
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS, with_recipes
+from graspd.models.trust.assessment import assess
+from graspd.models.trust.learner import SCALE, Learner, sigmoid
+from graspd.models.trust.risk import Permission, Risk, RiskLimits
 
 OWN, PUBLISHED = "small-session", "cnn1"
 """Systems that judge: graspd's default, and the published network on the plain image."""
@@ -120,18 +119,19 @@ def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCAL
     Without `every`, only stable and supervised grasps are lifted and their outcomes told. `scale`
     takes the place of the learner's own.
     """
-    trust, count = Trust("worth", stream.features.shape[1], limits), len(stream.slipped)
-    trust.learner.scale = scale
+    learner, risk = Learner(stream.features.shape[1]), Risk(limits)
+    learner.scale, count = scale, len(stream.slipped)
     p_slip, stable = np.full(count, np.nan), np.zeros(count, np.bool_)
     supervised, outcomes = np.zeros(count, np.bool_), np.zeros(count, np.int64)
     for index in np.flatnonzero(~stream.refused).tolist():
-        grasp = GraspId(f"{stream.table} {stream.order}", index)
+        name = f"{stream.table} {stream.order}", index
         margin, slipped = float(stream.margins[index]), bool(stream.slipped[index])
-        assessed = trust.judge(grasp, sigmoid(margin), margin, stream.features[index])
-        p_slip[index] = sigmoid(margin) if assessed.p_slip is None else assessed.p_slip
+        inputs = stream.features[index]
+        assessed = assess(learner, risk, sigmoid(margin), margin, inputs, name=name)
+        p_slip[index] = assessed.p_slip
         supervised[index], outcomes[index] = assessed.supervised, assessed.outcomes
         stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5
-        trust.note(grasp, assessed, stable=bool(stable[index]))
         if every or stable[index] or assessed.supervised:
-            trust.outcome(grasp, slipped=slipped)
+            risk.take(stable=bool(stable[index]), slipped=slipped, proves=True)
+            learner.learn(np.frombuffer(assessed.features, "<f8"), slipped=slipped)
     return Life(stream, p_slip, stable, supervised, outcomes)

@@ -25,7 +25,6 @@ from graspd.daemon.measure.reliability import (
 )
 from graspd.daemon.measure.streams import Life, Stream, live, streams
 from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
-from graspd.daemon.trust.risk import RiskLimits
 from graspd.models.contract import ModelError
 from graspd.models.training.data.datasets import DatasetError, read_all
 from graspd.models.training.evaluating.files import to_json, write_whole
@@ -41,6 +40,7 @@ from graspd.models.training.evaluating.style import (
     to_svg,
 )
 from graspd.models.training.evaluating.summaries import VerdictFigures
+from graspd.models.trust.risk import RiskLimits
 from graspd.models.zoo import read_card
 
 ALLOWED: Final = 0.05

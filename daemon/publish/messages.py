@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from graspd.biotac import Finger
 from graspd.daemon.judge.reasons import Decision, FingerState, GateCause, GateState, Reason
 from graspd.daemon.trust.lift_book import OutcomeStatus
-from graspd.daemon.trust.risk import RiskReport
+from graspd.daemon.trust.trust import RiskReport
 
 WIRE_VERSION: Final = 1
 

@@ -190,7 +190,7 @@ class Outbox:
             p_slip_model=judgement.opinion.p_slip if valid else None,
             outcomes=0 if worth is None else worth.outcomes,
             supervised=judgement.supervised,
-            risk=None if worth is None else worth.report,
+            risk=judgement.risk,
             early=(valid or judgement.supervised) and moment.early,
             still_ms=moment.still_ms,
             motion=moment.motion,

@@ -10,7 +10,7 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from graspd.daemon.trust.learner import INPUT_MAX, vector
+from graspd.models.trust.learner import INPUT_MAX, vector
 
 LIFTS_MAX: Final = 256
 """Grasps in the book: those of an hour and more. Outcomes of older ones are refused."""

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from graspd.daemon.trust.learner import Learner, LearnerState, sigmoid
 from graspd.daemon.trust.lift_book import (
     NOT_ASSESSED,
     GraspId,
@@ -23,7 +22,9 @@ from graspd.daemon.trust.lift_book import (
     LiftBookState,
     OutcomeStatus,
 )
-from graspd.daemon.trust.risk import Permission, Risk, RiskLimits, RiskReport, RiskState
+from graspd.models.trust.assessment import Assessment, assess
+from graspd.models.trust.learner import Learner, LearnerState
+from graspd.models.trust.risk import Count, Permission, Risk, RiskLimits, RiskState
 
 VERSION: Final = 2
 """Format of a state. In format 1 the learner had no residual."""
@@ -36,21 +37,32 @@ class FormatError(ValueError):
     """A state is of another format: another graspd kept it."""
 
 
-class Assessment(msgspec.Struct, frozen=True):
-    """Assessment of a grasp by outcomes, before the decision; the defaults mean no grasp."""
+class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Outcomes of `stable` lifts so far, for a controller that decides to lift."""
 
-    outcomes: int
-    """Number of outcomes that `p_slip` rests on."""
-    report: RiskReport
-    p_slip: float | None = None
-    """After learning, 0..1; the model's own until something was learned. None: not judged."""
-    log_odds: float = 0.0
-    """Log-odds of slip, after learning."""
-    permission: Permission = Permission.ALLOWED
-    supervised: bool = False
-    """True to ask for its lift under supervision."""
-    features: bytes = b""
-    """Learner's features, float64, for the lift book."""
+    target: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] | None
+    """`[risk] max_slip_when_stable`; null: none is set."""
+    lifts: Count
+    """Lifts of `stable` verdicts whose outcome was told."""
+    slips: Count
+    """Slips among them."""
+    outstanding: Count
+    """`stable` verdicts whose outcome can still come; each may add one slip to the bound."""
+    bound: Annotated[float, msgspec.Meta(ge=0.0)] | None
+    """Upper bound of `slips` without `outstanding`; null: no risk is set."""
+    warm_up_left: Count
+    """Outcomes that are missing until the warm-up is over; 0 without a risk."""
+    announced: Count = 0
+    """`lift` questions that were answered `stable`, one a grasp."""
+    awaited: Count = 0
+    """Those of them whose outcome is out. From `[risk] outstanding_max` on nothing is `stable`."""
+
+    @property
+    def beyond_share(self) -> float:
+        """Slips that the bound allows beyond the target's share of the lifts; 0 without a bound."""
+        if self.target is None or self.bound is None:
+            return 0.0
+        return self.bound - self.target * self.lifts
 
 
 class _Versioned(msgspec.Struct, frozen=True):
@@ -88,24 +100,9 @@ class Trust:
     def judge(
         self, grasp: GraspId, p_slip: float, margin: float, inputs: NDArray[np.floating]
     ) -> Assessment:
-        """Assess a grasp by the model's `p_slip`, its log-odds `margin`, and its flat `inputs`.
-
-        Raises `ValueError` for values that are not finite and for another shape: such a grasp must
-        be `unknown`.
-        """
-        if not 0.0 <= p_slip <= 1.0:  # also true for NaN
-            raise ValueError(f"{p_slip} is no probability")
-        log_odds, features = self._judging.judge(margin, inputs)
-        permission = self.risk.decide(log_odds, self.lifts.awaited)
-        return Assessment(
-            outcomes=self._judging.outcomes,
-            report=self.report(),
-            p_slip=sigmoid(log_odds) if self._judging.outcomes else p_slip,
-            log_odds=log_odds,
-            permission=permission,
-            supervised=self.risk.supervised(permission, grasp.boot_id, grasp.grasp),
-            features=features.astype("<f8").tobytes(),
-        )
+        """Assess a grasp, as `assess` does; raises `ValueError` for what it cannot be."""
+        awaited = self.lifts.awaited
+        return assess(self._judging, self.risk, p_slip, margin, inputs, name=grasp, awaited=awaited)
 
     def review(self, grasp: GraspId, former: Assessment | None) -> Assessment:
         """Return the assessment of a grasp that was judged before, None for none, as it is now.
@@ -113,13 +110,12 @@ class Trust:
         A grasp that was called `stable` stays allowed. Any other is allowed only if it was then and
         is by the outcomes told since.
         """
-        report = self.report()
         if former is None:
-            return Assessment(self._judging.outcomes, report)
-        permission = former.permission
-        if permission is Permission.ALLOWED and not self.lifts.is_stable(grasp):
-            permission = self.risk.decide(former.log_odds, self.lifts.awaited)
-        return replace(former, permission=permission, report=report)
+            return Assessment(self._judging.outcomes)
+        if former.permission is not Permission.ALLOWED or self.lifts.is_stable(grasp):
+            return former
+        permission = self.risk.decide(former.log_odds, self.lifts.awaited)
+        return former if permission is former.permission else replace(former, permission=permission)
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
         """Enter the verdict on a grasp in the book. Raises `ValueError` if it was not allowed."""

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.trust.learner import Learner
-from graspd.daemon.trust.risk import Permission, Risk, RiskLimits
 from graspd.models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics
+from graspd.models.trust.learner import Learner
+from graspd.models.trust.risk import Permission, Risk, RiskLimits
 
 Note = Callable[..., None]
 Random = np.random.Generator

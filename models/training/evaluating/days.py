@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +12,7 @@ from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED
 from graspd.models.training.fitting.trained import Trained
 from graspd.models.training.systems.registry import SessionFeatures
+from graspd.models.trust.learner import sigmoid
 
 Judged = tuple[dict[str, Floats], dict[str, Bools], dict[str, Ints]]
 """By variant: log-odds of slip, refusals, and age of the session at each grasp."""
@@ -94,5 +93,5 @@ class TrainedNetwork:
     def run(self) -> tuple[float, float]:
         """Return the probabilities (stable, slip) for `input`."""
         (self.margin,) = self._fitted.margins(self.input[np.newaxis]).tolist()
-        p_slip = 0.5 + 0.5 * math.tanh(0.5 * self.margin)  # the logistic function
+        p_slip = sigmoid(self.margin)
         return 1.0 - p_slip, p_slip

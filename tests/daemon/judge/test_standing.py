@@ -16,7 +16,6 @@ from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.trust.lift_book import GraspId
-from graspd.daemon.trust.risk import RiskLimits
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.twins.grasps.grasps import Counts
@@ -24,6 +23,7 @@ from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.models import zoo
 from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
+from graspd.models.trust.risk import RiskLimits
 from tests.bench.attacks.standing import drifting
 from tests.daemon.fakes import MS, Clock, sound
 from tests.daemon.judge.test_only_stable_if import HELD, Feel, Flaw, Hand, limits, tared

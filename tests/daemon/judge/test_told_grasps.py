@@ -13,8 +13,8 @@ from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.run.reload import start_again
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
-from graspd.daemon.trust.risk import RiskLimits
 from graspd.daemon.trust.trust import Trust
+from graspd.models.trust.risk import RiskLimits
 from tests.daemon.judge.test_only_stable_if import HELD, Feel, Hand, begins, feels, gates, tared
 from tests.daemon.judge.test_only_stable_if import limits as gate_limits
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.trust.lift_book import GraspId
-from graspd.daemon.trust.risk import Permission, RiskLimits
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import ElectrodeFault
+from graspd.models.trust.risk import Permission, RiskLimits
 from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
 
 BOOT = "b" * 32

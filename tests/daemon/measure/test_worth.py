@@ -31,14 +31,14 @@ from graspd.daemon.measure.worth import (
     measured,
     risk_figures,
 )
-from graspd.daemon.trust.learner import SCALE
-from graspd.daemon.trust.risk import RiskLimits
 from graspd.models import zoo
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.data.protocols import object_folds
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS, System, with_recipes
+from graspd.models.trust.learner import SCALE
+from graspd.models.trust.risk import RiskLimits
 from tests.kit.inside import graspd
 
 GRASPS = 300

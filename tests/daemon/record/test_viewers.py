@@ -21,10 +21,10 @@ from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Topic, flat, schema_of, schemas, table
 from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
-from graspd.daemon.trust.learner import LearnerState
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.models.layout import D1
 from graspd.models.session_statistics import SessionState
+from graspd.models.trust.learner import LearnerState
 from tests.daemon.record.recorded import HEADER, files, messages, recorder
 from tests.daemon.watch.watch_fakes import status, tactile, verdict
 from tests.kit.messages import GOLDEN

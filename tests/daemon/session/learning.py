@@ -17,14 +17,14 @@ from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder, look
 from graspd.daemon.session.keeper import SessionKeeper
 from graspd.daemon.session.sensors import SensorWatch
-from graspd.daemon.trust.learner import sigmoid
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
-from graspd.daemon.trust.risk import Permission, RiskLimits
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.models.contract import SessionInput, Sharpness
 from graspd.models.judge.session import SessionCalibration
+from graspd.models.trust.learner import sigmoid
+from graspd.models.trust.risk import Permission, RiskLimits
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.trust.learner import sigmoid
 from graspd.daemon.trust.lift_book import GraspId
-from graspd.daemon.trust.risk import Permission, RiskLimits
 from graspd.daemon.trust.trust import Trust
+from graspd.models.trust.learner import sigmoid
+from graspd.models.trust.risk import Permission, RiskLimits
 
 BOOT = "0123456789abcdef" * 2
 INPUTS = 26

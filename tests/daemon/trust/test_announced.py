@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from graspd.daemon.trust.lift_book import OutcomeStatus
-from graspd.daemon.trust.risk import RiskLimits
 from graspd.daemon.trust.trust import decode, encode
+from graspd.models.trust.risk import RiskLimits
 from tests.daemon.trust.grasps import RULE, judge, named, trust
 
 OUTSTANDING = (1, 2, 5, 9)

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd.daemon.trust.learner import sigmoid
 from graspd.daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
-from graspd.daemon.trust.residual import GRASPS_MAX
-from graspd.daemon.trust.risk import Permission, RiskLimits
 from graspd.daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
+from graspd.models.trust.learner import sigmoid
+from graspd.models.trust.residual import GRASPS_MAX
+from graspd.models.trust.risk import Permission, RiskLimits
 from tests.daemon.trust.grasps import INPUTS, RULE, inputs, judge, named, trust
 
 

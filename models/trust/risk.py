@@ -58,34 +58,6 @@ class RiskLimits:
     """Announced lifts, from 1 on, whose outcome may be out at once."""
 
 
-class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcomes of `stable` lifts so far, for a controller that decides to lift."""
-
-    target: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] | None
-    """`[risk] max_slip_when_stable`; null: none is set."""
-    lifts: Count
-    """Lifts of `stable` verdicts whose outcome was told."""
-    slips: Count
-    """Slips among them."""
-    outstanding: Count
-    """`stable` verdicts whose outcome can still come; each may add one slip to the bound."""
-    bound: Annotated[float, msgspec.Meta(ge=0.0)] | None
-    """Upper bound of `slips` without `outstanding`; null: no risk is set."""
-    warm_up_left: Count
-    """Outcomes that are missing until the warm-up is over; 0 without a risk."""
-    announced: Count = 0
-    """`lift` questions that were answered `stable`, one a grasp."""
-    awaited: Count = 0
-    """Those of them whose outcome is out. From `[risk] outstanding_max` on nothing is `stable`."""
-
-    @property
-    def beyond_share(self) -> float:
-        """Slips that the bound allows beyond the target's share of the lifts; 0 without a bound."""
-        if self.target is None or self.bound is None:
-            return 0.0
-        return self.bound - self.target * self.lifts
-
-
 class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of `Risk`; see its attributes."""
 

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.trust.residual import GRASPS_MAX, Matrix, Residual, Vector
+from graspd.models.trust.residual import GRASPS_MAX, Matrix, Residual, Vector
 
 TEMPERATURE: Final = 2.0
 """Divisor of the model's margin; networks are too sure of another day's grasps."""

@@ -11,11 +11,11 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
-from graspd.daemon.trust import learner as module
-from graspd.daemon.trust import residual
-from graspd.daemon.trust.learner import Learner, LearnerState, sigmoid
-from tests.daemon.trust.reference import Reference
-from tests.daemon.trust.streams import CLIP, Outcome, learn, lifts
+from graspd.models.trust import learner as module
+from graspd.models.trust import residual
+from graspd.models.trust.learner import Learner, LearnerState, sigmoid
+from tests.models.trust.reference import Reference
+from tests.models.trust.streams import CLIP, Outcome, learn, lifts
 
 ONE_FINGER, THREE_FINGERS = 26, 78
 

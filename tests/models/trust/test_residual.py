@@ -7,11 +7,11 @@ import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from graspd.daemon.trust import residual as module
-from graspd.daemon.trust.learner import Learner
-from graspd.daemon.trust.residual import Residual
-from tests.daemon.trust.reference import Reference
-from tests.daemon.trust.streams import learn, lifts
+from graspd.models.trust import residual as module
+from graspd.models.trust.learner import Learner
+from graspd.models.trust.residual import Residual
+from tests.models.trust.reference import Reference
+from tests.models.trust.streams import learn, lifts
 
 INPUTS = 26
 LENGTH = 0.5 * INPUTS**0.5

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.trust.learner import Learner, sigmoid
+from graspd.models.trust.learner import Learner, sigmoid
 
 CLIP = 3.0
 Outcome = tuple[float, NDArray[np.float32], bool]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd.daemon.trust.risk import Permission, Risk, RiskLimits, RiskState
+from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskState
 
 ALPHAS = (0.001, 0.01, 0.02, 0.05, 0.1, 0.25, 0.3, 0.5)
 ROUNDING = 1e-6
