@@ -57,8 +57,8 @@ def test_in_the_warm_up_grasps_are_to_be_lifted_under_supervision() -> None:
         assert judgement.reasons == (Reason.UNPROVEN,)
         assert judgement.p_slip is None
         assert judgement.supervised
-        assert judgement.assessment is not None
-        assert judgement.assessment.report.warm_up_left == left
+        assert judgement.risk is not None
+        assert judgement.risk.warm_up_left == left
     assert found[3].reasons in ((), (Reason.LOW_CONFIDENCE,))
     assert not found[3].supervised
 
