@@ -24,7 +24,7 @@ from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
 from graspd.models import own, trial, zoo
 from graspd.models.contract import ModelError, SessionInput
-from graspd.models.judge.grasp_judge import GraspJudge, Opinion
+from graspd.models.judge.grasp_judge import Examined, GraspJudge
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,15 +70,15 @@ class GraspModel:
         with self._turn:
             self._begin(session)
             for row, values in enumerate(judged):
-                p_slip = self._opinion(values).p_slip
+                p_slip = self._judge.weigh(self._examine(values)).p_slip
                 if p_slip is not None:
                     probabilities[row] = 1.0 - p_slip, p_slip
         return probabilities
 
-    def _opinion(self, values: NDArray[np.float64]) -> Opinion:
+    def _examine(self, values: NDArray[np.float64]) -> Examined:
         counts = np.where(np.isnan(values), 0.0, values).astype(np.uint16)
         broken = at_rail(counts)  # as is a NaN, which is 0 there
-        return self._judge.judge(counts, broken if broken.any() else None)
+        return self._judge.examine(counts, broken if broken.any() else None)
 
     def _begin(self, session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None) -> None:
         """Begin a session of today's sensors."""
@@ -92,7 +92,8 @@ class GraspModel:
             session_file.restore(Path(session), self.fingers, calibration)
         elif session is not None:
             for values in self._counts(session):
-                self._judge.observe(self._opinion(values))
+                examined = self._examine(values)
+                self._judge.observe(examined, self._judge.weigh(examined))
         if not calibration.now.calibrated:
             warnings.warn(
                 f"{self.name} does not know the sensors of this day: its probabilities mean little "

@@ -234,8 +234,9 @@ class Pipeline:
             moment, counts = self.hand.step(made_ns, reading.counts, checked, in_time=in_time)
         grasp = None
         if counts is not None:
-            memory.opinion, memory.assessment = self._judge.judge(counts, checked.broken), None
-            grasp = memory.opinion.grasp
+            examined = self._judge.examine(counts, checked.broken)
+            memory.opinion, memory.assessment = self._judge.weigh(examined), None
+            grasp = examined.grasp
             if checked.broken is not None:
                 counts = None
         elif moment.state is not GateState.JUDGED:

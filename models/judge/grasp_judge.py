@@ -69,7 +69,7 @@ class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
     """
 
 
-class Opinion(msgspec.Struct, frozen=True, eq=False, gc=False):
+class Opinion(msgspec.Struct, frozen=True, gc=False):
     """Answer of the network for a grasp, or why there is none."""
 
     p_slip: float | None = None
@@ -80,8 +80,6 @@ class Opinion(msgspec.Struct, frozen=True, eq=False, gc=False):
     """`Examined.repaired` of the counts."""
     margin: float = 0.0
     """Log-odds of slip as the network gave them; 0 without an answer."""
-    grasp: NDArray[np.generic] | None = None
-    """`Examined.grasp` of the counts, for `GraspJudge.observe`."""
 
 
 NO_OPINION = Opinion()
@@ -135,13 +133,13 @@ class GraspJudge:
         """
         return self.weigh(self.examine(counts, broken))
 
-    def observe(self, opinion: Opinion) -> None:
-        """Have the session take in a grasp that was judged, if it may learn from it."""
-        if self.session is None or opinion.grasp is None:
+    def observe(self, examined: Examined, opinion: Opinion) -> None:
+        """Have the session take in a grasp with the opinion on it, if it may learn from it."""
+        if self.session is None or examined.grasp is None:
             return
         p_slip = opinion.p_slip
         slip = None if p_slip is None else p_slip >= self._slip_threshold
-        self.session.observe(opinion.grasp, slip=slip)
+        self.session.observe(examined.grasp, slip=slip)
 
     def examine(
         self, counts: NDArray[np.uint16], broken: NDArray[np.bool_] | None = None
@@ -179,26 +177,26 @@ class GraspJudge:
 
     def weigh(self, examined: Examined) -> Opinion:
         """Return the network's opinion on examined counts, or why there is none."""
-        network, repaired, grasp = self._network, examined.repaired, examined.grasp
+        network, repaired = self._network, examined.repaired
         if examined.refusal is not None:
-            return Opinion(None, examined.refusal, repaired, 0.0, grasp)
+            return Opinion(None, examined.refusal, repaired)
         spread = self.prepare(examined.counts)
         if not (spread >= SPREAD_FLOOR_COUNTS).all():  # also for NaN
-            return Opinion(None, Refusal.FLAT, repaired, 0.0, grasp)
+            return Opinion(None, Refusal.FLAT, repaired)
         try:
             p_stable, p_slip = network.run()
         except ModelError:
-            return Opinion(None, Refusal.MODEL_FAILED, repaired, 0.0, grasp)
+            return Opinion(None, Refusal.MODEL_FAILED, repaired)
         sound = 0.0 <= p_slip <= 1.0 and 0.0 <= p_stable <= 1.0  # false for NaN
         if not (sound and abs(p_stable + p_slip - 1.0) < 1e-3):
-            return Opinion(None, Refusal.MODEL_FAILED, repaired, 0.0, grasp)
+            return Opinion(None, Refusal.MODEL_FAILED, repaired)
         margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
         temperature = 1.0 if self.session is None else self.session.now.temperature
         if temperature != 1.0:
             # Counted from the threshold, so that it stays on the same side.
             log_odds = self._log_threshold + (margin - self._log_threshold) / temperature
             p_slip = 1.0 / (1.0 + math.exp(-log_odds))
-        return Opinion(p_slip, None, repaired, margin, grasp)
+        return Opinion(p_slip, None, repaired, margin)
 
     def prepare(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
         """Write the network's input for counts (fingers, 24); return each finger's spread."""

@@ -72,11 +72,12 @@ class Day:
 
     def judge(self, counts: NDArray[np.uint16]) -> tuple[float, bool]:
         """Return log-odds of slip and True if refused; then learn from the grasp."""
-        opinion = self.judge_of.judge(counts)
+        examined = self.judge_of.examine(counts)
+        opinion = self.judge_of.weigh(examined)
         if opinion.refusal is not None:
             self.judge_of.prepare(counts)
             self.network.run()
-        self.judge_of.observe(opinion)
+        self.judge_of.observe(examined, opinion)
         return self.network.margin, opinion.refusal is not None
 
 

@@ -119,7 +119,6 @@ def test_a_refused_grasp_is_kept_from_the_network() -> None:
         *(None, Refusal.NEVER_SEEN),
         ("ff_1",),
     )
-    assert opinion.grasp is COUNTS, "a session may learn from it all the same"
     assert model.runs == 0
 
 
