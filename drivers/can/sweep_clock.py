@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from enum import Enum, auto
 from typing import Final
 
-from graspd.drivers.base import ELECTRODES
+from graspd.biotac import ELECTRODES
 from graspd.drivers.link import OUTAGE_NS
 
 NEXT_SWEEP_PERIODS: Final = 0.75
