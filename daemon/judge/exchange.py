@@ -1,4 +1,4 @@
-"""What is known of sensors that take the place of others."""
+"""Sensors that take the place of others, and the knowledge of them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a held grasp is worth by its counts: pure, without time, for the daemon and for training."""
+"""Judges of held grasps by their counts: pure, without time, for the daemon and for training."""

@@ -56,7 +56,7 @@ class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
     """Counts of a grasp after repair, and whether a network may judge them."""
 
     counts: NDArray[np.generic]
-    """Shape (fingers, 24): as read, but for electrodes that contradict the others."""
+    """Shape (fingers, 24): as read, except electrodes that contradict the others."""
     refusal: Refusal | None = None
     """Why they must not be judged; None: they are sound, or could be repaired."""
     repaired: tuple[str, ...] = ()

@@ -1,1 +1,1 @@
-"""What outcomes teach about a verdict, and the risk that is set; pure, without time and peers."""
+"""Lessons of outcomes for a verdict, and the risk that is set; pure, without time and peers."""
