@@ -65,7 +65,7 @@ class SessionKeeper(SensorWatch):
     ) -> None:
         """Restore the last session of these fingers, and what this model learned with its sensors.
 
-        State that `pipeline` does not use stays kept. A folder that cannot be locked is tried again.
+        State that `pipeline` does not use stays kept. A folder that is in use is tried again.
         """
         self._session = pipeline.session
         self._trust = pipeline.trust
