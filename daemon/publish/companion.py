@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from enum import Enum
-from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar
+from enum import Enum, StrEnum
+from typing import Any, Concatenate, Final, NamedTuple, ParamSpec, Protocol, TypeVar
 
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import Reason
@@ -15,15 +15,38 @@ from graspd.drivers.base import Reading, TactileReading
 P = ParamSpec("P")
 R = TypeVar("R")
 
-Answer = Callable[[str | None], None]
-"""Function that answers a peer: with None for yes, with the reason for no."""
-REPEATED = "repeated"
-"""Answer for an outcome that was told before, and is on the disk."""
+
+class Told(StrEnum):
+    """Result for an outcome. A refusal has the word that `why` begins with on the wire."""
+
+    KEPT = "kept"
+    REPEATED = "repeated"
+    """Known before, and on the disk."""
+    UNKNOWN_START = "unknown boot_id"
+    UNKNOWN_GRASP = "unknown grasp"
+    NOT_YOURS = "not yours"
+    CONTRADICTS = "contradicts"
+    MALFORMED = "malformed"
+    NOT_KEPT = "not kept"
+    BUSY = "busy"
+
+
+class Reply(NamedTuple):
+    """Answer to a peer that told an outcome."""
+
+    told: Told
+    detail: str = ""
+    """Why it is refused, for a person."""
+
+
+KEPT: Final = Reply(Told.KEPT)
+Answer = Callable[[Reply], None]
+"""Function that answers a peer."""
 
 
 def at_once(answer: Answer) -> None:
-    """Answer yes at once. Used where outcomes are not saved."""
-    answer(None)
+    """Answer at once that all is kept. Used where outcomes are not saved."""
+    answer(KEPT)
 
 
 class LoopEvent(Enum):
@@ -65,10 +88,7 @@ class Requests(Protocol):
         """Publish that no reading has come."""
 
     def outcome(self, report: Report, answer: Answer) -> None:
-        """Tell the outcome of a lift; `answer` is called with None once it is on the disk.
-
-        Else with `REPEATED`, or with the reason why the outcome is refused or not saved.
-        """
+        """Tell the outcome of a lift; `answer` is called once it is on the disk, or refused."""
 
 
 class Companion:

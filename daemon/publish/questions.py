@@ -14,7 +14,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from graspd.daemon.judge.reasons import Decision, Reason
-from graspd.daemon.publish.companion import REPEATED, PublishedVerdict, Requests
+from graspd.daemon.publish.companion import KEPT, PublishedVerdict, Reply, Requests, Told
 from graspd.daemon.publish.messages import OBJECT_PATTERN, encode, withheld
 from graspd.daemon.publish.porter import Frames
 from graspd.daemon.trust.lift_book import NAME_BYTES, GraspId, LiftBook, Peer, Report
@@ -34,7 +34,8 @@ _REPORT = re.compile(
     rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip|not-lifted)(?: (%b))?"
     % OBJECT_PATTERN.encode()
 )
-MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip|not-lifted> [<object>]"
+FORM = "outcome <boot_id> <grasp> <stable|slip|not-lifted> [<object>]"
+REFUSED = frozenset(Told) - {Told.KEPT, Told.REPEATED}
 
 
 @dataclass(slots=True)
@@ -52,10 +53,10 @@ class Question:
     kept: bool | None = None
     """True once the offer is on the disk, False if it cannot be."""
 
-    def keep(self, offer: tuple[GraspId, Decision], problem: str | None) -> None:
-        """Note that an offer is on the disk, or why it cannot be."""
+    def keep(self, offer: tuple[GraspId, Decision], reply: Reply) -> None:
+        """Note whether an offer is on the disk."""
         if offer == self.offer:
-            self.kept = problem is None
+            self.kept = reply.told is Told.KEPT
 
 
 class Questions:
@@ -135,14 +136,14 @@ class Questions:
         self.waiting.pop(peer, None)
         grasp = None if self._last is None else self._last.lifts.offered(peer)
         if grasp is None:
-            answer(None)
+            answer(KEPT)
         else:
             requests.outcome(Report(grasp, "not-lifted", peer=peer), answer)
 
     def _take_outcome(self, envelope: Frames, peer: Peer, text: bytes, requests: Requests) -> None:
         told = _REPORT.fullmatch(text)
         if told is None:
-            self._answer_outcome(envelope, MALFORMED)
+            self._answer_outcome(envelope, Reply(Told.MALFORMED, FORM))
             return
         report = Report(
             grasp=GraspId(told[1].decode(), int(told[2])),
@@ -152,14 +153,16 @@ class Questions:
         )
         requests.outcome(report, partial(self._answer_outcome, envelope))
 
-    def _answer_outcome(self, envelope: Frames, refusal: str | None) -> None:
-        answer: dict[str, object] = {"v": 1, "ok": refusal in (None, REPEATED)}
-        if refusal == REPEATED:
+    def _answer_outcome(self, envelope: Frames, reply: Reply) -> None:
+        answer: dict[str, object] = {"v": 1, "ok": reply.told not in REFUSED}
+        counter = "malformed" if reply.told is Told.MALFORMED else "outcomes_refused"
+        if reply.told in REFUSED:
+            answer["why"] = f"{reply.told}: {reply.detail}"
+        else:
+            counter = "outcomes"
+        if reply.told is Told.REPEATED:
             answer["repeated"] = True
-        elif refusal is not None:
-            answer["why"] = refusal
-        refused = "malformed" if refusal == MALFORMED else "outcomes_refused"
-        self.counters["outcomes" if answer["ok"] else refused] += 1
+        self.counters[counter] += 1
         self._answer(envelope, json.dumps(answer, separators=(",", ":")).encode())
 
     def _answer(self, envelope: Frames, payload: bytes) -> None:

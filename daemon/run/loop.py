@@ -16,11 +16,12 @@ from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.sleep import Sleep
 from graspd.daemon.publish.companion import (
-    REPEATED,
     Answer,
     Companion,
     LoopEvent,
     PublishedVerdict,
+    Reply,
+    Told,
     at_once,
     hooks,
 )
@@ -31,14 +32,17 @@ from graspd.daemon.run.reload import Reload
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus, Report
 from graspd.drivers.base import Driver, JointReading, Reading, TactileReading
 
-NOT_YOURS: Final = "not yours: another peer may lift here, or this one has too short a routing id"
-UNKNOWN_START: Final = "unknown boot_id: of a start whose grasps are not known any more"
-"""Why an outcome is refused, besides `REFUSALS`."""
+NOT_YOURS: Final = Reply(
+    Told.NOT_YOURS, "another peer may lift here, or this one has too short a routing id"
+)
+UNKNOWN_START: Final = Reply(Told.UNKNOWN_START, "of a start whose grasps are not known any more")
 REFUSALS: Final = {
-    OutcomeStatus.UNKNOWN: "unknown grasp: not judged, or too long ago",
-    OutcomeStatus.CONTRADICTS: "contradicts: another outcome of this grasp was told before",
+    OutcomeStatus.UNKNOWN: Reply(Told.UNKNOWN_GRASP, "not judged, or too long ago"),
+    OutcomeStatus.CONTRADICTS: Reply(
+        Told.CONTRADICTS, "another outcome of this grasp was told before"
+    ),
 }
-"""Why an outcome is refused, for the peer that told it."""
+"""Answers to an outcome that is refused."""
 STATUS_PERIOD_NS: Final = 1_000_000_000
 """Time between two status messages, ns."""
 SILENCE_PERIODS: Final = 10
@@ -371,14 +375,14 @@ class Loop:
             for on_outcome in self._on_outcome:
                 on_outcome(report._replace(grasp=grasp))
         elif lifts.is_kept(grasp):
-            answer(REPEATED)
+            answer(Reply(Told.REPEATED))
             return
         self._keep(partial(self._kept, grasp, answer))
 
-    def _kept(self, grasp: GraspId, answer: Answer, problem: str | None) -> None:
-        if problem is None:
+    def _kept(self, grasp: GraspId, answer: Answer, reply: Reply) -> None:
+        if reply.told is Told.KEPT:
             self._pipeline.lifts.keep(grasp)
-        answer(problem)
+        answer(reply)
 
 
 def _count_tactile(readings: Sequence[Reading]) -> int:

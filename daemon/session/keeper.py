@@ -16,7 +16,7 @@ from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.worker import Worker
-from graspd.daemon.publish.companion import Answer, Requests
+from graspd.daemon.publish.companion import KEPT, Answer, Reply, Requests, Told
 from graspd.daemon.session.file import (
     KeptSession,
     SessionFileError,
@@ -42,10 +42,10 @@ SAVE_PERIOD_NS: Final = 10_000_000_000
 """Time between two saves, ns, while no outcome waits."""
 WAITING_MAX: Final = 64
 """Most answers that wait for the disk; a new one replaces the oldest."""
-BUSY: Final = "busy: too many wait for the disk, tell it again"
+BUSY: Final = Reply(Told.BUSY, "too many wait for the disk, tell it again")
+HANGS: Final = Reply(Told.NOT_KEPT, "the disk does not answer")
 UNEXPECTED: Final = "it could not be written"
 SEEDED: Final = "the seeded session names no sensors: it is used once %d grasps fit it"
-HANGS: Final = "not kept: the disk does not answer"
 
 
 Sessions = tuple[KeptSession, ...]
@@ -101,7 +101,7 @@ class SessionKeeper(SensorWatch):
             self._start_save()
 
     def keep(self, answer: Answer) -> None:
-        """Call `answer` after the present state is saved: with None, or with the failure."""
+        """Call `answer` after the present state is saved, or cannot be."""
         if len(self._waiting) == WAITING_MAX:
             self._waiting.popleft()(BUSY)
             self._in_writing = max(self._in_writing - 1, 0)
@@ -123,7 +123,7 @@ class SessionKeeper(SensorWatch):
             return
         if not isinstance(result, Exception):
             self._saved, self._warned = result, False
-            self._answer(self._in_writing, None)
+            self._answer(self._in_writing, KEPT)
             return
         why = str(result) if isinstance(result, SessionFileError) else UNEXPECTED
         if not self._warned:
@@ -131,7 +131,7 @@ class SessionKeeper(SensorWatch):
             warning = "%s; the next start begins without what is new"
             log.warning(warning, why, exc_info=unexpected)
         self._warned = True
-        self._answer(self._in_writing, f"not kept: {why}")
+        self._answer(self._in_writing, Reply(Told.NOT_KEPT, why))
 
     def _start_save(self) -> None:
         """Start a save of the present state, with all waiting outcomes, unless one runs."""
@@ -140,22 +140,22 @@ class SessionKeeper(SensorWatch):
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
         state = self._now(), *self._others
         if state == self._saved:
-            self._answer(len(self._waiting), None)
+            self._answer(len(self._waiting), KEPT)
         elif self._worker.submit(partial(self._write, state)):
             self._in_writing = len(self._waiting)
         else:
-            self._answer(len(self._waiting), f"not kept: {UNEXPECTED}")
+            self._answer(len(self._waiting), Reply(Told.NOT_KEPT, UNEXPECTED))
 
     def _write(self, state: Sessions) -> Sessions:
         """Write `state` in the worker, and return it. Raises `SessionFileError`."""
         self._folder.save(state)
         return state
 
-    def _answer(self, count: int, why: str | None) -> None:
-        """Give the first `count` answers, with the failure `why` or None."""
+    def _answer(self, count: int, reply: Reply) -> None:
+        """Give the first `count` answers."""
         self._in_writing = 0
         for _ in range(count):
-            self._waiting.popleft()(why)
+            self._waiting.popleft()(reply)
 
     def _now(self) -> KeptSession:
         statistics, trust = self._unused.statistics, self._unused.trust

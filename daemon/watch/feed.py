@@ -12,6 +12,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from graspd.daemon.process.sleep import boottime_ns
 from graspd.daemon.publish.keys import load_pair, load_public
+from graspd.daemon.watch.snapshot import Link
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX: Final = 2000
@@ -27,22 +28,18 @@ HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Time between two heartbeats on TCP, and their timeout, as in the daemon, ms."""
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 """Shortest and longest time before connecting again, ms."""
-CONNECTED: Final = "connected"
-NOT_CONNECTED: Final = "not connected"
-NOT_ALLOWED: Final = ": this user may not open the socket; is it in the group graspd?"
-WANTS_KEY: Final = "turned away: the daemon wants a key (--keys)"
 EVENTS: Final = {
-    int(zmq.EVENT_HANDSHAKE_SUCCEEDED): CONNECTED,
-    int(zmq.EVENT_DISCONNECTED): NOT_CONNECTED,
-    int(zmq.EVENT_CONNECT_RETRIED): NOT_CONNECTED,
-    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "turned away: the daemon does not know this key",
-    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): WANTS_KEY,
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): WANTS_KEY,
+    int(zmq.EVENT_HANDSHAKE_SUCCEEDED): Link.CONNECTED,
+    int(zmq.EVENT_DISCONNECTED): Link.NOT_CONNECTED,
+    int(zmq.EVENT_CONNECT_RETRIED): Link.NOT_CONNECTED,
+    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): Link.UNKNOWN_KEY,
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): Link.NEEDS_KEY,
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): Link.NEEDS_KEY,
 }
 """State of the connection after an event."""
 EVENTS_WITH_KEYS: Final = EVENTS | {
-    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "turned away: this daemon takes no keys",
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "turned away: is the daemon's key right?",
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): Link.TAKES_NO_KEYS,
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): Link.WRONG_DAEMON,
 }
 FOLLOW: Final = 2
 """Number of events after a refusal that must not hide it: disconnected, retried."""
@@ -61,7 +58,7 @@ class Feed:
 
         `keys`: from `load_keys`; None: no keys. `clock`: returns ns, and runs on in a sleep.
         """
-        self.link = "connecting"
+        self.link = Link.CONNECTING
         self._endpoint = endpoint
         self._keys = keys
         self._clock = clock
@@ -119,39 +116,35 @@ class Feed:
         if paused:
             self.stood_still = self._taken_ns, now_ns
         self._taken_ns = now_ns
-        if paused or (self.is_turned_away and now_ns - self._opened_ns > RETRY_NS):
+        if paused or (self.link.is_turned_away and now_ns - self._opened_ns > RETRY_NS):
             self._opened_ns = self.empty_ns = now_ns
             self._close_sockets()
             self._open()
-
-    @property
-    def is_turned_away(self) -> bool:
-        return self.link.startswith("turned away")
 
     def _update_link(self) -> None:
         while self._monitor.poll(0):
             event = int(recv_monitor_message(self._monitor)["event"])
             link = self._events.get(event, self.link)
-            if link == NOT_CONNECTED and self._follow:
+            if link is Link.NOT_CONNECTED and self._follow:
                 self._follow -= 1
                 continue
-            self.link = link + self._obstacle() if link == NOT_CONNECTED else link
-            self._follow = FOLLOW if self.is_turned_away else 0
+            self.link = self._obstacle() if link is Link.NOT_CONNECTED else link
+            self._follow = FOLLOW if link.is_turned_away else 0
 
-    def _obstacle(self) -> str:
-        """Return what is known of the socket file, in words; "" over TCP."""
-        if not self._endpoint.startswith("ipc:///"):
-            return ""
-        path = Path(self._endpoint.removeprefix("ipc://"))
+    def _obstacle(self) -> Link:
+        """Return why there is no connection, by the socket's file; over TCP that is not known."""
+        scheme, _, path = self._endpoint.partition("://")
+        if scheme != "ipc":
+            return Link.NOT_CONNECTED
         try:
-            path.stat()
+            os.stat(path)
         except FileNotFoundError:
-            return ": there is no such socket, so no daemon serves it"
+            return Link.NO_SOCKET
         except PermissionError:
-            return NOT_ALLOWED
-        except OSError as error:
-            return f": {error.strerror}"
-        return ": no daemon serves this socket" if os.access(path, os.W_OK) else NOT_ALLOWED
+            return Link.NOT_ALLOWED
+        except OSError:
+            return Link.NOT_CONNECTED
+        return Link.NO_DAEMON if os.access(path, os.W_OK) else Link.NOT_ALLOWED
 
     def close(self) -> None:
         self._close_sockets()

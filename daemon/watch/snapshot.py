@@ -26,6 +26,29 @@ class Tone(StrEnum):
     """`unknown`, because no message arrives."""
 
 
+class Link(StrEnum):
+    """State of the connection to a daemon, in words for a person."""
+
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+    NOT_CONNECTED = "not connected"
+    NO_SOCKET = "not connected: the socket does not exist, no daemon runs there"
+    NO_DAEMON = "not connected: no daemon serves this socket"
+    NOT_ALLOWED = "not connected: this user may not open the socket; join the group graspd"
+    NEEDS_KEY = "turned away: the daemon wants a key (--keys)"
+    UNKNOWN_KEY = "turned away: the daemon does not know this key"
+    TAKES_NO_KEYS = "turned away: this daemon takes no keys"
+    WRONG_DAEMON = "turned away: is the daemon's key right?"
+
+    @property
+    def is_turned_away(self) -> bool:
+        """True if the daemon is there and refuses this viewer."""
+        return self in TURNED_AWAY
+
+
+TURNED_AWAY = frozenset({Link.NEEDS_KEY, Link.UNKNOWN_KEY, Link.TAKES_NO_KEYS, Link.WRONG_DAEMON})
+
+
 class Line(msgspec.Struct, frozen=True):
     """A line of two texts: a reason and advice, or the name of a figure and its value."""
 
@@ -81,7 +104,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """The state of one hand."""
 
     endpoint: str
-    link: str
+    link: Link
     hand: str | None
     t: float
     """Time of the snapshot, wall-clock seconds since 1970."""

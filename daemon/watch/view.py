@@ -29,10 +29,10 @@ from graspd.daemon.publish.messages import (
     Verdict,
 )
 from graspd.daemon.watch import figures
-from graspd.daemon.watch.feed import CONNECTED, Feed
+from graspd.daemon.watch.feed import Feed
 from graspd.daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
 from graspd.daemon.watch.hand import OPEN, Fingers, GraspLog
-from graspd.daemon.watch.snapshot import Line, Snapshot, Tone
+from graspd.daemon.watch.snapshot import Line, Link, Snapshot, Tone
 
 TICK_S = 0.02
 """Time between two looks at the feeds, s: silence is timed this exactly."""
@@ -118,7 +118,7 @@ class View:
         `look`, `doctor`: advice for a person if no message, or no reading, comes.
         `wall`: returns seconds since 1970.
         """
-        self.link = "connecting"
+        self.link = Link.CONNECTING
         self.stood_still = 0, 0
         """When the viewer itself last stopped and went on, ns."""
         self._endpoint = endpoint
@@ -296,9 +296,9 @@ class View:
 
     def _where_to_look(self) -> list[Line]:
         lines = [Line("link", self.link)]
-        if self.link == CONNECTED:
+        if self.link is Link.CONNECTED:
             return [*lines, Line("look", LATE)]
-        if self._look and not self.link.startswith("turned away"):
+        if self._look and not self.link.is_turned_away:
             lines.append(Line("look", self._look))
         return lines
 

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from graspd.daemon import scene
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import Moment
-from graspd.daemon.publish.companion import Answer, PublishedVerdict, at_once
+from graspd.daemon.publish.companion import KEPT, Answer, PublishedVerdict, Reply, at_once
 from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener
@@ -82,13 +82,13 @@ class Publisher:
 class Asked:
     """Stands for the loop: counts questions, takes outcomes, and keeps them at once."""
 
-    def __init__(self, why: Callable[[Report], str | None] = lambda _report: None) -> None:
-        """`why` says why an outcome is refused; None: it is taken."""
+    def __init__(self, reply: Callable[[Report], Reply] = lambda _report: KEPT) -> None:
+        """`reply`: what an outcome is answered."""
         self.times = 0
         self.outcomes: list[Report] = []
         self.waiting: list[Answer] | None = None
         """Answers that wait until the outcomes are kept; None: they are kept at once."""
-        self._why = why
+        self._reply = reply
 
     def ask(self) -> None:
         self.times += 1
@@ -98,9 +98,9 @@ class Asked:
 
     def outcome(self, report: Report, answer: Answer) -> None:
         self.outcomes.append(report)
-        why = self._why(report)
-        if why is not None or self.waiting is None:
-            answer(why)
+        reply = self._reply(report)
+        if reply != KEPT or self.waiting is None:
+            answer(reply)
         else:
             self.waiting.append(answer)
 

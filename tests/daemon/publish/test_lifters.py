@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from graspd.daemon.publish.companion import Answer
+from graspd.daemon.publish.companion import KEPT, Answer, Reply, Told
 from graspd.daemon.publish.porter import Frames
 from graspd.daemon.publish.questions import WAITING_MAX, Questions
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
@@ -34,12 +34,12 @@ class Book(Asked):
 
     def outcome(self, report: Report, answer: Answer) -> None:
         if not self.lifts.may_report(report.grasp, report.peer):
-            answer("not yours")
+            answer(Reply(Told.NOT_YOURS))
         elif report.outcome == "not-lifted":
-            answer(None if self.lifts.take_back(report.grasp) else "contradicts")
+            answer(KEPT if self.lifts.take_back(report.grasp) else Reply(Told.CONTRADICTS))
         else:
             self.lifts.tell(report.grasp, slipped=report.outcome == "slip")
-            answer(None)
+            answer(KEPT)
 
 
 class Bench:
@@ -146,7 +146,7 @@ def test_a_lift_is_on_the_disk_before_the_answer(bench: Bench) -> None:
     bench.verdict(keep=bench.book.disk.append)
     assert (bench.sent, bench.announced) == ([], (1, 1))
     bench.verdict(now_ns=0)
-    bench.book.disk[0](None)
+    bench.book.disk[0](KEPT)
     assert bench.sent == []
     bench.verdict(now_ns=0)
     assert (bench.answers, len(bench.book.disk)) == ([{"said": "stable"}], 1)
@@ -154,7 +154,7 @@ def test_a_lift_is_on_the_disk_before_the_answer(bench: Bench) -> None:
 
 def test_a_lift_that_cannot_be_kept_is_unknown(bench: Bench) -> None:
     bench.say(b"lift")
-    bench.verdict(keep=lambda answer: answer("not kept: full"))
+    bench.verdict(keep=lambda answer: answer(Reply(Told.NOT_KEPT, "full")))
     (answer,) = bench.answers
     assert (answer["verdict"], answer["reasons"], answer["p_slip"]) == (
         "unknown",
@@ -168,7 +168,7 @@ def test_a_lift_that_cannot_be_kept_is_unknown(bench: Bench) -> None:
 def test_what_is_no_longer_stable_is_not_announced(bench: Bench, name: str) -> None:
     bench.say(b"lift")
     bench.verdict(keep=bench.book.disk.append)
-    bench.book.disk[0](None)
+    bench.book.disk[0](KEPT)
     bench.verdict(name, now_ns=0, supervised=False)
     assert (bench.answers, bench.announced) == ([{"said": name}], (0, 0))
 
@@ -176,7 +176,7 @@ def test_what_is_no_longer_stable_is_not_announced(bench: Bench, name: str) -> N
 @pytest.mark.parametrize("answered", [True, False])
 def test_a_word_takes_a_lift_back(bench: Bench, answered: bool) -> None:
     bench.say(b"lift")
-    bench.verdict(keep=(lambda answer: answer(None)) if answered else bench.book.disk.append)
+    bench.verdict(keep=(lambda answer: answer(KEPT)) if answered else bench.book.disk.append)
     assert bench.announced == (1, 1)
     assert bench.say(b"not-lifting") == {"v": 1, "ok": True}
     assert bench.announced == (0, 0)
@@ -250,7 +250,7 @@ def test_a_lift_that_waits_too_long_for_the_disk_ends_unknown(bench: Bench) -> N
     bench.questions.expire(S, bench.book)
     assert [answer["reasons"] for answer in bench.answers] == [["not-kept"]]
     assert bench.announced == (0, 0)
-    bench.book.disk[0](None)
+    bench.book.disk[0](KEPT)
     bench.verdict()
     assert len(bench.sent) == 1
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.daemon.publish.companion import REPEATED, Answer
+from graspd.daemon.publish.companion import KEPT, Answer, Reply, Told
 from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.publish.questions import Questions
@@ -82,8 +82,8 @@ class Asked:
         return answer
 
 
-def takes_the_seventh(report: Report) -> str | None:
-    return None if report.grasp == GraspId(BOOT, 7) else "no such"
+def takes_the_seventh(report: Report) -> Reply:
+    return KEPT if report.grasp == GraspId(BOOT, 7) else Reply(Told.UNKNOWN_GRASP, "no such")
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
     assert asked.tell(TELLER, STABLE) == {"v": 1, "ok": True}
     assert asked.tell(TELLER, b"", STABLE) == {"v": 1, "ok": True}
     refused = asked.tell(TELLER, f"outcome {BOOT} 8 slip".encode())
-    assert refused == {"v": 1, "ok": False, "why": "no such"}
+    assert refused == {"v": 1, "ok": False, "why": "unknown grasp: no such"}
     assert len(asked.questions.waiting) == 0
     assert asked.questions.counters["outcomes"] == 2
     assert asked.questions.counters["outcomes_refused"] == 1
@@ -113,10 +113,10 @@ def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(asked: Asked) -> N
     messages = [[TELLER, USER, text] for text in texts]
     asked.questions.take(messages, 0, requests)
     assert [json.loads(frames[-1]) for frames in asked.sent] == [
-        {"v": 1, "ok": False, "why": "no such"}
+        {"v": 1, "ok": False, "why": "unknown grasp: no such"}
     ]
-    waiting[0]("not kept: full")
-    waiting[1](None)
+    waiting[0](Reply(Told.NOT_KEPT, "full"))
+    waiting[1](KEPT)
     assert [json.loads(frames[-1]) for frames in asked.sent[1:]] == [
         {"v": 1, "ok": False, "why": "not kept: full"},
         {"v": 1, "ok": True},
@@ -126,7 +126,7 @@ def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(asked: Asked) -> N
 
 
 def test_a_repeated_outcome_is_answered_as_taken_and_repeated(asked: Asked) -> None:
-    answer = asked.tell(TELLER, SLIP, requests=Requests(lambda _report: REPEATED))
+    answer = asked.tell(TELLER, SLIP, requests=Requests(lambda _report: Reply(Told.REPEATED)))
     assert answer == {"v": 1, "ok": True, "repeated": True}
     assert asked.questions.counters["outcomes"] == 1
 

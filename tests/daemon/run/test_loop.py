@@ -14,11 +14,14 @@ import pytest
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import (
+    KEPT,
     Answer,
     Companion,
     LoopEvent,
     PublishedVerdict,
+    Reply,
     Requests,
+    Told,
     hooks,
 )
 from graspd.daemon.publish.messages import Lifts, State
@@ -260,7 +263,7 @@ class Peer(Companion):
 
     def __init__(self, boot_id: str) -> None:
         self.boot_id = boot_id
-        self.refused: list[str | None] = []
+        self.refused: list[Reply] = []
         self.heard: list[object] = []
 
     def before_wait(self, requests: Requests) -> None:
@@ -278,7 +281,7 @@ class Peer(Companion):
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        return {"peer": {"outcomes": self.refused.count(None)}}
+        return {"peer": {"outcomes": self.refused.count(KEPT)}}
 
 
 def test_a_companion_asks_and_tells_and_hears_what_comes_of_it() -> None:
@@ -289,7 +292,7 @@ def test_a_companion_asks_and_tells_and_hears_what_comes_of_it() -> None:
     bench.run()
     first, second = bench.payloads
     told = Report(GraspId(peer.boot_id, 1), "slip", "mug")
-    assert peer.refused == ["unknown grasp: not judged, or too long ago", None]
+    assert peer.refused == [Reply(Told.UNKNOWN_GRASP, "not judged, or too long ago"), KEPT]
     assert peer.heard == [LoopEvent.ASKED, first, LoopEvent.ASKED, told, second]
     assert [topic for topic, _ in bench.output.sent[:-1]].count(b"outcome.right") == 1
     assert bench.statuses[-1].drivers["peer"] == {"outcomes": 1}
@@ -298,9 +301,9 @@ def test_a_companion_asks_and_tells_and_hears_what_comes_of_it() -> None:
 BOOT = "b" * 32
 
 
-def told(bench: LoopBench, outcome: Literal["stable", "slip"]) -> list[str | None]:
+def told(bench: LoopBench, outcome: Literal["stable", "slip"]) -> list[Reply]:
     """What the answers to an outcome of the first grasp are, as they come."""
-    answers: list[str | None] = []
+    answers: list[Reply] = []
     bench.loop.outcome(Report(GraspId(BOOT, 1), outcome), answers.append)
     return answers
 
@@ -312,12 +315,13 @@ def test_an_outcome_is_answered_when_it_is_kept_and_repeated_only_then() -> None
     bench.run()
     first, again = told(bench, "slip"), told(bench, "slip")
     assert (first, again, len(waiting)) == ([], [], 2)
-    waiting[0]("not kept: full")
+    full = Reply(Told.NOT_KEPT, "full")
+    waiting[0](full)
     third = told(bench, "slip")
-    assert (first, third, len(waiting)) == (["not kept: full"], [], 3)
-    waiting[2](None)
-    assert third == [None]
-    assert told(bench, "slip") == ["repeated"]
+    assert (first, third, len(waiting)) == ([full], [], 3)
+    waiting[2](KEPT)
+    assert third == [KEPT]
+    assert told(bench, "slip") == [Reply(Told.REPEATED)]
     assert len(waiting) == 3
     assert [topic for topic, _ in bench.output.sent].count(b"outcome.right") == 1
 
@@ -328,7 +332,7 @@ def test_a_replay_takes_outcomes_by_its_own_name_of_the_start() -> None:
     bench = LoopBench(FakeDriver([reading(clock())], clock), clock, boot_id=BOOT)
     bench.pipeline.boot_id = "e" * 32
     bench.run()
-    assert told(bench, "slip") == [None]
+    assert told(bench, "slip") == [KEPT]
     assert bench.pipeline.lifts.is_told(GraspId("e" * 32, 1))
 
 
@@ -365,7 +369,7 @@ def test_an_outcome_of_a_grasp_of_an_earlier_start_is_taken_once_it_is_known() -
         bench = LoopBench(driver, clock, companions=[peer], boot_id="b" * 32, trust=trust)
         bench.run()
         taken = trust is known
-        expected = [None, "repeated"] if taken else [UNKNOWN_START] * 2
+        expected = [KEPT, Reply(Told.REPEATED)] if taken else [UNKNOWN_START] * 2
         assert peer.refused == expected
         assert trust.learner.outcomes == int(taken)
 

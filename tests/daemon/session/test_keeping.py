@@ -15,6 +15,7 @@ from typing import cast
 import pytest
 
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.publish.companion import KEPT, Reply, Told
 from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.session.keeper import (
@@ -128,29 +129,29 @@ def test_an_outcome_is_answered_when_it_is_on_the_disk(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
-    found: list[tuple[str | None, TrustState | None]] = []
+    found: list[tuple[Reply, TrustState | None]] = []
     keeper = keeper_of(part)
     judge(part, 1)
     tell(part, 1)
     disk.goes_on.clear()
-    keeper.keep(lambda why: found.append((why, kept_trust(folder))))
+    keeper.keep(lambda reply: found.append((reply, kept_trust(folder))))
     for _ in range(3):
         read_once(keeper)
     assert found == []
     disk.goes_on.set()
     go_round(keeper)
-    assert found == [(None, part.state())]
+    assert found == [(KEPT, part.state())]
 
 
 def test_outcomes_that_come_while_one_is_written_share_the_next_save(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
-    found: list[tuple[int, str | None, int]] = []
+    found: list[tuple[int, Reply, int]] = []
     keeper = keeper_of(part)
 
-    def answer(grasp: int, why: str | None) -> None:
-        found.append((grasp, why, outcomes(folder)))
+    def answer(grasp: int, reply: Reply) -> None:
+        found.append((grasp, reply, outcomes(folder)))
 
     disk.goes_on.clear()
     for grasp in range(5):
@@ -160,7 +161,7 @@ def test_outcomes_that_come_while_one_is_written_share_the_next_save(
     assert (found, disk.written) == ([], 0)
     disk.goes_on.set()
     go_round(keeper)
-    assert [(grasp, why) for grasp, why, _ in found] == [(grasp, None) for grasp in range(5)]
+    assert [(grasp, reply) for grasp, reply, _ in found] == [(grasp, KEPT) for grasp in range(5)]
     assert disk.written == 2
     assert [outcomes for _, _, outcomes in found] == [1, 5, 5, 5, 5]
 
@@ -169,14 +170,14 @@ def test_what_is_kept_already_is_answered_at_once(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
-    found: list[str | None] = []
+    found: list[Reply] = []
     keeper = keeper_of(part)
     judge(part, 1)
     tell(part, 1)
     keeper.keep(found.append)
     go_round(keeper)
     keeper.keep(found.append)
-    assert found == [None, None]
+    assert found == [KEPT, KEPT]
     assert disk.written == 1
 
 
@@ -184,7 +185,7 @@ def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
     folder: SessionFolder, disk: Disk, caplog: pytest.LogCaptureFixture, keeper_of: KeeperOf
 ) -> None:
     part: Trust = trust()
-    found: list[str | None] = []
+    found: list[Reply] = []
     keeper = keeper_of(part)
     judge(part, 1)
     assert tell(part, 1) is OutcomeStatus.TAKEN
@@ -195,14 +196,14 @@ def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
     keeper.keep(found.append)
     go_round(keeper)
     where = f"{folder.path}: cannot keep the session: No space left on device"
-    assert found == [f"not kept: {where}"] * 2
+    assert found == [Reply(Told.NOT_KEPT, where)] * 2
     assert caplog.text.count("No space left on device") == 1
     assert last_kept(folder.path) is None
     disk.is_full = False
     assert tell(part, 1) is OutcomeStatus.REPEATED
     keeper.keep(found.append)
     go_round(keeper)
-    assert found[2:] == [None]
+    assert found[2:] == [KEPT]
     assert kept_trust(folder) == part.state()
 
 
@@ -210,11 +211,11 @@ def test_a_disk_that_hangs_holds_neither_the_loop_nor_too_many_answers(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
-    found: list[tuple[int, str | None]] = []
+    found: list[tuple[int, Reply]] = []
     keeper = keeper_of(part)
 
-    def answer(grasp: int, why: str | None) -> None:
-        found.append((grasp, why))
+    def answer(grasp: int, reply: Reply) -> None:
+        found.append((grasp, reply))
 
     disk.goes_on.clear()
     told = WAITING_MAX + 6
@@ -226,7 +227,7 @@ def test_a_disk_that_hangs_holds_neither_the_loop_nor_too_many_answers(
     assert found == [(grasp, BUSY) for grasp in range(6)]
     disk.goes_on.set()
     go_round(keeper)
-    assert found[6:] == [(grasp, None) for grasp in range(6, told)]
+    assert found[6:] == [(grasp, KEPT) for grasp in range(6, told)]
     assert disk.written == 2
     assert kept_trust(folder) == part.state()
 
@@ -235,7 +236,7 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part: Trust = trust()
-    found: list[str | None] = []
+    found: list[Reply] = []
     threads = threading.active_count()
     keeper = keeper_of(part)
     disk.goes_on.clear()
@@ -305,26 +306,26 @@ def test_what_cannot_be_kept_at_the_start_is_said_and_kept_later(
 ) -> None:
     """As on a full or read-only disk, and in a folder that is gone."""
     gone = tmp_path / "gone"
-    folder, part, found = SessionFolder(gone / "right"), trust(), list[str | None]()
+    folder, part, found = SessionFolder(gone / "right"), trust(), list[Reply]()
     keeper = session_keeper(None, sensors(), folder, part=part)
     judge(part, 1)
     tell(part, 1)
     keeper.keep(found.append)
     go_round(keeper)
     where = f"{gone}/right: cannot keep the session: No such file or directory"
-    assert found == [f"not kept: {where}"]
+    assert found == [Reply(Told.NOT_KEPT, where)]
     assert caplog.text.count(where) == 1
     gone.mkdir()
     keeper.keep(found.append)
     go_round(keeper)
-    assert found[1:] == [None]
+    assert found[1:] == [KEPT]
     assert kept_trust(folder) == part.state()
     keeper.save()
     folder.close()
 
 
 def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path) -> None:
-    path, mine, theirs, found = tmp_path / "right", trust(), trust(), list[str | None]()
+    path, mine, theirs, found = tmp_path / "right", trust(), trust(), list[Reply]()
     with SessionFolder(path) as other:
         folder = SessionFolder(path)
         keeper = session_keeper(None, sensors(), folder, part=mine)
@@ -338,7 +339,8 @@ def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path) -> None:
     go_round(keeper)
     keeper.save()
     folder.close()
-    assert found == [f"not kept: {path}: in use by another graspd, stop that one first", None]
+    in_use = f"{path}: in use by another graspd, stop that one first"
+    assert found == [Reply(Told.NOT_KEPT, in_use), KEPT]
     of_each = [kept.trust for kept in kept_in(path) if kept.trust is not None]
     assert of_each == [mine.state(), theirs.state()]
 
@@ -352,7 +354,7 @@ def test_announced_lifts_are_on_the_disk_when_that_is_answered(
         judge(part, len(part.lifts.state().records))
     part.lifts.announce()
 
-    def answer(_why: str | None) -> None:
+    def answer(_reply: Reply) -> None:
         kept = kept_trust(folder)
         assert kept is not None
         announced.append(sum(lift.is_awaited for lift in kept.lifts.records))
@@ -365,18 +367,18 @@ def test_announced_lifts_are_on_the_disk_when_that_is_answered(
 def test_whoever_waits_is_answered_whatever_ends_the_writing(
     folder: SessionFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    part, found = trust(), list[str | None]()
+    part, found = trust(), list[Reply]()
     keeper = session_keeper(None, sensors(), folder, part=part)
     save = folder.save
     monkeypatch.setattr(folder, "save", lambda *_: 1 // 0)
     judge(part, 0)
     keeper.keep(found.append)
     keeper.wait(WAIT_S)
-    assert found == ["not kept: it could not be written"]
+    assert found == [Reply(Told.NOT_KEPT, "it could not be written")]
     monkeypatch.setattr(folder, "save", save)
     keeper.keep(found.append)
     keeper.save()
-    assert found[1:] == [None]
+    assert found[1:] == [KEPT]
 
 
 def test_session_and_what_was_learned_are_restored_together(folder: SessionFolder) -> None:

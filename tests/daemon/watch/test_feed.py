@@ -114,7 +114,7 @@ def test_whoever_is_turned_away_is_told_why(
 ) -> None:
     keys = None if own is None else keys_of(tmp_path, own, server)
     with Feed(door.endpoint, keys) as feed:
-        assert not hears(door, feed, lambda heard: heard or feed.is_turned_away)
+        assert not hears(door, feed, lambda heard: heard or feed.link.is_turned_away)
         assert said in feed.link
         later_s = time.monotonic() + 0.5  # whatever is tried again says the same
         assert not hears(door, feed, lambda heard: heard or time.monotonic() > later_s)
@@ -126,7 +126,7 @@ def test_who_was_turned_away_is_let_in_when_its_key_is_known(
 ) -> None:
     clock = Clock()
     with Feed(door.endpoint, keys_of(tmp_path, "stranger"), clock) as feed:
-        hears(door, feed, lambda _: feed.is_turned_away)
+        hears(door, feed, lambda _: feed.link.is_turned_away)
         (tmp_path / "theirs" / "stranger.key").rename(door.clients / "stranger.key")
         door.knows(2)
         for _ in range(6):  # looks, and is not paused

@@ -11,7 +11,7 @@ from msgspec import structs
 from graspd.daemon.commands.watch import where_to_look
 from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
 from graspd.daemon.publish.messages import State
-from graspd.daemon.watch.snapshot import Line, Tone
+from graspd.daemon.watch.snapshot import Line, Link, Tone
 from graspd.daemon.watch.view import View
 from tests.daemon.watch.watch_fakes import (
     ENDPOINT,
@@ -93,9 +93,9 @@ def test_a_silent_daemon_has_the_commands_to_look_with() -> None:
     look = "systemctl status graspd@right; journalctl -u graspd@right"
     view = View(ENDPOINT, look=look)
     assert view.snapshot(0).why[-1] == Line("look", look)
-    view.link = "connected"
+    view.link = Link.CONNECTED
     assert "the daemon is there" in view.snapshot(0).why[-1].advice
-    view.link = "turned away: the daemon wants a key (--keys)"
+    view.link = Link.NEEDS_KEY
     assert [line.what for line in view.snapshot(0).why] == ["silent", "link"]
 
 
