@@ -46,7 +46,7 @@ COMMANDS = {
         "measure how good systems are (extra: train)",
     ),
     "report": (
-        ".report",
+        "graspd.models.training.reports.command",
         "measure error, time and exactness of the models (extras: train, report)",
     ),
     "completion": (".texts", "print what makes a shell complete commands"),

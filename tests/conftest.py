@@ -35,7 +35,7 @@ BEGUN_FIRST = (
     "emulated/test_timing.py",
     "bench/test_mutants.py",
     "stability/test_models.py",
-    "daemon/measure/test_error_vs_time.py",
+    "models/training/reports/test_error_vs_time.py",
     "daemon/doctor/test_link_faults.py",
     "daemon/judge/test_only_stable_if.py",
     "daemon/judge/test_grasps_to_the_lift.py",

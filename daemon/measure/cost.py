@@ -11,7 +11,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from graspd.daemon.process.text import markdown_table, printable
+from graspd.daemon.process.text import printable
+from graspd.models.training.evaluating.files import markdown_table
 
 TIMEOUT_S = 120.0
 """Longest measurement, s. A scene takes about a second."""

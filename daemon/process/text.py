@@ -1,11 +1,11 @@
-"""Text for people: escaped for terminals, coloured, in tables."""
+"""Text for people: escaped for terminals, coloured."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from enum import IntEnum
 
 from graspd.daemon.process.logs import JOURNAL_ERROR, is_journal
@@ -76,14 +76,3 @@ def progress(doing: str) -> None:
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{printable(doing, PROGRESS_MAX)}")
         sys.stderr.flush()
-
-
-def markdown_table(
-    titles: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[str] = ()
-) -> Iterator[str]:
-    """Yield the lines of a Markdown table; columns named in `right` are right-aligned."""
-    yield f"| {' | '.join(titles)} |"
-    yield f"| {' | '.join('---:' if title in right else '---' for title in titles)} |"
-    for row in rows:
-        cells = (cell.replace("|", "\\|") for cell in row)
-        yield f"| {' | '.join(cells)} |"

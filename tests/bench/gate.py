@@ -19,8 +19,8 @@ from graspd.daemon.judge.decision import HandLimits
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import FingerState
-from graspd.daemon.process.text import markdown_table
 from graspd.drivers.twins.grasps.whole_grasps import Sampler
+from graspd.models.training.evaluating.files import markdown_table
 from tests.daemon.fakes import FINGERS
 from tests.drivers.twins.slides import SLIDE_SPREAD, HeldNoise, Hold
 

@@ -25,8 +25,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from graspd.daemon.process.text import markdown_table
 from graspd.drivers.twins.faults import LinkFaults
+from graspd.models.training.evaluating.files import markdown_table
 from tests.bench.live import (
     PATIENCE_S,
     STOP_S,

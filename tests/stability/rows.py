@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from graspd.daemon.process.text import markdown_table, printable
+from graspd.daemon.process.text import printable
+from graspd.models.training.evaluating.files import markdown_table
 
 Row = dict[str, Any]
 QUICK_BELOW = 1_000_000

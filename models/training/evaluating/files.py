@@ -1,9 +1,9 @@
-"""Write result files that are complete or absent, whenever the program ends."""
+"""Write result files that are complete or absent, whenever the program ends; tables in them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -35,3 +35,14 @@ def write_whole(path: Path, data: bytes) -> None:
 def to_json(value: object) -> bytes:
     """Return indented JSON with a newline."""
     return msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"
+
+
+def markdown_table(
+    titles: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[str] = ()
+) -> Iterator[str]:
+    """Yield the lines of a Markdown table; columns named in `right` are right-aligned."""
+    yield f"| {' | '.join(titles)} |"
+    yield f"| {' | '.join('---:' if title in right else '---' for title in titles)} |"
+    for row in rows:
+        cells = (cell.replace("|", "\\|") for cell in row)
+        yield f"| {' | '.join(cells)} |"

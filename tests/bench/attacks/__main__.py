@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from graspd.daemon.process.text import markdown_table
+from graspd.models.training.evaluating.files import markdown_table
 from tests.bench.attacks import doors, files, hands, hang_ups, rings, standing, who
 from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import end_children_at_sigterm

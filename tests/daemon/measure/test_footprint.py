@@ -33,8 +33,7 @@ NEVER = {
 } | ours(
     *("models.training", "models.onnx_file", "drivers.twins", "drivers.recordings.can_log"),
     "drivers.recordings.serial_log",
-    *("daemon.measure.candidates", "daemon.measure.error_vs_time", "daemon.measure.stability"),
-    *("daemon.measure.streams", "daemon.measure.worth", "daemon.measure.cost"),
+    "daemon.measure.cost",
     *("daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
     *("daemon.scene.errors", "daemon.commands.doctor", "daemon.watch", "daemon.judge.memory"),
     *("daemon.record", "daemon.assembly.recordings", "daemon.assembly.sources"),

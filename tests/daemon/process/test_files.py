@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from graspd.daemon.process.files import read_regular, write_atomically
-from graspd.daemon.process.text import markdown_table
 from graspd.extras import installer, needs
+from graspd.models.training.evaluating.files import markdown_table
 
 
 def test_a_file_is_replaced_with_the_mode_that_is_asked_for(tmp_path: Path) -> None:

@@ -7,14 +7,13 @@ Networks saw neither the objects nor the pose of a stream. The days are those of
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.process.text import progress
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
@@ -69,11 +68,16 @@ class Life:
 
 
 def streams(
-    grasps: Grasps, seeds: int, folds: int = DAYS_FOLDS, epochs: int | None = None
+    grasps: Grasps,
+    seeds: int,
+    folds: int = DAYS_FOLDS,
+    epochs: int | None = None,
+    on_day: Callable[[str], None] = lambda _day: None,
 ) -> Iterator[Stream]:
     """Train the networks of each day and fold; yield the streams of the three tables.
 
     Objects are split `seeds` times; `folds` of each are judged. `epochs` None: the systems' own.
+    `on_day` is called before each day's training.
     """
     systems = [SYSTEMS[name] for name in (OWN, PUBLISHED)]
     if epochs is not None:
@@ -82,7 +86,7 @@ def streams(
     for seed, fold in itertools.product(range(seeds), range(folds)):
         fold_of = object_folds(grasps.objects, DAYS_FOLDS, seed)
         for protocol, training, tables in DAYS:
-            progress(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {protocol}")
+            on_day(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {protocol}")
             others = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
             own, published = (train(system, others, fold_seed(seed, fold)) for system in systems)
             random = np.random.default_rng([seed, fold])

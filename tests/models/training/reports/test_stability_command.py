@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("onnx", reason="needs the extra `train`")
 pytest.importorskip("torch", reason="needs the extra `train`")
 
-from graspd.daemon.measure import stability
+from graspd.models.training.reports import stability
 from tests.kit.inside import graspd
 from tests.stability.rows import NUMBERS, row_of, text
 

@@ -9,13 +9,12 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from graspd.daemon.process.text import complain, progress
 from graspd.extras import needs
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
-from graspd.models.contract import ModelError
+from graspd.models.training.commands.common import WrongInputError, say
 
-CHECKOUT = Path(__file__).resolve().parents[2]
+CHECKOUT = Path(__file__).resolve().parents[3]
 CASES = Path("tests/stability")
 PACKAGES = ("pytest", "hypothesis", "onnx", "torch")
 BROKEN, WRONG = 1, 2
@@ -24,11 +23,8 @@ OUTCOMES, QUICK_OUTCOMES = 100_000, 3_000
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print; return 1 if a bound is broken, 2 if something is missing or unknown."""
-    problem = _missing(args)
-    if problem is not None:
-        complain(problem)
-        return WRONG
+    """Measure and print; return 1 if a bound is broken. Raises `WrongInputError`, `ModelError`."""
+    _check(args)
     command = [sys.executable, "-m", "pytest", "--override-ini=addopts=", "--import-mode=importlib"]
     command += ["-p", "no:terminal", "-p", "no:cacheprovider"]
     command.append("--timeout=0")  # a slow machine is no error of the chain
@@ -37,28 +33,25 @@ def run(args: argparse.Namespace) -> int:
     command += [f"--model={name}" for name in args.model]
     if args.data is not None:
         command.append(f"--data={args.data.resolve()}")
-    progress(f"running the cases of {CASES}, one to four minutes")
+    say("report", f"running the cases of {CASES}, one to four minutes")
     done = subprocess.run(
         [*command, str(CASES)], check=False, cwd=CHECKOUT, stdout=subprocess.PIPE, encoding="utf-8"
     )
-    progress("")
     sys.stdout.write(done.stdout)
     return done.returncode if done.returncode in (0, BROKEN) else WRONG
 
 
-def _missing(args: argparse.Namespace) -> str | None:
-    """Return what is missing: the tests, a package, a model or a table."""
+def _check(args: argparse.Namespace) -> None:
+    """Raise `WrongInputError` or `ModelError` if tests, a package, model or table is missing."""
     if not (CHECKOUT / CASES).is_dir():
-        return f"report stability runs {CASES}: run it in a checkout of graspd, not as installed"
+        raise WrongInputError(f"stability runs {CASES}: run it in a checkout, not as installed")
     for package in PACKAGES:
         if find_spec(package) is None:
             absent = ModuleNotFoundError(name=package)
-            return needs("report stability", "train,test", absent)
-    try:
-        for name in args.model:
-            zoo.find(name)
-    except ModelError as error:
-        return str(error)
-    tables = [] if args.data is None else [args.data / f"{table.name}.csv" for table in TABLES]
-    absent_tables = [path for path in tables if not path.is_file()]
-    return f"{absent_tables[0]}: no such file; `graspd data` gets it" if absent_tables else None
+            raise WrongInputError(needs("report stability", "train,test", absent))
+    for name in args.model:
+        zoo.find(name)
+    for table in () if args.data is None else TABLES:
+        path = args.data / f"{table.name}.csv"
+        if not path.is_file():
+            raise WrongInputError(f"{path}: no such file; `graspd data` gets it")

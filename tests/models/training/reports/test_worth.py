@@ -16,11 +16,16 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `train`")
 pytest.importorskip("matplotlib", reason="needs the extra `report`")
 
-from graspd.daemon.measure import streams as module
-from graspd.daemon.measure import worth
-from graspd.daemon.measure.reliability import fitted_scales, outcomes_of, slope
-from graspd.daemon.measure.streams import Stream, judged, live, streams
-from graspd.daemon.measure.worth import (
+from graspd.models import zoo
+from graspd.models.training.arrays import Ints
+from graspd.models.training.data.datasets import Grasps, read_all
+from graspd.models.training.data.protocols import object_folds
+from graspd.models.training.fitting.trained import Trained, train
+from graspd.models.training.reports import streams as module
+from graspd.models.training.reports import worth
+from graspd.models.training.reports.reliability import fitted_scales, outcomes_of, slope
+from graspd.models.training.reports.streams import Stream, judged, live, streams
+from graspd.models.training.reports.worth import (
     ALLOWED,
     ALONE,
     LEARNING,
@@ -31,11 +36,6 @@ from graspd.daemon.measure.worth import (
     measured,
     risk_figures,
 )
-from graspd.models import zoo
-from graspd.models.training.arrays import Ints
-from graspd.models.training.data.datasets import Grasps, read_all
-from graspd.models.training.data.protocols import object_folds
-from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS, System, with_recipes
 from graspd.models.trust.learner import SCALE
 from graspd.models.trust.risk import RiskLimits

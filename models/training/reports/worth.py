@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -17,17 +18,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from graspd.daemon.measure.reliability import (
-    Reliability,
-    fitted_scales,
-    reliability,
-    reliability_lines,
-)
-from graspd.daemon.measure.streams import Life, Stream, live, streams
-from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
-from graspd.models.contract import ModelError
-from graspd.models.training.data.datasets import DatasetError, read_all
-from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.commands.common import progress_bar
+from graspd.models.training.data.datasets import read_all
+from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS
+from graspd.models.training.evaluating.files import markdown_table, to_json, write_whole
 from graspd.models.training.evaluating.style import (
     BLUE,
     NAVY,
@@ -40,6 +34,13 @@ from graspd.models.training.evaluating.style import (
     to_svg,
 )
 from graspd.models.training.evaluating.summaries import VerdictFigures
+from graspd.models.training.reports.reliability import (
+    Reliability,
+    fitted_scales,
+    reliability,
+    reliability_lines,
+)
+from graspd.models.training.reports.streams import Life, Stream, live, streams
 from graspd.models.trust.risk import RiskLimits
 from graspd.models.zoo import read_card
 
@@ -126,27 +127,23 @@ class Worth:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, draw and print; 2 if data, card or folder are wrong."""
-    try:
-        grasps = read_all(args.data)
-        args.out.mkdir(parents=True, exist_ok=True)
+    """Measure, draw and print. Raises `DatasetError`, `ModelError` or `OSError`."""
+    grasps = read_all(args.data)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with progress_bar("trainings", args.seeds * DAYS_FOLDS * len(DAYS), hidden=False) as on_day:
         if args.quick:
             several = list(streams(grasps.few(), seeds=1, folds=1, epochs=1))
         else:
-            several = list(streams(grasps, args.seeds))
-        progress("")
-        quick = " --quick" if args.quick else ""
-        worth = worth_of(several, f"graspd report worth --data DIR --seeds {args.seeds}{quick}")
-        text = "\n".join([*([f"**{QUICK}**", ""] if quick else []), *lines(worth)])
-        write_whole(args.out / "worth.json", to_json(worth))
-        write_whole(args.out / "worth.md", f"{text}\n".encode())
-        write_whole(args.out / "worth.svg", draw(worth.curves, quick=args.quick).encode())
-        if args.card is not None:
-            write_whole(args.card, to_json({**read_card(args.card), "worth": worth}))
-    except (DatasetError, ModelError, OSError) as error:
-        complain(error)
-        return 2
-    write_lines(text)
+            several = list(streams(grasps, args.seeds, on_day=on_day))
+    quick = " --quick" if args.quick else ""
+    worth = worth_of(several, f"graspd report worth --data DIR --seeds {args.seeds}{quick}")
+    text = "\n".join([*([f"**{QUICK}**", ""] if quick else []), *lines(worth)])
+    write_whole(args.out / "worth.json", to_json(worth))
+    write_whole(args.out / "worth.md", f"{text}\n".encode())
+    write_whole(args.out / "worth.svg", draw(worth.curves, quick=args.quick).encode())
+    if args.card is not None:
+        write_whole(args.card, to_json({**read_card(args.card), "worth": worth}))
+    sys.stdout.write(f"{text}\n")
     return 0
 
 

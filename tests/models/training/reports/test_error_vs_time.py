@@ -16,13 +16,13 @@ pytest.importorskip("matplotlib", reason="needs the extra `report`")
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from graspd.daemon.measure import error_vs_time
-from graspd.daemon.measure.candidates import errors, loop_image, measure, model_step
-from graspd.daemon.measure.error_vs_time import Point
 from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from graspd.models.tactile_image import TactileImager
+from graspd.models.training.reports import error_vs_time
+from graspd.models.training.reports.candidates import errors, loop_image, measure, model_step
+from graspd.models.training.reports.error_vs_time import Point
 from tests.daemon.fakes import FakeModel, contract
 from tests.kit.inside import graspd
 from tests.models.training.samples import sessions

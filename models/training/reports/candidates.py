@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from graspd.biotac import TABLE_FINGERS
-from graspd.daemon.process.text import progress
 from graspd.models.contract import ModelError
 from graspd.models.layout import D1
 from graspd.models.runtime import TactileModel
@@ -171,9 +170,8 @@ def measure(steps: Mapping[str, Step], readings: int, paced: int) -> dict[str, T
 def _hot(steps: Mapping[str, Step], readings: int) -> dict[str, list[int]]:
     """Wall time of readings right after each other, ns."""
     times: dict[str, list[int]] = {name: [] for name in steps}
-    for done in range(ROUNDS):
+    for _ in range(ROUNDS):
         for name, step in steps.items():
-            progress(f"one reading after the other, round {done + 1} of {ROUNDS}: {name}")
             for index in range(readings):
                 began_ns = time.perf_counter_ns()
                 step(index)
@@ -189,7 +187,6 @@ def _paced(
     cpu: dict[str, list[int]] = {name: [] for name in steps}
     due_s = time.perf_counter()
     for index in range(readings):
-        progress(f"paced at 100 Hz: {index} of {readings} readings each")
         for name, step in steps.items():
             due_s += PERIOD_S
             time.sleep(max(due_s - time.perf_counter(), 0.0))

@@ -6,6 +6,9 @@ import argparse
 import importlib
 from pathlib import Path
 
+from graspd.models.training.commands.common import WrongInputError, say
+from graspd.models.training.data.datasets import DatasetError
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the reports and their arguments; what measures takes seconds to load."""
@@ -18,8 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the report; its exit code."""
-    code: int = importlib.import_module(REPORTS[args.report][0]).run(args)
+    """Make the report; return its exit code, 2 for wrong input, data or folder."""
+    try:
+        code: int = importlib.import_module(REPORTS[args.report][0]).run(args)
+    except (DatasetError, OSError, WrongInputError) as error:
+        say("report", str(error))
+        return 2
     return code
 
 
@@ -78,17 +85,17 @@ def _worth(parser: argparse.ArgumentParser) -> None:
 
 REPORTS = {
     "error-vs-time": (
-        "graspd.daemon.measure.error_vs_time",
+        "graspd.models.training.reports.error_vs_time",
         "how wrong each model is against how long it takes",
         _error_vs_time,
     ),
     "stability": (
-        "graspd.daemon.measure.stability",
+        "graspd.models.training.reports.stability",
         "numerical error of the whole chain on stiff and extreme readings",
         _stability,
     ),
     "worth": (
-        "graspd.daemon.measure.worth",
+        "graspd.models.training.reports.worth",
         "what `stable` is worth on another day, by how many outcomes were told",
         _worth,
     ),

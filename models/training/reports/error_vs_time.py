@@ -10,6 +10,7 @@ import argparse
 import itertools
 import json
 import platform
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -20,11 +21,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from graspd.daemon.measure.candidates import Row, candidates, measure
-from graspd.daemon.process.text import complain, markdown_table, progress, write_lines
 from graspd.models import zoo
-from graspd.models.contract import ModelError
-from graspd.models.training.data.datasets import DatasetError, Grasps, read_all
+from graspd.models.training.commands.common import say
+from graspd.models.training.data.datasets import Grasps, read_all
+from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.training.evaluating.style import (
     BLUE,
     ORANGE,
@@ -35,6 +35,7 @@ from graspd.models.training.evaluating.style import (
     style,
     to_svg,
 )
+from graspd.models.training.reports.candidates import Row, candidates, measure
 
 READINGS, PACED = 2000, 300
 QUICK_READINGS, QUICK_PACED = 100, 5
@@ -75,21 +76,18 @@ Report = dict[str, Any]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure models' error and time, write and print; return 2 for wrong input."""
-    try:
-        grasps = read_all(args.data)
-        measured = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
-        args.out.mkdir(parents=True, exist_ok=True)
-        lines, figures = table(measured), json.dumps(measured)
-        text = "\n".join(lines)
-        base = args.out / "error-vs-time"
-        base.with_suffix(".json").write_text(figures + "\n")
-        base.with_suffix(".md").write_text(text + "\n")
-        base.with_suffix(".svg").write_text(draw(measured, lines))
-    except (DatasetError, ModelError, OSError) as error:
-        complain(error)
-        return 2
-    write_lines(figures if args.json else text)
+    """Measure models' error and time, write and print. Raises `DatasetError` or `ModelError`."""
+    grasps = read_all(args.data)
+    say("report", "measuring, one candidate after the other: some minutes")
+    measured = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
+    args.out.mkdir(parents=True, exist_ok=True)
+    lines, figures = table(measured), json.dumps(measured)
+    text = "\n".join(lines)
+    base = args.out / "error-vs-time"
+    base.with_suffix(".json").write_text(figures + "\n")
+    base.with_suffix(".md").write_text(text + "\n")
+    base.with_suffix(".svg").write_text(draw(measured, lines))
+    sys.stdout.write(f"{figures if args.json else text}\n")
     return 0
 
 
@@ -100,7 +98,6 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> R
     several = candidates(folders, grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
     times = measure({row["name"]: step for row, step in several}, readings, paced)
-    progress("")
     rows = [{**row, "time": times[row["name"]]} for row, _ in several]
     return {
         "machine": {"processor": _processor(), "python": platform.python_version()}

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from graspd.daemon.measure.streams import Group, Life
-from graspd.daemon.process.text import markdown_table
+from graspd.models.training.evaluating.files import markdown_table
+from graspd.models.training.reports.streams import Group, Life
 from graspd.models.trust.learner import SCALE
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
