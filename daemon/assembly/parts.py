@@ -173,7 +173,7 @@ def build_recorder(
 
 
 def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
-    """Return the header of a recording, without the state of judge and session."""
+    """Return the header of a recording, without session and learning."""
     from graspd.daemon.record.mcap import RecordingHeader
 
     network = scene.model.model_dump(mode="json", exclude_none=True)
@@ -202,16 +202,14 @@ def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeade
 
 
 def header_now(pipeline: Pipeline, header: RecordingHeader) -> Callable[[], RecordingHeader]:
-    """Copy the judge's state; return a function that makes the header in any thread."""
-    from graspd.daemon.judge.memory import encode, remember
-
-    judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
-    state = None if session is None else session.state()
+    """Copy session and learning; return a function that makes the header in any thread."""
+    grasps, session = pipeline.hand.grasp, pipeline.session_then()
+    required = {**header.scene["session"], "required": pipeline.needs_session}
     trust = None if pipeline.trust is None else pipeline.trust.state()
     return lambda: replace(
         header,
-        judge=encode(judge),
-        axis_ns=axis_ns,
-        session=state,
+        scene={**header.scene, "session": required},
+        grasps=grasps,
+        session=session,
         trust=b"" if trust is None else encode_trust(trust),
     )

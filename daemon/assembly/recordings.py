@@ -1,4 +1,4 @@
-"""Build what judges recordings again, from the state in their headers."""
+"""Build what judges recordings again, from session and learning in their headers."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any, Final
 from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.assembly.sources import Source
 from graspd.daemon.judge.exchange import Exchanged
-from graspd.daemon.judge.memory import recall
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import GateCause
 from graspd.daemon.publish.companion import Companion
-from graspd.daemon.publish.messages import OutcomeMessage
+from graspd.daemon.publish.messages import GateMessage, OutcomeMessage
 from graspd.daemon.record.mcap import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
-from graspd.daemon.record.topics import Topic
+from graspd.daemon.record.topics import Late, Topic
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.daemon.trust.trust import FormatError, decode
@@ -27,9 +27,9 @@ log = logging.getLogger("graspd")
 
 SECTIONS: Final[tuple[str, ...]] = ("hand", "model", "gate", "session", "learn", "risk")
 """Sections of a scene that a recording has."""
-NOTHING_KNOWN: Final = (
-    "%s: begins in the middle of a run and has no usable state of the judge: verdicts may "
-    "differ until the hand has been open and grasps again"
+BEGINS_WITHIN: Final = (
+    "%s: begins in the middle of a run: verdicts may differ until the hand has been open for a "
+    "second and grasps again"
 )
 
 
@@ -70,18 +70,13 @@ class RecordedRun(Source):
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
         header = self.header
-        same_model = model.sha256 == header.model_sha256
-        if not same_model:
+        if model.sha256 != header.model_sha256:
             log.warning("%s: was judged by %s, not by this model", self._paths[0], header.model)
-        driver = McapReplayDriver(
-            self._paths, replayed.hand.fingers, speed=speed, axis_ns=header.axis_ns
-        )
+        if header.file > 0:
+            log.warning(BEGINS_WITHIN, self._paths[0])
+        driver = McapReplayDriver(self._paths, replayed.hand.fingers, speed=speed)
         parts = Parts.played(replayed, model, driver, header.boot_id)
-        try:
-            recall(parts.pipeline, header.judge, same_model=same_model)
-        except ValueError:
-            if header.file > 0:
-                log.warning(NOTHING_KNOWN, self._paths[0])
+        parts.pipeline.hand.count_from(header.grasps)
         driver.on_event = partial(self._repeat, parts.pipeline)
         return parts
 
@@ -112,6 +107,10 @@ class RecordedRun(Source):
                 pipeline.lifts.announce()
             case Topic.TAKEN_BACK if self._same_grasps:
                 pipeline.lifts.take_back(None)
+            case Late():
+                pipeline.expect_late(judged=event.judged)
+            case GateMessage(cause=GateCause.CONTACT) if self._same_grasps:
+                pipeline.hand.count_from(event.grasp - 1)
             case Exchanged():
                 try:
                     pipeline.sensors_exchanged(event)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.daemon.judge.decision import ContactLimits
-from graspd.daemon.judge.health import Number
 
 WINDOW = 100
 """Untouched sweeps whose median is a baseline: one second at 100 Hz."""
@@ -94,7 +93,7 @@ class Touch:
     """Time since which it touches without all the others. None: it does not."""
     held_long: bool = False
     """True at the sweep in which a long hold ends."""
-    untouched: Number = 0
+    untouched: int = 0
     """Sweeps since the last fall that may be a touch."""
     tared_ns: int | None = None
     """Time of the last tare. None: never."""
@@ -166,7 +165,7 @@ class Window:
 
     counts: NDArray[np.uint16]
     usable: NDArray[np.bool_]
-    number: Number = 0
+    number: int = 0
     """Sweeps so far."""
 
     @classmethod
@@ -205,24 +204,6 @@ class Window:
             yield None if moved else Rest(baseline[finger], sigma, sound[finger])
 
 
-@dataclass(slots=True, eq=False)
-class ContactMemory:
-    """State of `Contact`; arrays have shape (fingers, 24) or (fingers,)."""
-
-    window: Window
-    touches: list[Touch]
-    baseline: NDArray[np.float64]
-    """Resting count of each electrode; infinite: not known yet."""
-    known: list[int]
-    """Number of electrodes of each finger whose baseline is known."""
-    touching: NDArray[np.bool_]
-    """True for fingers that touch."""
-    tared: NDArray[np.bool_]
-    """True for fingers that have a baseline; contact of the others is not known."""
-    last_ns: int | None = None
-    """Time of the last sweep."""
-
-
 class Contact:
     """Tares all fingers while they rest, and finds which touch. Constant memory, no clock."""
 
@@ -230,18 +211,22 @@ class Contact:
         """`fingers`: their number. None has a baseline yet."""
         shape = (fingers, ELECTRODES)
         self._limits = limits
-        self.memory = ContactMemory(
-            window=Window.of(fingers),
-            touches=[Touch(limits.counts) for _ in range(fingers)],
-            baseline=np.full(shape, np.inf),
-            known=[0] * fingers,
-            touching=np.zeros(fingers, dtype=np.bool_),
-            tared=np.zeros(fingers, dtype=np.bool_),
-        )
+        self.touches = [Touch(limits.counts) for _ in range(fingers)]
+        self.touching = np.zeros(fingers, dtype=np.bool_)
+        """True for fingers that touch, shape (fingers,)."""
+        self.tared = np.zeros(fingers, dtype=np.bool_)
+        """True for fingers that have a baseline; contact of the others is not known."""
+        self.baseline = np.full(shape, np.inf)
+        """Resting count of each electrode, shape (fingers, 24); infinite: not known yet."""
+        self.window = Window.of(fingers)
+        self._known = [0] * fingers
+        """Number of electrodes of each finger whose baseline is known."""
+        self._last_ns: int | None = None
+        """Time of the last sweep."""
 
     def forget(self) -> None:
         """Forget every tare. Call when sensors were exchanged, or may have been off."""
-        for finger in range(len(self.memory.touches)):
+        for finger in range(len(self.touches)):
             self._forget(finger)
 
     def observe(
@@ -255,39 +240,38 @@ class Contact:
 
         Arrays have shape (fingers, 24). `usable`: False for electrodes to ignore; None: use all.
         """
-        memory = self.memory
         falls, numbers = self._falls(median, usable)
-        elapsed_s = 0.0 if memory.last_ns is None else max(t_ns - memory.last_ns, 0) / 1e9
-        memory.last_ns = t_ns
-        memory.window.add(counts, usable)
+        elapsed_s = 0.0 if self._last_ns is None else max(t_ns - self._last_ns, 0) / 1e9
+        self._last_ns = t_ns
+        self.window.add(counts, usable)
         middles = [0.0] * len(numbers)
         all_touch = True
-        for finger, touch in enumerate(memory.touches):
+        for finger, touch in enumerate(self.touches):
             number = numbers[finger]
-            if memory.tared[finger] and number >= SOUND_MIN:
+            if self.tared[finger] and number >= SOUND_MIN:
                 deep = falls.item(finger, number - FALLEN)
                 middles[finger] = falls.item(finger, number // 2)
                 touch.follow(t_ns, elapsed_s, deep, deep - middles[finger])
             else:
                 # With too few electrodes it is not known any more, until it is tared again.
-                memory.tared[finger] = False
+                self.tared[finger] = False
                 touch.end()
-            memory.touching[finger] = touch.touching
+            self.touching[finger] = touch.touching
             all_touch &= touch.touching
-        for finger, touch in enumerate(memory.touches):
+        for finger, touch in enumerate(self.touches):
             if all_touch:
                 touch.alone_since_ns = None
-            elif memory.tared[finger] and touch.has_lost_rest(t_ns, middles[finger]):
+            elif self.tared[finger] and touch.has_lost_rest(t_ns, middles[finger]):
                 self._forget(finger)
         due = []
-        for finger, touch in enumerate(memory.touches):
+        for finger, touch in enumerate(self.touches):
             touch.untouched += 1
-            if memory.tared[finger] and touch.fall >= SUSPECT * touch.threshold:
+            if self.tared[finger] and touch.fall >= SUSPECT * touch.threshold:
                 touch.untouched = 0  # it may be the beginning of a touch
             elif touch.untouched >= WINDOW and touch.untouched % TARE_EVERY == 0:
                 due.append(finger)
         if due:
-            for finger, rest in zip(due, memory.window.rests(due), strict=True):
+            for finger, rest in zip(due, self.window.rests(due), strict=True):
                 if rest is not None:
                     self._settle(finger, rest, t_ns)
 
@@ -295,8 +279,8 @@ class Contact:
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float64], list[int]]:
         """Return each finger's falls, ascending, and the number of those, the first, that count."""
-        falls, numbers = median.astype(np.float64), self.memory.known
-        np.subtract(self.memory.baseline, falls, out=falls)
+        falls, numbers = median.astype(np.float64), self._known
+        np.subtract(self.baseline, falls, out=falls)
         if usable is not None:
             falls[~usable] = np.inf
             numbers = np.isfinite(falls).sum(axis=1).tolist()
@@ -304,28 +288,26 @@ class Contact:
         return falls, numbers
 
     def _forget(self, finger: int) -> None:
-        memory = self.memory
-        memory.tared[finger] = memory.touching[finger] = False
-        memory.baseline[finger], memory.known[finger] = np.inf, 0
-        memory.touches[finger] = Touch(memory.touches[finger].threshold)
+        self.tared[finger] = self.touching[finger] = False
+        self.baseline[finger], self._known[finger] = np.inf, 0
+        self.touches[finger] = Touch(self.touches[finger].threshold)
 
     def _settle(self, finger: int, rest: Rest, t_ns: int) -> None:
         """Take over how a finger rests."""
-        memory = self.memory
-        touch, former, baseline = memory.touches[finger], memory.baseline[finger], rest.baseline
+        touch, former, baseline = self.touches[finger], self.baseline[finger], rest.baseline
         elapsed_s = 0.0 if touch.tared_ns is None else max(t_ns - touch.tared_ns, 0) / 1e9
         touch.tared_ns = t_ns
-        if memory.tared[finger]:
+        if self.tared[finger]:
             lowest = former - DOWN_COUNTS_PER_S * elapsed_s
             highest = former + UP_COUNTS_PER_S * elapsed_s
             # An electrode that was not known before is taken as it is.
             limited = np.minimum(np.maximum(baseline, lowest), highest)
             baseline = np.where(np.isfinite(former), limited, baseline)
-        memory.baseline[finger] = np.where(rest.known, baseline, np.inf)
-        memory.known[finger] = int(np.count_nonzero(rest.known))
+        self.baseline[finger] = np.where(rest.known, baseline, np.inf)
+        self._known[finger] = int(np.count_nonzero(rest.known))
         limits = self._limits
         touch.threshold = max(limits.counts, limits.sigmas * rest.sigma)
-        memory.tared[finger] = True
+        self.tared[finger] = True
 
 
 def _median(values: NDArray[np.number]) -> Floats:

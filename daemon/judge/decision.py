@@ -134,25 +134,24 @@ class Limits:
     """
 
 
-class RecentVerdict(msgspec.Struct, frozen=True, gc=False):
-    """The latest judgement by which a grasp was not `stable`."""
+class HoldDown(msgspec.Struct, frozen=True, gc=False):
+    """A judgement by which a grasp was not `stable`: it holds later ones of the grasp down."""
 
     grasp: int
-    made_ns: int
-    """Time of the reading that was judged, ns."""
+    until_ns: int
+    """Time of a reading, ns, from which on it no longer counts."""
     decision: Decision
 
-    def of(self, grasp: int, made_ns: int, limits: Limits) -> Decision:
-        """Return the decision if it still forbids `stable` at `made_ns`, else `stable`.
+    def at(self, grasp: int, made_ns: int) -> HoldDown:
+        """Return itself while it counts against this `grasp` at `made_ns`, else `NOTHING_HELD`."""
+        return self if grasp == self.grasp and made_ns < self.until_ns else NOTHING_HELD
 
-        It does for `Limits.steady_ns`, and only for the same `grasp`.
-        """
-        if grasp != self.grasp or made_ns - self.made_ns >= limits.steady_ns:
-            return Decision.STABLE
-        return self.decision
+    def allows(self, decision: Decision) -> bool:
+        """Return True unless the decision is `stable`, and this one is not."""
+        return decision is not Decision.STABLE or self.decision is Decision.STABLE
 
 
-NO_RECENT_VERDICT = RecentVerdict(0, 0, Decision.STABLE)
+NOTHING_HELD: Final = HoldDown(0, 0, Decision.STABLE)
 """No judgement yet: grasps are numbered from 1."""
 HELD: Final = Moment(0)
 """Moment of a hand that holds still, to decide by the network's answer alone."""
@@ -166,13 +165,13 @@ def decide(
     limits: Limits,
     *,
     withheld: Reason | None = None,
-    recent: Decision = Decision.STABLE,
+    held: HoldDown = NOTHING_HELD,
 ) -> tuple[Decision, tuple[Reason, ...]]:
     """Return the decision, and the reasons if it is `unknown`. Any doubt makes it `unknown`.
 
     `p_slip`: probability of slip, 0..1; None: the network gave none. `objections`: reasons against
     the reading, or against the one that was judged. `age_ns`: age of the reading. `withheld`: why
-    the risk forbids `stable`; None: it does not. `recent`: result of `RecentVerdict.of`.
+    the risk forbids `stable`; None: it does not. `held`: result of `HoldDown.at`.
     """
     reasons = [*objections]
     if not (moment.in_contact and moment.settled):
@@ -180,11 +179,12 @@ def decide(
     if not 0 <= age_ns <= limits.max_age_ns:
         reasons.append(Reason.STALE)
     if p_slip is not None and 0.0 <= p_slip <= 1.0:  # false for NaN
-        slips = p_slip >= limits.slip_threshold or recent is Decision.SLIP
-        decision = Decision.SLIP if slips else Decision.STABLE
+        decision = Decision.SLIP if p_slip >= limits.slip_threshold else Decision.STABLE
+        if not held.allows(decision):
+            decision = held.decision
+        slips, doubted = decision is Decision.SLIP, decision is Decision.UNKNOWN
         confidence = p_slip if slips else 1.0 - p_slip
         withheld = None if slips else withheld
-        doubted = recent is Decision.UNKNOWN and not slips
         if confidence < limits.min_confidence or (doubted and withheld is None):
             reasons.append(Reason.LOW_CONFIDENCE)
         if withheld is not None:

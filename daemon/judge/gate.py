@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,41 +41,6 @@ STANDS_NS = 100_000_000
 """Age above which a verdict no longer stands, ns."""
 
 
-@dataclass(slots=True, eq=False)
-class GateMemory:
-    """The current grasp. Changes that no moment told yet are not for another judge to tell."""
-
-    reference: NDArray[np.float32]
-    """Shape (fingers, 24): counts where it had settled; means nothing before."""
-    judged_ns: int = 0
-    """Time of the last judgement."""
-    last_ns: int | None = None
-    """Time of the last reading."""
-    touched_ns: int = 0
-    """Time at which all required fingers touched; means nothing unless `in_contact`."""
-    still_since_ns: int | None = None
-    """Time since which touch and stillness have lasted. None: something moves."""
-    moved_since_ns: int | None = None
-    """Time since which a judged grasp has moved. None: it does not move."""
-    sure: bool = False
-    """True if it has settled with slow slides excluded: the loose limit holds from then on."""
-    early: bool = False
-    """True if it was judged while something might slide slowly: it is judged again, unasked."""
-    released_ns: int = 0
-    """Time of the end of the last touch."""
-    asked: bool = False
-    """True while the controller waits for a judgement."""
-    asked_until_ns: int | None = None
-    """None until the first reading after the question."""
-    state: GateState = GateState.IDLE
-    grasp: int = 0
-    """Touches until now; the number of the current grasp."""
-    in_contact: bool = False
-    """True if all required fingers touch."""
-    objections: tuple[Reason, ...] = (Reason.NO_CONTACT,)
-    """Reasons of the last reading against settling."""
-
-
 class Gate:
     """Follows the grasps of one hand."""
 
@@ -89,7 +53,35 @@ class Gate:
         self._limits = limits.gate
         self._on_request = limits.on_request
         self.motion = Motion(len(fingers), self._limits.false_alarms, early=self._limits.early)
-        self.memory = GateMemory(np.zeros((len(fingers), ELECTRODES), dtype=np.float32))
+        self.state = GateState.IDLE
+        self.grasp = 0
+        """Touches until now; the number of the current grasp."""
+        self.in_contact = False
+        """True if all required fingers touch."""
+        self._reference = np.zeros((len(fingers), ELECTRODES), dtype=np.float32)
+        """Shape (fingers, 24): counts where it had settled; means nothing before."""
+        self._judged_ns = 0
+        """Time of the last judgement."""
+        self._last_ns: int | None = None
+        """Time of the last reading."""
+        self._touched_ns = 0
+        """Time at which all required fingers touched; means nothing unless `in_contact`."""
+        self._still_since_ns: int | None = None
+        """Time since which touch and stillness have lasted. None: something moves."""
+        self._moved_since_ns: int | None = None
+        """Time since which a judged grasp has moved. None: it does not move."""
+        self._sure = False
+        """True if it has settled with slow slides excluded: the loose limit holds from then on."""
+        self._early = False
+        """True if it was judged while something might slide slowly: it is judged again, unasked."""
+        self._released_ns = 0
+        """Time of the end of the last touch."""
+        self._asked = False
+        """True while the controller waits for a judgement."""
+        self._asked_until_ns: int | None = None
+        """None until the first reading after the question."""
+        self._objections: tuple[Reason, ...] = (Reason.NO_CONTACT,)
+        """Reasons of the last reading against settling."""
         self._changes: list[GateChange] = []
         """Those since the last moment: three of a reading, and one of a restart before it."""
         unknown: dict[Finger, float | None] = dict.fromkeys(fingers)
@@ -97,12 +89,12 @@ class Gate:
 
     def ask(self) -> None:
         """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
-        self.memory.asked = True
-        self.memory.asked_until_ns = None
+        self._asked = True
+        self._asked_until_ns = None
 
     def skip(self, t_ns: int) -> None:
         """Take in the time of a reading that cannot be used, ns."""
-        last_ns = self.memory.last_ns
+        last_ns = self._last_ns
         if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gap_ns:
             self.restart(t_ns)
 
@@ -120,7 +112,7 @@ class Gate:
         any finger touches.
         """
         self.skip(t_ns)
-        self.memory.last_ns = t_ns
+        self._last_ns = t_ns
         self.motion.add(t_ns, counts, usable, wanted=touches or not self.required)
 
     def step(
@@ -141,26 +133,25 @@ class Gate:
         grasp is judged only `in_time` and by `fresh` values, or by the newest once the verdict is
         too old to stand. `fingers` goes into the moment as it is.
         """
-        memory = self.memory
         self._follow_question(t_ns)
         in_contact = self.required.issubset(touching)
-        if in_contact and not memory.in_contact:
-            memory.touched_ns = t_ns
-        memory.in_contact = in_contact
+        if in_contact and not self.in_contact:
+            self._touched_ns = t_ns
+        self.in_contact = in_contact
         reasons = self._disturbances(objections)
         self._follow_stillness(t_ns, bool(reasons))
         self._follow_contact(t_ns, bool(touching))
-        state = memory.state
+        state = self.state
         if state is GateState.JUDGED:
             reasons += self._follow_judged(t_ns, median.astype(np.float32), usable)
         elif state is GateState.SETTLED and (reasons or not self._is_still):
-            cause = GateCause.MOVED if memory.in_contact else GateCause.CONTACT_LOST
+            cause = GateCause.MOVED if self.in_contact else GateCause.CONTACT_LOST
             self._enter(GateState.CLOSING, t_ns, cause)
         elif state is GateState.CLOSING and not reasons and self._is_still:
             self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
-        if memory.state is GateState.CLOSING and not reasons:
+        if self.state is GateState.CLOSING and not reasons:
             reasons = (Reason.MOVING if self.motion.slides else Reason.SETTLING,)
-        memory.objections = reasons
+        self._objections = reasons
         if in_time and self._wants_judgement(fresh=fresh):
             judged = self._judge(t_ns, median)
             return self.moment(touching, fingers, judges=True, judged=judged)
@@ -175,24 +166,23 @@ class Gate:
         judged: bool = False,
     ) -> Moment:
         """Return where in a grasp the hand is, and forget the changes that led there."""
-        memory = self.memory
-        is_judged, reasons = memory.state is GateState.JUDGED, memory.objections
+        is_judged, reasons = self.state is GateState.JUDGED, self._objections
         if not (reasons or is_judged):
             reasons = (Reason.SETTLING if self._is_asked else Reason.NOT_ASKED,)
         changes, self._changes = self._changes, []
         motion, motion_limits = self._nearest_to_limit()
         return Moment(
-            grasp=memory.grasp,
-            state=memory.state,
+            grasp=self.grasp,
+            state=self.state,
             judges=judges,
             judged=judged,
-            in_contact=memory.in_contact,
+            in_contact=self.in_contact,
             settled=is_judged and not reasons,
             reasons=reasons,
             touching=touching,
             changes=tuple(changes),
             still_ms=self._still_ns / 1e6,
-            early=is_judged and memory.early,
+            early=is_judged and self._early,
             steady=self._keeps_to(self.motion.strict),
             motion=motion,
             motion_limits=motion_limits,
@@ -201,29 +191,27 @@ class Gate:
 
     def restart(self, t_ns: int) -> None:
         """Have the grasp settle again: readings are missing, or time went back."""
-        memory = self.memory
-        if memory.last_ns is not None and t_ns < memory.last_ns:
-            memory.released_ns = t_ns
-            memory.asked_until_ns = None
-        memory.last_ns = t_ns
-        memory.still_since_ns = None
-        memory.touched_ns = min(memory.touched_ns, t_ns)
+        if self._last_ns is not None and t_ns < self._last_ns:
+            self._released_ns = t_ns
+            self._asked_until_ns = None
+        self._last_ns = t_ns
+        self._still_since_ns = None
+        self._touched_ns = min(self._touched_ns, t_ns)
         self.motion.reset()
-        memory.objections = (Reason.SEQUENCE_GAP,)
-        if memory.state in (GateState.SETTLED, GateState.JUDGED):
+        self._objections = (Reason.SEQUENCE_GAP,)
+        if self.state in (GateState.SETTLED, GateState.JUDGED):
             self._enter(GateState.CLOSING, t_ns, GateCause.GAP)
 
     @property
     def _is_asked(self) -> bool:
-        return self.memory.asked or self.memory.early or not self._on_request
+        return self._asked or self._early or not self._on_request
 
     @property
     def _still_ns(self) -> int:
         """Time of touch and stillness, ns; less than the long window if something may slide."""
-        memory = self.memory
-        if memory.still_since_ns is None or memory.last_ns is None:
+        if self._still_since_ns is None or self._last_ns is None:
             return 0
-        return max(memory.last_ns - memory.still_since_ns, 0)
+        return max(self._last_ns - self._still_since_ns, 0)
 
     @property
     def _is_still(self) -> bool:
@@ -233,33 +221,31 @@ class Gate:
     @property
     def _motion_limits(self) -> MotionLimits:
         """Limits of motion now: loose once the grasp is sure, else strict."""
-        return self.motion.loose if self.memory.sure else self.motion.strict
+        return self.motion.loose if self._sure else self.motion.strict
 
     def _keeps_to(self, limits: MotionLimits) -> bool:
         """Return True if nothing moves by which a judged grasp would not stand."""
-        return limits.early if self.memory.early else limits.sure
+        return limits.early if self._early else limits.sure
 
     def _wants_judgement(self, *, fresh: bool) -> bool:
         """Return True if this reading is the one to judge."""
-        memory = self.memory
-        if memory.objections:
+        if self._objections:
             return False
-        if memory.state is GateState.JUDGED:
-            age_ns = (memory.last_ns or 0) - memory.judged_ns
-            return age_ns > STANDS_NS or (fresh and (memory.asked or age_ns >= REFRESH_NS))
-        return fresh and memory.state is GateState.SETTLED and self._is_asked
+        if self.state is GateState.JUDGED:
+            age_ns = (self._last_ns or 0) - self._judged_ns
+            return age_ns > STANDS_NS or (fresh and (self._asked or age_ns >= REFRESH_NS))
+        return fresh and self.state is GateState.SETTLED and self._is_asked
 
     def _judge(self, t_ns: int, median: NDArray[np.uint16]) -> bool:
         """Enter `judged`, or stay there; return False if that only refreshes a judgement."""
-        memory = self.memory
-        refreshes = memory.state is GateState.JUDGED and not (memory.asked and self._on_request)
-        memory.judged_ns = t_ns
-        memory.asked = False
-        if memory.state is not GateState.JUDGED:
+        refreshes = self.state is GateState.JUDGED and not (self._asked and self._on_request)
+        self._judged_ns = t_ns
+        self._asked = False
+        if self.state is not GateState.JUDGED:
             # Kept when it is judged again: else a grasp that creeps would never be another.
-            memory.reference = median.astype(np.float32)
-            memory.early = self._still_ns < LONG_NS
-            memory.moved_since_ns = None
+            self._reference = median.astype(np.float32)
+            self._early = self._still_ns < LONG_NS
+            self._moved_since_ns = None
             self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
         return not refreshes
 
@@ -279,16 +265,15 @@ class Gate:
         return motion, limits
 
     def _follow_question(self, t_ns: int) -> None:
-        memory = self.memory
-        if not memory.asked:
+        if not self._asked:
             return
-        if memory.asked_until_ns is None:
-            memory.asked_until_ns = t_ns + self._limits.request_ns
-        elif t_ns > memory.asked_until_ns:
-            memory.asked = False
+        if self._asked_until_ns is None:
+            self._asked_until_ns = t_ns + self._limits.request_ns
+        elif t_ns > self._asked_until_ns:
+            self._asked = False
 
     def _disturbances(self, objections: tuple[Reason, ...]) -> tuple[Reason, ...]:
-        if not self.memory.in_contact:
+        if not self.in_contact:
             not_tared = tuple(reason for reason in objections if reason is Reason.NOT_TARED)
             return (*not_tared, Reason.NO_CONTACT)
         if not self.motion.known:
@@ -297,62 +282,59 @@ class Gate:
 
     def _follow_stillness(self, t_ns: int, disturbed: bool) -> None:
         """The windows say for how long nothing has moved; the touch must have lasted as long."""
-        memory = self.memory
         if disturbed:
-            memory.still_since_ns = None
+            self._still_since_ns = None
             return
-        since_ns = memory.still_since_ns
+        since_ns = self._still_since_ns
         if since_ns is None:
-            since_ns = max(t_ns - SHORT_NS, memory.touched_ns)
+            since_ns = max(t_ns - SHORT_NS, self._touched_ns)
         if self._motion_limits.sure:
-            since_ns = min(since_ns, max(t_ns - LONG_NS, memory.touched_ns))
+            since_ns = min(since_ns, max(t_ns - LONG_NS, self._touched_ns))
         else:
             since_ns = max(since_ns, t_ns - LONG_NS + 1_000_000)  # a ms short of it
-        memory.still_since_ns = since_ns
+        self._still_since_ns = since_ns
 
     def _follow_contact(self, t_ns: int, touches: bool) -> None:
-        memory, release_ns = self.memory, self._limits.release_ns
-        if memory.state is GateState.RELEASED and t_ns - memory.released_ns >= release_ns:
+        release_ns = self._limits.release_ns
+        if self.state is GateState.RELEASED and t_ns - self._released_ns >= release_ns:
             self._enter(GateState.IDLE, t_ns, GateCause.TIME)
-        if touches and memory.state in (GateState.IDLE, GateState.RELEASED):
-            memory.grasp += 1
+        if touches and self.state in (GateState.IDLE, GateState.RELEASED):
+            self.grasp += 1
             self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT)
-        if not touches and memory.state not in (GateState.IDLE, GateState.RELEASED):
-            memory.released_ns = t_ns
+        if not touches and self.state not in (GateState.IDLE, GateState.RELEASED):
+            self._released_ns = t_ns
             self._enter(GateState.RELEASED, t_ns, GateCause.CONTACT_LOST)
 
     def _follow_judged(
         self, t_ns: int, counts: NDArray[np.float32], usable: NDArray[np.bool_] | None
     ) -> tuple[Reason, ...]:
         """Check that the judged grasp is still the same; return what else is against it."""
-        memory = self.memory
-        if not memory.in_contact:
+        if not self.in_contact:
             self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT_LOST)
             return ()
-        distance = _mean_distance(counts, memory.reference, usable)
+        distance = _mean_distance(counts, self._reference, usable)
         if max(distance.tolist()) > self._limits.change_counts:
             self._enter(GateState.CLOSING, t_ns, GateCause.CHANGED)
             return ()
         limits = self._motion_limits
         if self._keeps_to(limits):
-            memory.moved_since_ns = None
-            if memory.early and self._still_ns >= LONG_NS:
+            self._moved_since_ns = None
+            if self._early and self._still_ns >= LONG_NS:
                 self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
             return ()
-        if memory.moved_since_ns is None:
-            memory.moved_since_ns = t_ns
-        elif t_ns - memory.moved_since_ns >= 2 * LONG_NS:
+        if self._moved_since_ns is None:
+            self._moved_since_ns = t_ns
+        elif t_ns - self._moved_since_ns >= 2 * LONG_NS:
             self._enter(GateState.CLOSING, t_ns, GateCause.MOVED)
         return (Reason.MOVING,) if limits.early else ()
 
     def _enter(self, state: GateState, t_ns: int, cause: GateCause) -> None:
-        memory = self.memory
-        self._changes.append(GateChange(t_ns, memory.grasp, memory.state, state, cause))
-        memory.state = state
+        self._changes.append(GateChange(t_ns, self.grasp, self.state, state, cause))
+        self.state = state
         if state in (GateState.SETTLED, GateState.JUDGED):
-            memory.sure = memory.sure or self._still_ns >= LONG_NS
+            self._sure = self._sure or self._still_ns >= LONG_NS
         else:
-            memory.early, memory.sure, memory.moved_since_ns = False, False, None
+            self._early, self._sure, self._moved_since_ns = False, False, None
 
 
 def _mean_distance(

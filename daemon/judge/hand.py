@@ -10,9 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from graspd.daemon.judge.contact import Contact
 from graspd.daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from graspd.daemon.judge.gate import Gate
 from graspd.daemon.judge.health import NO_COUNT, Checked
-from graspd.daemon.judge.reasons import FingerState, Moment, Reason
+from graspd.daemon.judge.reasons import OPEN, FingerState, GateState, Moment, Reason
 from graspd.daemon.judge.stillness import Motion
 from graspd.drivers.base import JointReading
 
@@ -40,43 +39,30 @@ A real hold passes the limit of motion for moments; a quarter of them are shorte
 """
 
 
-@dataclass(slots=True, eq=False)
-class MedianMemory:
-    """State of `FreshMedian`; arrays have shape (fingers, 24)."""
-
-    fresh: NDArray[np.uint16]
-    """The last three fresh values, oldest first, shape (3, fingers, 24)."""
-    last: NDArray[np.uint16]
-    """The last value, fresh or not."""
-    held: NDArray[np.bool_]
-    """True where the last value repeated the one before."""
-    number: NDArray[np.uint8]
-    """Number of fresh values in `fresh`, up to three."""
-    all_full: bool = False
-    """True if `number` is three for all electrodes."""
-
-
 class FreshMedian:
     """Median of the last three fresh values of each electrode; constant memory, no clock."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
-        self.memory = MedianMemory(
-            fresh=np.zeros((MEDIAN_SWEEPS, *shape), dtype=np.uint16),
-            last=np.full(shape, NO_COUNT, dtype=np.uint16),
-            held=np.zeros(shape, dtype=np.bool_),
-            number=np.zeros(shape, dtype=np.uint8),
-        )
         self.counts = np.zeros(shape, dtype=np.uint16)
         """Median of the last three fresh values, shape (fingers, 24); 0 where there is none."""
+        self._fresh = np.zeros((MEDIAN_SWEEPS, *shape), dtype=np.uint16)
+        """The last three fresh values, oldest first, shape (3, fingers, 24)."""
+        self._last = np.full(shape, NO_COUNT, dtype=np.uint16)
+        """The last value, fresh or not."""
+        self._held = np.zeros(shape, dtype=np.bool_)
+        """True where the last value repeated the one before."""
+        self._number = np.zeros(shape, dtype=np.uint8)
+        """Number of fresh values in `_fresh`, up to three."""
+        self._all_full = False
+        """True if `_number` is three for all electrodes."""
 
     def reset(self) -> None:
         """Forget everything: what comes next does not continue what came before."""
-        memory = self.memory
-        memory.last = np.full_like(memory.last, NO_COUNT)
-        memory.held.fill(False)
-        memory.number.fill(0)
-        memory.all_full = False
+        self._last = np.full_like(self._last, NO_COUNT)
+        self._held.fill(False)
+        self._number.fill(0)
+        self._all_full = False
 
     def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_] | None) -> None:
         """Take in one sweep, shape (fingers, 24).
@@ -85,27 +71,25 @@ class FreshMedian:
         that repeats the one before is not fresh. If it comes a third time it is: a palm's data of
         71.43 Hz never repeats twice.
         """
-        memory = self.memory
-        oldest, middle, newest = memory.fresh
-        memory.held = (counts == memory.last) & ~memory.held
-        fresh = ~memory.held
+        oldest, middle, newest = self._fresh
+        self._held = (counts == self._last) & ~self._held
+        fresh = ~self._held
         if usable is not None:
             fresh &= usable
         np.putmask(oldest, fresh, middle)
         np.putmask(middle, fresh, newest)
         np.putmask(newest, fresh, counts)
-        if usable is not None or not memory.all_full:
+        if usable is not None or not self._all_full:
             self._fill(counts, usable, fresh)
-        memory.last = counts if usable is None else np.where(usable, counts, memory.last)
+        self._last = counts if usable is None else np.where(usable, counts, self._last)
         low, high = np.minimum(oldest, middle), np.maximum(oldest, middle)
         self.counts = np.maximum(low, np.minimum(high, newest))
 
     def is_full(self, usable: NDArray[np.bool_] | None) -> bool:
         """Return True if each `usable` electrode has three fresh values."""
-        memory = self.memory
-        if memory.all_full or usable is None:
-            return memory.all_full
-        return bool((memory.number[usable] == MEDIAN_SWEEPS).all())
+        if self._all_full or usable is None:
+            return self._all_full
+        return bool((self._number[usable] == MEDIAN_SWEEPS).all())
 
     def _fill(
         self,
@@ -114,17 +98,16 @@ class FreshMedian:
         fresh: NDArray[np.bool_],
     ) -> None:
         """Count the fresh values; until there are three, the first stands for those missing."""
-        memory = self.memory
         if usable is not None:
-            memory.number[~usable] = 0
-        first = fresh & (memory.number == 0)
-        np.copyto(memory.fresh, counts, where=first)
-        memory.number += fresh & (memory.number < MEDIAN_SWEEPS)
-        memory.all_full = bool((memory.number == MEDIAN_SWEEPS).all())
+            self._number[~usable] = 0
+        first = fresh & (self._number == 0)
+        np.copyto(self._fresh, counts, where=first)
+        self._number += fresh & (self._number < MEDIAN_SWEEPS)
+        self._all_full = bool((self._number == MEDIAN_SWEEPS).all())
 
 
 @dataclass(slots=True)
-class FingerMemory:
+class FingerWord:
     """Motion of a finger during its touch; a touch that ends, or a gap, resets it."""
 
     was_still: bool = False
@@ -153,18 +136,6 @@ class FingerMemory:
         self.was_still, self.moves_since_ns = False, None
 
 
-@dataclass(slots=True)
-class HandMemory:
-    """State of the hand that its parts do not keep themselves."""
-
-    fingers: list[FingerMemory]
-
-    last_ns: int | None = None
-    """Time of the last usable reading."""
-    unsettled: Annotated[int, msgspec.Meta(ge=0, le=MEDIAN_SWEEPS)] = 0
-    """Readings to come that do not continue those before: 1 or 0, in older recordings up to 3."""
-
-
 class HandTracker:
     """Follows contact, joints and gate of one hand, and says when a grasp is to be judged."""
 
@@ -179,24 +150,38 @@ class HandTracker:
             from graspd.daemon.judge.joint_motion import JointMotion  # only where it is needed
 
             self._joints = JointMotion(limits.joints)
+        self.on_request = limits.on_request
         self.gate = Gate(fingers, limits)
-        self.memory = HandMemory([FingerMemory() for _ in fingers])
+        self._words = [FingerWord() for _ in fingers]
+        self._last_ns: int | None = None
+        """Time of the last usable reading."""
+        self._interrupted = False
+        """True if the next reading does not continue those before."""
 
     @property
     def tared(self) -> tuple[Finger, ...]:
         """Fingers whose baseline is known."""
-        return self._named(self._contact.memory.tared)
+        return self._named(self._contact.tared)
 
     @property
-    def rest(self) -> NDArray[np.float64]:
+    def state(self) -> GateState:
+        """State of the gate."""
+        return self.gate.state
+
+    @property
+    def grasp(self) -> int:
+        """Number of the current grasp; 0 before the first."""
+        return self.gate.grasp
+
+    def read_rest(self) -> NDArray[np.float64]:
         """Return the resting counts, shape (fingers, 24); 0: not known."""
-        contact = self._contact.memory
+        contact = self._contact
         known = np.isfinite(contact.baseline) & contact.tared[:, np.newaxis]
         return np.where(known, contact.baseline, 0.0)
 
     def health(self) -> dict[str, Reason]:
         """Return what is not well: fingers without a tare, and `joints`."""
-        tared, joints, last_ns = self.tared, self._joints, self.memory.last_ns
+        tared, joints, last_ns = self.tared, self._joints, self._last_ns
         findings: dict[str, Reason] = {
             finger: Reason.NOT_TARED for finger in self._fingers if finger not in tared
         }
@@ -213,26 +198,27 @@ class HandTracker:
         self._fresh.reset()
         self.restart()
 
+    def holds(self, grasp: int) -> bool:
+        """Return True while this grasp lasts."""
+        return grasp == self.gate.grasp and self.gate.state not in OPEN
+
+    def count_from(self, grasp: int) -> None:
+        """Give the next grasp the number after this, unless one is held."""
+        if self.gate.state in OPEN:
+            self.gate.grasp = grasp
+
+    def ask(self) -> None:
+        """Judge the current grasp once it has settled: the controller waits for the verdict."""
+        self.gate.ask()
+
     def restart(self) -> None:
         """Have the current grasp settle again, from the last reading on."""
-        if self.memory.last_ns is not None:
-            self.gate.restart(self.memory.last_ns)
+        if self._last_ns is not None:
+            self.gate.restart(self._last_ns)
 
     def interrupt(self) -> None:
         """Have the current grasp settle again. Call when readings before the next are missing."""
-        self.memory.unsettled = 1
-
-    def memories(self) -> dict[str, dict[str, Any]]:
-        """Return the state of the hand's parts, by group and part; see `Pipeline.memories`."""
-        hand: dict[str, Any] = {
-            "hand": self.memory,
-            "fresh": self._fresh.memory,
-            "contact": self._contact.memory,
-            "gate": self.gate.memory,
-            "motion": self.gate.motion.memory,
-        }
-        joints = {} if self._joints is None else {"joints": {"joints": self._joints.memory}}
-        return {"hand": hand, **joints}
+        self._interrupted = True
 
     def observe_joints(self, reading: JointReading) -> None:
         """Take in joint angles."""
@@ -253,13 +239,13 @@ class HandTracker:
         """
         if checked.reasons:
             self.gate.skip(t_ns)
-            return self.moment(), None
+            return self._now(), None
         self._follow_time(t_ns)
         usable = None if checked.broken is None else ~checked.broken
         self._fresh.push(counts, usable)
         median, fresh = self._fresh.counts, self._fresh.is_full(usable)
         self._contact.observe(t_ns, counts, median, usable)
-        contact = self._contact.memory
+        contact = self._contact
         touching, tared = contact.touching.tolist(), contact.tared.tolist()
         named_tared = compress(self._fingers, tared)
         objections = () if self.gate.required.issubset(named_tared) else (Reason.NOT_TARED,)
@@ -281,9 +267,12 @@ class HandTracker:
             return moment, None
         return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else counts
 
-    def moment(self) -> Moment:
-        """Return the state of the grasp without a new reading; it is not to be judged."""
-        touching = self._named(self._contact.memory.touching)
+    def silent(self) -> Moment:
+        """Return the state of the grasp when no reading comes; its motion is not known."""
+        return self._now()._replace(still_ms=None, motion=None, motion_limits=None)
+
+    def _now(self) -> Moment:
+        touching = self._named(self._contact.touching)
         return self.gate.moment(touching, dict.fromkeys(self._fingers))
 
     def _feel(
@@ -293,25 +282,25 @@ class HandTracker:
         motion = self.gate.motion
         feelings: dict[Finger, FingerState | None] = {}
         for place, finger in enumerate(self._fingers):
-            memory = self.memory.fingers[place]
+            word = self._words[place]
             if touching[place]:
-                feelings[finger] = memory.touch(t_ns, _moves(motion, place))
+                feelings[finger] = word.touch(t_ns, _moves(motion, place))
             else:
-                memory.let_go()
+                word.let_go()
                 feelings[finger] = FingerState.FREE if tared[place] else None
         return feelings
 
     def _follow_time(self, t_ns: int) -> None:
         """Forget what does not continue at the time of a usable reading."""
-        last_ns = self.memory.last_ns
+        last_ns = self._last_ns
         if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gate.gap_ns:
             self._fresh.reset()
             if t_ns - last_ns > OUTAGE_NS:
                 self._contact.forget()
                 self.gate.motion.forget()
-        self.memory.last_ns = t_ns
-        if self.memory.unsettled:
-            self.memory.unsettled -= 1
+        self._last_ns = t_ns
+        if self._interrupted:
+            self._interrupted = False
             self._fresh.reset()
             self.gate.restart(t_ns)
 

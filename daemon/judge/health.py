@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,9 +11,6 @@ from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.models.electrodes import any_of, too_many
-
-Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
-"""A count of readings or grasps; bounded, because a part's memory may come from a recording."""
 
 REASON_OF_FAULT: dict[ElectrodeFault, Reason] = {
     ElectrodeFault.MISSING: Reason.SENSOR_MISSING,
@@ -85,41 +80,26 @@ class Checked:
     """True for electrodes whose counts mean nothing, shape (fingers, 24). None: all are sound."""
 
 
-@dataclass(slots=True, eq=False)
-class HealthMemory:
-    """State of the checks of earlier readings; arrays have shape (fingers, 24)."""
-
-    previous: NDArray[np.uint16]
-    """Counts of the last reading."""
-    number: Number
-    """Number of readings until now."""
-    changed: NDArray[np.int64]
-    """Number of the reading in which the count of each electrode changed last."""
-    jumps: NDArray[np.float64]
-    """Recent jumps of each electrode; earlier ones count less."""
-    has_jumped: bool
-    """True if `jumps` is not all zero."""
-    faults: NDArray[np.uint8]
-    """Faults that the driver flagged in the last reading."""
-    past: NDArray[np.uint16]
-    """Shape (24, fingers, 128): sweeps of each finger; `NO_COUNT` where none was read."""
-
-
 class Health:
     """Finds broken electrodes and repeated sweeps by comparing each reading with those before."""
 
     def __init__(self, fingers: int) -> None:
         self._shape = shape = (fingers, ELECTRODES)
-        self.memory = HealthMemory(
-            previous=np.full(shape, NO_COUNT, dtype=np.uint16),
-            number=0,
-            changed=np.zeros(shape, dtype=np.int64),
-            jumps=np.zeros(shape),
-            has_jumped=False,
-            faults=np.zeros(shape, dtype=np.uint8),
-            past=np.full((ELECTRODES, fingers, SWEEPS), NO_COUNT, dtype=np.uint16),
-        )
-        self._no_faults = self.memory.faults.tobytes()
+        self._previous = np.full(shape, NO_COUNT, dtype=np.uint16)
+        """Counts of the last reading, shape (fingers, 24), as the arrays that follow."""
+        self._number = 0
+        """Number of readings until now."""
+        self._changed = np.zeros(shape, dtype=np.int64)
+        """Number of the reading in which the count of each electrode changed last."""
+        self._jumps = np.zeros(shape)
+        """Recent jumps of each electrode; earlier ones count less."""
+        self._has_jumped = False
+        """True if `_jumps` is not all zero."""
+        self._faults = np.zeros(shape, dtype=np.uint8)
+        """Faults that the driver flagged in the last reading."""
+        self._past = np.full((ELECTRODES, fingers, SWEEPS), NO_COUNT, dtype=np.uint16)
+        """Sweeps of each finger; `NO_COUNT` where none was read."""
+        self._no_faults = self._faults.tobytes()
         # Constants of full shape, and buffers: numpy takes half the time.
         self._one, self._jump, *limits = (
             np.full(shape, number, dtype=np.uint16) for number in (1, JUMP_COUNTS, *LIMITS)
@@ -134,8 +114,7 @@ class Health:
         counts = reading.counts
         if counts.shape != self._shape:
             return Checked((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
-        memory = self.memory
-        memory.faults = reading.faults
+        self._faults = reading.faults
         railed, differs = self._compare(counts)
         sound, faults = None, 0
         # Nearly all readings are sound, and that is seen with a few cheap operations.
@@ -143,7 +122,7 @@ class Health:
             # Flagged counts were not read: they neither repeat anything nor hide that others do.
             sound = reading.faults == 0
             faults = int(np.bitwise_or.reduce(reading.faults, axis=None))
-            memory.changed[~sound] = memory.number
+            self._changed[~sound] = self._number
             railed &= sound
             differs &= sound
         broken = railed | self._worn_out()
@@ -165,39 +144,38 @@ class Health:
     def electrodes(self) -> dict[tuple[int, int], Reason]:
         """Return why electrodes are broken now, by (finger, electrode 0..23)."""
         findings: dict[tuple[int, int], Reason] = {}
-        memory = self.memory
         for where, reason in (
-            (memory.jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
-            (memory.changed <= memory.number - UNCHANGED_MAX, Reason.ELECTRODE_DEAD),
-            (at_rail(memory.previous) & (memory.previous != NO_COUNT), Reason.SATURATED),
+            (self._jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
+            (self._changed <= self._number - UNCHANGED_MAX, Reason.ELECTRODE_DEAD),
+            (at_rail(self._previous) & (self._previous != NO_COUNT), Reason.SATURATED),
         ):
             findings |= dict.fromkeys(_places(where), reason)
-        for finger, electrode in _places(memory.faults != 0):
-            findings[finger, electrode] = _fault_reasons(int(memory.faults[finger, electrode]))[0]
+        for finger, electrode in _places(self._faults != 0):
+            findings[finger, electrode] = _fault_reasons(int(self._faults[finger, electrode]))[0]
         return findings
 
     def _compare(self, counts: NDArray[np.uint16]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Take in counts; return which are at a rail, and which differ from those before."""
-        memory, previous = self.memory, self.memory.previous
-        memory.number += 1
+        previous = self._previous
+        self._number += 1
         above = self._above
         np.subtract(counts, self._one, out=above[0])
         step = np.subtract(counts, previous, out=above[2])
         np.add(step, self._jump, out=above[1])
         railed, far, differs = above > self._limits
-        np.putmask(memory.changed, differs, memory.number)
-        if memory.has_jumped:
-            memory.jumps *= JUMPS_FADE
-            remembered = memory.jumps >= JUMPS_FORGOTTEN
-            memory.jumps *= remembered
-            memory.has_jumped = any_of(remembered)
+        np.putmask(self._changed, differs, self._number)
+        if self._has_jumped:
+            self._jumps *= JUMPS_FADE
+            remembered = self._jumps >= JUMPS_FORGOTTEN
+            self._jumps *= remembered
+            self._has_jumped = any_of(remembered)
         if any_of(far):
             near = counts - previous + STILL_COUNTS <= 2 * STILL_COUNTS
             if np.count_nonzero(near) >= STILL:  # some finger may keep still
                 jumps = far & (near.sum(axis=1, keepdims=True) >= STILL)
-                memory.has_jumped |= any_of(jumps)
-                memory.jumps += jumps
-        memory.previous = counts
+                self._has_jumped |= any_of(jumps)
+                self._jumps += jumps
+        self._previous = counts
         return railed, differs
 
     def _recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
@@ -205,7 +183,7 @@ class Health:
 
         `sound` tells which of the counts were read; None: all. The others may be anything.
         """
-        past, place = self.memory.past, self.memory.number % SWEEPS
+        past, place = self._past, self._number % SWEEPS
         now = kept = counts.T
         if sound is not None:
             now = np.where(sound, counts, np.uint16(NO_COUNT)).T
@@ -227,10 +205,9 @@ class Health:
 
     def _worn_out(self) -> NDArray[np.bool_]:
         """Return the electrodes, (fingers, 24), that the last readings show to be broken."""
-        memory = self.memory
-        worn_out: NDArray[np.bool_] = memory.changed <= memory.number - UNCHANGED_MAX
-        if memory.has_jumped:
-            worn_out |= memory.jumps > JUMPS_MAX
+        worn_out: NDArray[np.bool_] = self._changed <= self._number - UNCHANGED_MAX
+        if self._has_jumped:
+            worn_out |= self._jumps > JUMPS_MAX
         return worn_out
 
 

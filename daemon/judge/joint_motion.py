@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,37 +17,25 @@ SOURCES_MAX = 8
 """Most sets of joints that are followed apart; a sender may send one finger at a time."""
 
 
-@dataclass(slots=True, eq=False)
-class JointMemory:
-    """State of `JointMotion`. A set is the tuple of names of joints that are sent together."""
-
-    past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]] = field(default_factory=dict)
-    """Times, ns, and angles, rad, shape (names,), of each set, oldest first."""
-    latest_ns: dict[tuple[str, ...], int] = field(default_factory=dict)
-    """Time of the last reading of each set, ns."""
-    waits_since_ns: int | None = None
-    """Time since which no set is known. None: it was always so."""
-    changed_ns: int | None = None
-    """Time of the last change of any angle. None: no angle came yet."""
-    lost: list[str] = field(default_factory=list)
-    """Joints whose angles no longer come."""
-
-    def __post_init__(self) -> None:
-        """Raise `ValueError` if the fields contradict each other."""
-        for names, past in self.past.items():
-            if not past or any(angles.shape != (len(names),) for _, angles in past):
-                raise ValueError("as many angles as names are needed")
-        if self.past.keys() != self.latest_ns.keys():
-            raise ValueError("joints without a time")
-
-
 class JointMotion:
     """Follows the joints of one hand. Constant memory, no clock."""
 
     def __init__(self, limits: JointLimits) -> None:
         """Start without angles; `lost_ns` counts from the first sweep on."""
         self._limits = limits
-        self.memory = JointMemory()
+        self.past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]] = {}
+        """Times, ns, and angles, rad, shape (names,), of each set, oldest first.
+
+        A set is the tuple of names of joints that are sent together.
+        """
+        self.latest_ns: dict[tuple[str, ...], int] = {}
+        """Time of the last reading of each set, ns."""
+        self.lost: list[str] = []
+        """Joints whose angles no longer come."""
+        self._waits_since_ns: int | None = None
+        """Time since which no set is known. None: it was always so."""
+        self._changed_ns: int | None = None
+        """Time of the last change of any angle. None: no angle came yet."""
 
     def observe(self, reading: JointReading, t_ns: int) -> None:
         """Take in the angles of `t_ns`, a time on the clock of the sweeps.
@@ -62,70 +48,65 @@ class JointMotion:
         names = tuple(
             name for name, is_valid in zip(reading.names, valid, strict=False) if is_valid
         )
-        memory = self.memory
-        if names not in memory.past and len(memory.past) >= SOURCES_MAX:
-            memory.past.clear()
-            memory.latest_ns.clear()
-        past = memory.past.setdefault(names, [])
-        latest_ns = memory.latest_ns.get(names, t_ns)
+        if names not in self.past and len(self.past) >= SOURCES_MAX:
+            self.past.clear()
+            self.latest_ns.clear()
+        past = self.past.setdefault(names, [])
+        latest_ns = self.latest_ns.get(names, t_ns)
         before = past[-1][1] if past else None
         if not 0 <= t_ns - latest_ns <= self._limits.late_ns:
             past.clear()  # time went back, or it is not known what the joints did meanwhile
-        memory.latest_ns[names] = t_ns
+        self.latest_ns[names] = t_ns
         if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
             angles = reading.position_rad[valid]
             past.append((t_ns, angles))
             del past[: -(ANGLES + 2)]  # and one at each end of the window
             # Joints that were not heard of before tell nothing: they may come and go.
             changed = before is not None and angles.tobytes() != before.tobytes()
-            if changed or memory.changed_ns is None or t_ns < memory.changed_ns:
-                memory.changed_ns = t_ns
+            if changed or self._changed_ns is None or t_ns < self._changed_ns:
+                self._changed_ns = t_ns
 
     def objection(self, t_ns: int) -> Reason | None:
         """Return the reason why joints forbid settling at `t_ns`. None: they are still, or lost."""
         self._drop_lost(t_ns)
-        memory = self.memory
-        if not memory.past:
-            if memory.waits_since_ns is None or memory.waits_since_ns > t_ns:
-                memory.waits_since_ns = t_ns
+        if not self.past:
+            if self._waits_since_ns is None or self._waits_since_ns > t_ns:
+                self._waits_since_ns = t_ns
             return None if self.is_lost(t_ns) else Reason.JOINTS_LATE
-        if any(t_ns - at_ns > self._limits.late_ns for at_ns in memory.latest_ns.values()):
+        if any(t_ns - at_ns > self._limits.late_ns for at_ns in self.latest_ns.values()):
             return Reason.JOINTS_LATE
-        if not all(map(self._is_still, memory.past.values())):
+        if not all(map(self._is_still, self.past.values())):
             return Reason.MOVING
         return Reason.JOINTS_FROZEN if self.is_frozen else None
 
     def misses_some(self, t_ns: int) -> bool:
         """Return True if judging goes on at `t_ns` without joints that should be there."""
-        return self.is_lost(t_ns) or bool(set(self.memory.lost).difference(*self.memory.past))
+        return self.is_lost(t_ns) or bool(set(self.lost).difference(*self.past))
 
     @property
     def is_frozen(self) -> bool:
         """True if angles have come for over `frozen_ns` without any change."""
-        memory = self.memory
-        if memory.changed_ns is None or not memory.latest_ns:
+        if self._changed_ns is None or not self.latest_ns:
             return False
-        return max(memory.latest_ns.values()) - memory.changed_ns > self._limits.frozen_ns
+        return max(self.latest_ns.values()) - self._changed_ns > self._limits.frozen_ns
 
     def is_lost(self, t_ns: int) -> bool:
         """Return True if no joint angle has come for over `lost_ns` at `t_ns`."""
-        memory = self.memory
         return (
-            not memory.past
-            and memory.waits_since_ns is not None
-            and t_ns - memory.waits_since_ns > self._limits.lost_ns
+            not self.past
+            and self._waits_since_ns is not None
+            and t_ns - self._waits_since_ns > self._limits.lost_ns
         )
 
     def _drop_lost(self, t_ns: int) -> None:
         """Forget joints that no longer come, and those of a time that has gone back."""
-        memory = self.memory
-        for names, latest_ns in list(memory.latest_ns.items()):
+        for names, latest_ns in list(self.latest_ns.items()):
             if -self._limits.late_ns <= t_ns - latest_ns <= self._limits.lost_ns:
                 continue
-            del memory.past[names], memory.latest_ns[names]
-            memory.waits_since_ns = min(latest_ns, t_ns)
-            if len(memory.lost) < LOST_MAX:
-                memory.lost += [name for name in names if name not in memory.lost]
+            del self.past[names], self.latest_ns[names]
+            self._waits_since_ns = min(latest_ns, t_ns)
+            if len(self.lost) < LOST_MAX:
+                self.lost += [name for name in names if name not in self.lost]
 
     def _is_still(self, past: list[tuple[int, NDArray[np.float64]]]) -> bool:
         now_ns, now = past[-1]

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import ELECTRODES, Finger, electrode_name
+from graspd.biotac import Finger, electrode_name
 from graspd.daemon.judge.decision import (
     HELD,
-    NO_RECENT_VERDICT,
+    NOTHING_HELD,
     WITHHELD,
     HandLimits,
+    HoldDown,
     Limits,
-    RecentVerdict,
     decide,
 )
-from graspd.daemon.judge.health import Health, Number
-from graspd.daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
+from graspd.daemon.judge.health import Health
+from graspd.daemon.judge.reasons import OPEN, WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
 from graspd.daemon.trust.trust import RiskReport
 from graspd.drivers.base import JointReading, TactileReading
@@ -31,10 +30,11 @@ from graspd.models.runtime import TactileModel
 from graspd.models.trust.assessment import Assessment
 
 if TYPE_CHECKING:
+    from graspd.daemon.judge.every_reading import EveryReading
     from graspd.daemon.judge.exchange import Exchanged
     from graspd.daemon.judge.hand import HandTracker
     from graspd.daemon.trust.trust import Trust
-    from graspd.models.judge.session import SessionCalibration
+    from graspd.models.session_statistics import SessionState
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False):
@@ -63,27 +63,6 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
     this very reading, or if electrodes of it are broken."""
 
 
-@dataclass(slots=True, eq=False)
-class PipelineMemory:
-    """State of the pipeline: the grasps judged so far."""
-
-    to_learn: NDArray[np.float64]
-    """Shape (fingers, 24): counts that the session is to take in; means nothing if none are."""
-    is_to_learn: bool = False
-    to_learn_slip: bool | None = None
-    """True if they were judged to slip."""
-    readings: Number = 0
-    learnt_grasp: Number = 0
-    """The grasp that the session took in last, or is about to."""
-    opinion: Opinion = NO_OPINION
-    """Answer of the network for the current grasp."""
-    assessment: Assessment | None = None
-    """Worth of `opinion` when it was given."""
-    recent: RecentVerdict = NO_RECENT_VERDICT
-    needs_session: bool = False
-    """True if sensors were exchanged: nothing is judged before their session is calibrated."""
-
-
 class Pipeline:
     """Judges readings of one hand with one model."""
 
@@ -110,11 +89,13 @@ class Pipeline:
                 f"in this order, the hand has {', '.join(fingers)}"
             )
         self._judge = GraspJudge.of(model, limits.slip_threshold)
-        self._session = self._judge.session
+        self.session = self._judge.session
+        """Calibration of today's sensors up to the last `learn`; None: the model has no session."""
         self._limits = limits
         self.clock = clock
         self._learns = learns
-        self._needs_session = needs_session
+        self.needs_session = needs_session
+        """True if nothing is judged before the session is calibrated."""
         self._fingers = model.contract.fingers
         self._health = Health(len(fingers))
         self.trust = trust
@@ -123,42 +104,59 @@ class Pipeline:
         """Which grasps were judged, and how their lifts ended."""
         self.boot_id = ""
         """Identifies the start of the daemon in the names of its grasps."""
-        self.hand: HandTracker | None = None
-        """None where each reading is a grasp."""
-        self.on_request = False
-        """True if a settled grasp is judged only when the controller asks."""
-        if hand is not None:
-            from graspd.daemon.judge.hand import HandTracker  # only where it is needed
+        self.hand: HandTracker | EveryReading
+        """Says when a grasp is to be judged."""
+        if hand is None:
+            from graspd.daemon.judge.every_reading import EveryReading
 
-            self.hand, self.on_request = HandTracker(fingers, hand), hand.on_request
-        self.memory = PipelineMemory(np.zeros((len(fingers), ELECTRODES)))
-        self._latest_ns = 0, 0
-        """Times `t_ns` and `made_ns` of the last reading."""
+            self.hand = EveryReading()
+        else:
+            from graspd.daemon.judge.hand import HandTracker
+
+            self.hand = HandTracker(fingers, hand)
+        self.read_rest = self.hand.read_rest
+        """Gives where each electrode rests, counts, shape (fingers, 24); None: a table."""
+        self._opinion = NO_OPINION
+        """Answer of the network for the current grasp."""
+        self._assessment: Assessment | None = None
+        """Worth of `_opinion` when it was given."""
+        self._held = NOTHING_HELD
+        self._to_learn: NDArray[np.float64] | None = None
+        """Shape (fingers, 24): counts that the session is to take in. None: none."""
+        self._to_learn_slip: bool | None = None
+        """True if they were judged to slip."""
+        self._learnt_grasp = 0
+        """The grasp that the session took in last, or is about to."""
+        self._late: bool | None = None
+        """Argument of `expect_late` for the next reading. None: its age says if it is late."""
         self.on_exchange: Callable[[Exchanged | None], None] | None = None
         """Called when the sensors were exchanged, with what was known of the new ones."""
 
     @property
-    def session(self) -> SessionCalibration | None:
-        """Calibration of today's sensors up to the last grasp; None: a model without a session."""
-        self.learn()
-        return self._session
+    def on_request(self) -> bool:
+        """True if a settled grasp is judged only when the controller asks."""
+        return self.hand.on_request
 
-    @property
-    def axis_ns(self) -> int:
-        """Time from which a replay counts: `t_ns` less `made_ns`, 0 of live readings."""
-        t_ns, made_ns = self._latest_ns
-        return t_ns - made_ns
-
-    @property
-    def read_rest(self) -> Callable[[], NDArray[np.float64]] | None:
-        """Gives where each electrode rests; None where each reading is a grasp."""
-        hand = self.hand
-        return None if hand is None else lambda: hand.rest
+    def session_then(self) -> SessionState | None:
+        """Return the state of the session with the grasp that is held, as if it were over."""
+        session = self.session
+        if session is None:
+            return None
+        state = session.state()
+        if self._to_learn is None:
+            return state
+        session.observe(self._to_learn, slip=self._to_learn_slip)
+        then = session.state()
+        session.restore(state)
+        return then
 
     def ask(self) -> None:
         """Judge the current grasp once it has settled: the controller waits for the verdict."""
-        if self.hand is not None:
-            self.hand.gate.ask()
+        self.hand.ask()
+
+    def expect_late(self, *, judged: bool) -> None:
+        """In a replay: the next reading was late when it was live; `judged`: the network ran."""
+        self._late = judged
 
     def sensors_exchanged(self, known: Exchanged | None = None) -> None:
         """Forget session, grasp and maybe the tare: the sensors are others.
@@ -166,18 +164,18 @@ class Pipeline:
         Go on from what is `known` of them. Raises `ValueError` if that is of another model.
         """
         self._forget_opinion()
-        self.memory.is_to_learn = False
-        self.memory.needs_session = True
-        if self._session is not None:
-            self._session.reset()
+        self._to_learn = None
+        self.needs_session = True
+        if self.session is not None:
+            self.session.reset()
             if known is not None and known.session is not None:
-                self._session.restore(known.session)
+                self.session.restore(known.session)
         if self.trust is not None:
             learned, proven = (None, 0) if known is None else (known.learned, known.proven)
             self.trust.sensors_exchanged(learned, proven)
-        if self.hand is not None and known is not None and known.tared:
+        if known is not None and known.tared:
             self.hand.restart()
-        elif self.hand is not None:
+        else:
             self.hand.forget()
         if self.on_exchange is not None:
             self.on_exchange(known)
@@ -189,68 +187,51 @@ class Pipeline:
         return self.lifts.tell(grasp, slipped=slipped)[0]
 
     def restart(self) -> None:
-        """Discard the current grasp's verdict: its state is of another model or gate."""
+        """Discard the current grasp's verdict."""
         self._forget_opinion()
-        self.memory.learnt_grasp, self.memory.recent = 0, NO_RECENT_VERDICT
-        self.memory.is_to_learn = False
-        if self.hand is not None:
-            self.hand.restart()
-
-    def memories(self) -> dict[str, dict[str, Any]]:
-        """Return the state of each part of the judge but the session, by group and part.
-
-        Groups: `judge` always, `hand` with a gate, `joints` with joint angles.
-        """
-        judge = {"judge": {"judge": self.memory, "health": self._health.memory}}
-        return judge if self.hand is None else judge | self.hand.memories()
+        self._learnt_grasp, self._held, self._to_learn = 0, NOTHING_HELD, None
+        self.hand.restart()
 
     def skip(self) -> None:
         """Note that readings were left out before the next one: anything may have moved."""
-        if self.hand is not None:
-            self.hand.interrupt()
+        self.hand.interrupt()
 
     def observe_joints(self, reading: JointReading) -> None:
         """Take in joint angles."""
-        if self.hand is not None:
-            self.hand.observe_joints(reading)
+        self.hand.observe_joints(reading)
 
     def judge(self, reading: TactileReading) -> Judgement:
         """Return the judgement of a reading: `unknown` unless its grasp has settled.
 
         Bad data gives `unknown`; it never raises.
         """
-        memory = self.memory
-        if memory.is_to_learn:
+        if self._to_learn is not None:
             self.learn()
-        made_ns = reading.made_ns
-        self._latest_ns = reading.t_ns, made_ns
-        memory.readings += 1
-        checked = self._health.check(reading)
-        if self.hand is None:
-            counts = None if checked.reasons else reading.counts
-            moment = Moment(memory.readings, judges=counts is not None)
-        else:
+        checked, made_ns = self._health.check(reading), reading.made_ns
+        in_time = self._late
+        if in_time is None:
             in_time = 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns
-            moment, counts = self.hand.step(made_ns, reading.counts, checked, in_time=in_time)
+        moment, counts = self.hand.step(made_ns, reading.counts, checked, in_time=in_time)
         grasp = None
         if counts is not None:
             examined = self._judge.examine(counts, checked.broken)
-            memory.opinion, memory.assessment = self._judge.weigh(examined), None
+            self._opinion, self._assessment = self._judge.weigh(examined), None
             grasp = examined.grasp
             if checked.broken is not None:
                 counts = None
         elif moment.state is not GateState.JUDGED:
             self._forget_opinion()
-        assessment = self._assess(moment)
-        judgement = self._decide(
-            reading.t_ns, checked.reasons, moment, memory.opinion, assessment, counts
+        lift = GraspId(self.boot_id, moment.grasp)
+        worth = None if self.trust is None else self._assess(self.trust, lift, moment)
+        judgement = self._conclude(
+            reading.t_ns, made_ns, checked.reasons, moment, self._opinion, worth, counts
         )
-        learns = self._learns and moment.steady and Reason.STALE not in judgement.reasons
-        if grasp is not None and learns:
+        self._late = None
+        if grasp is not None and moment.steady and Reason.STALE not in judgement.reasons:
             self._keep_to_learn(grasp, moment.grasp)
         stable = judgement.decision is Decision.STABLE
         if stable or moment.judges or moment.judged:
-            self._note(GraspId(self.boot_id, moment.grasp), assessment, stable=stable)
+            self._note(lift, worth, stable=stable)
         return judgement
 
     def watch(self, reading: TactileReading) -> None:
@@ -259,27 +240,21 @@ class Pipeline:
 
     def silence(self, last_t_ns: int) -> Judgement:
         """Return the judgement when no reading came for too long since that of `last_t_ns`."""
-        if self.hand is None:
-            moment = Moment(self.memory.readings, judges=False, judged=False)
-        else:
-            now = self.hand.moment()
-            moment = now._replace(still_ms=None, motion=None, motion_limits=None)
-        grasp = GraspId(self.boot_id, moment.grasp)
-        assessment = None if self.trust is None else self.trust.review(grasp, None)
-        return self._decide(last_t_ns, (Reason.STALE,), moment, NO_OPINION, assessment)
+        moment = self.hand.silent()
+        worth = None
+        if self.trust is not None:
+            worth = self.trust.review(GraspId(self.boot_id, moment.grasp), None)
+        return self._conclude(last_t_ns, 0, (Reason.STALE,), moment, NO_OPINION, worth)
 
     def health(self) -> dict[str, Reason]:
         """Return what is not well: electrodes such as `ff_7`, fingers, joints, model, session."""
-        self.learn()
-        opinion = self.memory.opinion
-        findings = dict.fromkeys(opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
+        findings = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
         for (finger, place), reason in self._health.electrodes().items():
             findings[electrode_name(self._fingers[finger], place)] = reason
-        if self.hand is not None:
-            findings |= self.hand.health()
-        if opinion.refusal is Refusal.MODEL_FAILED:
+        findings |= self.hand.health()
+        if self._opinion.refusal is Refusal.MODEL_FAILED:
             findings["model"] = Reason.MODEL_FAILED
-        if self._session is not None and not self._session.now.calibrated:
+        if self.session is not None and not self.session.now.calibrated:
             findings["session"] = Reason.NOT_CALIBRATED
         return findings
 
@@ -287,84 +262,80 @@ class Pipeline:
         """Take the grasp that was judged last into the session, if it is over.
 
         A grasp is judged only by those before it. Learning takes as long as judging."""
-        memory = self.memory
-        if self._session is None or not memory.is_to_learn:
+        counts = self._to_learn
+        if counts is None or self.session is None or self.hand.holds(self._learnt_grasp):
             return
-        now = None if self.hand is None else self.hand.gate.memory
-        over = GateState.IDLE, GateState.RELEASED
-        if now is None or now.grasp != memory.learnt_grasp or now.state in over:
-            memory.is_to_learn = False
-            self._session.observe(memory.to_learn, slip=memory.to_learn_slip)
-
-    def _forget_opinion(self) -> None:
-        self.memory.opinion, self.memory.assessment = NO_OPINION, None
-
-    def _assess(self, moment: Moment) -> Assessment | None:
-        """Return what the opinion is worth by the outcomes that are known now."""
-        memory, opinion, trust = self.memory, self.memory.opinion, self.trust
-        if trust is None:
-            return None
-        grasp = GraspId(self.boot_id, moment.grasp)
-        if not moment.judges or opinion.p_slip is None:
-            return trust.review(grasp, memory.assessment)
-        try:
-            memory.assessment = trust.judge(
-                grasp, opinion.p_slip, opinion.margin, self._judge.features
-            )
-        except ValueError:
-            memory.opinion = Opinion(None, Refusal.MODEL_FAILED, opinion.repaired)
-            return trust.review(grasp, None)
-        return memory.assessment
-
-    def _is_told(self, moment: Moment) -> bool:
-        over = moment.state in (GateState.IDLE, GateState.RELEASED)
-        return not over and self.lifts.is_told(GraspId(self.boot_id, moment.grasp))
-
-    def _note(self, grasp: GraspId, assessment: Assessment | None, *, stable: bool) -> None:
-        if self.trust is None or assessment is None:
-            self.lifts.note(grasp, NOT_ASSESSED, stable=stable)
-        else:
-            self.trust.note(grasp, assessment, stable=stable)
+        self._to_learn = None
+        self.session.observe(counts, slip=self._to_learn_slip)
 
     def _keep_to_learn(self, counts: NDArray[np.generic], grasp: int) -> None:
         """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
-        if self._session is not None and grasp != self.memory.learnt_grasp:
-            memory, p_slip = self.memory, self.memory.opinion.p_slip
-            slip = None if p_slip is None else p_slip >= self._limits.slip_threshold
-            memory.learnt_grasp, memory.is_to_learn = grasp, True
-            memory.to_learn, memory.to_learn_slip = counts.astype(np.float64), slip
+        if self._learns and self.session is not None and grasp != self._learnt_grasp:
+            p_slip = self._opinion.p_slip
+            self._to_learn_slip = None if p_slip is None else p_slip >= self._limits.slip_threshold
+            self._to_learn, self._learnt_grasp = counts.astype(np.float64), grasp
 
-    def _decide(
+    def _forget_opinion(self) -> None:
+        self._opinion, self._assessment = NO_OPINION, None
+
+    def _assess(self, trust: Trust, grasp: GraspId, moment: Moment) -> Assessment:
+        """Return what the opinion is worth by the outcomes that are known now."""
+        opinion = self._opinion
+        if not moment.judges or opinion.p_slip is None:
+            return trust.review(grasp, self._assessment)
+        try:
+            self._assessment = trust.judge(
+                grasp, opinion.p_slip, opinion.margin, self._judge.features
+            )
+        except ValueError:
+            self._opinion = Opinion(None, Refusal.MODEL_FAILED, opinion.repaired)
+            return trust.review(grasp, None)
+        return self._assessment
+
+    def _note(self, grasp: GraspId, worth: Assessment | None, *, stable: bool) -> None:
+        if self.trust is None or worth is None:
+            self.lifts.note(grasp, NOT_ASSESSED, stable=stable)
+        else:
+            self.trust.note(grasp, worth, stable=stable)
+
+    def _conclude(
         self,
         t_ns: int,
+        made_ns: int,
         unusable: tuple[Reason, ...],
         moment: Moment,
         opinion: Opinion,
-        assessment: Assessment | None,
+        worth: Assessment | None,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
-        """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
-        calibrated = None if self._session is None else self._session.now.calibrated
+        """Return the judgement of a reading that is `unusable` for these reasons, or for none.
+
+        A judgement that is not `stable` is kept, to hold down later ones.
+        """
+        calibrated = None if self.session is None else self.session.now.calibrated
         objections = unusable
         if opinion.refusal is not None:
             objections = (*unusable, Reason(opinion.refusal))
-        if self._is_told(moment):
+        if moment.state not in OPEN and self.lifts.is_told(GraspId(self.boot_id, moment.grasp)):
             objections = (*objections, Reason.OUTCOME_TOLD)
-        if calibrated is False and (self._needs_session or self.memory.needs_session):
+        if calibrated is False and self.needs_session:
             objections = (*objections, Reason.NOT_CALIBRATED)
-        p_slip, withheld = opinion.p_slip, None
-        if assessment is not None:
-            p_slip, withheld = assessment.p_slip, WITHHELD[assessment.permission]
+        p_slip, withheld, held = opinion.p_slip, None, NOTHING_HELD
+        if worth is not None:
+            p_slip, withheld = worth.p_slip, WITHHELD[worth.permission]
+        if p_slip is not None:
+            held = self._held.at(moment.grasp, made_ns)
+            if moment.judges:
+                said, _ = decide(p_slip, objections, HELD, 0, self._limits, withheld=withheld)
+                if said is not Decision.STABLE:
+                    until_ns = made_ns + self._limits.steady_ns
+                    self._held, held = HoldDown(moment.grasp, until_ns, said), NOTHING_HELD
+        # Taken last, so that a slow inference counts too.
+        age_ns = self.clock() - t_ns if self._late is None else self._limits.max_age_ns + 1
         decision, reasons = decide(
-            p_slip,
-            objections,
-            moment,
-            self.clock() - t_ns,  # taken last, so that a slow inference counts too
-            self._limits,
-            withheld=withheld,
-            recent=self._recent(p_slip, objections, withheld, moment),
+            p_slip, objections, moment, age_ns, self._limits, withheld=withheld, held=held
         )
-        supervised = assessment is not None and assessment.supervised
+        supervised = worth is not None and worth.supervised
         if moment.fingers is not None and Reason.STALE in reasons:
             moment = moment._replace(fingers=dict.fromkeys(moment.fingers))
         return Judgement(
@@ -374,25 +345,9 @@ class Pipeline:
             p_slip=None if decision is Decision.UNKNOWN else p_slip,
             moment=moment,
             opinion=opinion,
-            assessment=assessment,
+            assessment=worth,
             risk=None if self.trust is None else self.trust.report(),
             supervised=supervised and WATCHED_LIFT.issuperset(reasons),
             session_calibrated=calibrated,
             judged_counts=counts,
         )
-
-    def _recent(
-        self,
-        p_slip: float | None,
-        objections: tuple[Reason, ...],
-        withheld: Reason | None,
-        moment: Moment,
-    ) -> Decision:
-        """Return an earlier decision that still counts against `stable`, and note this one."""
-        memory, made_ns = self.memory, self._latest_ns[1]
-        if moment.judges and p_slip is not None:
-            said, _ = decide(p_slip, objections, HELD, 0, self._limits, withheld=withheld)
-            if said is not Decision.STABLE:
-                memory.recent = RecentVerdict(moment.grasp, made_ns, said)
-                return Decision.STABLE
-        return memory.recent.of(moment.grasp, made_ns, self._limits)

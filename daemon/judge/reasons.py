@@ -150,6 +150,10 @@ class GateState(StrEnum):
     """Nothing touches since less than `GateLimits.release_ns`; a new touch may follow."""
 
 
+OPEN = frozenset({GateState.IDLE, GateState.RELEASED})
+"""States of an open hand: no grasp lasts."""
+
+
 class FingerState(StrEnum):
     """State of a finger in a word: free, in touch or sliding."""
 

@@ -23,7 +23,6 @@ from graspd.daemon.judge.windows import (
     STEP_SWEEPS_MAX,
     STEPS,
     STEPS_MIN,
-    MotionMemory,
     Noise,
 )
 
@@ -114,19 +113,42 @@ class Motion:
         self._loose = Tails.of(fingers, LOOSE_SHARE * false_alarms, early=early)
         self._noise: Noise | None = None
         """Worked out when it is needed, once for each new block."""
-        self.memory = MotionMemory(
-            times_ns=np.zeros(2 * STEPS, dtype=np.int64),
-            steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
-            clean=np.zeros(shape, dtype=np.float32),
-            counts=np.zeros(shape, dtype=np.float32),
-            jumped=np.zeros(shape, dtype=np.uint8),
-            lost=np.zeros(shape, dtype=np.uint8),
-            usable_since_ns=np.zeros(shape, dtype=np.int64),
-            all_usable_since_ns=0,
-            total=np.zeros(shape, dtype=np.float32),
-            block=np.zeros((APART, fingers)),
-            blocks=np.zeros((BLOCKS, APART, fingers)),
-        )
+        self.clean = np.zeros(shape, dtype=np.float32)
+        """The last sweep without spikes, shape (fingers, 24), as all arrays of sweeps."""
+        self._times_ns = np.zeros(2 * STEPS, dtype=np.int64)
+        """Oldest first; as with `steps`, what is remembered is a slice."""
+        self.steps = np.zeros((2 * STEPS, *shape), dtype=np.float32)
+        """It moves to the right, and then goes back to the left."""
+        self.first = self.number = 0
+        """Index of the oldest entry in `steps`, and number of steps that are remembered."""
+        self._counts = np.zeros(shape, dtype=np.float32)
+        """The last sweep as it came."""
+        self._jumped = np.zeros(shape, dtype=np.uint8)
+        """Number of sweeps for which it has jumped and was not believed."""
+        self._lost = np.zeros(shape, dtype=np.uint8)
+        """Number of sweeps for which it has not been usable, up to `LOST_MAX` and one."""
+        self._usable_since_ns = np.zeros(shape, dtype=np.int64)
+        """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
+        self._all_usable_since_ns = 0
+        """Since when all have."""
+        self._total = np.zeros(shape, dtype=np.float32)
+        """Sum of the sweeps of the step at hand."""
+        self._sweeps = 0
+        """Sweeps of the step at hand."""
+        self._total_ns = 0
+        """Sum of their times since the step before."""
+        self._last_ns: int | None = None
+        """Time of the last sweep that ended a step."""
+        self.block = np.zeros((APART, fingers))
+        """Sums of the squared differences of steps 1 to `APART` apart."""
+        self._blocks = np.zeros((BLOCKS, APART, fingers))
+        """Their means, written round and round."""
+        self._block_steps = 0
+        """Steps of the block at hand."""
+        self._pending = 0
+        """The last of these, which are still to be taken into it."""
+        self._block_number = 0
+        """Blocks so far."""
         self._jumps = np.zeros(shape, dtype=np.float32)
         self._unknown = [math.inf] * fingers
         self._no_limits = MotionLimits([1.0] * fingers, [1.0] * fingers)
@@ -148,17 +170,16 @@ class Motion:
 
     def reset(self) -> None:
         """Forget the motion: what comes next does not continue what came before."""
-        memory = self.memory
-        memory.number = memory.sweeps = memory.block_steps = memory.total_ns = 0
-        memory.first = memory.pending = 0
-        memory.last_ns = None
-        memory.block.fill(0.0)
+        self.number = self._sweeps = self._block_steps = self._total_ns = 0
+        self.first = self._pending = 0
+        self._last_ns = None
+        self.block.fill(0.0)
         self._say_unknown()
 
     def forget(self) -> None:
         """Forget the noise too: the sensors may be others."""
         self.reset()
-        self.memory.block_number = 0
+        self._block_number = 0
         self._noise = None
 
     def add(
@@ -174,42 +195,42 @@ class Motion:
         `usable` is None if all are. How the fingers move is not worked out, and not known, where it
         is not `wanted`. Times must not go back; call `reset` where they do, and after a gap.
         """
-        memory, sweep = self.memory, counts.astype(np.float32)
-        if memory.last_ns is None:
-            memory.last_ns = memory.all_usable_since_ns = t_ns
-            memory.clean = memory.counts = sweep
-            memory.jumped.fill(0)
-            memory.lost.fill(LOST_MAX)
-            memory.usable_since_ns.fill(t_ns)
+        sweep = counts.astype(np.float32)
+        if self._last_ns is None:
+            self._last_ns = self._all_usable_since_ns = t_ns
+            self.clean = self._counts = sweep
+            self._jumped.fill(0)
+            self._lost.fill(LOST_MAX)
+            self._usable_since_ns.fill(t_ns)
         if usable is None:
-            memory.lost.fill(0)
+            self._lost.fill(0)
         else:
-            sweep = np.where(usable, sweep, memory.clean)
-            gone = ~usable & (memory.lost >= LOST_MAX)
+            sweep = np.where(usable, sweep, self.clean)
+            gone = ~usable & (self._lost >= LOST_MAX)
             if gone.any():
-                end = memory.first + memory.number
-                was_usable = memory.usable_since_ns[gone] <= memory.times_ns[end - 1 - APART]
-                if memory.pending and was_usable.any():
+                end = self.first + self.number
+                was_usable = self._usable_since_ns[gone] <= self._times_ns[end - 1 - APART]
+                if self._pending and was_usable.any():
                     self._fill_block()
                 # Not in this step, and what comes next has nothing to jump from.
-                memory.all_usable_since_ns = t_ns + STEP_NS
-                memory.usable_since_ns[gone] = t_ns + STEP_NS
-                memory.jumped[gone] = SPIKE_SWEEPS_MAX
-            memory.lost += ~usable & ~gone
-            memory.lost[usable] = 0
+                self._all_usable_since_ns = t_ns + STEP_NS
+                self._usable_since_ns[gone] = t_ns + STEP_NS
+                self._jumped[gone] = SPIKE_SWEEPS_MAX
+            self._lost += ~usable & ~gone
+            self._lost[usable] = 0
         self._clean(sweep)
-        memory.total = memory.total + memory.clean if memory.sweeps else memory.clean
-        memory.total_ns += t_ns - memory.last_ns
-        memory.sweeps += 1
-        if memory.number and t_ns - memory.last_ns < STEP_NS:
-            if memory.sweeps > STEP_SWEEPS_MAX:
+        self._total = self._total + self.clean if self._sweeps else self.clean
+        self._total_ns += t_ns - self._last_ns
+        self._sweeps += 1
+        if self.number and t_ns - self._last_ns < STEP_NS:
+            if self._sweeps > STEP_SWEEPS_MAX:
                 self._say_unknown()
             elif wanted and not self.looked:
                 self._decide()
             return
-        self._remember(memory.last_ns + memory.total_ns // memory.sweeps)
-        memory.sweeps = memory.total_ns = 0
-        memory.last_ns = t_ns
+        self._remember(self._last_ns + self._total_ns // self._sweeps)
+        self._sweeps = self._total_ns = 0
+        self._last_ns = t_ns
         self._learn_noise()
         if wanted:
             self._decide()
@@ -218,68 +239,65 @@ class Motion:
 
     def _clean(self, counts: NDArray[np.float32]) -> None:
         """Leave out what has jumped for one sweep alone, or is held for a few."""
-        memory, jumps = self.memory, self._jumps
-        np.abs(np.subtract(counts, memory.clean, out=jumps), out=jumps)
-        memory.counts, before = counts, memory.counts
+        jumps = self._jumps
+        np.abs(np.subtract(counts, self.clean, out=jumps), out=jumps)
+        self._counts, before = counts, self._counts
         if jumps.item(jumps.argmax()) <= SPIKE_COUNTS:
-            memory.clean = counts
-            memory.jumped.fill(0)
+            self.clean = counts
+            self._jumped.fill(0)
             return
         jumped = jumps > SPIKE_COUNTS
         jumped[np.count_nonzero(jumped, axis=1) > SPIKES_MAX] = False
-        held = (counts == before) & (memory.jumped < SPIKE_SWEEPS_MAX)
-        jumped &= (memory.jumped == 0) | held
-        memory.jumped += 1
-        memory.jumped *= jumped
-        memory.clean = np.where(jumped, memory.clean, counts)
+        held = (counts == before) & (self._jumped < SPIKE_SWEEPS_MAX)
+        jumped &= (self._jumped == 0) | held
+        self._jumped += 1
+        self._jumped *= jumped
+        self.clean = np.where(jumped, self.clean, counts)
 
     def _remember(self, t_ns: int) -> None:
-        memory = self.memory
-        if memory.number == STEPS:
-            memory.first += 1
-            memory.number -= 1
-        place = memory.first + memory.number
-        if place == len(memory.steps):
-            memory.steps[: memory.number] = memory.steps[memory.first :]
-            memory.times_ns[: memory.number] = memory.times_ns[memory.first :]
-            memory.first, place = 0, memory.number
-        np.divide(memory.total, memory.sweeps, out=memory.steps[place])
-        memory.times_ns[place] = t_ns
-        memory.number += 1
+        if self.number == STEPS:
+            self.first += 1
+            self.number -= 1
+        place = self.first + self.number
+        if place == len(self.steps):
+            self.steps[: self.number] = self.steps[self.first :]
+            self._times_ns[: self.number] = self._times_ns[self.first :]
+            self.first, place = 0, self.number
+        np.divide(self._total, self._sweeps, out=self.steps[place])
+        self._times_ns[place] = t_ns
+        self.number += 1
 
     def _learn_noise(self) -> None:
-        memory = self.memory
-        if memory.number <= APART:
+        if self.number <= APART:
             return
-        memory.pending += 1
-        memory.block_steps += 1
-        if memory.block_steps >= BLOCK_STEPS:
+        self._pending += 1
+        self._block_steps += 1
+        if self._block_steps >= BLOCK_STEPS:
             self._fill_block()
-            memory.blocks[memory.block_number % BLOCKS] = memory.block / BLOCK_STEPS
-            memory.block_number += 1
+            self._blocks[self._block_number % BLOCKS] = self.block / BLOCK_STEPS
+            self._block_number += 1
             self._noise = None
-            memory.block_steps = 0
-            memory.block.fill(0.0)
+            self._block_steps = 0
+            self.block.fill(0.0)
 
     def _fill_block(self) -> None:
         """Take the pending steps into the block, by the electrodes that are usable until now."""
-        memory = self.memory
-        end = memory.first + memory.number
-        begin, memory.pending = end - memory.pending, 0
-        since_ns = memory.times_ns[begin - APART : end - APART, np.newaxis, np.newaxis]
-        usable = memory.usable_since_ns <= since_ns
+        end = self.first + self.number
+        begin, self._pending = end - self._pending, 0
+        since_ns = self._times_ns[begin - APART : end - APART, np.newaxis, np.newaxis]
+        usable = self._usable_since_ns <= since_ns
         numbers = np.maximum(np.count_nonzero(usable, axis=2), 1)
-        for apart, sums in enumerate(memory.block, start=1):
-            differences = memory.steps[begin:end] - memory.steps[begin - apart : end - apart]
+        for apart, sums in enumerate(self.block, start=1):
+            differences = self.steps[begin:end] - self.steps[begin - apart : end - apart]
             means = (np.square(differences) * usable) @ ONES / numbers
             np.add.reduce((sums, *means), axis=0, out=sums)
 
     def _mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
         """Return each finger's mean over electrodes usable since `begin`; infinite: too few."""
-        memory, since_ns = self.memory, self.memory.times_ns.item(begin)
-        if memory.all_usable_since_ns <= since_ns:
+        since_ns = self._times_ns.item(begin)
+        if self._all_usable_since_ns <= since_ns:
             return [total / ELECTRODES for total in values.dot(ONES).tolist()]
-        usable = memory.usable_since_ns <= since_ns
+        usable = self._usable_since_ns <= since_ns
         totals = ((values * usable) @ ONES).tolist()
         numbers = np.count_nonzero(usable, axis=1).tolist()
         return [
@@ -288,8 +306,8 @@ class Motion:
         ]
 
     def _known_noise(self) -> Noise:
-        number = min(self.memory.block_number, BLOCKS)
-        squares = np.sort(self.memory.blocks[:number], axis=0)[number // 4]
+        number = min(self._block_number, BLOCKS)
+        squares = np.sort(self._blocks[:number], axis=0)[number // 4]
         low, high = SIGMA_COUNTS
         correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
         correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
@@ -297,13 +315,12 @@ class Motion:
         return Noise.of(variance, correlations)
 
     def _decide(self) -> None:
-        memory = self.memory
-        number, end = memory.number, memory.first + memory.number
+        number, end = self.number, self.first + self.number
         self._say_unknown()
         self.looked = True
-        if memory.block_number < BLOCKS_MIN or number <= STEPS_MIN:
+        if self._block_number < BLOCKS_MIN or number <= STEPS_MIN:
             return
-        times_ns = memory.times_ns[memory.first : end]
+        times_ns = self._times_ns[self.first : end]
         now_ns = times_ns.item(-1)
         age_ns = now_ns - times_ns.item(0)
         if age_ns < SHORT_NS:
@@ -313,7 +330,7 @@ class Motion:
         if self._noise is None:
             self._noise = self._known_noise()
         times_s = (times_ns[long:] - now_ns) / 1e9
-        first, noise, is_full = memory.first, self._noise, age_ns >= LONG_NS
+        first, noise, is_full = self.first, self._noise, age_ns >= LONG_NS
         fast_noise = self._follow_fast(first + short, end, times_s[short - long :], noise)
         self.known = max(self.fast) < math.inf
         of_slow = self._follow_slow(first + long, end, times_s, noise) if is_full else None
@@ -322,19 +339,19 @@ class Motion:
 
     def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
         """Find how steps moved; return the mean absolute slopes that noise makes, counts/s."""
-        memory, line = self.memory, centred(times_s)
+        line = centred(times_s)
         extent = float(line.dot(line))
         root = math.sqrt(extent)
         by_noise = [each / root for each in noise.slope[len(line)].tolist()]
         weights = (line / extent).astype(np.float32)
-        slopes = np.abs(weights.dot(memory.steps[begin:end].reshape(len(line), -1)))
-        means = self._mean(slopes.reshape(memory.clean.shape), begin)
+        slopes = np.abs(weights.dot(self.steps[begin:end].reshape(len(line), -1)))
+        means = self._mean(slopes.reshape(self.clean.shape), begin)
         self.fast = [mean / usual for mean, usual in zip(means, by_noise, strict=True)]
         return by_noise
 
     def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> SlowNoise:
         """Find how far steps have spread; return what noise makes of that."""
-        steps, number, line = self.memory.steps[begin:end], end - begin, centred(times_s)
+        steps, number, line = self.steps[begin:end], end - begin, centred(times_s)
         middle = np.add.reduce(steps, axis=0)
         middle /= number
         squares = np.add.reduce(np.square(steps - middle), axis=0)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import ELECTRODES
-from graspd.daemon.judge.health import Number
 
 STEP_NS = 5_000_000
 """Shortest step of a window, ns. Faster sweeps are averaged within a step."""
@@ -84,54 +83,3 @@ class Noise:
             variance=variance * spreads,
             spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
         )
-
-
-@dataclass(slots=True, eq=False)
-class MotionMemory:
-    """The last steps and the noise of a hand; arrays of sweeps have shape (fingers, 24)."""
-
-    times_ns: NDArray[np.int64]
-    """Shape (2 * STEPS,), oldest first; as with `steps`, what is remembered is a slice."""
-    steps: NDArray[np.float32]
-    """Shape (2 * STEPS, fingers, 24): it moves to the right, and then goes back to the left."""
-    clean: NDArray[np.float32]
-    """The last sweep without spikes."""
-    counts: NDArray[np.float32]
-    """The last sweep as it came."""
-    jumped: NDArray[np.uint8]
-    """Number of sweeps for which it has jumped and was not believed."""
-    lost: NDArray[np.uint8]
-    """Number of sweeps for which it has not been usable, up to `LOST_MAX` and one."""
-    usable_since_ns: NDArray[np.int64]
-    """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
-    all_usable_since_ns: Number
-    """Since when all have."""
-    total: NDArray[np.float32]
-    """Sum of the sweeps of the step at hand."""
-    block: NDArray[np.float64]
-    """Sums of the squared differences of steps 1 to `APART` apart, shape (APART, fingers)."""
-    blocks: NDArray[np.float64]
-    """Their means, shape (BLOCKS, APART, fingers), written round and round."""
-    first: Number = 0
-    """Index of the oldest entry in `steps`."""
-    number: Number = 0
-    """Steps that are remembered."""
-    sweeps: Number = 0
-    """Sweeps of the step at hand."""
-    total_ns: Number = 0
-    """Sum of their times since the step before."""
-    last_ns: Number | None = None
-    """Time of the last sweep that ended a step."""
-    block_steps: Number = 0
-    """Steps of the block at hand."""
-    pending: Number = 0
-    """The last of these, which are still to be taken into it."""
-    block_number: Number = 0
-    """Blocks so far."""
-
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for what no such memory can be."""
-        end = self.first + self.number
-        pending_max = max(self.number - APART, 0)
-        if self.number > STEPS or end > len(self.steps) or self.pending > pending_max:
-            raise ValueError("more steps than are remembered")

@@ -85,15 +85,13 @@ class Export:
 def collect(paths: Sequence[Path]) -> Export:
     """Return the grasps of recordings. `paths`: in the order of time.
 
-    Raises `RecordingError` for a file that is damaged, of other fingers, or without judged counts.
+    Raises `RecordingError` for a file that is damaged or of other fingers.
     """
     export = Export()
     for path in paths:
         with open_recording(path) as stream:
             recording = McapReader(path, stream)
             header = recording.header
-            if not header.says_judged:
-                raise RecordingError(path, "does not say which counts were judged")
             if export.fingers and header.fingers != export.fingers:
                 raise RecordingError(path, f"has other fingers than {paths[0]}")
             export.fingers = header.fingers

@@ -45,14 +45,12 @@ _DAMAGE = (
 )
 """Exceptions of the library for a damaged file; huge lengths cause the last two."""
 
-_TEXTS: Final = ("boot_id", "model", "model_sha256", "judge", "trust")
+_TEXTS: Final = ("boot_id", "model", "model_sha256", "trust")
 """Fields written as text, or as base64 if they are bytes; all others are JSON."""
-_OLDER: Final = {"trust": "", "says_judged": "false"}
-"""Values of the fields that older recordings lack."""
 
 
 class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
-    """Description of the run, and its state, so that one file alone can be replayed."""
+    """Description of the run, with session and learning where the file begins."""
 
     fingers: tuple[str, ...]
     """Fingers in the order of a reading's rows."""
@@ -67,16 +65,12 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
     """Number of the file in the run; one is skipped after a failure of the disk."""
     wall_minus_monotonic_ns: int = 0
     """Wall time less the daemon's monotonic time, ns."""
-    judge: bytes = b""
-    """State of the judge, from `graspd.daemon.judge.memory.encode`; empty: not known."""
-    axis_ns: int = 0
-    """Difference `t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
+    grasps: int = 0
+    """Number of the run's last grasp before the file."""
     session: SessionState | None = None
-    """Statistics of the session; None for a model without a session."""
+    """Statistics of the session, with a grasp that is held; None: the model has no session."""
     trust: bytes = b""
     """State of learning, from `graspd.daemon.trust.trust.encode`; empty without learning."""
-    says_judged: bool = True
-    """True if the file has `judged` messages."""
 
     def texts(self) -> dict[str, str]:
         """Return the fields as texts, for a metadata record of MCAP."""
@@ -88,9 +82,7 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def of(cls, texts: Mapping[str, str]) -> Self:
         """Return the header in `texts`. Raises `KeyError` or `ValueError`."""
-        texts = {**_OLDER, **texts}
         fields: dict[str, Any] = {name: texts[name] for name in cls.__struct_fields__}
-        fields["session"] = fields["session"] or "null"  # older recordings have this
         for name in fields.keys() - _TEXTS:
             fields[name] = msgspec.json.decode(fields[name])
         header = msgspec.convert(fields, cls)

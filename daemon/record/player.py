@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from graspd.daemon.judge.exchange import Exchanged
-from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome
+from graspd.daemon.publish.messages import GateMessage, OutcomeMessage, decode_outcome
 from graspd.daemon.record.mcap import McapReader, RecordedMessage, header_of
 from graspd.daemon.record.topics import (
     EVENTS,
+    PLAYED,
+    Late,
     Topic,
     decode_exchanged,
+    decode_gate,
+    decode_late,
     joint_reading,
     tactile_reading,
 )
@@ -24,8 +28,9 @@ from graspd.drivers.recordings.player import RecordedDriver
 
 _log = logging.getLogger(__name__)
 
-RecordedEvent = Topic | OutcomeMessage | Exchanged
-"""An event of `EVENTS`, an outcome, or an exchange of sensors."""
+RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage
+"""An event of `EVENTS`, an outcome, an exchange of sensors, or what belongs to the next reading:
+that it was late, or that it changed the gate."""
 _Item = Reading | RecordedEvent
 
 
@@ -53,17 +58,14 @@ class McapReplayDriver(RecordedDriver[_Item]):
         fingers: Sequence[str],
         *,
         speed: float | None = None,
-        axis_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Raises `ValueError` without `paths`, or for a `speed` of 0 or less.
 
         `fingers`: those to play, in this order; each file must have them. `speed`: factor of real
-        time; None: as fast as possible. `axis_ns`: ns subtracted from each recorded `t_ns` to get
-        the `recorded_ns` of its reading; the run's `Pipeline.axis_ns`, from its header.
+        time; None: as fast as possible.
         """
         super().__init__(paths, speed, clock)
-        self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
         self.on_event: Callable[[RecordedEvent], None] | None = None
         """Called with each event that changes the judge's state."""
@@ -100,7 +102,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
             self.counters.late += late_ns > self.period_ns
         if isinstance(item, TactileReading):
             self._count(item)
-        return [self.hand_over(item, at_ns, self._axis_ns)]
+        return [self.hand_over(item, at_ns)]
 
     def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
@@ -115,25 +117,50 @@ class McapReplayDriver(RecordedDriver[_Item]):
         for path in self.paths:
             with open_recording(path) as stream:
                 recording = McapReader(path, stream)
-                for message in recording:
-                    for item in self._items_of(message):
+                for message in _in_order(recording):
+                    item = self._item_of(message)
+                    if item is not None:
                         yield message.at_ns, item
                 if recording.cut_off:
                     self.counters.cut_off += 1
                     _log.warning("%s: is cut off or damaged; played up to there", path)
 
-    def _items_of(self, message: RecordedMessage) -> Sequence[_Item]:
+    def _item_of(self, message: RecordedMessage) -> _Item | None:
         try:
-            if message.kind == Topic.TACTILE:
-                reading, asked = tactile_reading(message.payload, self._fingers)
-                return (Topic.ASKED, reading) if asked else (reading,)
-            if message.kind == Topic.JOINTS:
-                return (joint_reading(message.payload),)
-            if message.kind == Topic.OUTCOME:
-                return (decode_outcome(message.payload),)
-            if message.kind == Topic.EXCHANGED:
-                return (decode_exchanged(message.payload),)
+            match message.kind:
+                case Topic.TACTILE:
+                    return tactile_reading(message.payload, self._fingers)
+                case Topic.JOINTS:
+                    return joint_reading(message.payload)
+                case Topic.OUTCOME:
+                    return decode_outcome(message.payload)
+                case Topic.EXCHANGED:
+                    return decode_exchanged(message.payload)
+                case Topic.LATE:
+                    return decode_late(message.payload)
+                case Topic.GATE:
+                    return decode_gate(message.payload)
         except (ValueError, OverflowError):
             self.counters.malformed += 1
-            return ()
-        return (Topic(message.kind),) if message.kind in EVENTS else ()
+            return None
+        return Topic(message.kind) if message.kind in EVENTS else None
+
+
+def _in_order(messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
+    """Yield the messages to play, those about a reading before it, at its time."""
+    reading: RecordedMessage | None = None
+    for message in messages:
+        if message.kind in (Topic.LATE, Topic.GATE):
+            yield message if reading is None else message._replace(at_ns=reading.at_ns)
+            continue
+        if message.kind not in PLAYED:
+            continue
+        if reading is not None:
+            yield reading
+            reading = None
+        if message.kind == Topic.TACTILE:
+            reading = message
+        else:
+            yield message
+    if reading is not None:
+        yield reading

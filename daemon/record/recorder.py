@@ -21,10 +21,11 @@ import msgspec
 from msgspec.structs import replace
 
 from graspd.daemon.judge.exchange import Exchanged
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
 from graspd.daemon.record.mcap import McapWriter, RecordingFile, RecordingHeader
-from graspd.daemon.record.topics import EVENT, Joints, Judged, Topic, flat
+from graspd.daemon.record.topics import EVENT, Joints, Judged, Late, Topic, flat
 from graspd.daemon.record.viewers import Viewer
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.base import JointReading, Reading
@@ -48,7 +49,7 @@ CLOSE_S: Final = 0.5
 _STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 MakeHeader = Callable[[], RecordingHeader]
-"""Function that makes the header of a copied state; called in the thread."""
+"""Function that makes the header of what was copied; called in the thread."""
 
 LINK: Final = b""
 """Topic of entries that are link traffic."""
@@ -89,8 +90,8 @@ class Recorder(Companion):
     ) -> None:
         """Start the thread, which creates the first file.
 
-        `take_header`: copies the state for a file's header. It is called here and after a status,
-        when no reading is being judged.
+        `take_header`: copies session and learning for a file's header. It is called here and after
+        a status, when no reading is being judged.
         """
         self._options = options
         self._hand = hand
@@ -136,6 +137,9 @@ class Recorder(Companion):
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         judgement = published.judgement
+        if published.reading is not None and Reason.STALE in judgement.reasons:
+            late = Late(judgement.moment.judges)
+            self._put(self._names[Topic.LATE], lambda: late)
         if judgement.moment.judged and judgement.judged_counts is not None:
             making = partial(Judged.of, self._boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)

@@ -84,6 +84,13 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
+class Late(msgspec.Struct, frozen=True):
+    """The last reading was late, so its verdict is `stale`; a replay must not find it in time."""
+
+    judged: bool
+    """True if the network judged it all the same."""
+
+
 class Event(msgspec.Struct, frozen=True):
     """An event; its topic tells which."""
 
@@ -103,6 +110,8 @@ class Topic(StrEnum):
     ASKED = "asked"
     """A controller asked for a judgement."""
     EXCHANGED = "exchanged"
+    LATE = "late"
+    """The last reading was late."""
     SKIPPED = "skipped"
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
@@ -120,6 +129,7 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
     "judged": Judged,
     "asked": Event,
     "exchanged": Exchanged,
+    "late": Late,
     "skipped": Event,
     "announced": Event,
     "taken-back": Event,
@@ -128,9 +138,14 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
 }
 """Type of the messages by the first part of their topic."""
 EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED, Topic.TAKEN_BACK)
+PLAYED: Final = (*EVENTS, Topic.TACTILE, Topic.JOINTS, Topic.OUTCOME, Topic.EXCHANGED)
+"""Topics that a replay repeats, in the order of the file."""
 EVENT: Final = b"{}"
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
+decode_late = msgspec.json.Decoder(Late).decode
+decode_gate = msgspec.json.Decoder(messages.GateMessage).decode
+_decode_joints = msgspec.json.Decoder(Joints).decode
 _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 
@@ -152,11 +167,10 @@ def decode_judged(payload: bytes) -> Judged:
     return msgspec.convert(content, Judged)
 
 
-def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileReading, bool]:
-    """Return the reading of a `tactile` message with `fingers`, and a bool.
+def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
+    """Return the reading of a `tactile` message with `fingers`.
 
-    The bool is True if an older recording says that a controller asked before the reading. Raises
-    `ValueError` or `OverflowError`.
+    Raises `ValueError` or `OverflowError`.
     """
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
@@ -167,18 +181,12 @@ def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileRead
     shape = (len(names), ELECTRODES)
     counts = np.array(message.counts, dtype=np.uint16).reshape(shape)
     faults = np.array(message.faults, dtype=np.uint8).reshape(shape)
-    reading = TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
-    return reading, content.get("asked") is True
+    return TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
 
 
 def joint_reading(payload: bytes) -> JointReading:
     """Return the reading of a `joints` message. Raises `ValueError`."""
-    content = _decode(payload)
-    angles = content.get("position_rad")
-    if isinstance(angles, list):  # older recordings have these
-        pairs = zip(map(str, content.get("names", "")), angles, strict=True)
-        content["position_rad"] = {name: angle for name, angle in pairs if angle is not None}
-    message = msgspec.convert(content, Joints)
+    message = _decode_joints(payload)
     if not message.position_rad.keys() <= set(message.names):
         raise ValueError("an angle of no joint")
     position_rad = [message.position_rad.get(name, np.nan) for name in message.names]
@@ -203,8 +211,8 @@ def _part(name: str, value: object) -> object:
 
 
 def table(values: object) -> object:
-    """Return recorded counts as rows of 24, one per finger, as in older recordings."""
-    if not isinstance(values, list) or not values or isinstance(values[0], list):
+    """Return recorded counts, row by row, as rows of 24, one per finger."""
+    if not isinstance(values, list):
         return values
     return [values[first : first + ELECTRODES] for first in range(0, len(values), ELECTRODES)]
 

@@ -9,7 +9,6 @@ from typing import Final
 
 from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.judge.reasons import GateState
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion
@@ -95,9 +94,9 @@ def losses(pipeline: Pipeline, *, kept: bool) -> Iterator[str]:
             f"{outcomes} told outcomes and a session of {grasps} grasps are forgotten: "
             "only [session] keep = true keeps them"
         )
-    gate = None if pipeline.hand is None else pipeline.hand.gate.memory
-    if gate is not None and gate.state not in (GateState.IDLE, GateState.RELEASED):
-        yield f"grasp {gate.grasp} was held: release it, because the hand must be tared again"
+    grasp = pipeline.hand.grasp
+    if pipeline.hand.holds(grasp):
+        yield f"grasp {grasp} was held: release it, because the hand must be tared again"
 
 
 def start_again(pipeline: Pipeline) -> None:
@@ -107,5 +106,4 @@ def start_again(pipeline: Pipeline) -> None:
     as if it were another.
     """
     pipeline.restart()
-    if pipeline.hand is not None:
-        pipeline.hand.forget()
+    pipeline.hand.forget()

@@ -105,14 +105,11 @@ class RecordedDriver(Opened, Generic[Item]):
         self._read_ahead(self._playing)
         return *item, now_ns - due_ns
 
-    def hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
-        """Return the reading `made`, complete at `at_ns`, moved to now.
-
-        `axis_ns`: time on the recording's clock that `recorded_ns` counts from.
-        """
+    def hand_over(self, made: Reading, at_ns: int) -> Reading:
+        """Return the reading `made`, complete at `at_ns`, moved to now."""
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)
-        return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)
+        return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns)
 
     def _read_ahead(self, items: Generator[tuple[int, Item], None, None]) -> None:
         self._next, self._failure = None, None

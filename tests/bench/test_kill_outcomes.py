@@ -63,8 +63,7 @@ class Reference:
         pipeline = assembly.build_pipeline(self._scene, self._model, learns=False)
         assert pipeline.session is not None
         pipeline.session.restore(self._statistics)
-        pipeline.judge(sound(counts, time.monotonic_ns()))
-        assessment = pipeline.memory.assessment
+        assessment = pipeline.judge(sound(counts, time.monotonic_ns())).assessment
         if assessment is not None:
             self.trust.lifts.note(grasp, assessment.features, stable=stable)
 

@@ -95,7 +95,7 @@ def test_a_grasp_at_a_tenth_of_a_hertz_is_never_judged(note: Note) -> None:
 def grasp_through_gate(period_ns: int, touching: int) -> tuple[int, list[Reason]]:
     """How often a grasp of `touching` sweeps is judged, and the objections to it."""
     hand, random = HandTracker(FINGERS, HandLimits()), np.random.default_rng(0)
-    judged, reasons = 0, dict.fromkeys(hand.moment().reasons)
+    judged, reasons = 0, dict.fromkeys(hand.silent().reasons)
     for number in range(TARE_SWEEPS + touching):
         mean = np.full((len(FINGERS), ELECTRODES), float(REST_COUNTS))
         if number >= TARE_SWEEPS:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from graspd.daemon.judge import decision
-from graspd.daemon.judge.decision import HELD, Limits, decide
+from graspd.daemon.judge.decision import HELD, HoldDown, Limits, decide
 from graspd.daemon.judge.reasons import Decision, Moment, Reason
 from tests.kit.mutants import mutants
 
@@ -86,7 +86,7 @@ def broken_cases(judge: Callable[..., Any]) -> Iterator[tuple[object, ...]]:
             worth = "unsure slip"  # the more, the likelier it is to hold
         worth = worth.removeprefix("unsure ") if limits is ANY_CONFIDENCE else worth
         moment = Moment(1, in_contact=contact, settled=settled, reasons=gate)
-        given: dict[str, Any] = {"withheld": withheld, "recent": doubt}
+        given: dict[str, Any] = {"withheld": withheld, "held": HoldDown(1, 1, doubt)}
         if doubt is Decision.STABLE and withheld is None:
             given = {}  # the defaults
         well = contact and settled

@@ -223,7 +223,7 @@ class Bench:
 
     def hold(self) -> None:
         hand = self.pipeline.hand
-        if hand is None or len(hand.tared) < len(self.rows):
+        if hand.tared is None or len(hand.tared) < len(self.rows):
             self.play("rest", 115)
         if self.random.random() < 0.7:
             self.pipeline.ask()

@@ -9,7 +9,7 @@ import pytest
 
 from graspd.biotac import Finger
 from graspd.daemon.judge.decision import Limits
-from graspd.daemon.judge.hand import FingerMemory, HandTracker
+from graspd.daemon.judge.hand import FingerWord, HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import FingerState, GateState, Reason
@@ -65,15 +65,13 @@ def test_the_words_follow_a_grasp_from_rest_to_release() -> None:
 
 
 def test_motion_of_a_still_finger_is_a_slide_once_it_lasts() -> None:
-    finger = FingerMemory()
+    finger = FingerWord()
     moves = [True, True, False, True, True, True, False, True, None, True]
     told = [finger.touch(place * 10 * MS, each) for place, each in enumerate(moves)]
     # While it has not been still at all, it slides from the first reading.
     first, later, again = [SLIDE, SLIDE, TOUCH], [TOUCH, TOUCH, SLIDE], [TOUCH, TOUCH, None, SLIDE]
     assert told == first + later + again
-    assert FingerMemory(was_still=True, moves_since_ns=50).touch(49, True) is SLIDE, (
-        "time went back"
-    )
+    assert FingerWord(was_still=True, moves_since_ns=50).touch(49, True) is SLIDE, "time went back"
 
 
 def test_a_word_is_told_once_both_windows_are_known() -> None:
@@ -108,7 +106,7 @@ def test_a_reading_that_cannot_be_used_tells_nothing(reason: Reason) -> None:
         moment, _ = hand.step(reading.made_ns, reading.counts, Checked(reasons, None))
         told.append(moment.fingers)
     assert told[229:232] == [HELD, UNKNOWN, HELD]
-    assert hand.moment().fingers == UNKNOWN, "and nothing is told without a reading"
+    assert hand.silent().fingers == UNKNOWN, "and nothing is told without a reading"
 
 
 def test_a_finger_with_too_few_electrodes_is_not_known_and_hides_no_other() -> None:

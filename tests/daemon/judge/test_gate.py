@@ -332,7 +332,7 @@ def test_gate_follows(scenario: Scenario) -> None:
     played = play(scenario)
     assert played.story == scenario.changes
     assert len(played.judged) == scenario.judged
-    assert played.hand.gate.memory.grasp == scenario.grasp
+    assert played.hand.gate.grasp == scenario.grasp
     if scenario.settled_s is not None:
         earliest, latest = scenario.settled_s
         assert earliest <= played.first_s(GateState.SETTLED) <= latest

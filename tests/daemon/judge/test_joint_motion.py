@@ -7,10 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from graspd.daemon.judge.decision import HandLimits, JointLimits, Limits
-from graspd.daemon.judge.joint_motion import JointMemory, JointMotion
+from graspd.daemon.judge.joint_motion import JointMotion
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import JointReading
@@ -230,7 +229,7 @@ def test_eighteen_angles_a_sixteenth_of_a_window_apart_are_kept(every_ms: float,
     motion = JointMotion(LIMITS)
     for place in range(200):
         send(motion, START_NS + round(place * every_ms * MS), 0.3, 1.2, -0.1)
-    (past,) = motion.memory.past.values()
+    (past,) = motion.past.values()
     assert len(past) == kept
     steps = {later[0] - earlier[0] for earlier, later in itertools.pairwise(past)}
     assert steps == {round({5: 5, 4: 8, 2.5: 5, 10: 10}[every_ms] * MS)}
@@ -254,11 +253,11 @@ def test_eight_senders_are_told_apart_and_a_ninth_begins_anew() -> None:
     motion = JointMotion(LIMITS)
     for sender in range(8):
         send(motion, START_NS, 1.0, names=(f"J{sender}",))
-    assert len(motion.memory.past) == len(motion.memory.latest_ns) == 8
+    assert len(motion.past) == len(motion.latest_ns) == 8
     send(motion, START_NS, 1.0, names=("J3",))
-    assert len(motion.memory.past) == 8
+    assert len(motion.past) == 8
     send(motion, START_NS, 1.0, names=("J8",))
-    assert set(motion.memory.past) == set(motion.memory.latest_ns) == {("J8",)}
+    assert set(motion.past) == set(motion.latest_ns) == {("J8",)}
 
 
 def test_no_more_than_64_lost_joints_are_remembered_and_each_once() -> None:
@@ -267,32 +266,12 @@ def test_no_more_than_64_lost_joints_are_remembered_and_each_once() -> None:
         t_ns = START_NS + place * 2000 * MS
         send(motion, t_ns, 1.0, names=(f"J{place // 2}",))  # each comes twice
         motion.objection(t_ns + 1500 * MS)
-    assert motion.memory.lost == [f"J{joint}" for joint in range(35)]
+    assert motion.lost == [f"J{joint}" for joint in range(35)]
     for place in range(70, 200):
         t_ns = START_NS + place * 2000 * MS
         send(motion, t_ns, 1.0, names=(f"J{place}",))
         motion.objection(t_ns + 1500 * MS)
-    assert len(motion.memory.lost) == 64
-
-
-@pytest.mark.parametrize(
-    ("past", "latest_ns", "message"),
-    [
-        ({("FFJ1",): []}, {("FFJ1",): 1}, "as many angles"),
-        ({("FFJ1",): [(1, np.zeros(2))]}, {("FFJ1",): 1}, "as many angles"),
-        ({("FFJ1",): [(1, np.zeros(1)), (2, np.zeros(0))]}, {("FFJ1",): 1}, "as many angles"),
-        ({("FFJ1",): [(1, np.zeros(1))]}, {}, "without a time"),
-        ({}, {("FFJ1",): 1}, "without a time"),
-    ],
-)
-def test_a_memory_that_cannot_have_been_is_refused(
-    past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]],
-    latest_ns: dict[tuple[str, ...], int],
-    message: str,
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        JointMemory(past, latest_ns)
-    JointMemory({("FFJ1",): [(1, np.zeros(1))]}, {("FFJ1",): 1})
+    assert len(motion.lost) == 64
 
 
 def held(rates_hz: Mapping[tuple[str, ...], float], seconds: float) -> JointMotion:

@@ -82,7 +82,7 @@ def test_the_depth_of_a_hold_fades_by_the_time_between_sweeps() -> None:
         pressed = rest.copy()
         pressed[0, :6] -= np.uint16(fall)
         contact.observe(t_ns, pressed, pressed, None)
-    assert contact.memory.touches[0].depth == 195.0
+    assert contact.touches[0].depth == 195.0
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_a_window_is_looked_at_after_a_hundred_sweeps_and_every_25_more() -> Non
         counts = rest.copy()
         counts[0, :6] -= np.uint16(100 if place == 160 else 0)
         contact.observe(place * 10 * MS, counts, counts, ALL)
-        if contact.memory.touches[0].tared_ns == place * 10 * MS:
+        if contact.touches[0].tared_ns == place * 10 * MS:
             looks.append(place)
     assert looks == [100, 125, 150, 260, 285, 310], "a hundred sweeps after what looked as a touch"
 
@@ -196,9 +196,9 @@ def test_a_finger_that_touches_with_all_others_at_times_is_not_alone() -> None:
     both[:, :6] -= np.uint16(200)
     for at_s, counts in ((1, one), (20, both), (21, one), (50, one)):
         contact.observe(at_s * S, counts, counts, None)
-        assert contact.memory.tared.tolist() == [True, True]
+        assert contact.tared.tolist() == [True, True]
     contact.observe(51 * S + 1, one, one, None)
-    assert contact.memory.tared.tolist() == [False, True], "half a minute since it was left alone"
+    assert contact.tared.tolist() == [False, True], "half a minute since it was left alone"
 
 
 def test_the_baseline_is_the_median_of_the_last_hundred_sweeps_only() -> None:
@@ -275,10 +275,10 @@ def test_a_touch_takes_five_sigmas_or_twenty_counts(
 ) -> None:
     contact = Contact(1, limits)
     for place, counts in enumerate(wavering(step)):
-        assert not contact.memory.tared.any()
+        assert not contact.tared.any()
         contact.observe(place * 10 * MS, counts[None], counts[None], ALL)
-    assert contact.memory.tared.all()
-    assert contact.memory.touches[0].threshold == pytest.approx(threshold)
+    assert contact.tared.all()
+    assert contact.touches[0].threshold == pytest.approx(threshold)
 
 
 @pytest.mark.parametrize(
@@ -293,11 +293,11 @@ def test_a_baseline_rises_five_and_sinks_one_and_a_half_counts_a_second(
     for place in range(100):
         counts = np.full((1, 24), 3000, dtype=np.uint16)
         contact.observe(place * 10 * MS, counts, counts, ALL)
-    contact.memory.window.counts[:] = 3000
-    contact.memory.baseline[:] = 3000.0 - step
+    contact.window.counts[:] = 3000
+    contact.baseline[:] = 3000.0 - step
     for place in range(100, 125):
         contact.observe(place * 10 * MS, counts, counts, ALL)
-    assert contact.memory.baseline[0, 0] == pytest.approx(3000.0 - step + followed)
+    assert contact.baseline[0, 0] == pytest.approx(3000.0 - step + followed)
 
 
 def test_the_third_deepest_electrode_makes_the_touch() -> None:
@@ -309,5 +309,5 @@ def test_the_third_deepest_electrode_makes_the_touch() -> None:
         pressed = rest.copy()
         pressed[0, :fallen] -= np.arange(50, 50 + fallen, dtype=np.uint16)
         contact.observe(S, pressed, pressed, ALL)
-        assert contact.memory.touching.tolist() == [touches]
-    assert contact.memory.touches[0].fall == 50.0
+        assert contact.touching.tolist() == [touches]
+    assert contact.touches[0].fall == 50.0

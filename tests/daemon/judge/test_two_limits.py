@@ -69,7 +69,6 @@ def test_a_session_learns_only_what_the_strict_limit_lets_pass(
     monkeypatch.setattr(
         SessionCalibration, "observe", lambda _self, counts, **_: learnt.append(counts)
     )
-    assert pipeline.hand is not None
     rows = grasps(6)
     steady = [(1, False), (2, False), (2, True), (2, True), (3, False), (4, False)]
     moments = [Moment(grasp, GateState.JUDGED, steady=each) for grasp, each in steady]

@@ -35,7 +35,7 @@ NEVER = {
     "drivers.recordings.serial_log",
     "daemon.measure.cost",
     *("daemon.run.summary", "daemon.run.realtime", "daemon.run.systemd"),
-    *("daemon.scene.errors", "daemon.commands.doctor", "daemon.watch", "daemon.judge.memory"),
+    *("daemon.scene.errors", "daemon.commands.doctor", "daemon.watch"),
     *("daemon.record", "daemon.assembly.recordings", "daemon.assembly.sources"),
     "daemon.publish.keys",
 )

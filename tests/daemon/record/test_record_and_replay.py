@@ -169,12 +169,6 @@ def test_outcomes_are_not_those_of_grasps_that_are_told_apart_otherwise(rotated:
     assert "no outcome of a lift is known, so there is no score" in result.stdout
 
 
-def test_a_later_file_alone_is_judged_as_then(rotated: Lab) -> None:
-    for path in rotated.files[1:3]:
-        now = again(path)
-        assert [compared(v) for v in now] == [compared(v) for v in of_readings(path)]
-
-
 def test_files_that_do_not_follow_each_other_are_named(
     rotated: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:

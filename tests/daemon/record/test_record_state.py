@@ -20,15 +20,17 @@ from graspd.daemon.assembly.parts import build_recorder
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Judgement
-from graspd.daemon.judge.reasons import GateCause
+from graspd.daemon.judge.reasons import Decision, GateCause, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent, PublishedVerdict
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.outbox import Outbox
-from graspd.daemon.record.mcap import McapWriter, RecordingHeader, header_of
+from graspd.daemon.record.mcap import RecordingHeader, header_of
 from graspd.daemon.record.recorder import Recorder
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
-from tests.daemon.fakes import NO_LIFT
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
+from tests.daemon.fakes import NO_LIFT, sound
 from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, files, messages, recorder
 from tests.kit.waiting import wait_until
 
@@ -45,7 +47,7 @@ class Loop:
         self.sent = 0
 
     def header(self) -> Callable[[], RecordingHeader]:
-        header = replace(HEADER, axis_ns=self.sent)
+        header = replace(HEADER, grasps=self.sent)
         return lambda: header
 
     def send(self, recorder: Recorder, topic: bytes) -> None:
@@ -69,7 +71,7 @@ def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_pat
     writing.close()
     number = 7
     for path in files(tmp_path):
-        assert header_of(path).axis_ns == number
+        assert header_of(path).grasps == number
         found = messages(path)
         assert [content["number"] for _, content in found] == [*range(number, number + len(found))]
         assert found[-1][0] == "status"
@@ -88,7 +90,7 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
     loop.send(writing, STATUS)
     wait_until(lambda: writing.counters["record"]["files"] == 2)
     writing.close()
-    assert header_of(files(tmp_path)[1]).axis_ns == loop.sent
+    assert header_of(files(tmp_path)[1]).grasps == loop.sent
 
 
 def test_a_disk_that_refuses_is_told_once_and_recorded_on_when_it_takes_files_again(
@@ -113,7 +115,7 @@ def test_a_disk_that_refuses_is_told_once_and_recorded_on_when_it_takes_files_ag
     loop.send(writing, VERDICT)
     writing.close()
     (path,) = files(tmp_path)
-    known = header_of(path).axis_ns
+    known = header_of(path).grasps
     assert [content["number"] for _, content in messages(path)] == [*range(known, loop.sent)]
     assert writing.counters["record"]["lost"] == known > 0
 
@@ -142,10 +144,15 @@ class Daemon:
     def _clock(self) -> int:
         return self._now_ns
 
-    def judge(self, reading: TactileReading) -> Judgement:
-        """And every second a status, if the thread has had time to look."""
+    def judge(self, reading: TactileReading, ages_ms: tuple[int, int] = (0, 0)) -> Judgement:
+        """Judge it, and every second send a status, if the thread has had time to look.
+
+        `ages_ms`: age of the reading before the network, and after it.
+        """
+        ages = iter(ages_ms)
         self._now_ns = reading.t_ns
         self._outbox.tactile(reading, None)
+        self.pipeline.clock = lambda: reading.t_ns + next(ages) * 1_000_000
         judgement = self.pipeline.judge(reading)
         self.recorder.on_verdict(
             PublishedVerdict(judgement, NO_VERDICT, b"", reading, True, *NO_LIFT)
@@ -190,13 +197,38 @@ def again(*paths: Path) -> list[Judgement]:
 
 
 def assert_played_alike(folder: Path, expected: list[Judgement]) -> None:
-    """The whole run, and each of its files alone, are judged as they were."""
+    """The whole run is judged as it was."""
     paths = files(folder)
     assert len(paths) > 3
     assert again(*paths) == expected
-    for path in paths:
+
+
+def judged_grasps(judgements: list[Judgement]) -> list[tuple[int, Decision]]:
+    """Each first judgement: number of the grasp, and what it was called."""
+    return [(each.moment.grasp, each.decision) for each in judgements if each.moment.judged]
+
+
+def test_a_later_file_judges_as_then_from_its_first_rest_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(tmp_path, monkeypatch)
+    rests = Durations(first_rest_s=(3.0, 3.0), rest_s=(2.5, 3.5))
+    stream = enumerate(synthetic_grasps(12, durations=rests, seed=3))
+    made = (sound(each.counts, START_NS + place * 10_000_000, place) for place, each in stream)
+    expected = [daemon.judge(each) for each in made]
+    daemon.recorder.close()
+    assert_played_alike(tmp_path, expected)
+    compared = 0
+    for path in files(tmp_path)[1:]:
         times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
-        assert again(path) == [each for each in expected if each.t_ns in times]
+        then, rest = [each for each in expected if each.t_ns in times], 0
+        for place, each in enumerate(then):
+            rest = rest + 1 if each.moment.state is GateState.IDLE else 0
+            if rest == 130:
+                found = judged_grasps(again(path)[place:])
+                assert found == judged_grasps(then[place:])
+                compared += len(found)
+    assert compared >= 2
 
 
 def test_exchanged_sensors_and_their_return_are_played_again(
@@ -237,29 +269,29 @@ def test_where_readings_were_left_out_the_replay_knows_too(
     assert_played_alike(tmp_path, expected)
 
 
-def rewritten(path: Path, to: Path, judge: bytes, number: int) -> Path:
-    """A recording with another header."""
-    header = header_of(path)
-    file = McapWriter(to, replace(header, judge=judge, file=number))
-    for kind, content in messages(path):
-        if kind not in ("image", "log"):
-            file.write(f"{kind}.right".encode(), json.dumps(content).encode(), content["t_mono_ns"])
-    file.close()
-    return to
+def test_late_readings_are_late_again_in_the_replay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also those that only the network made late: their answer counts, as it did."""
+    daemon = Daemon(tmp_path, monkeypatch)
+    ages_ms = {7: (101, 101), 8: (101, 120), 20: (50, 101), 31: (0, 200), 32: (100, 100)}
+    expected = [daemon.judge(each, ages_ms.get(each.seq % 50, (0, 0))) for each in sweeps()[:2000]]
+    daemon.recorder.close()
+    late = [each for each in expected if Reason.STALE in each.reasons]
+    assert len(late) == 2000 // 50 * 4
+    assert {each.moment.judges for each in late} == {False, True}
+    assert again(*files(tmp_path)) == expected
 
 
-@pytest.mark.parametrize("judge", [b"", bytes(3), b"\x9e\x8ab\x0b\xde"])
-def test_a_file_from_within_a_run_that_does_not_say_what_was_known_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, judge: bytes
+def test_a_file_from_within_a_run_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     daemon = Daemon(tmp_path, monkeypatch)
-    for reading in sweeps()[:50]:
+    for reading in sweeps()[:1000]:
         daemon.judge(reading)
     daemon.recorder.close()
-    (path,) = files(tmp_path)
-    first = rewritten(path, tmp_path / "first.mcap", judge, 0)
-    later = rewritten(path, tmp_path / "later.mcap", judge, 3)
-    assert len(again(first)) == 50
+    first, later = files(tmp_path)[:2]
+    again(first)
     assert not [each for each in caplog.records if each.levelno >= logging.WARNING]
-    assert len(again(later)) == 50
-    assert "later.mcap: begins in the middle of a run" in caplog.text
+    again(later)
+    assert f"{later}: begins in the middle of a run" in caplog.text

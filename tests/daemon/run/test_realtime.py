@@ -150,10 +150,8 @@ def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None)
 def test_the_rehearsal_goes_through_a_whole_grasp() -> None:
     tactile = {"driver": "spi", "port": "/nowhere"}
     pipeline = rehearse(scene.parse({"tactile": tactile}, Path("any.toml")))
-    assert pipeline.hand is not None
-    memory = pipeline.hand.gate.memory
-    assert memory.grasp == 1
-    assert memory.state in (GateState.RELEASED, GateState.IDLE)
+    assert pipeline.hand.grasp == 1
+    assert pipeline.hand.state in (GateState.RELEASED, GateState.IDLE)
     assert pipeline.session is not None
     assert pipeline.session.grasps == 1
 

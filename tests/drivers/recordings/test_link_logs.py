@@ -270,9 +270,8 @@ def test_a_reading_is_handed_over_as_old_as_it_was() -> None:
     player = Player(None, clock)
     clock.now_ns += 5 * MS
     made = JointReading(480 * MS, 3, (), np.zeros(0))
-    given = player.hand_over(made, 500 * MS, 100 * MS)
-    assert (given.t_ns, given.recorded_ns) == (clock.now_ns - 20 * MS, 380 * MS)
-    assert player.hand_over(made, 500 * MS).recorded_ns == 480 * MS
+    given = player.hand_over(made, 500 * MS)
+    assert (given.t_ns, given.recorded_ns) == (clock.now_ns - 20 * MS, 480 * MS)
     assert player.handed_over_ns == clock.now_ns
 
 

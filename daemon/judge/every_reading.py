@@ -1,0 +1,76 @@
+"""The hand of a grasp table: each reading is a grasp of its own, held still and touched by all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.biotac import Finger
+from graspd.daemon.judge.health import Checked
+from graspd.daemon.judge.reasons import GateState, Moment, Reason
+from graspd.drivers.base import JointReading
+
+
+class EveryReading:
+    """Has every usable reading judged; stands where `HandTracker` does for live readings."""
+
+    on_request = False
+    state: GateState | None = None
+    tared: tuple[Finger, ...] | None = None
+    read_rest: Callable[[], NDArray[np.float64]] | None = None
+    """A table has no gate, no tare and no rest."""
+
+    def __init__(self) -> None:
+        self.grasp = 0
+        """Readings until now; the number of the current grasp."""
+
+    def step(
+        self,
+        _t_ns: int,
+        counts: NDArray[np.uint16],
+        checked: Checked,
+        *,
+        in_time: bool = True,
+    ) -> tuple[Moment, NDArray[np.uint16] | None]:
+        """Take in the counts of a reading, shape (fingers, 24); return them to be judged.
+
+        None in their place if the reading cannot be used. Unless it is `in_time` it is judged all
+        the same, and refused as stale.
+        """
+        self.grasp += 1
+        if checked.reasons:
+            return Moment(self.grasp, judges=False), None
+        return Moment(self.grasp), counts
+
+    def silent(self) -> Moment:
+        """Return the state of the grasp when no reading comes."""
+        return Moment(self.grasp, judges=False, judged=False)
+
+    def count_from(self, grasp: int) -> None:
+        """Give the next grasp the number after this."""
+        self.grasp = grasp
+
+    def holds(self, _grasp: int) -> bool:
+        """Return False: a grasp of a table is over with its reading."""
+        return False
+
+    def health(self) -> dict[str, Reason]:
+        """Return nothing: there is neither tare nor joints."""
+        return {}
+
+    def observe_joints(self, reading: JointReading) -> None:
+        """Ignore joint angles."""
+
+    def ask(self) -> None:
+        """Ignore a question: every reading is judged."""
+
+    def interrupt(self) -> None:
+        """Ignore missing readings: no grasp continues the one before."""
+
+    def restart(self) -> None:
+        """Ignore it, as `interrupt`."""
+
+    def forget(self) -> None:
+        """Ignore it: nothing is known of the sensors."""
