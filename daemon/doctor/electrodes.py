@@ -29,27 +29,27 @@ NAMED_MAX = 6
 WORDS = ElectrodeFault.PARITY | ElectrodeFault.ERROR_WORD | ElectrodeFault.NOT_A_COUNT
 DEAD = Trouble(
     Cause.ELECTRODE_DEAD,
-    "it is at the end of its range and has no noise: a dead electrode; refill or replace the "
-    "sensor, if it is so on another day too",
+    "The electrode is dead: it is at the end of its range, without noise. Refill or replace the "
+    "sensor if it is the same on another day.",
     Level.ERROR,
 )
 FROZEN = Trouble(
     Cause.ELECTRODE_FROZEN,
-    "its count never changes and others do: look longer (--listen 20); if it stays so, power-cycle "
-    "the sensor",
+    "Its count never changes, and others do. Look longer (--listen 20). If it stays, power-cycle "
+    "the sensor.",
     Level.ERROR,
 )
 NEAR_RAIL = Trouble(
-    Cause.ELECTRODE_RAIL, "alive, for it has noise: let go of what the hand holds, and look again"
+    Cause.ELECTRODE_RAIL, "It has noise, so it is alive. Empty the hand, and look again."
 )
 RESTLESS = Trouble(
     Cause.ELECTRODE_RESTLESS,
-    "it jumps while its neighbours keep still: look again with the hand untouched and its motors "
-    "off; a loose contact stays",
+    "It jumps while its neighbours are still. Look again with the hand untouched and its motors "
+    "off: a loose contact stays.",
 )
 WORDS_ADVICE = (
-    "words are damaged between sensor and board: look longer (--listen 20); if it stays one "
-    "sensor, its cable and the edges of the clock"
+    "Words are damaged between sensor and board. Look longer (--listen 20). If it stays one "
+    "sensor, check its cable and the edges of the clock."
 )
 
 Mask = NDArray[np.bool_]
@@ -118,7 +118,7 @@ class ElectrodeStatistics:
         if (missing | rail & still).all():
             return [_absent(name, missing, faults)]
         if still.all():
-            advice = "reset the board; does a relay or a recording repeat old data?"
+            advice = "Reset the board. Check that no relay or recording repeats old data."
             what = f"{name}: all counts are frozen"
             return [Finding(Level.ERROR, what, Cause.REPEATED, advice)]
         # A dead electrode is at a rail and has no noise: one of the two alone is no such sign.
@@ -141,16 +141,16 @@ class ElectrodeStatistics:
 
 def _absent(name: str, missing: Mask, faults: ElectrodeFault) -> Finding:
     if missing.any() and faults == ElectrodeFault.HELD:
-        advice = "the board sends old values: reset it, and see whether its clock runs"
+        advice = "The board sends old values. Reset it, and check that its clock runs."
         return Finding(Level.ERROR, f"{name}: old values repeat", Cause.REPEATED, advice)
     why = _in_words(faults) if missing.any() else "each is at the end of its range, without noise"
-    advice = "check the finger's plug, its chip select and its supply"
+    advice = "Check the finger's plug, its chip select and its supply."
     what = f"{name}: no electrode can be read ({why})"
     return Finding(Level.ERROR, what, Cause.SENSOR_ABSENT, advice)
 
 
 def _missing(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
-    advice = "does the board's sequence have it? if frames are lost, see there"
+    advice = "Check that the board's sequence has it. Lost frames are another finding."
     what = f"{_names(name, which)} never or rarely sampled ({_in_words(faults)})"
     if faults & WORDS:
         return Finding(Level.ERROR, what, Cause.SENSOR_WORDS, WORDS_ADVICE)
@@ -162,9 +162,9 @@ def _unreliable(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
     if faults & WORDS:
         return Finding(Level.WARNING, what, Cause.SENSOR_WORDS, WORDS_ADVICE)
     if faults & ElectrodeFault.HELD:
-        advice = "the board repeats values now and then: see how long its sweep takes"
+        advice = "The board repeats values at times. Check how long its sweep takes."
         return Finding(Level.WARNING, what, Cause.REPEATED, advice)
-    advice = "samples are lost on the way: see the load of the bus and of this computer"
+    advice = "Samples are lost. Check the load of the bus and of this computer."
     return Finding(Level.WARNING, what, Cause.ELECTRODE_UNREAD, advice)
 
 

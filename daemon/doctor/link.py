@@ -1,4 +1,4 @@
-"""Findings on devices and links, by the faults and counters that their drivers tell."""
+"""Findings on devices and links, by the faults and counters that their drivers report."""
 
 from __future__ import annotations
 
@@ -22,179 +22,209 @@ NOT_FRAMES = frozenset(
     {"not_counts", "missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
 )
 """Counters of values, of which a frame has many, and of readings, which may take many frames."""
-JOINING, JOINING_MAX = "unsynchronised", 108
-"""Counter, and its most samples that are no trouble: a listener may join in mid-sweep.
+JOINING = frozenset({"unsynchronised_frames", "unsynchronised_packets"})
+JOINING_MAX = 108
+"""Most samples in `JOINING` that are harmless: a listener in mid-sweep loses up to two of 54."""
 
-It then loses up to two sweeps of 54 samples.
-"""
+FLASH = "Flash the firmware of this graspd: deploy/bridge/BUILD.md."
+AGAIN = "Look longer (--listen 20). If it continues, check"
+CLOCK_ADVICE = f"The board's clock stands, was reset, or is wrong. {FLASH}"
 
-FLASH = "flash the firmware of this graspd: deploy/bridge/BUILD.md"
-AGAIN = "look longer (--listen 20); if it goes on"
-CLOCK_ADVICE = f"it stands, was reset, or is wrong: {FLASH}"
-
-NOT_OURS = {
-    ("bad_lengths",): Trouble(
-        Cause.VERSION,
-        "no palm that graspd knows sends these: its firmware is another one, or the relay adds "
-        "bytes",
-    ),
-    ("bad_messages",): Trouble(
-        Cause.JOINTS, "what comes are no joint angles: deploy/wire/JOINTS.md"
-    ),
-    ("error_frames", "bus_off"): Trouble(
-        Cause.BITRATE, "the board has another bit rate than the interface: set that of the board"
-    ),
-    ("bad_cobs", "bad_crc", "too_long", "unknown_frames"): Trouble(
-        Cause.NOT_A_BRIDGE,
-        f"damaged or foreign bytes: is the baud rate the bridge's? not a bridge yet: {FLASH}",
-    ),
-    ("service_packets", "empty_packets", "nonsense_packets"): Trouble(
-        Cause.PALM_MODE,
-        "the palm is in a service mode or starting: let the hand's own driver start it",
-    ),
-    (
-        *("wrong_length_frames", "unknown_commands", "malformed_frames", "unexpected_channels"),
-        *("foreign_frames", "frames"),
-    ): Trouble(
-        Cause.SETTINGS,
-        "let arbitration_id, sequence and data_length be those of the board (candump shows "
-        "what it sends); are sensors connected to it?",
-    ),
-}
-"""Trouble of a link that receives data but gives no reading, by counters that are not 0."""
 FLAPS_MIN = 3
 """Fewest losses of a link while the doctor listens that are an error."""
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
 """Causes that a link shows between its losses; they are not reported beside the losses."""
-COUNTERS = {
-    ("link_losses",): Trouble(
-        Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"
+BUS_ERRORS = Trouble(
+    Cause.BUS_ERRORS,
+    f"Frames are cut on the bus. {AGAIN} the bit rates, and the 120 ohm terminators at both ends.",
+    counters=("error_frames", "bus_off"),
+)
+NOT_OURS = (
+    Trouble(
+        Cause.VERSION,
+        "No known palm sends this length. Its firmware is another one, or the relay adds bytes.",
+        counters=("bad_lengths",),
     ),
-    ("restarts",): Trouble(
-        Cause.RESTARTED, f"the board was reset: {AGAIN}, its supply and reset line"
+    Trouble(
+        Cause.JOINTS,
+        "The messages are not joint angles: see deploy/wire/JOINTS.md.",
+        counters=("bad_messages",),
     ),
-    ("error_frames", "bus_off"): Trouble(
-        Cause.BUS_ERRORS,
-        f"frames are cut on the bus: {AGAIN}, bit rates, and terminators of 120 Ohm at both ends",
+    Trouble(
+        Cause.BITRATE,
+        "Set the interface to the board's bit rate.",
+        counters=BUS_ERRORS.counters,
     ),
-    (
-        *("bad_cobs", "bad_crc", "too_long", "bad_frames", "unknown_frames", "malformed_frames"),
-        *("wrong_length_frames", "unknown_commands", "nonsense_packets", "bad_lengths"),
-        "not_counts",
-    ): Trouble(
-        Cause.DAMAGED, f"damaged or foreign bytes: {AGAIN}, cable and hub, and who else sends there"
+    Trouble(
+        Cause.NOT_A_BRIDGE,
+        f"The bytes are damaged or foreign. Check the baud rate. If it is no bridge yet: {FLASH}",
+        counters=("bad_cobs", "bad_crc", "too_long", "unknown_frames"),
     ),
-    ("kernel_drops", "untimed_frames", "host_tx_dropped"): Trouble(
-        Cause.COMPUTER_BUSY,
-        "this computer was too late to read: top shows why; [realtime] puts graspd first",
-    ),
-    ("clock_faults",): Trouble(Cause.CLOCK, CLOCK_ADVICE),
-    (
-        *("duplicates", "duplicate_frames", "duplicate_packets", "conflicting_packets"),
-        "old_messages",
-    ): Trouble(
-        Cause.REPEATED,
-        "the same comes twice: is there a second sender, or does the board stand still?",
-    ),
-    ("foreign_datagrams",): Trouble(
-        Cause.FOREIGN_SENDER,
-        "two send to one port, and one of them is listened to: name it with only_from",
-    ),
-    ("unexpected_channels",): Trouble(
-        Cause.SETTINGS, "the board samples what the scene's sequence does not have: let them agree"
-    ),
-    (
-        *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps", "interrupted_sweeps"),
-        *("interrupted_rounds", "controller_overflows"),
-        *("unsynchronised_frames", "unsynchronised_packets"),
-    ): Trouble(
-        Cause.FRAMES_LOST,
-        f"lost or late on the way: {AGAIN}, see the load of bus, hub and this computer",
-    ),
-    (
-        *("reordered", "reordered_frames", "reordered_packets", "late_frames", "late_packets"),
-    ): Trouble(
-        Cause.OUT_OF_ORDER,
-        f"frames overtake each other: {AGAIN}, what lies between board and computer (relay, hub)",
-    ),
-    ("service_packets", "empty_packets"): Trouble(
+    Trouble(
         Cause.PALM_MODE,
-        "the palm is in a service mode, or too late: let the hand's own driver start it",
+        "The palm is in a service mode or starting. Let the hand's own driver start it.",
+        counters=("service_packets", "empty_packets", "nonsense_packets"),
     ),
-    ("bad_messages", "unknown_names", "bad_angles"): Trouble(
-        Cause.JOINTS, "what is no joint or no angle is left out: deploy/wire/JOINTS.md"
+    Trouble(
+        Cause.SETTINGS,
+        "Compare arbitration_id, sequence and data_length with the board's (candump shows what it "
+        "sends). Check that sensors are connected to it.",
+        counters=(
+            *("wrong_length_frames", "unknown_commands", "malformed_frames"),
+            *("unexpected_channels", "foreign_frames", "frames"),
+        ),
     ),
-    ("cut_off", "malformed"): Trouble(
-        Cause.RECORDING, "the recording is damaged or ends in the middle: record it again"
+)
+"""Troubles of a link that receives data but gives no reading; the first that counts is meant."""
+COUNTED = (
+    Trouble(
+        Cause.LINK_LOST,
+        f"It went away and came back. {AGAIN} plug, hub and supply.",
+        counters=("link_losses",),
     ),
-}
-"""Counters that are trouble on a link that is up. Others show at the electrodes or are harmless."""
+    Trouble(
+        Cause.RESTARTED,
+        f"The board was reset. {AGAIN} its supply and reset line.",
+        counters=("restarts",),
+    ),
+    BUS_ERRORS,
+    Trouble(
+        Cause.DAMAGED,
+        f"Bytes are damaged or foreign. {AGAIN} cable and hub, and who else sends there.",
+        counters=(
+            *("bad_cobs", "bad_crc", "too_long", "bad_frames", "unknown_frames"),
+            *("malformed_frames", "wrong_length_frames", "unknown_commands"),
+            *("nonsense_packets", "bad_lengths", "not_counts"),
+        ),
+    ),
+    Trouble(
+        Cause.COMPUTER_BUSY,
+        "This computer read too late. top shows why; [realtime] puts graspd first.",
+        counters=("kernel_drops", "untimed_frames", "host_tx_dropped"),
+    ),
+    Trouble(Cause.CLOCK, CLOCK_ADVICE, counters=("clock_faults",)),
+    Trouble(
+        Cause.REPEATED,
+        "Data comes twice. Check for a second sender, and whether the board stands still.",
+        counters=(
+            *("duplicates", "duplicate_frames", "duplicate_packets", "conflicting_packets"),
+            "old_messages",
+        ),
+    ),
+    Trouble(
+        Cause.FOREIGN_SENDER,
+        "Two programs send to one port, and one is read. Name it with only_from.",
+        counters=("foreign_datagrams",),
+    ),
+    Trouble(
+        Cause.SETTINGS,
+        "The board samples electrodes that the scene's sequence does not have. Make them equal.",
+        counters=("unexpected_channels",),
+    ),
+    Trouble(
+        Cause.FRAMES_LOST,
+        f"Data is lost or late. {AGAIN} the load of bus, hub and this computer.",
+        counters=(
+            *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps"),
+            *("interrupted_sweeps", "interrupted_rounds", "controller_overflows"),
+            *("unsynchronised_frames", "unsynchronised_packets"),
+        ),
+    ),
+    Trouble(
+        Cause.OUT_OF_ORDER,
+        f"Frames overtake each other. {AGAIN} what lies between board and computer (relay, hub).",
+        counters=(
+            *("reordered", "reordered_frames", "reordered_packets"),
+            *("late_frames", "late_packets"),
+        ),
+    ),
+    Trouble(
+        Cause.PALM_MODE,
+        "The palm is in a service mode, or too late. Let the hand's own driver start it.",
+        counters=("service_packets", "empty_packets"),
+    ),
+    Trouble(
+        Cause.JOINTS,
+        "Unknown joints and wrong angles are left out: see deploy/wire/JOINTS.md.",
+        counters=("bad_messages", "unknown_names", "bad_angles"),
+    ),
+    Trouble(
+        Cause.RECORDING,
+        "The recording is damaged or ends in the middle. Record it again.",
+        counters=("cut_off", "malformed"),
+    ),
+)
+"""Troubles of a link that is up. Other counters show at the electrodes or are harmless."""
 TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     LinkCause.UNKNOWN: Trouble(
-        Cause.LINK_DOWN, "is it powered, connected, and the one that the scene names?"
+        Cause.LINK_DOWN, "Check that it is powered, connected, and the one that the scene names."
     ),
     LinkCause.NOT_FOUND: Trouble(
         Cause.PORT_MISSING,
-        "plug it in, or name an existing one; a Pico that is a drive has no firmware yet",
+        "Plug it in, or name another port. A Pico that shows as a drive has no firmware yet.",
     ),
-    LinkCause.DENIED: Trouble(
-        Cause.PORT_DENIED, "join the group of the port: ls -lL and the port names it"
-    ),
+    LinkCause.DENIED: Trouble(Cause.PORT_DENIED, "Join the group of the port: ls -lL PORT."),
     LinkCause.IN_USE: Trouble(
         Cause.PORT_HELD,
-        "sudo fuser -v and the port names it (of UDP: sudo ss -ulpn); a daemon: systemctl stop "
-        "'graspd@*'",
+        "Find the program: sudo fuser -v PORT, of UDP sudo ss -ulpn. End a daemon with "
+        "systemctl stop 'graspd@*'.",
     ),
-    LinkCause.NO_INTERFACE: Trouble(Cause.INTERFACE_MISSING, "plug its adapter in"),
-    LinkCause.INTERFACE_DOWN: Trouble(Cause.INTERFACE_DOWN, "bring it up"),
+    LinkCause.NO_INTERFACE: Trouble(Cause.INTERFACE_MISSING, "Plug its adapter in."),
+    LinkCause.INTERFACE_DOWN: Trouble(Cause.INTERFACE_DOWN, "Bring it up."),
     LinkCause.NO_ADDRESS: Trouble(
-        Cause.ADDRESS, "ip -brief address has those of this computer: listen on one of them"
+        Cause.ADDRESS, "Listen on an address of this computer: ip -brief address lists them."
     ),
     LinkCause.BUS_OFF: Trouble(
-        Cause.BITRATE, "let the interface have the board's bit rate; it has: then the terminators"
+        Cause.BITRATE,
+        "Set the interface to the board's bit rate. If it already matches, check the 120 ohm "
+        "terminators.",
     ),
     LinkCause.SILENT: Trouble(
-        Cause.SILENT, "it has said nothing yet: is it on and connected? longer: --listen 10"
+        Cause.SILENT, "No data yet. Check power and connection, or look longer (--listen 10)."
     ),
     LinkCause.NO_ANSWER: Trouble(
-        Cause.SILENT, f"plug it in again; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
+        Cause.SILENT,
+        f"Plug it in again. On a UART check TX to RX, and the baud rate. If it is no bridge yet: "
+        f"{FLASH}",
     ),
     LinkCause.FOREIGN: Trouble(
-        Cause.FOREIGN_SENDER, "name the sender in only_from if it is the right one"
+        Cause.FOREIGN_SENDER, "Name the sender in only_from if it is the right one."
     ),
     LinkCause.TIMEOUT: Trouble(
-        Cause.LINK_LOST,
-        "it began and stopped: see its supply and cable, and how busy this computer is",
+        Cause.LINK_LOST, "Data came and stopped. Check supply, cable, and this computer's load."
     ),
     LinkCause.DISCONNECTED: Trouble(
-        Cause.LINK_LOST, "plug, cable, hub and supply: it was unplugged, or lost power"
+        Cause.LINK_LOST, "It was unplugged, or lost power. Check plug, cable, hub and supply."
     ),
     LinkCause.VERSION: Trouble(Cause.VERSION, FLASH),
     LinkCause.SETTINGS: Trouble(
-        Cause.SETTINGS, f"let the scene and the settings of the bridge agree: {FLASH}"
+        Cause.SETTINGS, f"Make the settings of scene and bridge equal. {FLASH}"
     ),
     LinkCause.SERIALS: Trouble(
-        Cause.SENSOR_WORDS, "serial numbers are misread: see supply, ground, MISO and its pull-up"
+        Cause.SENSOR_WORDS,
+        "Serial numbers are misread. Check supply, ground, MISO and its pull-up.",
     ),
-    DeviceFault.BUS_ERROR: COUNTERS["error_frames", "bus_off"],
+    DeviceFault.BUS_ERROR: BUS_ERRORS,
     DeviceFault.OLD_FIRMWARE: Trouble(Cause.FIRMWARE_OLD, FLASH),
     DeviceFault.NO_SENSOR: Trouble(
         Cause.SENSOR_ABSENT,
-        "see what all share: 3.3 V, ground, SCK, MOSI, MISO and its pull-up",
+        "Check the lines that all share: 3.3 V, ground, SCK, MOSI, MISO and its pull-up.",
         Level.ERROR,
     ),
     DeviceFault.SENSOR_TWICE: Trouble(
-        Cause.SENSOR_TWICE, "two chip selects lead to one sensor, or touch", Level.ERROR
+        Cause.SENSOR_TWICE,
+        "Two chip selects lead to one sensor, or touch each other.",
+        Level.ERROR,
     ),
     DeviceFault.SENSOR_ABSENT: Trouble(
-        Cause.SENSOR_ABSENT, "they stand in the order of the chip selects"
+        Cause.SENSOR_ABSENT, "The list is in the order of the chip selects."
     ),
     DeviceFault.SENSOR_WORDS: Trouble(
         Cause.SENSOR_WORDS,
-        "by chip select, since its reset: look again; of one, and growing: its wires",
+        "Counted by chip select since its reset. If one grows, check the wires of that sensor.",
     ),
     DeviceFault.SWEEP_TOO_LONG: Trouble(
-        Cause.SETTINGS, "set a longer period or a shorter sequence, and flash it"
+        Cause.SETTINGS, "Set a longer period or a shorter sequence, and flash it."
     ),
     DeviceFault.CLOCK_NOT_TRUSTED: Trouble(Cause.CLOCK, CLOCK_ADVICE),
 }
@@ -217,8 +247,8 @@ def device_findings(
             what += f"; it was up and was lost {losses} {'time' if losses == 1 else 'times'}"
             trouble = TROUBLES[LinkCause.DISCONNECTED]
         elif trouble.cause is Cause.SILENT:
-            for names, other in NOT_OURS.items():
-                if counted := _counted(names, counters):
+            for other in NOT_OURS:
+                if counted := _counted(other.counters, counters):
                     what, trouble = f"{what}, but {counted}", other
                     break
         return [Finding(Level.ERROR, what, trouble.cause, trouble.advice)]
@@ -232,10 +262,10 @@ def device_findings(
 def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
     """Return a finding for each trouble that the counters of a link that is up show."""
     found = []
-    for names, trouble in COUNTERS.items():
-        if counted := _counted(names, counters):
+    for trouble in COUNTED:
+        if counted := _counted(trouble.counters, counters):
             finding = trouble.finding(f"{driver}: {counted}")
-            if _is_too_much(trouble.cause, names, counters):
+            if _is_too_much(trouble, counters):
                 finding = replace(finding, level=Level.ERROR)
             found.append(finding)
     return found
@@ -245,30 +275,29 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
     """Judge whether readings come at their nominal rate."""
     rate_hz = readings / seconds
     if not readings:
-        advice = "is it powered, connected, and the one that the scene names?"
         what = f"{driver}: no reading in {seconds:.1f} s"
-        return Finding(Level.ERROR, what, Cause.SILENT, advice)
+        return Finding(Level.ERROR, what, Cause.SILENT, TROUBLES[LinkCause.UNKNOWN].advice)
     if period_ns is None:
         return fine(f"{driver}: {rate_hz:.1f} readings/s")
     nominal_hz = 1e9 / period_ns
     what = f"{driver}: {rate_hz:.1f} readings/s of {nominal_hz:.1f}"
     if rate_hz < RATE_FRACTION * nominal_hz:
-        advice = "none was lost on the way: the board is late, or this computer is busy (top)"
+        advice = "Nothing was lost. The board is slow, or this computer is busy (top)."
         return Finding(Level.WARNING, what, Cause.SLOW, advice)
     return fine(what)
 
 
-def _is_too_much(cause: Cause, names: Sequence[str], counters: Mapping[str, int]) -> bool:
+def _is_too_much(trouble: Trouble, counters: Mapping[str, int]) -> bool:
     """Return True for `FLAPS_MIN` losses of a link, and for a share of bad frames in `TOO_MUCH`."""
-    if cause is Cause.LINK_LOST:
+    if trouble.cause is Cause.LINK_LOST:
         return counters["link_losses"] >= FLAPS_MIN
-    share = TOO_MUCH.get(cause)
+    share = TOO_MUCH.get(trouble.cause)
     if share is None:
         return False
     frames = next(filter(None, (counters.get(name, 0) for name in WHOLES)), 0)
-    of_frames = [name for name in names if name not in NOT_FRAMES]
+    of_frames = [name for name in trouble.counters if name not in NOT_FRAMES]
     pairs = [(sum(counters.get(name, 0) for name in of_frames), frames)]
-    if "missed_readings" in names:
+    if trouble.cause is Cause.FRAMES_LOST:
         pairs.append((counters.get("missed_readings", 0), counters.get("readings", 0)))
     return any(
         bad >= BAD_MIN and bad + 2.0 * math.sqrt(bad) >= share * (bad + sound)
@@ -281,5 +310,5 @@ def _counted(names: Sequence[str], counters: Mapping[str, int]) -> str:
     return ", ".join(
         f"{count} {name.replace('_', ' ')}"
         for name in names
-        if (count := counters.get(name, 0)) > JOINING_MAX * name.startswith(JOINING)
+        if (count := counters.get(name, 0)) > (JOINING_MAX if name in JOINING else 0)
     )

@@ -30,8 +30,8 @@ NOT_HEARD = frozenset(
 )
 """Causes that the kernel's state of the CAN interface may explain."""
 HELD_BY_GRASPD = (
-    "graspd itself runs: graspd watch shows what it sees; to look from here end it first "
-    "(systemctl stop 'graspd@*')"
+    "graspd itself runs: see graspd watch. To look from here, end it first "
+    "(systemctl stop 'graspd@*')."
 )
 
 
@@ -40,16 +40,16 @@ def model_finding(wanted: Scene) -> Finding:
     try:
         path = assembly.model_path(wanted)
     except ModelError as problem:
-        advice = "graspd models lists those that there are"
+        advice = "See graspd models for those that exist."
         return Finding(Level.ERROR, str(problem), Cause.MODEL_MISSING, advice)
     if not path.exists():
-        advice = "[model] path is relative to the scene; graspd models lists those of the zoo"
+        advice = "[model] path is relative to the scene. See graspd models for those of the zoo."
         return Finding(Level.ERROR, f"no model at {path}", Cause.MODEL_MISSING, advice)
     try:
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
     except ModelError as problem:
-        advice = "choose another model that fits the hand: graspd models"
+        advice = "Choose another model that fits the hand: see graspd models."
         return Finding(Level.ERROR, str(problem), Cause.MODEL_MISFIT, advice)
     return fine(f"model {model.contract.name} ({model.sha256[:12]}) fits the hand")
 
@@ -61,7 +61,7 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
             return _on_socketcan(finding, section)
         case SpiTactile() | CanTactile(), Cause.PORT_MISSING:
             ports = [fine(str(port)) for port in computer.serial_ports()]
-            return [finding, *(ports or [fine("no serial port is there")])]
+            return [finding, *(ports or [fine("no serial port")])]
         case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_DENIED:
             return [_denied(finding, port)]
         case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_HELD:
@@ -77,7 +77,7 @@ def shared_findings(section: Section) -> list[Finding]:
     match section:
         case SpiTactile(port=port) | CanTactile(channel=port) if computer.file_holders(port):
             what = f"{section.driver}: {port} is open in another program, which may take its bytes"
-            return [Finding(Level.WARNING, what, Cause.PORT_HELD, "end it")]
+            return [Finding(Level.WARNING, what, Cause.PORT_HELD, "End it.")]
     return []
 
 
@@ -88,7 +88,7 @@ def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = N
     line = ip_link(interface.name, tactile)
     if interface.is_down:
         return Finding(Level.WARNING, str(interface), Cause.INTERFACE_DOWN, line)
-    advice = f"is its bit rate the board's? sudo ip link set {interface.name} down; {line}"
+    advice = f"Set the board's bit rate: sudo ip link set {interface.name} down; {line}"
     return Finding(Level.WARNING, str(interface), Cause.BUS_ERRORS, advice)
 
 
@@ -123,7 +123,7 @@ def realtime_findings(wanted: Scene) -> list[Finding]:
     with RealtimeMode(wanted.realtime) as mode:
         lacking = mode.lacking.items()
     warnings = [Finding(Level.WARNING, what, Cause.REALTIME, advice) for what, advice in lacking]
-    return warnings or [fine("realtime as the scene wants it may be had")]
+    return warnings or [fine("this user may have the realtime that the scene asks for")]
 
 
 def _denied(finding: Finding, port: str) -> Finding:
@@ -132,7 +132,7 @@ def _denied(finding: Finding, port: str) -> Finding:
     except (OSError, KeyError):
         return finding
     if group == "root":  # not a group to join
-        advice = "install deploy/udev/70-graspd.rules, and plug it in again"
+        advice = "Install deploy/udev/70-graspd.rules, and plug it in again."
         return replace(finding, advice=advice)
     return replace(finding, advice=f"sudo usermod -aG {group} $USER, then log in again")
 
@@ -143,7 +143,7 @@ def _held(finding: Finding, holders: Sequence[computer.Process]) -> Finding:
     what = f"{finding.what}: {'; '.join(map(str, holders))}"
     if any(process.is_graspd for process in holders):
         return replace(finding, what=what, advice=HELD_BY_GRASPD)
-    return replace(finding, what=what, advice=f"end it: kill {holders[0].pid}")
+    return replace(finding, what=what, advice=f"End it: kill {holders[0].pid}")
 
 
 def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
@@ -152,9 +152,9 @@ def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
     here, line = interfaces.get(tactile.channel), ip_link(tactile.channel, tactile)
     if here is None:
         others = [can_finding(other, tactile) for other in interfaces.values()]
-        advice = f"plug its adapter in, then: {line}"
+        advice = f"Plug its adapter in, then: {line}"
         missing = replace(finding, cause=Cause.INTERFACE_MISSING, advice=advice)
-        names = [fine(finding.what) for finding in others] or [fine("no CAN interface is there")]
+        names = [fine(finding.what) for finding in others] or [fine("no CAN interface")]
         return [missing, *names]
     what = f"{finding.what}; {here}"
     if here.is_down:
@@ -170,7 +170,7 @@ def _of_socket(name: str, path: Path) -> Iterator[Finding]:
     folder = path.parent
     if not folder.is_dir():
         what = f"{name}: there is no folder {folder}"
-        advice = f"the service makes it; without: sudo install -d -o $USER {folder}"
+        advice = f"The service makes it. Without a service: sudo install -d -o $USER {folder}"
         level = Level.WARNING if folder == SERVICE_FOLDER else Level.ERROR
         yield Finding(level, what, Cause.SOCKET_FOLDER, advice)
         return
@@ -179,8 +179,8 @@ def _of_socket(name: str, path: Path) -> Iterator[Finding]:
         what = f"{name}: {path} is in use: {'; '.join(map(str, holders))}"
         yield Finding(Level.WARNING, what, Cause.SOCKET_HELD, HELD_BY_GRASPD)
     elif path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
-        advice = f"name another one, or move it away: mv {path} {path}.old"
-        yield Finding(Level.ERROR, f"{name}: {path} is no socket", Cause.SOCKET_HELD, advice)
+        advice = f"Name another one, or move it away: mv {path} {path}.old"
+        yield Finding(Level.ERROR, f"{name}: {path} is not a socket", Cause.SOCKET_HELD, advice)
     elif not os.access(folder, os.W_OK | os.X_OK):
         what = f"{name}: you may not make {path}"
         advice = f"as its owner: sudo -u {folder.owner()} graspd"
@@ -198,10 +198,10 @@ def _of_port(name: str, address: str) -> Iterator[Finding]:
         except OSError as problem:
             what = f"{name}: tcp://{address}: {problem.strerror}"
             if problem.errno != errno.EADDRINUSE:
-                advice = "ip -brief address has those of this computer: name one of them"
+                advice = "Name an address of this computer: ip -brief address lists them."
                 yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
                 return
-            advice = f"sudo ss -tlpn 'sport = {port}' names who has it"
+            advice = f"sudo ss -tlpn 'sport = {port}' names the program that has it."
             finding = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
             yield _held(finding, computer.port_holders("tcp", int(port)))
 
@@ -226,5 +226,5 @@ def _of_users(wanted: Scene) -> Iterator[Finding]:
         try:
             user_id(user)
         except PublishError as problem:
-            advice = "getent passwd lists users"
+            advice = "getent passwd lists the users."
             yield Finding(Level.ERROR, str(problem), Cause.SOCKET_USER, advice)

@@ -25,7 +25,7 @@ CAN = '[tactile]\ndriver = "can"\ninterface = "{}"\n[publish]\nendpoint = "ipc:/
         ('[ask]\ntell = ["root", "no-such-user"]', "ask.tell: there is no user no-such-user"),
         (f'[ask]\ntell = ["{"9" * 5000}"]', "ask.tell: there is no user 9"),
         ('[ask]\nendpoint = "ipc://F/absent/a"', "ask: there is no folder F/absent"),
-        ('[ask]\nendpoint = "ipc://F/scene.toml"', "ask: F/scene.toml is no socket"),
+        ('[ask]\nendpoint = "ipc://F/scene.toml"', "ask: F/scene.toml is not a socket"),
         ('[ask]\nendpoint = "ipc://F/./v"', "ask.endpoint ipc://F/./v must differ"),
     ],
 )

@@ -88,7 +88,7 @@ def test_a_port_that_is_missing_is_told_with_those_that_there_are(
     ("group", "advice"),
     [
         ("dialout", "sudo usermod -aG dialout $USER, then log in again"),
-        ("root", "install deploy/udev/70-graspd.rules, and plug it in again"),
+        ("root", "Install deploy/udev/70-graspd.rules, and plug it in again."),
     ],
 )
 def test_a_port_that_is_denied_is_told_with_its_group(
@@ -139,7 +139,7 @@ def test_a_port_that_another_program_holds_is_told_with_its_pid(tmp_path: Path) 
         os.close(slave)
     assert told["cause"] == "port-held"
     assert f"PID {other}, {sys.executable} -c" in told["what"]
-    assert told["advice"] == f"end it: kill {other}"
+    assert told["advice"] == f"End it: kill {other}"
 
 
 def test_a_reader_without_a_lock_is_told_with_its_pid(tmp_path: Path, healthy: str) -> None:
@@ -148,7 +148,7 @@ def test_a_reader_without_a_lock_is_told_with_its_pid(tmp_path: Path, healthy: s
     assert (told["cause"], told["level"]) == ("port-held", "warning")
     assert f"{tmp_path / 'bridge'} is open in another program" in told["what"]
     assert f"PID {other}, " in told["what"]
-    assert told["advice"] == f"end it: kill {other}"
+    assert told["advice"] == f"End it: kill {other}"
 
 
 def test_a_port_that_graspd_itself_holds_is_told(tmp_path: Path, healthy: str) -> None:
@@ -187,7 +187,7 @@ def test_an_interface_that_is_missing_is_told_with_those_that_there_are(
             "bitrate",
             "sudo ip link set lo down; sudo ip link set lo up type can bitrate 1000000",
         ),
-        (("error-active", 1_000_000), "silent", "is it on and connected?"),
+        (("error-active", 1_000_000), "silent", "Check power and connection"),
     ],
 )
 def test_an_interface_that_is_down_or_at_another_rate_is_told_with_the_command(

@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Level
-from graspd.daemon.doctor.link import COUNTERS, counter_findings, device_findings, rate_finding
+from graspd.daemon.doctor.link import (
+    COUNTED,
+    JOINING,
+    NOT_FRAMES,
+    NOT_OURS,
+    WHOLES,
+    counter_findings,
+    device_findings,
+    rate_finding,
+)
 from graspd.daemon.record.player import McapCounters
 from graspd.drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
 from graspd.drivers.can.frames import CanCounters
@@ -177,13 +186,13 @@ def test_joining_in_the_middle_of_a_sweep_is_no_trouble(number: int, findings: i
     ("fault", "level", "cause", "advice"),
     [
         (None, Level.OK, None, ""),
-        (DeviceFault.OLD_FIRMWARE, Level.WARNING, Cause.FIRMWARE_OLD, "flash"),
-        (DeviceFault.SENSOR_TWICE, Level.ERROR, Cause.SENSOR_TWICE, "two chip selects"),
+        (DeviceFault.OLD_FIRMWARE, Level.WARNING, Cause.FIRMWARE_OLD, "Flash"),
+        (DeviceFault.SENSOR_TWICE, Level.ERROR, Cause.SENSOR_TWICE, "Two chip selects"),
         (DeviceFault.SENSOR_ABSENT, Level.WARNING, Cause.SENSOR_ABSENT, "order of the chip"),
         (DeviceFault.NO_SENSOR, Level.ERROR, Cause.SENSOR_ABSENT, "MISO"),
         (DeviceFault.SENSOR_WORDS, Level.WARNING, Cause.SENSOR_WORDS, "by chip select"),
         (DeviceFault.SWEEP_TOO_LONG, Level.WARNING, Cause.SETTINGS, "longer period"),
-        (DeviceFault.CLOCK_NOT_TRUSTED, Level.WARNING, Cause.CLOCK, "flash"),
+        (DeviceFault.CLOCK_NOT_TRUSTED, Level.WARNING, Cause.CLOCK, "Flash"),
         (DeviceFault.BUS_ERROR, Level.WARNING, Cause.BUS_ERRORS, "terminators"),
     ],
 )
@@ -226,9 +235,10 @@ def test_a_recording_has_no_link() -> None:
 
 def test_counters_that_are_told_exist_and_have_a_cause_and_advice() -> None:
     kinds = (BridgeCounters, CanCounters, PalmCounters, JointCounters, ReplayCounters, McapCounters)
-    told = {name for names in COUNTERS for name in names}
+    told = {name for trouble in COUNTED for name in trouble.counters}
     names = {name for kind in kinds for name in kind().as_dict()}
-    assert told <= names
+    others = {name for trouble in NOT_OURS for name in trouble.counters}
+    assert told | others | NOT_FRAMES | JOINING | {*WHOLES} <= names
     for name in names:
         findings = counter_findings("x", {name: 1000})
         assert len(findings) == (name in told), name
