@@ -25,7 +25,7 @@ from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, Outco
 from graspd.daemon.trust.trust import RiskReport
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.models.contract import ModelError
-from graspd.models.judge.grasp_judge import NO_OPINION, GraspJudge, Opinion, Refusal
+from graspd.models.judge.grasp_judge import NO_OPINION, Examined, GraspJudge, Opinion, Refusal
 from graspd.models.runtime import TactileModel
 from graspd.models.trust.assessment import Assessment
 
@@ -121,10 +121,8 @@ class Pipeline:
         self._assessment: Assessment | None = None
         """Worth of `_opinion` when it was given."""
         self._held = NOTHING_HELD
-        self._to_learn: NDArray[np.float64] | None = None
-        """Shape (fingers, 24): counts that the session is to take in. None: none."""
-        self._to_learn_slip: bool | None = None
-        """True if they were judged to slip."""
+        self._to_learn: tuple[Examined, Opinion] | None = None
+        """Grasp that the session is to take in, as it was judged first. None: none."""
         self._learnt_grasp = 0
         """The grasp that the session took in last, or is about to."""
         self._late: bool | None = None
@@ -145,7 +143,7 @@ class Pipeline:
         state = session.state()
         if self._to_learn is None:
             return state
-        session.observe(self._to_learn, slip=self._to_learn_slip)
+        self._judge.observe(*self._to_learn)
         then = session.state()
         session.restore(state)
         return then
@@ -212,11 +210,10 @@ class Pipeline:
         if in_time is None:
             in_time = 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns
         moment, counts = self.hand.step(made_ns, reading.counts, checked, in_time=in_time)
-        grasp = None
+        examined = None
         if counts is not None:
             examined = self._judge.examine(counts, checked.broken)
             self._opinion, self._assessment = self._judge.weigh(examined), None
-            grasp = examined.grasp
             if checked.broken is not None:
                 counts = None
         elif moment.state is not GateState.JUDGED:
@@ -224,13 +221,13 @@ class Pipeline:
         lift = GraspId(self.boot_id, moment.grasp)
         worth = None if self.trust is None else self._assess(self.trust, lift, moment)
         judgement = self._conclude(
-            reading.t_ns, made_ns, checked.reasons, moment, self._opinion, worth, counts
+            reading.t_ns, made_ns, checked.reasons, lift, moment, self._opinion, worth, counts
         )
         self._late = None
-        if grasp is not None and moment.steady and Reason.STALE not in judgement.reasons:
-            self._keep_to_learn(grasp, moment.grasp)
+        if examined is not None and moment.steady and Reason.STALE not in judgement.reasons:
+            self._keep_to_learn(examined, moment.grasp)
         stable = judgement.decision is Decision.STABLE
-        if stable or moment.judges or moment.judged:
+        if stable or moment.judges:
             self._note(lift, worth, stable=stable)
         return judgement
 
@@ -241,10 +238,9 @@ class Pipeline:
     def silence(self, last_t_ns: int) -> Judgement:
         """Return the judgement when no reading came for too long since that of `last_t_ns`."""
         moment = self.hand.silent()
-        worth = None
-        if self.trust is not None:
-            worth = self.trust.review(GraspId(self.boot_id, moment.grasp), None)
-        return self._conclude(last_t_ns, 0, (Reason.STALE,), moment, NO_OPINION, worth)
+        lift = GraspId(self.boot_id, moment.grasp)
+        worth = None if self.trust is None else self.trust.review(lift, None)
+        return self._conclude(last_t_ns, 0, (Reason.STALE,), lift, moment, NO_OPINION, worth)
 
     def health(self) -> dict[str, Reason]:
         """Return what is not well: electrodes such as `ff_7`, fingers, joints, model, session."""
@@ -262,18 +258,15 @@ class Pipeline:
         """Take the grasp that was judged last into the session, if it is over.
 
         A grasp is judged only by those before it. Learning takes as long as judging."""
-        counts = self._to_learn
-        if counts is None or self.session is None or self.hand.holds(self._learnt_grasp):
-            return
-        self._to_learn = None
-        self.session.observe(counts, slip=self._to_learn_slip)
+        if self._to_learn is not None and not self.hand.holds(self._learnt_grasp):
+            self._judge.observe(*self._to_learn)
+            self._to_learn = None
 
-    def _keep_to_learn(self, counts: NDArray[np.generic], grasp: int) -> None:
+    def _keep_to_learn(self, examined: Examined, grasp: int) -> None:
         """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
-        if self._learns and self.session is not None and grasp != self._learnt_grasp:
-            p_slip = self._opinion.p_slip
-            self._to_learn_slip = None if p_slip is None else p_slip >= self._limits.slip_threshold
-            self._to_learn, self._learnt_grasp = counts.astype(np.float64), grasp
+        has_grasp = self.session is not None and examined.grasp is not None
+        if self._learns and has_grasp and grasp != self._learnt_grasp:
+            self._to_learn, self._learnt_grasp = (examined, self._opinion), grasp
 
     def _forget_opinion(self) -> None:
         self._opinion, self._assessment = NO_OPINION, None
@@ -303,6 +296,7 @@ class Pipeline:
         t_ns: int,
         made_ns: int,
         unusable: tuple[Reason, ...],
+        lift: GraspId,
         moment: Moment,
         opinion: Opinion,
         worth: Assessment | None,
@@ -316,7 +310,7 @@ class Pipeline:
         objections = unusable
         if opinion.refusal is not None:
             objections = (*unusable, Reason(opinion.refusal))
-        if moment.state not in OPEN and self.lifts.is_told(GraspId(self.boot_id, moment.grasp)):
+        if moment.state not in OPEN and self.lifts.is_told(lift):
             objections = (*objections, Reason.OUTCOME_TOLD)
         if calibrated is False and self.needs_session:
             objections = (*objections, Reason.NOT_CALIBRATED)

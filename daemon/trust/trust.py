@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from graspd.daemon.trust.lift_book import (
-    NOT_ASSESSED,
     GraspId,
     LiftBook,
     LiftBookState,
@@ -119,12 +118,9 @@ class Trust:
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
         """Enter the verdict on a grasp in the book. Raises `ValueError` if it was not allowed."""
-        # Nothing is learned from an assessment of another model.
-        is_ours = len(assessment.features) == 8 * (self.learner.inputs + 2)
-        features = assessment.features if is_ours else NOT_ASSESSED
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
-        if self.lifts.note(grasp, features, stable=stable):
+        if self.lifts.note(grasp, assessment.features, stable=stable):
             self.risk.take_untold()
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
