@@ -21,7 +21,7 @@ from graspd.models.runtime import ModelFile, TactileModel, check_operators, read
 TRIAL_S = 10.0
 """Longest trial, s: loading and the first runs. A model of 12 MB takes 0.3.
 
-A start or reload of the daemon waits for it.
+A start of the daemon waits for it.
 """
 MEMORY_MAX_BYTES = 640 << 20
 """Most memory of the trial's process, bytes; the service has a gigabyte."""

@@ -7,7 +7,6 @@ import contextlib
 import faulthandler
 import os
 import resource
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +14,8 @@ from typing import TYPE_CHECKING
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import complain
 from graspd.daemon.publish.listener import PublishError
-from graspd.daemon.run.runner import Runner
+from graspd.daemon.run.loop import Ended
+from graspd.daemon.run.runner import run_scene
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
 
 if TYPE_CHECKING:
@@ -31,14 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording.
-    SIGHUP reads the scene again, but ends a daemon that has a terminal."""
+    """Run until stopped; 0 after SIGINT, SIGTERM, SIGHUP or the end of a recording."""
     _allow_descriptors()
     try:
         with ExitStack() as stack:
-            on_terminal = sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
-            stop = stack.enter_context(StopSignal(reloads=not on_terminal))
-            Runner(args.scene, stop, manager=_manager(stack)).run()
+            stop = stack.enter_context(StopSignal())
+            ended = run_scene(args.scene, stop, manager=_manager(stack))
     except RecordingError:
         raise
     except PublishError as error:
@@ -49,6 +47,9 @@ def run(args: argparse.Namespace) -> int:
         if isinstance(error, LinkError) and error.cause is LinkCause.IN_USE:
             taken = error.endpoint
         complain(f"{error}{_held_by(taken)}")
+        return 1
+    if ended is Ended.SLEPT:
+        complain("the computer has slept: start graspd again, as systemd does")
         return 1
     return 0
 

@@ -162,10 +162,8 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     meter.take("sockets")
     from graspd.daemon.process.signals import StopSignal
     from graspd.daemon.run.loop import Loop, LoopTiming
-    from graspd.daemon.run.reload import Reload
 
-    stop = Reload(stack.enter_context(StopSignal()), lambda: parts, lambda: None)
-    stack.callback(stop.close)
+    stop = stack.enter_context(StopSignal())
     timing = LoopTiming(parts.scene.max_age_ns)
     Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
     meter.take("loop")

@@ -9,7 +9,8 @@ import signal
 from types import FrameType
 from typing import Any, Self
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that stop the process; SIGHUP unless it is ignored, as `nohup` has it."""
 WAKEUPS_MAX = 4096
 """Most bytes of one read from the pipe; each signal is one byte."""
 
@@ -17,11 +18,8 @@ WAKEUPS_MAX = 4096
 class StopSignal:
     """Handler that keeps the signal that stops the process."""
 
-    def __init__(self, *, reloads: bool = False) -> None:
-        """`reloads`: True if SIGHUP asks for a reload."""
+    def __init__(self) -> None:
         self.received: signal.Signals | None = None
-        self._reload = False
-        self._signals = (*STOPPING, signal.SIGHUP) if reloads else STOPPING
         self._former: dict[signal.Signals, Any] = {}
         self._former_wakeup = -1
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -35,21 +33,16 @@ class StopSignal:
         poll = select.poll()
         poll.register(self._read, select.POLLIN)
         poll.poll(seconds * 1000)
-        self._empty()
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._read, WAKEUPS_MAX)
         return self.received is not None
-
-    def take_reload(self) -> bool:
-        """Return True if SIGHUP came since the last call."""
-        if not self._reload:
-            return False
-        self._reload = False
-        self._empty()
-        return True
 
     def __enter__(self) -> Self:
         """Take over the signals. Only the main thread can."""
         self._former_wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        self._former = {signum: signal.signal(signum, self._handle) for signum in self._signals}
+        for signum in STOPPING:
+            if signum is not signal.SIGHUP or signal.getsignal(signum) is not signal.SIG_IGN:
+                self._former[signum] = signal.signal(signum, self._handle)
         return self
 
     def __exit__(self, *_details: object) -> None:
@@ -59,12 +52,5 @@ class StopSignal:
         os.close(self._read)
         os.close(self._write)
 
-    def _empty(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            os.read(self._read, WAKEUPS_MAX)
-
     def _handle(self, signum: int, _frame: FrameType | None) -> None:
-        if signum == signal.SIGHUP:
-            self._reload = True
-        else:
-            self.received = signal.Signals(signum)
+        self.received = signal.Signals(signum)

@@ -1,4 +1,4 @@
-"""A thread for slow jobs, so that neither a disk nor a parser delays the loop."""
+"""A thread for slow jobs, so that a slow disk does not delay the loop."""
 
 from __future__ import annotations
 

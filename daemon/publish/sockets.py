@@ -29,7 +29,6 @@ class Sockets(Companion):
 
     def __init__(self, wanted: Scene, clock: Callable[[], int] = time.monotonic_ns) -> None:
         """`clock` gives monotonic ns. Raises `PublishError` or `KeysError`."""
-        self.plan = plan(wanted)
         self.endpoint = wanted.endpoint
         self._clock = clock
         self._counters = Counter(dropped=0)
@@ -148,15 +147,3 @@ def _load_keys(curve: Curve) -> tuple[str, str, str]:
     public, secret = keys.load_own(curve.secret_key)
     keys.load_clients(curve.clients)  # raises `KeysError` where it can be mended
     return public.decode(), secret.decode(), str(curve.clients)
-
-
-def plan(wanted: Scene) -> object:
-    """Return the parts of a scene that its sockets depend on."""
-    rights = wanted.ask_file_mode, wanted.ask_group, None if wanted.ask is None else wanted.ask.tell
-    asked = wanted.ask_endpoint, rights, wanted.gate.request_ms
-    own_key = None
-    if wanted.curve is not None:
-        from graspd.daemon.publish import keys  # only where there are any
-
-        own_key = keys.state(wanted.curve.secret_key.parent)
-    return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked

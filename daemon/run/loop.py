@@ -28,7 +28,6 @@ from graspd.daemon.publish.companion import (
 from graspd.daemon.publish.messages import State, Verdict
 from graspd.daemon.publish.outbox import Deadlines, Outbox
 from graspd.daemon.run.overload import LoadShedder, mark_repeats
-from graspd.daemon.run.reload import Reload
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus, Report
 from graspd.drivers.base import Driver, JointReading, Reading, TactileReading
 
@@ -54,15 +53,12 @@ BLOCKED_NS: Final = 50_000
 
 
 class Ended(Enum):
-    """Reason why the loop ended."""
+    """Reason why the loop ended; the value is for the log."""
 
-    STOPPED = "stopped"
-    EXHAUSTED = "exhausted"
-    """The recording has ended."""
-    RELOAD = "reload"
-    """A new scene is ready to run."""
-    SLEPT = "slept"
-    """The computer has slept, so older readings may look new."""
+    STOPPED = "a signal"
+    EXHAUSTED = "the end of the recording"
+    SLEPT = "a sleep of the computer"
+    """Readings from before the sleep may look new."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +87,7 @@ class Loop:
         drivers: Sequence[Driver],
         pipeline: Pipeline,
         outbox: Outbox,
-        stop: StopSignal | Reload,
+        stop: StopSignal,
         companions: Sequence[Companion],
         timing: LoopTiming,
         keep: Callable[[Answer], None] = at_once,
@@ -137,18 +133,12 @@ class Loop:
         self._readings_since_status = 0
 
     def run(self) -> Ended:
-        """Run until something ends the loop. Raises `DriverError`.
-
-        After `RELOAD` it may be called again. Call `close` after the last call.
-        """
-        self._watched = []
+        """Run until something ends the loop; call `close` after it. Raises `DriverError`."""
         with closing(self._new_selector()) as selector:
             selector.register(self._stop, selectors.EVENT_READ)
             while self._stop.received is None:
                 if self._tactile.exhausted:
                     return Ended.EXHAUSTED
-                if self._stop.take_reload():
-                    return Ended.RELOAD
                 if self._sleep.has_slept():
                     self._report_silence(self._clock(), is_answer=True)
                     return Ended.SLEPT

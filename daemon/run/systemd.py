@@ -1,4 +1,4 @@
-"""Tell systemd that the daemon is ready, alive, reloading or stopping (sd_notify(3))."""
+"""Tell systemd that the daemon is ready, alive or stopping (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ log = logging.getLogger("graspd")
 
 FEEDINGS_PER_TIMEOUT = 4
 """Number of feedings within the watchdog's timeout; systemd recommends two."""
-RELOAD_PATIENCE_US = 60_000_000
-"""Timeout of the watchdog while a scene is read and its model loaded, us."""
 NS_PER_US = 1000
 
 
@@ -51,17 +49,7 @@ class Systemd(Companion):
 
     def ready(self, what: str) -> None:
         """Tell systemd that the daemon runs. `what`: text for people."""
-        lines = ["READY=1", f"STATUS={what}"]
-        if self._watchdog_us is not None:
-            lines += [f"WATCHDOG_USEC={self._watchdog_us}", "WATCHDOG=1"]
-        self._send(*lines)
-
-    def reloading(self) -> None:
-        """Tell systemd that the scene is read again. Until `ready` the watchdog waits longer."""
-        lines = ["RELOADING=1", f"MONOTONIC_USEC={self._clock() // NS_PER_US}"]
-        if self._watchdog_us is not None:
-            lines += [f"WATCHDOG_USEC={RELOAD_PATIENCE_US}", "WATCHDOG=1"]
-        self._send(*lines)
+        self._send("READY=1", f"STATUS={what}")
 
     def stopping(self) -> None:
         self._send("STOPPING=1", "STATUS=stopping")

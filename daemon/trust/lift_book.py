@@ -251,10 +251,6 @@ class LiftBook:
         self.told[status] += 1
         return status, lift
 
-    def follow(self, former: LiftBook) -> None:
-        """Take over who may lift from the book before a reload or a sleep."""
-        self.lifter = former.lifter
-
     def is_kept(self, grasp: GraspId) -> bool:
         """True unless an outcome of the grasp was taken and is not on the disk yet."""
         return grasp not in self._unkept

@@ -42,7 +42,6 @@ STEPS: Final[tuple[Step, ...]] = (
     steps_faults.hangs,
     steps_faults.killed,
     steps_faults.bus_down,
-    steps_faults.wrong_reload,
     steps_faults.hung,
     steps_faults.stopped,
     steps_install.enabled,

@@ -187,28 +187,6 @@ def _stale_too_early(message: Message) -> bool:
     return "stale" in message.body["reasons"] and message.t_s - message.made_s < STALE_S
 
 
-def wrong_reload(lab: Lab) -> Outcome:
-    """SIGHUP with a wrong scene keeps the old one and says so; with a right one takes it."""
-    scene = "/etc/graspd/can.toml"
-    pid = lab.show("can", "MainPID")
-    lab.sh(f"cp {scene} /root/can.toml && sed -i 's/^max_age_ms/max_age_mss/' {scene}")
-    at_s = lab.deed("systemctl reload graspd@can")
-    lab.await_journal("can", at_s, "not reloaded")
-    if not any("max_age_mss" in line for line in lab.journal("can", at_s, "err")):
-        raise StepError("the journal does not name the wrong key")
-    lab.await_message("can", lab.now_s(), "a verdict under the old scene")
-    lab.verdicts("can", at_s, lab.now_s())
-    lab.sh(f"sed 's/^max_age_ms .*/max_age_ms = 2500/' /root/can.toml > {scene}")
-    at_s = lab.deed("systemctl reload graspd@can")
-    well = lab.await_message("can", at_s, "a verdict under the new scene", _silence_of_2500)
-    _same_process(lab, "can", pid)
-    return Outcome("a wrong scene is refused, its key named; a right one is taken", well.t_s - at_s)
-
-
-def _silence_of_2500(message: Message) -> bool:
-    return message.told and message.body["silence_ms"] == 2500.0
-
-
 def stopped(lab: Lab) -> Outcome:
     """systemctl stop: a last status, exit code 0."""
     lab.sh("systemctl -q enable graspd@can")  # else systemd forgets how it ended

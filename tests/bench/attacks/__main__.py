@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from graspd.models.training.evaluating.files import markdown_table
-from tests.bench.attacks import doors, files, hands, hang_ups, rings, standing, who
+from tests.bench.attacks import doors, hands, hang_ups, rings, standing, who
 from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import end_children_at_sigterm
 from tests.daemon.processes import before_others
@@ -31,9 +31,6 @@ ATTACKS: Final[dict[str, Callable[[Plan], Outcome]]] = {
     "noise-ipc": doors.noises,
     "flood": doors.flood,
     "ping-hangup": hang_ups.hang_ups,
-    "scene-nested": files.nested_scenes,
-    "sighup-storm": files.sighup_storm,
-    "model-giant": files.giant_model,
     "misread-serial": hands.misread_serial,
     "forged-outcomes": doors.forged,
     "revoked-half-copied": who.removed_key,

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from graspd.daemon.judge.decision import HandLimits
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.run.reload import start_again
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.trust import Trust
 from graspd.models.trust.risk import RiskLimits
@@ -78,20 +77,6 @@ def test_an_open_hand_is_not_told_to_release_anything() -> None:
     tell(hand, 1, slipped=False)
     (*_, said) = hand.play(Feel("rest", times=40))
     assert (said.moment.grasp, said.reasons) == (1, (Reason.NO_CONTACT,))
-
-
-@pytest.mark.parametrize("limits", RISKS.values(), ids=RISKS)
-def test_a_told_grasp_under_the_name_of_another_start_is_not_offered(
-    limits: RiskLimits | None,
-) -> None:
-    hand = trusting(gate_limits(), limits)
-    hand.play(HELD)
-    tell(hand, 1, slipped=True)
-    start_again(hand.pipeline)
-    hand.pipeline.boot_id = "c" * 32
-    said = hand.play(Feel(times=300))
-    assert not any(map(is_offered, said))
-    assert Reason.NOT_TARED in said[0].reasons
 
 
 def test_the_grasp_after_a_told_one_is_offered() -> None:

@@ -17,7 +17,7 @@ import zmq
 from graspd.daemon import scene
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish.listener import PublishError
-from graspd.daemon.publish.sockets import Sockets, plan
+from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.trust.lift_book import GraspId
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import USER, Asked, Peers, processes, published
@@ -167,12 +167,6 @@ def test_an_unknown_group_is_said(tmp_path: Path) -> None:
     with pytest.raises(PublishError, match="no group no-such-group"):
         Sockets(wanted(tmp_path, group="no-such-group"))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_scenes_share_sockets_exactly_if_they_want_the_same(tmp_path: Path) -> None:
-    same, other = wanted(tmp_path), wanted(tmp_path, high_water_mark=7)
-    assert plan(same) == plan(wanted(tmp_path))
-    assert plan(same) != plan(other)
 
 
 def junk(rng: random.Random) -> list[bytes]:

@@ -51,7 +51,7 @@ def test_the_demo_turns_solid_green_within_two_minutes(
     heard = Heard()
     monkeypatch.setattr(runner, "RunLog", lambda: heard)
     with StopSignal() as stop:
-        runner.Runner(scene, stop).run()
+        runner.run_scene(scene, stop)
     verdicts = heard.verdicts
     with SHOW_RECORDING.open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -5,14 +5,12 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Sequence
-from contextlib import closing
 from typing import Literal
 
 import numpy as np
 import pytest
 
 from graspd.daemon.judge.reasons import Decision, Reason
-from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import (
     KEPT,
     Answer,
@@ -199,40 +197,6 @@ class Watchdog(Companion):
 
     def after_round(self) -> None:
         self.fed += 1
-
-
-def test_a_loop_that_goes_on_after_a_wrong_scene_has_lost_nothing() -> None:
-    """Descriptors are watched again, grasps and messages counted on, nobody is told of an end."""
-    clock = Clock()
-    bytes_there, write = os.pipe()
-
-    class PipeDriver(FakeDriver):
-        def fileno(self) -> int | None:
-            return bytes_there
-
-        def due_ns(self) -> int | None:
-            return None
-
-        def read_ready(self) -> Sequence[Reading]:
-            os.read(bytes_there, 1)
-            if len(self.queue) == 2:
-                os.kill(os.getpid(), signal.SIGHUP)
-            return super().read_ready()
-
-    with StopSignal(reloads=True) as stop:
-        queue = [reading(clock(), seed) for seed in range(2)]
-        bench = LoopBench(PipeDriver(queue, clock), clock, stop=stop)
-        os.write(write, b"12")
-        with closing(bench.loop):
-            assert bench.loop.run() is Ended.RELOAD
-            assert len(bench.verdicts) == 1
-            assert bench.statuses == []
-            assert bench.loop.run() is Ended.EXHAUSTED
-    os.close(bytes_there)
-    os.close(write)
-    assert [(verdict.seq, verdict.grasp) for verdict in bench.verdicts] == [(0, 1), (1, 2)]
-    assert len({verdict.boot_id for verdict in bench.verdicts}) == 1
-    assert [status.state for status in bench.statuses] == [State.STOPPING]
 
 
 def test_a_reading_is_sent_before_its_verdict_only_while_somebody_wants_it() -> None:

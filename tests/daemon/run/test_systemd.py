@@ -38,32 +38,9 @@ def heard(ears: socket.socket) -> list[str]:
     return ears.recv(4096).decode().split("\n")
 
 
-def test_ready_comes_with_a_status_and_starts_the_watchdog(
-    ears: socket.socket, systemd: Systemd
-) -> None:
+def test_ready_comes_with_a_status(ears: socket.socket, systemd: Systemd) -> None:
     systemd.ready("ready: spi, cnn1")
-    assert heard(ears) == [
-        "READY=1",
-        "STATUS=ready: spi, cnn1",
-        "WATCHDOG_USEC=2000000",
-        "WATCHDOG=1",
-    ]
-
-
-def test_a_reload_tells_the_time_and_asks_for_patience_until_ready(
-    ears: socket.socket,
-) -> None:
-    manager = Systemd(ears.getsockname(), 2_000_000, Clock(123_456_789_000))
-    manager.reloading()
-    assert heard(ears) == [
-        "RELOADING=1",
-        "MONOTONIC_USEC=123456789",
-        "WATCHDOG_USEC=60000000",
-        "WATCHDOG=1",
-    ]
-    manager.ready("back")
-    assert "WATCHDOG_USEC=2000000" in heard(ears)
-    manager.close()
+    assert heard(ears) == ["READY=1", "STATUS=ready: spi, cnn1"]
 
 
 def test_the_watchdog_is_fed_four_times_within_its_timeout(ears: socket.socket) -> None:
