@@ -18,7 +18,6 @@ from graspd.daemon.scene.drivers import (
     CanTactile,
     PalmJoints,
     PalmTactile,
-    ReplayFaultsSection,
     ReplayTactile,
     SpiTactile,
     StreamJoints,
@@ -297,7 +296,6 @@ def _replay(scene: Scene, options: ReplayTactile) -> Driver:
         return _replay_mcap(scene, options, speed)
     from graspd.drivers.recordings.csv_player import ReplayDriver
     from graspd.drivers.recordings.csv_rows import SLIPPED
-    from graspd.drivers.recordings.faults import ReplayFaults
 
     if options.outcomes and not all(columns.has_labels for columns in _columns(scene, options)):
         raise ValueError(f"outcomes needs the column `{SLIPPED}` in every recording")
@@ -308,13 +306,12 @@ def _replay(scene: Scene, options: ReplayTactile) -> Driver:
         rate_hz=options.rate_hz,
         loop=options.loop,
         strict=options.strict,
-        faults=ReplayFaults(**options.faults.model_dump()),
     )
 
 
 def _replay_mcap(scene: Scene, options: ReplayTactile, speed: float | None) -> Driver:
-    if options.loop or options.strict or options.faults != ReplayFaultsSection():
-        raise ValueError("MCAP files are replayed as they are: no loop, strict or faults")
+    if options.loop or options.strict:
+        raise ValueError("MCAP files are replayed as they are: no loop or strict")
     if options.outcomes:
         raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
     from graspd.daemon.record.player import McapReplayDriver

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
-from graspd.biotac import COUNT_MAX, ELECTRODES, Finger
+from graspd.biotac import Finger
 
 StrOrPath = TypeVar("StrOrPath", str, Path)
 
@@ -34,8 +34,6 @@ def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
 
 
 Fingers = Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)]
-Electrode = Annotated[int, Field(ge=1, le=ELECTRODES), unit()]
-Probability = Annotated[float, Field(ge=0.0, le=1.0), unit()]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
 UdpSource = Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
 Address = Annotated[str, AfterValidator(_ip_address)]
@@ -58,31 +56,6 @@ class Section(BaseModel):
     )
 
 
-class ReplayFaultsSection(Section):
-    """`[tactile.faults]`: faults of the replayed sensor."""
-
-    off_from: Annotated[int, Field(ge=0), unit("readings")] | None = None
-    """First of the readings that are lost."""
-    stuck_from: Annotated[int, Field(ge=1), unit("readings")] | None = None
-    """First of the readings that repeat the one before."""
-    garbage_probability: Probability = 0.0
-    """Share of readings with random values."""
-    wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX), unit("counts")] = 0
-    """Offset added to the counts."""
-    slow_every: Annotated[int, Field(ge=1), unit("readings")] = 1
-    """Only every n-th reading arrives."""
-    delayed_s: Annotated[float, Field(ge=0.0, le=3600.0), unit("s")] = 0.0
-    """Delay of all readings."""
-    intermittent_probability: Probability = 0.0
-    """Share of readings that are lost."""
-    fingers: Fingers | None = None
-    """Fingers with these faults; without it all."""
-    electrodes: Annotated[tuple[Electrode, ...], Field(min_length=1, strict=False)] | None = None
-    """Electrodes with these faults; without it all."""
-    seed: Annotated[int, Field(ge=0), unit()] = 0
-    """The same seed gives the same faults."""
-
-
 class ReplayTactile(Section):
     """`[tactile]` with `driver = "replay"`: recorded CSV files instead of sensors."""
 
@@ -102,8 +75,6 @@ class ReplayTactile(Section):
     """True: tell the recorded outcome of each lift that a verdict allows."""
     strict: bool = False
     """True: stop at the first value that is not a 12-bit count."""
-    faults: ReplayFaultsSection = ReplayFaultsSection()
-    """Faults to inject: section `[tactile.faults]`."""
 
 
 class SpiTactile(Section):

@@ -20,6 +20,7 @@ SHOWN_MAX = 80
 MESSAGE_MAX = 320
 """Most characters of an explanation, which may contain such a value."""
 GONE = {
+    ("ReplayTactile", "faults"): "a twin (`graspd twin`) has faults: remove the section",
     ("CanTactile", "format"): "SynTouch's is the only format: remove the line",
     ("CanTactile", "data_bitrate"): "graspd reads classic CAN only: remove the line",
 }

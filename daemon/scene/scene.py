@@ -272,10 +272,6 @@ class Scene(Section):
                 "gate.mode every is for grasp tables (tactile.driver replay): of live sensors it "
                 'would judge the open hand too; use "settled" or "request"'
             )
-        if isinstance(tactile, ReplayTactile):
-            for finger in tactile.faults.fingers or ():
-                if finger not in fingers:
-                    raise ValueError(f"tactile.faults.fingers names {finger}, not in hand.fingers")
         if isinstance(tactile, SpiTactile | CanTactile) and tactile.sensors is not None:
             without = [finger for finger in fingers if finger not in tactile.sensors]
             if without or len(set(tactile.sensors)) != len(tactile.sensors):

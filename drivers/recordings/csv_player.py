@@ -5,19 +5,20 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.drivers.base import (
+    DriverCounters,
     ElectrodeFault,
     JointReading,
     Reading,
     TactileReading,
 )
 from graspd.drivers.recordings.csv_rows import Row, columns_of, read_rows
-from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
 from graspd.drivers.recordings.player import RecordedDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
@@ -33,6 +34,19 @@ IGNORED_COLUMNS_LOGGED = 10
 
 _NS_PER_S = 1_000_000_000
 _log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class ReplayCounters(DriverCounters):
+    """Counters of a replay."""
+
+    late: int = 0
+    """Readings handed over more than one period late; they are not skipped."""
+    not_counts: int = 0
+    """Electrode values handed over that are not 12-bit counts."""
+    cut_off: int = 0
+    """Readings handed over whose row has no line end."""
+    bad_angles: int = 0
 
 
 class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
@@ -55,23 +69,20 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         rate_hz: float = 100.0,
         loop: bool = False,
         strict: bool = False,
-        faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`speed`: factor of real time; None: fast. `rate_hz`: grasps of a table per second."""
-        super().__init__(paths, speed, clock, delay_ns=round(faults.delayed_s * _NS_PER_S))
+        super().__init__(paths, speed, clock)
         self._fingers = tuple(fingers)
         self._table_period_ns = _NS_PER_S / rate_hz
         self._loop = loop
         self._strict = strict
-        self._faults = faults
         self._reset()
 
     def _reset(self) -> None:
         self.counters = ReplayCounters()
         self.period_ns: int | None = None
         """Time between readings as played, ns; for a stream the shortest step so far."""
-        self._injector = FaultInjector(self._faults, self._fingers, self.counters)
         self._row_index = 0
         self._interrupted = False
 
@@ -98,7 +109,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         if recorded_period_ns is not None:
             self.period_ns = round(recorded_period_ns / (speed or 1.0))
             self.counters.late += speed is not None and late_ns > self.period_ns
-        t_ns = self._clock() - self._delay_ns if speed is None else self.played_ns(at_ns)
+        t_ns = self._clock() if speed is None else self.played_ns(at_ns)
         return self._readings(row, t_ns, at_ns)
 
     def _items(self) -> Generator[tuple[int, tuple[Row, int | None]], None, None]:
@@ -138,19 +149,14 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
             angles = row.position_rad
             readings.append(JointReading(t_ns, index, row.joint_names, angles, recorded_ns))
             self.counters.bad_angles += int(np.isnan(angles).sum())
-        seq = self._injector.inject(row.counts, row.faults)
-        if seq is not None:
-            interrupted, self._interrupted = self._interrupted, False
-            counts, faults, note = row.counts, row.faults, row.annotation
-            readings.append(
-                TactileReading(t_ns, seq, counts, faults, note, recorded_ns, interrupted)
-            )
-            self._count(faults)
+        interrupted, self._interrupted = self._interrupted, False
+        counts, faults, note = row.counts, row.faults, row.annotation
+        readings.append(TactileReading(t_ns, index, counts, faults, note, recorded_ns, interrupted))
+        self._count(faults)
         return readings
 
     def _count(self, faults: NDArray[np.uint8]) -> None:
         self.counters.readings += 1
-        self.counters.injected_delayed += self._delay_ns > 0
         if faults.any():
             self.counters.faulty_readings += 1
             not_counts = faults & np.uint8(ElectrodeFault.NOT_A_COUNT) != 0

@@ -33,10 +33,8 @@ class RecordedDriver(Opened, Generic[Item]):
         paths: Sequence[Path],
         speed: float | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
-        *,
-        delay_ns: int = 0,
     ) -> None:
-        """`speed`: factor of real time; None: as fast as possible. `delay_ns`: delay of items."""
+        """`speed`: factor of real time; None: as fast as possible."""
         self.paths = tuple(paths)
         self.speed = speed
         self.exhausted = False
@@ -44,7 +42,6 @@ class RecordedDriver(Opened, Generic[Item]):
         self.handed_over_ns = self._opened_ns = clock()
         """Time when the last reading was handed over, ns; the judge's now."""
         self._clock = clock
-        self._delay_ns = delay_ns
         self._playing: Generator[tuple[int, Item], None, None] | None = None
         self._next: tuple[int, Item] | None = None
         self._failure: RecordingError | None = None
@@ -80,10 +77,10 @@ class RecordedDriver(Opened, Generic[Item]):
             return None
         if self.speed is None or self._next is None or self._began is None:
             return self._opened_ns
-        return self.played_ns(self._next[0]) + self._delay_ns
+        return self.played_ns(self._next[0])
 
     def played_ns(self, at_ns: int) -> int:
-        """Return when an item of `at_ns` should be played, monotonic ns, without the delay."""
+        """Return when an item of `at_ns` should be played, monotonic ns."""
         began_ns, first_ns = self._began or (self._opened_ns, at_ns)
         return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
 

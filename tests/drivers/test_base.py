@@ -39,7 +39,7 @@ from graspd.drivers.joints import JointCounters, JointStreamDriver
 from graspd.drivers.link import Link, LinkState
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.palm.stream import PalmDriver
-from graspd.drivers.recordings.faults import ReplayCounters
+from graspd.drivers.recordings.csv_player import ReplayCounters
 from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.spi.messages import FrameCounters
 from graspd.drivers.spi.sweeps import BridgeCounters

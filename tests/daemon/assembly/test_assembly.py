@@ -18,7 +18,6 @@ from graspd.daemon.scene import Scene, SceneError, parse
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
 from graspd.drivers.palm.calibration import CalibrationError
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from graspd.drivers.recordings.faults import ReplayFaults
 from graspd.models.contract import ModelError
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
@@ -197,8 +196,8 @@ BEHIND = ("th", "ff", "mf")
         ),
         (
             "recordings.csv_player.ReplayDriver",
-            REPLAY | {"rate_hz": 20.0, "speed": 2.0, "faults": {"slow_every": 7}},
-            {"rate_hz": 20.0, "speed": 2.0, "faults": ReplayFaults(slow_every=7)},
+            REPLAY | {"rate_hz": 20.0, "speed": 2.0},
+            {"rate_hz": 20.0, "speed": 2.0},
         ),
         ("recordings.csv_player.ReplayDriver", REPLAY | {"pace": "fast"}, {"speed": None}),
     ],

@@ -27,7 +27,7 @@ from graspd.drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, Ta
 from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.joints import JointCounters
 from graspd.drivers.palm.packet import PalmCounters
-from graspd.drivers.recordings.faults import ReplayCounters
+from graspd.drivers.recordings.csv_player import ReplayCounters
 from graspd.drivers.spi.sweeps import BridgeCounters
 
 FINGERS = ("ff", "mf", "th")

@@ -14,7 +14,6 @@ from graspd.biotac import COUNT_MAX
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.palm.packet import ROUND
 from graspd.drivers.palm.stream import PalmStream
-from graspd.drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
 from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.faults import LinkFaults
 from tests.daemon.fakes import FINGERS, MS
@@ -27,27 +26,21 @@ SYNCHRONISING = 3
 """Sound rounds from which the parts behind a palm know where in the stream they are."""
 
 
-def replayed(**faults: int | float | tuple[int, ...] | tuple[str, ...]) -> Fault:
-    """A fault of the replay; the reading before the fault is its number 0."""
-    wanted = ReplayFaults(**faults)  # type: ignore[arg-type]
+def lost(is_lost: Callable[[int], bool]) -> Fault:
+    """Readings that do not come, by their number; the first under the fault is 1."""
 
     def spoil(sound: Sequence[Step]) -> list[Step]:
-        injector = FaultInjector(wanted, FINGERS, ReplayCounters())
-        steps = []
-        for step in sound:
-            reading = step.tactile
-            if reading is None:
-                continue
-            counts, flags = reading.counts.copy(), reading.faults.copy()
-            if injector.inject(counts, flags) is None:
-                reading = None
-            else:
-                reading = msgspec.structs.replace(reading, counts=counts, faults=flags)
-            now_ns = step.now_ns + round(wanted.delayed_s * 1e9)
-            steps.append(dataclasses.replace(step, now_ns=now_ns, tactile=reading))
-        return steps[1:]
+        return [
+            dataclasses.replace(step, tactile=None) if is_lost(number) else step
+            for number, step in enumerate(sound[1:], start=1)
+        ]
 
     return spoil
+
+
+def delayed(sound: Sequence[Step]) -> list[Step]:
+    """Readings that come 0.2 s late."""
+    return [dataclasses.replace(step, now_ns=step.now_ns + 200 * MS) for step in sound[1:]]
 
 
 def in_tactile(change: Callable[[TactileReading, TactileReading], TactileReading]) -> Fault:
@@ -90,6 +83,40 @@ def reading_only(count: int, where: Electrodes) -> Fault:
         return msgspec.structs.replace(reading, counts=counts)
 
     return in_tactile(change)
+
+
+def stuck(where: Electrodes | slice = slice(None)) -> Fault:
+    """Electrodes that repeat the last sound reading."""
+
+    def change(reading: TactileReading, before: TactileReading) -> TactileReading:
+        counts = reading.counts.copy()
+        counts[where] = before.counts[where]
+        return msgspec.structs.replace(reading, counts=counts)
+
+    return in_tactile(change)
+
+
+def wrong(by: int) -> Fault:
+    """Counts that are all off by as much."""
+
+    def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
+        counts = np.clip(reading.counts.astype(np.int32) + by, 0, COUNT_MAX)
+        return msgspec.structs.replace(reading, counts=counts.astype(np.uint16))
+
+    return in_tactile(change)
+
+
+def garbage(sound: Sequence[Step]) -> list[Step]:
+    """Any 16-bit words."""
+    random = np.random.default_rng(0)
+
+    def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
+        words = random.integers(0, 1 << 16, size=reading.counts.shape)
+        counts = np.where(words <= COUNT_MAX, words, 0).astype(np.uint16)
+        marks = np.where(words <= COUNT_MAX, 0, int(ElectrodeFault.NOT_A_COUNT)).astype(np.uint8)
+        return msgspec.structs.replace(reading, counts=counts, faults=marks)
+
+    return in_tactile(change)(sound)
 
 
 def shifted(time_ms: int) -> Fault:
@@ -193,16 +220,17 @@ SINGLE = (
     ElectrodeFault.HELD,
     ElectrodeFault.CUT_OFF,
 )
+HALF = np.random.default_rng(0).random(1000) < 0.5
 FAULTS: dict[str, Fault] = {
-    "replay off": replayed(off_from=1),
-    "replay stuck": replayed(stuck_from=1),
-    "replay stuck electrode": replayed(stuck_from=1, fingers=("ff",), electrodes=(7,)),
-    "replay garbage": replayed(garbage_probability=1.0),
-    "replay wrong by +500": replayed(wrong_counts=500),
-    "replay wrong by -500": replayed(wrong_counts=-500),
-    "replay slow, 20th": replayed(slow_every=20),
-    "replay delayed, 0.2 s": replayed(delayed_s=0.2),
-    "replay intermittent": replayed(intermittent_probability=0.5),
+    "replay off": lost(lambda _number: True),
+    "replay stuck": stuck(),
+    "replay stuck electrode": stuck(ONE),
+    "replay garbage": garbage,
+    "replay wrong by +500": wrong(500),
+    "replay wrong by -500": wrong(-500),
+    "replay slow, 20th": lost(lambda number: number % 20 > 0),
+    "replay delayed, 0.2 s": delayed,
+    "replay intermittent": lost(lambda number: bool(HALF[number])),
     **{
         f"{fault.name}, {name}".lower().replace("_", "-"): flagged(fault, where)
         for fault in SINGLE

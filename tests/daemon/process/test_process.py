@@ -56,7 +56,7 @@ def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
 
 def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, "loop = true")
-    result = python(AT_IMPORT.format(module="graspd.drivers.recordings.faults"), "run", scene)
+    result = python(AT_IMPORT.format(module="graspd.drivers.recordings.csv_player"), "run", scene)
     assert result.returncode == 0, result.stderr
     assert "Traceback" not in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]

@@ -59,7 +59,7 @@ def test_the_package_has_the_very_examples_of_deploy() -> None:
 def test_no_key_is_forgotten() -> None:
     named = {key for key, _ in KEYS}
     assert set(scene.Scene.model_fields) < named
-    assert {"tactile.port", "tactile.faults.seed", "gate.max_age_ms", "joints.calibration"} < named
+    assert {"tactile.port", "risk.warm_up", "gate.max_age_ms", "joints.calibration"} < named
 
 
 def test_the_schema_is_valid_and_the_file_of_the_editors_is_it() -> None:
