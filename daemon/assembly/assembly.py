@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
+from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.scene import Scene, SceneError
@@ -145,22 +145,16 @@ def hand_limits(scene: Scene) -> HandLimits | None:
     """Return the limits of the gate; None in mode `every`."""
     mode, gate = gate_mode(scene), scene.gate
     if mode == "every":
-        if gate.sweeps == 3:
-            raise SceneError("gate.sweeps 3: readings that are each a grasp have no median")
         return None
     return HandLimits(
         on_request=mode == "request",
-        sweeps=HandLimits.sweeps if gate.sweeps is None else gate.sweeps,
         required=gate.fingers,
-        contact=ContactLimits(counts=gate.contact_counts, sigmas=gate.contact_sigmas),
         gate=GateLimits(
             false_alarms=gate.false_alarms,
             early=gate.early,
-            change_counts=gate.change_counts,
             request_ns=round(gate.request_ms * 1e6),
-            gap_ns=round(gate.gap_ms * 1e6),
         ),
-        joints=joint_limits(scene),
+        joints=JointLimits() if has_joints(scene) else None,
     )
 
 
@@ -191,23 +185,16 @@ def require_mcap(what: str) -> None:
         raise SceneError(str(error)) from error
 
 
-def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
+def has_joints(scene: Scene) -> bool:
+    """Return True if joint angles come, from their own source or in a recording."""
+    options = scene.tactile
+    if scene.joints is not None or not isinstance(options, ReplayTactile):
+        return scene.joints is not None
     if not is_mcap(options):
         return any(columns.joints for columns in _columns(scene, options))
     from graspd.daemon.record.mcap import header_of
 
     return any(header_of(path).joints for path in options.recordings)
-
-
-def joint_limits(scene: Scene) -> JointLimits | None:
-    """Return the limits of the joints; None without joints."""
-    tactile = scene.tactile
-    recorded = isinstance(tactile, ReplayTactile) and _has_joints(scene, tactile)
-    if scene.joints is None and not recorded:
-        return None
-    return JointLimits(
-        rad_per_s=scene.gate.joint_rad_per_s, lost_ns=round(scene.gate.joints_lost_ms * 1e6)
-    )
 
 
 def refuse_absent_processors(scene: Scene) -> None:
@@ -291,7 +278,7 @@ def _palm(scene: Scene, options: PalmTactile) -> Driver:
 
 
 def _replay(scene: Scene, options: ReplayTactile) -> Driver:
-    speed = options.speed if options.pace == "realtime" else None
+    speed = 1.0 if options.pace == "realtime" else None
     if is_mcap(options):
         return _replay_mcap(scene, options, speed)
     from graspd.drivers.recordings.csv_player import ReplayDriver
@@ -303,15 +290,13 @@ def _replay(scene: Scene, options: ReplayTactile) -> Driver:
         options.recordings,
         scene.hand.fingers,
         speed=speed,
-        rate_hz=options.rate_hz,
         loop=options.loop,
-        strict=options.strict,
     )
 
 
 def _replay_mcap(scene: Scene, options: ReplayTactile, speed: float | None) -> Driver:
-    if options.loop or options.strict:
-        raise ValueError("MCAP files are replayed as they are: no loop or strict")
+    if options.loop:
+        raise ValueError("MCAP files are replayed as they are: no loop")
     if options.outcomes:
         raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
     from graspd.daemon.record.player import McapReplayDriver

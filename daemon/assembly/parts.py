@@ -193,7 +193,7 @@ def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeade
         sections["risk"] = scene.risk.model_dump(mode="json")
     return RecordingHeader(
         fingers=scene.hand.fingers,
-        joints=assembly.joint_limits(scene) is not None,
+        joints=assembly.has_joints(scene),
         boot_id=boot_id,
         scene=sections,
         model=model.contract.name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -19,13 +19,29 @@ from graspd.daemon.record.mcap import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late, Topic
 from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.drivers import Section
+from graspd.daemon.scene.scene import (
+    GateSection,
+    Hand,
+    Learn,
+    Model,
+    RiskSection,
+    SessionSection,
+)
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.daemon.trust.trust import FormatError, decode
 from graspd.models.runtime import TactileModel
 
 log = logging.getLogger("graspd")
 
-SECTIONS: Final[tuple[str, ...]] = ("hand", "model", "gate", "session", "learn", "risk")
+SECTIONS: Final[Mapping[str, type[Section]]] = {
+    "hand": Hand,
+    "model": Model,
+    "gate": GateSection,
+    "session": SessionSection,
+    "learn": Learn,
+    "risk": RiskSection,
+}
 """Sections of a scene that a recording has."""
 BEGINS_WITHIN: Final = (
     "%s: begins in the middle of a run: verdicts may differ until the hand has been open for a "
@@ -48,9 +64,12 @@ class RecordedRun(Source):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
         recorded = self.header.scene
-        sections = {name: dict(recorded[name]) for name in SECTIONS if name in recorded}
-        if sections.get("model", {}).pop("min_accuracy", None) is not None:
-            log.warning("%s: was judged with min_accuracy, which is not known here", paths[0])
+        sections: dict[str, dict[str, Any]] = {}
+        for name in filter(recorded.__contains__, SECTIONS):
+            keys, known = recorded[name], SECTIONS[name].model_fields
+            sections[name] = {key: value for key, value in keys.items() if key in known}
+            if gone := [key for key in keys if key not in known]:
+                log.warning("%s: was judged with %s, not known here", paths[0], ", ".join(gone))
         sections["tactile"] = {
             "driver": "replay",
             "recordings": [path.absolute() for path in paths],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import CanTactile, SpiTactile
 from graspd.daemon.scene.scene import Hand
+from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
@@ -59,20 +61,31 @@ class Source:
 class Tables(Source):
     """Grasp tables and streams, which do not say how they were judged."""
 
-    def __init__(self, paths: Sequence[Path], sections: Mapping[str, dict[str, Any]]) -> None:
-        """`sections`: of the scene, where it differs from one that plays `paths` fast."""
-        recordings = [path.absolute() for path in paths]
-        tactile = {"driver": "replay", "pace": "fast", "recordings": recordings}
-        changes = {
-            "tactile": tactile | sections.get("tactile", {}),
-            "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS},
-        }
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        sections: Mapping[str, dict[str, Any]],
+        *,
+        rate_hz: float = 100.0,
+        loop: bool = False,
+        strict: bool = False,
+    ) -> None:
+        """`sections`: of the scene, where it differs from one that plays `paths`.
+
+        `rate_hz`, `loop`, `strict`: as of `ReplayDriver`.
+        """
+        self._paths = [path.absolute() for path in paths]
+        self._driver = partial(ReplayDriver, self._paths, rate_hz=rate_hz, loop=loop, strict=strict)
+        tactile = {"driver": "replay", "recordings": self._paths}
+        changes = {"tactile": tactile, "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS}}
         super().__init__({**sections, **changes}, Path("command line"))
 
-    def parts(self, replayed: Scene, model: TactileModel, _speed: float | None) -> Parts:
-        """Make the parts for the model's fingers; the scene has the speed."""
+    def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
+        """Make the parts for the model's fingers."""
         hand = Hand(fingers=model.contract.fingers)
-        return Parts.of(replayed.model_copy(update={"hand": hand}), model)
+        wanted = replayed.model_copy(update={"hand": hand})
+        pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session.learn)
+        return Parts(wanted, model, pipeline, [self._driver(hand.fingers, speed=speed)])
 
 
 class LinkLogs(Source):

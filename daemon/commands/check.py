@@ -242,15 +242,13 @@ def _what_is_in(
 
 def _record(wanted: Record) -> str:
     raw = ", and what came over the link" if wanted.raw else ""
-    limits = f"at most {wanted.keep_mb:g} MB, flushed every {wanted.flush_ms:g} ms"
-    return f"in {wanted.folder}, {limits}{raw}"
+    return f"in {wanted.folder}, at most {wanted.keep_mb:g} MB{raw}"
 
 
 def _realtime(wanted: Realtime) -> str:
     priority = "" if wanted.priority is None else f"SCHED_FIFO {wanted.priority}, "
     cpus = "all processors" if wanted.cpus is None else f"processors {wanted.cpus}"
-    memory = ", memory locked" if wanted.lock_memory else ""
-    return f"{priority}{cpus}{memory}, no garbage collection on the hot path"
+    return f"{priority}{cpus}, memory locked, no garbage collection on the hot path"
 
 
 def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
@@ -258,11 +256,11 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
     age = f"not older than {gate.max_age_ms:g} ms"
     if limits is None:
         return f"every reading, {age}"
-    what = "one reading" if limits.sweeps == 1 else f"median of {limits.sweeps} fresh readings"
     when = "when asked, " if limits.on_request else ""
-    joints = "" if limits.joints is None else f", joints below {gate.joint_rad_per_s:g} rad/s"
+    joints = "" if limits.joints is None else f", joints below {limits.joints.rad_per_s:g} rad/s"
     fingers = ", ".join(gate.fingers or wanted.hand.fingers)
-    return f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}, {age}"
+    what = f"median of three fresh readings, {age}"
+    return f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}"
 
 
 def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:

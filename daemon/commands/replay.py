@@ -44,7 +44,7 @@ from graspd.models.runtime import TactileModel
 
 WAIT_MAX_S = 3600
 REPLAY_QUEUE = 1000
-"""`publish.high_water_mark`: a recording is not live, so a late message is as good."""
+"""Most messages that wait for a subscriber: a recording is not live, a late message is as good."""
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
 DEMO_TITLE = "A day on which the sensors drift. All grasps are synthetic: no hand made them."
@@ -201,7 +201,8 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         around = Assembly(parts, stack)
         sockets = None
         if args.publish is not None:
-            sockets = stack.enter_context(Sockets(parts.scene))
+            sockets = Sockets(parts.scene, high_water_mark=REPLAY_QUEUE)
+            stack.callback(sockets.close)
             around.add_sockets(sockets)
         around.open_drivers()
         if sockets is not None and args.wait is not None:
@@ -263,17 +264,14 @@ def _tables(args: argparse.Namespace) -> Tables:
     """Return tables that are judged as the command line says."""
     if args.scene is not None:
         raise UsageError("--scene is for what came over a link")
-    tactile = {"rate_hz": args.rate, "loop": args.loop, "strict": args.strict}
-    if args.speed is not None:
-        tactile |= {"pace": "realtime", "speed": args.speed}
-    sections = {"tactile": tactile}
+    sections: dict[str, dict[str, Any]] = {}
     if args.min_confidence is not None:
         sections["model"] = {"min_confidence": args.min_confidence}
     if args.max_slip_when_stable is not None:
         sections["risk"] = _risk(args)
     elif _risk(args):
         raise UsageError("--warm-up and --explore need --max-slip-when-stable")
-    return Tables(args.recordings, sections)
+    return Tables(args.recordings, sections, rate_hz=args.rate, loop=args.loop, strict=args.strict)
 
 
 def _risk(args: argparse.Namespace) -> dict[str, Any]:
@@ -287,8 +285,7 @@ def _parts(args: argparse.Namespace, source: Source) -> Parts:
     chosen = {}
     if args.model is not None:
         chosen["path" if args.model.endswith(".onnx") else "name"] = args.model
-    publish = {"endpoint": args.publish, "high_water_mark": REPLAY_QUEUE}
-    wanted = source.scene(publish, chosen, args.gate)
+    wanted = source.scene({"endpoint": args.publish}, chosen, args.gate)
     learns = wanted.session.learn and args.session != OFF
     session = wanted.session.model_copy(update={"learn": learns})
     wanted = wanted.model_copy(update={"session": session})

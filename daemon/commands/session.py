@@ -314,9 +314,7 @@ def _on_recordings(
     replay = scene_drivers.ReplayTactile(
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
-    gate = wanted.gate.model_copy(
-        update={"mode": mode, "sweeps": None, "max_age_ms": assembly.RECORDED_MAX_AGE_MS}
-    )
+    gate = wanted.gate.model_copy(update={"mode": mode, "max_age_ms": assembly.RECORDED_MAX_AGE_MS})
     changes = {"tactile": replay, "joints": None, "gate": gate, "risk": None}
     return wanted.model_copy(update=changes)
 

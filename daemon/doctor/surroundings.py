@@ -101,13 +101,14 @@ def ip_link(name: str, tactile: CanTactile | None) -> str:
 def socket_findings(wanted: Scene) -> list[Finding]:
     """Judge whether the sockets of the scene can be made; each cause once."""
     ask = wanted.ask_endpoint
-    sockets = [("publish", wanted.endpoint, wanted.publish.group)]
-    sockets += [] if ask is None else [("ask", ask, wanted.ask_group)]
+    sockets = [("publish", wanted.endpoint)]
+    sockets += [] if ask is None else [("ask", ask)]
     by_cause: dict[Cause | None, Finding] = {}
-    for name, endpoint, group in sockets:
+    for name, endpoint in sockets:
         scheme, _, address = endpoint.partition("://")
         if scheme == "ipc":
             users = () if name == "publish" else _of_users(wanted)
+            group = wanted.publish.group
             told = (*_of_socket(name, Path(address)), *_of_group(name, group), *users)
         else:
             told = tuple(_of_port(name, address))

@@ -22,13 +22,28 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 TACTILE = b"tactile."
+HIGH_WATER_MARK = 10
+"""Most messages that wait for a subscriber: a tenth of a second of verdicts at 100 Hz.
+
+With more a slow subscriber would read of the past.
+"""
 
 
 class Sockets(Companion):
     """The sockets, open until `close`."""
 
-    def __init__(self, wanted: Scene, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        """`clock` gives monotonic ns. Raises `PublishError` or `KeysError`."""
+    def __init__(
+        self,
+        wanted: Scene,
+        clock: Callable[[], int] = time.monotonic_ns,
+        *,
+        high_water_mark: int | None = None,
+    ) -> None:
+        """Raises `PublishError` or `KeysError`.
+
+        `clock` gives monotonic ns. `high_water_mark`: most messages that wait for a subscriber;
+        None: `HIGH_WATER_MARK`.
+        """
         self.endpoint = wanted.endpoint
         self._clock = clock
         self._counters = Counter(dropped=0)
@@ -44,7 +59,7 @@ class Sockets(Companion):
         self._filenos: list[int] = []
         try:
             self._listen(wanted)
-            self._door = Door(self._listeners, wanted.publish.high_water_mark, keys)
+            self._door = Door(self._listeners, high_water_mark or HIGH_WATER_MARK, keys)
             if self.questions is not None:
                 self._filenos = [self._door.fileno()]
         except BaseException:
@@ -56,7 +71,7 @@ class Sockets(Companion):
         mode = None if publish.file_mode is None else int(publish.file_mode, 8)
         self._listeners.append(Listener(wanted.endpoint, mode, publish.group))
         if wanted.ask_endpoint is not None:
-            ask = Listener(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
+            ask = Listener(wanted.ask_endpoint, wanted.ask_file_mode, publish.group)
             self._listeners.append(ask)
             from graspd.daemon.publish.questions import Questions  # only where peers may ask
 

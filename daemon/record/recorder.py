@@ -36,10 +36,21 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("graspd")
 
+FLUSH_NS: Final = 1_000_000_000
+"""Longest time whose data a killed daemon or a power cut loses, ns."""
+ROTATE_BYTES: Final = 256_000_000
+"""Size of the files from which the next ones begin, or a quarter of what is kept, if that is less:
+small enough to copy and open."""
+ROTATE_NS: Final = 3_600_000_000_000
+"""Age of the files from which the next ones begin, ns: an hour."""
+FILES_MAX: Final = 1000
+"""Most recordings of a hand, so that a folder can be listed: six weeks of hours."""
 QUEUE_MAX: Final = 20_000
 """Most queued entries: 12 MB, a minute of readings. Later ones are dropped."""
 RETRY_NS: Final = 60_000_000_000
 """Time after a failure of the disk until the next try, ns."""
+IMAGES_HZ: Final = 10.0
+"""Rate of tactile images for viewers, 1/s."""
 ROUNDS_PER_FLUSH: Final = 10
 """Rounds of the thread in a flush interval; few, so that it rarely delays the loop."""
 FLUSH_AFTER: Final = 0.8
@@ -96,9 +107,6 @@ class Recorder(Companion):
         self._options = options
         self._hand = hand
         self._boot_id = boot_id
-        self._rotate_bytes = round(options.rotate_mb * 1e6)
-        self._rotate_ns = round(options.rotate_minutes * 60e9)
-        self._flush_ns = round(options.flush_ms * 1e6)
         self._take_header = take_header
         self._tap = tap
         self._clock = clock
@@ -106,12 +114,12 @@ class Recorder(Companion):
         self._queue: deque[_Entry] = deque()
         self._names = {topic: f"{topic}.{hand}".encode() for topic in Topic}
         self._last_topic = b""
-        self._viewer = Viewer(options.images_hz)
+        self._viewer = Viewer(IMAGES_HZ)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
         self._open: _Open | None = None
         self._number = 0
-        self._flush_due_ns = clock() + self._flush_ns
+        self._flush_due_ns = clock() + FLUSH_NS
         self._retry_due_ns: int | None = None
         self._awaits_turn = True
         """True while `NEXT_FILES` is queued or requested by `_wants_turn`."""
@@ -182,7 +190,7 @@ class Recorder(Companion):
 
     def _work(self) -> None:
         try:
-            while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
+            while not self._stopping.wait(FLUSH_NS / ROUNDS_PER_FLUSH / 1e9):
                 self.go_round()
             self._flush_due_ns = 0
             self.go_round()
@@ -276,8 +284,8 @@ class Recorder(Companion):
             return
         self._counted["recorded"] += current.unflushed
         current.unflushed = 0
-        self._flush_due_ns = now_ns + round(self._flush_ns * FLUSH_AFTER)
-        if size >= self._rotate_bytes or now_ns - current.since_ns >= self._rotate_ns:
+        self._flush_due_ns = now_ns + round(FLUSH_NS * FLUSH_AFTER)
+        if size >= _rotate_bytes(self._options) or now_ns - current.since_ns >= ROTATE_NS:
             self._ask_for_turn()
 
     def _finish(self) -> None:
@@ -316,15 +324,19 @@ def make_room(options: Record, hand: str) -> int:
     """
     options.folder.mkdir(parents=True, exist_ok=True)
     recordings = _recordings(options.folder, hand)
-    total_mb = options.rotate_mb + sum(size for _, size in recordings.values()) / 1e6
+    total_bytes = _rotate_bytes(options) + sum(size for _, size in recordings.values())
     removed = 0
-    while recordings and (len(recordings) >= options.keep_files or total_mb > options.keep_mb):
+    while recordings and (len(recordings) >= FILES_MAX or total_bytes > options.keep_mb * 1e6):
         paths, size = recordings.pop(min(recordings))
         for path in paths:
             path.unlink(missing_ok=True)
-        total_mb -= size / 1e6
+        total_bytes -= size
         removed += 1
     return removed
+
+
+def _rotate_bytes(options: Record) -> float:
+    return min(ROTATE_BYTES, options.keep_mb * 1e6 / 4)
 
 
 def _recordings(folder: Path, hand: str) -> dict[str, tuple[list[Path], int]]:

@@ -39,8 +39,7 @@ class RealtimeMode(Companion):
         options = self._options
         if options.cpus is not None:
             self._pin(set(options.cpus))
-        if options.lock_memory:
-            self._lock()
+        self._lock()
         if options.priority is not None:
             self._raise(options.priority)
         gc.collect()
@@ -92,7 +91,7 @@ class RealtimeMode(Companion):
             if _libc().mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) == 0:
                 return
             problem = os.strerror(ctypes.get_errno())
-        self.lacking[f"realtime.lock_memory: {problem}"] = (
+        self.lacking[f"locked memory: {problem}"] = (
             "grant LimitMEMLOCK=infinity in the unit, or `memlock unlimited` in limits.conf"
         )
 

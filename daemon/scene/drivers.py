@@ -64,17 +64,11 @@ class ReplayTactile(Section):
     recordings: Annotated[tuple[FilePath, ...], Field(min_length=1, strict=False)]
     """Grasp tables or streams (deploy/RECORDING.md), in this order."""
     pace: Literal["realtime", "fast"] = "realtime"
-    """`fast`: as fast as readings can be judged."""
-    speed: Annotated[float, Field(ge=1e-3, le=1e3), unit()] = 1.0
-    """Factor of real time; not with pace `fast`."""
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e5), unit("1/s")] = 100.0
-    """Rate of a grasp table."""
+    """`realtime`: a grasp table has 100 rows a second; `fast`: as fast as they can be judged."""
     loop: bool = False
     """True: start again at the end."""
     outcomes: bool = False
     """True: tell the recorded outcome of each lift that a verdict allows."""
-    strict: bool = False
-    """True: stop at the first value that is not a 12-bit count."""
 
 
 class SpiTactile(Section):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from graspd.biotac import TABLE_FINGERS, Finger
-from graspd.daemon.judge.decision import ContactLimits, GateLimits, JointLimits, Limits
+from graspd.daemon.judge.decision import GateLimits, Limits
 from graspd.daemon.process.files import SceneError, read_regular
 from graspd.daemon.process.text import printable
 from graspd.daemon.scene.drivers import (
@@ -120,37 +120,15 @@ class GateSection(Section):
     `settled`."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
     """Largest age of a reading. An older one, or silence, gives `unknown`."""
-    sweeps: Annotated[Literal[1, 3], unit("readings")] | None = None
-    """Judge single readings, or the median of three. Without it 3, in mode `every` 1."""
     fingers: Fingers | None = None
     """Fingers that must touch; without it all of `hand.fingers`."""
-    contact_counts: Annotated[float, Field(ge=5, le=1000), unit("counts")] = ContactLimits.counts
-    """A finger touches when three of its electrodes are this far below their baseline, and also
-    `contact_sigmas`."""
-    contact_sigmas: Annotated[float, Field(ge=3, le=100), unit("sigma")] = ContactLimits.sigmas
-    """The same in standard deviations of the finger's noise."""
     false_alarms: Annotated[float, Field(ge=0.001, le=0.3), unit()] = GateLimits.false_alarms
     """Share of the time in which a settled hand that holds may count as moving. A smaller share
     finds fewer slow slides (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
     """True: judge once nothing moves fast, marked `early`, and again once nothing slides slowly."""
-    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), unit("rad/s")] = JointLimits.rad_per_s
-    """Speed from which a joint counts as moving."""
-    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0), unit("ms")] = (
-        JointLimits.lost_ns / 1e6
-    )
-    """Longest time for which missing joint angles block a verdict."""
     request_ms: Milliseconds = GateLimits.request_ns / 1e6
     """Time after which a question is answered with `unknown`."""
-    gap_ms: Annotated[float, Field(gt=0.0, le=GateLimits.gap_ns / 1e6), unit("ms")] = (
-        GateLimits.gap_ns / 1e6
-    )
-    """Time without a usable reading after which a grasp must settle again; more than two periods of
-    the readings."""
-    change_counts: Annotated[float, Field(ge=10, le=1000), unit("counts")] = (
-        GateLimits.change_counts
-    )
-    """Mean change of a finger that means another grasp."""
 
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
@@ -165,8 +143,6 @@ class Publish(Section):
 
     endpoint: Endpoint | None = None
     """Without it `ipc:///run/graspd/<hand>.ipc`. `tcp://` needs `[curve]`, except on loopback."""
-    high_water_mark: Annotated[int, Field(ge=1, le=100_000), unit("messages")] = 10
-    """Most messages that wait for a subscriber."""
     tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), unit("1/s")] = 25.0
     """Rate of readings on `tactile.<hand>`; 0: none; the sensor's rate or more: all."""
     file_mode: FileMode | None = None
@@ -187,16 +163,14 @@ class Curve(Section):
 
 
 class Ask(Section):
-    """`[ask]`: the socket for questions of the grasp controller (deploy/wire/README.md)."""
+    """`[ask]`: the socket for questions of the grasp controller (deploy/wire/README.md).
+
+    Its file has mode and group of `[publish]`, but only owner and group may ask.
+    """
 
     endpoint: Endpoint | None = None
     """Without it `ipc:///run/graspd/<hand>.ask.ipc`. `tcp://` needs `[curve]`, except on
     loopback."""
-    file_mode: FileMode | None = None
-    """Mode of an `ipc://` socket's file; users who may write may ask. Without it that of
-    `[publish]`, for owner and group only."""
-    group: Name | None = None
-    """Group of an `ipc://` socket's file; without it that of `[publish]`."""
     tell: Annotated[tuple[Name, ...], Field(strict=False)] | None = None
     """Users, on `tcp://` names of `.key` files, that may lift and tell outcomes. Without it the
     user or key of the first peer that may lift. They are trusted with the truth."""
@@ -212,8 +186,6 @@ class Realtime(Section):
     """Priority of SCHED_FIFO; below that of the hand's own controller."""
     cpus: Annotated[tuple[Processor, ...], Field(min_length=1, strict=False)] | None = None
     """Processors to run on, from 0; without it all."""
-    lock_memory: bool = True
-    """True: lock used memory, so that no reading waits for a disk."""
 
 
 class Record(Section):
@@ -221,18 +193,8 @@ class Record(Section):
 
     directory: FilePath | None = None
     """Folder of the files; without it `/var/lib/graspd/record`."""
-    flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0), unit("ms")] = 1000.0
-    """Longest time whose data a killed daemon or a power cut loses."""
-    rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0), unit("MB")] = 256.0
-    """Size of a file from which the next one begins."""
-    rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0), unit("minutes")] = 60.0
-    """Age of a file from which the next one begins."""
-    keep_files: Annotated[int, Field(ge=1, le=100_000), unit("files")] = 1000
-    """Most files of this hand; the oldest are deleted."""
     keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), unit("MB")] = 4096.0
     """Largest size of all files of this hand together."""
-    images_hz: Annotated[float, Field(ge=0.0, le=1000.0), unit("1/s")] = 10.0
-    """Rate of tactile images for viewers; 0: none."""
     raw: bool = False
     """True: also record the link: CAN frames (candump text) or serial bytes."""
 
@@ -321,16 +283,8 @@ class Scene(Section):
     @property
     def ask_file_mode(self) -> int | None:
         """Mode of the file of the socket for questions; None: the umask decides."""
-        if self.ask is not None and self.ask.file_mode is not None:
-            return int(self.ask.file_mode, 8)
         mode = self.publish.file_mode
         return None if mode is None else int(mode, 8) & ~OTHERS
-
-    @property
-    def ask_group(self) -> str | None:
-        """Group of the file of the socket for questions; None: that of the process."""
-        own = None if self.ask is None else self.ask.group
-        return own or self.publish.group
 
     @property
     def session_path(self) -> Path:

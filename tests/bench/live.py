@@ -30,6 +30,7 @@ from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, synthetic_grasps
 from graspd.drivers.twins.spi import SpiTwin
+from tests.daemon.processes import GRASPD, graspd_with
 from tests.kit.messages import decode_verdict
 
 PATIENCE_S = 100.0
@@ -184,6 +185,7 @@ def running(
     sections: str,
     *,
     publish: str = "",
+    high_water_mark: int | None = None,
     topics: Sequence[str] = ("verdict.",),
     endpoint: str | None = None,
     keys: Path | None = None,
@@ -191,12 +193,16 @@ def running(
     """Run a daemon on `scene.toml` in `folder`, and subscribe to it; its log is `log` there.
 
     The scene has `sections`, and a last one `[publish]` with the lines of `publish`. The `endpoint`
-    is `v` in `folder` unless given. `keys` as of `Subscriber`.
+    is `v` in `folder` unless given. `high_water_mark`: most messages that wait for a subscriber, if
+    it is not the daemon's own. `keys` as of `Subscriber`.
     """
     endpoint = endpoint or f"ipc://{folder}/v"
     scene = folder / "scene.toml"
     scene.write_text(f'{sections}[publish]\nendpoint = "{endpoint}"\n{publish}')
-    command = [sys.executable, "-m", "graspd", "run", str(scene)]
+    program = GRASPD
+    if high_water_mark is not None:
+        program = graspd_with("graspd.daemon.publish.sockets", HIGH_WATER_MARK=high_water_mark)
+    command = [*program, "run", str(scene)]
     nothing = subprocess.DEVNULL
     with (
         (folder / "log").open("a") as log,

@@ -64,8 +64,8 @@ FAULTS = LinkFaults(
     disconnect_every_frames=500,
     dead_electrodes=((0, 3), (2, 17)),
 )
-PUBLISH = "high_water_mark = 1000\n"
-"""So that a busy computer, on which the subscriber is slow, loses no message."""
+QUEUE = 1000
+"""Messages that wait for a subscriber: on a busy computer, where it is slow, it loses none."""
 LISTENER = """
 import sys, zmq
 socket = zmq.Context().socket(zmq.SUB)
@@ -115,7 +115,7 @@ class Soak:
         listener = [sys.executable, "-c", LISTENER, endpoint]
         topics = ("verdict.", "status.")
         with (
-            running(self._folder, sections, publish=PUBLISH, topics=topics) as (
+            running(self._folder, sections, high_water_mark=QUEUE, topics=topics) as (
                 self._daemon,
                 self._subscriber,
             ),

@@ -11,6 +11,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 GRASPD = (sys.executable, "-m", "graspd")
+WITH_CONSTANTS = """
+import importlib, sys
+module, _, constants = sys.argv[1].partition(":")
+vars(importlib.import_module(module)).update(eval(constants))
+from graspd.daemon.__main__ import main
+del sys.argv[1]
+sys.exit(main())
+"""
 TIMEOUT_S = 200
 NICENESS = -15
 
@@ -49,13 +57,20 @@ class Started(subprocess.Popen[str]):
         super().__exit__(kind, *rest)  # type: ignore[arg-type]
 
 
-def start(*arguments: object, before: Sequence[str] = ()) -> Started:
+def graspd_with(module: str, **constants: object) -> tuple[str, ...]:
+    """The command `graspd`, with other constants of a module."""
+    return (sys.executable, "-c", WITH_CONSTANTS, f"{module}:{constants!r}")
+
+
+def start(
+    *arguments: object, before: Sequence[str] = (), program: Sequence[str] = GRASPD
+) -> Started:
     """Start a command, by the words `before` it, and leave it running.
 
     Before other work, where that may be: a robot's computer leaves it time, one full of tests not.
     """
     process = Started(
-        [*before, *GRASPD, *map(str, arguments)],
+        [*before, *program, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -103,7 +103,7 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
 
 def _recorder(folder: Path, clock: Clock, pipeline: Pipeline, header: RecordingHeader) -> Recorder:
     return Recorder(
-        Record(directory=folder, images_hz=0.0),
+        Record(directory=folder),
         "right",
         BOOT_ID,
         take_header=lambda: header_now(pipeline, header),

@@ -100,12 +100,14 @@ class Hand:
 
 @contextlib.contextmanager
 def hand(
-    folder: Path, *, curve: bool = False, tcp: bool = False, publish: str = "", ask: str = ""
+    folder: Path,
+    *,
+    curve: bool = False,
+    tcp: bool = False,
+    publish: str = "",
+    high_water_mark: int | None = None,
 ) -> Iterator[Hand]:
-    """A daemon at rest: on Unix sockets, or on TCP, with keys; `publish` as of `running`.
-
-    `ask`: more keys of `[ask]`.
-    """
+    """A daemon at rest: on Unix sockets, or on TCP, with keys; the rest as of `running`."""
     endpoint, questions = f"ipc://{folder}/v", f"ipc://{folder}/ask"
     section, keys = "", None
     if curve:
@@ -117,12 +119,12 @@ def hand(
     sections = (
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[gate]\nmode = "every"\nrequest_ms = {PATIENCE_MS}.0\n[model]\nname = "cnn1"\n'
-        f'[ask]\nendpoint = "{questions}"\n{ask}{section}'
+        f'[ask]\nendpoint = "{questions}"\n{section}'
     )
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    started = running(folder, sections, endpoint=endpoint, keys=keys, publish=publish)
-    with started as (process, friend):
+    options = {"publish": publish, "high_water_mark": high_water_mark}
+    with running(folder, sections, endpoint=endpoint, keys=keys, **options) as (process, friend):
         if friend.take(PATIENCE_S) is None:
             raise TimeoutError("the daemon says nothing")
         for _ in range(100):
@@ -212,7 +214,7 @@ def flood(plan: Plan) -> Outcome:
     """Eight peers that keep every rule, as fast as can be."""
     tried, added_ms, share = 0, 0.0, 1.0
     # As many as the friend takes late; by default ten wait for a subscriber.
-    with hand(plan.folder, publish="high_water_mark = 1000\n") as daemon:
+    with hand(plan.folder, high_water_mark=1000) as daemon:
         for _ in plan.rounds():
             rest_ms, _ = cost(daemon)
             peers = [
@@ -327,7 +329,7 @@ def forged(plan: Plan) -> Outcome:
     forged_well = lies = told_well = tried = 0
     plan.folder.chmod(0o755)
     with (
-        hand(plan.folder, ask='file_mode = "0666"\n') as daemon,
+        hand(plan.folder, publish='file_mode = "0660"\ngroup = "nogroup"\n') as daemon,
         zmq.Context() as context,
         contextlib.ExitStack() as stack,
     ):

@@ -196,8 +196,8 @@ BEHIND = ("th", "ff", "mf")
         ),
         (
             "recordings.csv_player.ReplayDriver",
-            REPLAY | {"rate_hz": 20.0, "speed": 2.0},
-            {"rate_hz": 20.0, "speed": 2.0},
+            REPLAY | {"loop": True},
+            {"speed": 1.0, "loop": True},
         ),
         ("recordings.csv_player.ReplayDriver", REPLAY | {"pace": "fast"}, {"speed": None}),
     ],

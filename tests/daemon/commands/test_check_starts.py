@@ -21,7 +21,6 @@ CAN = '[tactile]\ndriver = "can"\ninterface = "{}"\n[publish]\nendpoint = "ipc:/
         ("[realtime]\ncpus = [-1]", "realtime.cpus.0: input should be greater than"),
         (f"[realtime]\ncpus = [0, {10**30}]", "realtime.cpus.1: input should be less than"),
         (f"[realtime]\ncpus = [0, {ABSENT}]", f"realtime.cpus: no processor {ABSENT}"),
-        ('[ask]\ngroup = "no-such-group"', "ask: there is no group no-such-group"),
         ('[ask]\ntell = ["root", "no-such-user"]', "ask.tell: there is no user no-such-user"),
         (f'[ask]\ntell = ["{"9" * 5000}"]', "ask.tell: there is no user 9"),
         ('[ask]\nendpoint = "ipc://F/absent/a"', "ask: there is no folder F/absent"),

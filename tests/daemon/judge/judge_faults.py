@@ -21,7 +21,7 @@ from tests.daemon.judge.fault_bench import Fault, Step
 from tests.drivers.one_sweep import tactile
 
 JOINTS_LOST_FOR = 120
-"""Readings at 100 Hz: longer than `joints_lost_ms` of the scene, 1000 ms."""
+"""Readings at 100 Hz: longer than the 1000 ms after which joints are lost."""
 SYNCHRONISING = 3
 """Sound rounds from which the parts behind a palm know where in the stream they are."""
 

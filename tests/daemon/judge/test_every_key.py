@@ -155,10 +155,7 @@ class Bench:
             fingers,
             gate.fingers or fingers,
             EARLY_MS if gate.early else STILL_MS,
-            touch_counts=gate.contact_counts,
             moved_counts=MOVED_COUNTS,
-            joint_rad_per_s=gate.joint_rad_per_s,
-            joints_lost_ms=gate.joints_lost_ms,
         )
         self.sent: list[NDArray[np.uint16]] = []
         self.open = 0
@@ -322,5 +319,5 @@ def test_a_held_grasp_is_stable_by_the_defaults() -> None:
 
 
 def test_each_section_that_judges_is_swept() -> None:
-    assert {"gate.gap_ms", "model.slip_threshold", "risk.explore", "hand.fingers"} < KEYS.keys()
+    assert {"gate.max_age_ms", "model.slip_threshold", "risk.explore", "hand.fingers"} < KEYS.keys()
     assert all(KEYS.values())

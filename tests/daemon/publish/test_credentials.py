@@ -177,7 +177,7 @@ def test_tellers_cannot_be_checked_on_plain_tcp(tmp_path: Path) -> None:
 def test_a_killed_daemon_takes_the_outcome_after_its_restart(tmp_path: Path, peers: Peers) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(
-        '[tactile]\ndriver = "replay"\nloop = true\nspeed = 2.0\n'
+        '[tactile]\ndriver = "replay"\nloop = true\n'
         f'recordings = ["{DEMO_RECORDING}"]\n[session]\nkeep = true\nfolder = "s"\n'
         f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n[ask]\nendpoint = "ipc://{tmp_path}/ask"\n'
     )

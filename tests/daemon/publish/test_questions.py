@@ -130,7 +130,7 @@ def test_an_answer_that_is_dropped_is_counted() -> None:
 def scene(folder: Path, mode: str, request_ms: float) -> Path:
     path = folder / "scene.toml"
     path.write_text(
-        '[tactile]\ndriver = "replay"\nloop = true\nspeed = 4.0\n'
+        '[tactile]\ndriver = "replay"\nloop = true\n'
         f'recordings = ["{DEMO_RECORDING}"]\n'
         f'[gate]\nmode = "{mode}"\nrequest_ms = {request_ms}\n[model]\nname = "cnn1"\n'
         f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'

@@ -26,13 +26,11 @@ from tests.kit.waiting import PATIENCE_S, wait_until
 HOSTILE_MESSAGES = 2_000
 
 
-def wanted(
-    folder: Path, ask: dict[str, str | None] | None = None, **publish: object
-) -> scene.Scene:
+def wanted(folder: Path, **publish: object) -> scene.Scene:
     text: dict[str, Any] = {
         "tactile": {"driver": "replay", "recordings": ["any.csv"]},
         "publish": {"endpoint": f"ipc://{folder}/v", **publish},
-        "ask": {"endpoint": f"ipc://{folder}/ask", **(ask or {})},
+        "ask": {"endpoint": f"ipc://{folder}/ask"},
     }
     return scene.parse(text, folder / "scene.toml")
 
@@ -134,33 +132,16 @@ def test_files_of_sockets_have_the_mode_and_the_group_of_the_scene(tmp_path: Pat
             assert status.st_gid == grp.getgrnam(group).gr_gid
 
 
-@pytest.mark.parametrize(
-    ("publish", "ask", "mode"),
-    [
-        ("0666", None, 0o660),
-        ("0666", "0600", 0o600),
-        ("0640", "0666", 0o666),
-        (None, "0620", 0o620),
-    ],
-)
-def test_who_may_ask_is_for_the_scene_to_say_and_never_everybody_unless_it_says_so(
-    tmp_path: Path, publish: str | None, ask: str | None, mode: int
-) -> None:
+@pytest.mark.parametrize(("publish", "mode"), [("0666", 0o660), ("0640", 0o640), (None, 0o755)])
+def test_only_owner_and_group_may_ask(tmp_path: Path, publish: str | None, mode: int) -> None:
     former = os.umask(0o022)
     try:
-        with Sockets(wanted(tmp_path, ask={"file_mode": ask}, file_mode=publish)):
+        with Sockets(wanted(tmp_path, file_mode=publish)):
             assert stat.S_IMODE((tmp_path / "ask").stat().st_mode) == mode
             published = stat.S_IMODE((tmp_path / "v").stat().st_mode)
             assert published == (0o755 if publish is None else int(publish, 8))
     finally:
         os.umask(former)
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to any group")
-def test_the_socket_for_questions_has_a_group_of_its_own(tmp_path: Path) -> None:
-    with Sockets(wanted(tmp_path, ask={"group": "daemon"}, group="nogroup")):
-        assert (tmp_path / "ask").group() == "daemon"
-        assert (tmp_path / "v").group() == "nogroup"
 
 
 def test_an_unknown_group_is_said(tmp_path: Path) -> None:

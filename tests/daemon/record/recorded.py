@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -18,7 +18,7 @@ from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.lift_book import NAME_BYTES
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.drivers.recordings.csv_rows import open_recording
-from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_verdict
 
 BOOT = "0123456789abcdef" * 2
@@ -79,18 +79,18 @@ def recorder(
     take_header: Callable[[], MakeHeader] = lambda: lambda: HEADER,
     **options: Any,  # noqa: ANN401
 ) -> Recorder:
-    """A recorder that flushes after 100 ms unless the options say otherwise."""
-    wanted = Record(**{"directory": folder / "record", "flush_ms": 100.0, **options})
+    """A recorder in a folder."""
+    wanted = Record(**{"directory": folder / "record", **options})
     return Recorder(wanted, "right", BOOT, take_header=take_header)
 
 
-def scene(folder: Path, record: str = "", more: str = "", gate: str = "") -> Path:
+def scene(folder: Path, more: str = "", gate: str = "") -> Path:
     """A scene that plays the demo recording and records; no reading is too old for it."""
     path = folder / "scene.toml"
     path.write_text(
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
         f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
-        f'[record]\ndirectory = "record"\n{record}\n{more}'
+        f'[record]\ndirectory = "record"\n{more}'
         f"[gate]\nmax_age_ms = 10000\n{gate}"
     )
     return path
@@ -103,10 +103,11 @@ def messages(path: Path) -> list[tuple[str, dict[str, Any]]]:
         return [(message.kind, json.loads(message.payload)) for message in recording]
 
 
-def work(folder: Path, grasps: int, more: str = "", record: str = "") -> Lab:
+def work(folder: Path, grasps: int, more: str = "", program: Sequence[str] = GRASPD) -> Lab:
     """Run until so many grasps were judged, telling of each but the first."""
     lab = Lab(folder)
-    with start("run", scene(folder, record, more)) as daemon, zmq.Context() as context:
+    running = start("run", scene(folder, more), program=program)
+    with running as daemon, zmq.Context() as context:
         wait_for(folder / "ask")
         with context.socket(zmq.SUB) as listener, context.socket(zmq.REQ) as controller:
             listener.connect(f"ipc://{folder}/graspd")

@@ -24,7 +24,7 @@ from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.models.training.data.datasets import read_table
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, graspd, graspd_with, start, wait_for
 from tests.daemon.record.recorded import (
     NAME,
     Lab,
@@ -39,7 +39,7 @@ from tests.kit.messages import decode_verdict
 
 GRASPS = 4
 FLUSH_S = 1.0
-"""Default of `[record] flush_ms`."""
+"""The daemon's own."""
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +120,10 @@ def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:
 @pytest.fixture(scope="module")
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     """A session model at work, and files that end after three seconds, whatever is held then."""
-    options = "rotate_minutes = 0.05\nflush_ms = 200"
+    soon = {"ROTATE_NS": 3_000_000_000, "FLUSH_NS": 200_000_000}
+    program = graspd_with("graspd.daemon.record.recorder", **soon)
     risk = "[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 2\n"
-    return work(tmp_path_factory.mktemp("rotated"), GRASPS, risk, record=options)
+    return work(tmp_path_factory.mktemp("rotated"), GRASPS, risk, program)
 
 
 def test_session_and_learning_go_on_in_the_replay_where_they_were(rotated: Lab) -> None:

@@ -58,10 +58,16 @@ class Loop:
             recorder.on_status(NO_STATUS)
 
 
+@pytest.fixture
+def short_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("graspd.daemon.record.recorder.ROTATE_NS", 600_000_000)
+
+
+@pytest.mark.usefixtures("short_files")
 def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_path: Path) -> None:
     loop = Loop()
     loop.sent = 7
-    writing = recorder(tmp_path, loop.header, rotate_minutes=0.01)
+    writing = recorder(tmp_path, loop.header)
     while writing.counters["record"]["files"] < 4:
         for _ in range(20):
             loop.send(writing, VERDICT)
@@ -80,9 +86,10 @@ def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_pat
     assert writing.counters["record"]["recorded"] == loop.sent - 7
 
 
+@pytest.mark.usefixtures("short_files")
 def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
     loop = Loop()
-    writing = recorder(tmp_path, loop.header, rotate_minutes=0.01)
+    writing = recorder(tmp_path, loop.header)
     for _ in range(90):
         loop.send(writing, VERDICT)
         time.sleep(0.01)
@@ -127,11 +134,12 @@ class Daemon:
         path = folder / "scene.toml"
         path.write_text(
             '[tactile]\ndriver = "spi"\nport = "/dev/null"\n[session]\nkeep = false\n'
-            '[record]\ndirectory = "record"\nrotate_minutes = 0.05\nflush_ms = 100\n'
+            '[record]\ndirectory = "record"\n'
         )
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
         self._now_ns = START_NS
+        monkeypatch.setattr("graspd.daemon.record.recorder.ROTATE_NS", 3_000_000_000)
         monkeypatch.setattr(
             "graspd.daemon.record.recorder.Recorder", partial(Recorder, clock=self._clock)
         )

@@ -94,9 +94,10 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
 
 
 def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
-    tmp_path: Path, make: Make
+    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writing = make(rotate_mb=0.1)
+    monkeypatch.setattr(recorder_module, "ROTATE_BYTES", 100_000)
+    writing = make()
     for number in range(300):
         writing.send(TOPIC, payload(number, 4000))
         if number % 30 == 29:
@@ -115,14 +116,17 @@ def old(folder: Path, hour: int, size: int, ending: str = "mcap") -> Path:
     return path
 
 
-def test_the_oldest_files_make_room_and_nothing_else_is_removed(tmp_path: Path) -> None:
+def test_the_oldest_files_make_room_and_nothing_else_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "FILES_MAX", 4)
     folder = tmp_path / "record"
     paths = [old(folder, hour, 10) for hour in range(5)]
     beside = old(folder, 0, 10, "can.log")
     strangers = [folder / "right-notes.mcap", folder / "left-20200101T000000Z-00000000-0000.mcap"]
     for path in strangers:
         path.write_bytes(b"")
-    assert make_room(Record(directory=folder, keep_files=4), "right") == 2
+    assert make_room(Record(directory=folder), "right") == 2
     assert not paths[0].exists()
     assert not beside.exists()
     assert not paths[1].exists()
@@ -133,7 +137,7 @@ def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
     for hour in range(5):
         old(tmp_path, hour, 10**6)
     for keep_mb, removed in ((4.5, 2), (1.0, 3), (1.0, 0)):
-        options = Record(directory=tmp_path, keep_mb=keep_mb, rotate_mb=1.0)
+        options = Record(directory=tmp_path, keep_mb=keep_mb)
         assert make_room(options, "right") == removed
 
 
@@ -192,7 +196,8 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
 
     The test goes the rounds itself: with this interval the thread's first one comes after 6 s.
     """
-    writing = make(flush_ms=60_000.0)
+    monkeypatch.setattr(recorder_module, "FLUSH_NS", 60_000_000_000)
+    writing = make()
     real, written = McapWriter.write, list[int]()
 
     def write(file: McapWriter, topic: bytes, payload: bytes, at_ns: int) -> None:
@@ -217,9 +222,7 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
 @pytest.mark.parametrize(
     ("text", "mistake"),
     [
-        ("flush_ms = 1", "record.flush_ms"),
-        ("rotate_mb = 0", "record.rotate_mb"),
-        ("keep_files = 0", "record.keep_files"),
+        ("keep_mb = 0", "record.keep_mb"),
         ("folder = 'x'", "record.folder: no such key"),
         ("raw = true", "record.raw is for tactile.driver spi and can"),
     ],

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from graspd.daemon.scene import Scene, SceneError, load, parse
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.endpoints import check_endpoint
+from graspd.daemon.scene.errors import GONE
 from graspd.daemon.scene.scene import SCENE_MAX_BYTES
 
 GOOD = """
@@ -22,6 +23,16 @@ recordings = ["grasps.csv"]
 """
 SPI = "[tactile]\ndriver = 'spi'\nport = '/dev/ttyACM0'\n"
 CAN = "[tactile]\ndriver = 'can'\n"
+BEFORE = {
+    "ReplayTactile": GOOD,
+    "CanTactile": CAN,
+    "GateSection": f"{CAN}[gate]\n",
+    "Publish": f"{CAN}[publish]\n",
+    "Ask": f"{CAN}[ask]\n",
+    "Realtime": f"{CAN}[realtime]\n",
+    "Record": f"{CAN}[record]\n",
+}
+"""Text before a key of each section that has lost some."""
 PALM = "[tactile]\ndriver = 'palm'\nsource = 'udp://127.0.0.1:5555'\n"
 
 
@@ -60,7 +71,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         ("[tactile]\ndriver = 'replay'\nrecordings = []", "tactile.recordings", "at least 1"),
         ("[tactile]\ndriver = 'replay'\nrecordings = 'a'", "tactile.recordings", "valid list"),
         (GOOD + "[hnad]\nname = 'left'", "hnad", "did you mean hand?"),
-        (GOOD + "sped = 2.0", "tactile.sped", "did you mean speed?"),
+        (GOOD + "outcome = true", "tactile.outcome", "did you mean outcomes?"),
         (GOOD + "[gate]\nmax_age_s = 0.1", "gate.max_age_s", "did you mean max_age_ms?"),
         (GOOD + "[gate]\nmax_age_ms = -1.0", "gate.max_age_ms", "greater than 0"),
         (GOOD + "[gate]\nmax_age_ms = inf", "gate.max_age_ms", "finite"),
@@ -88,12 +99,10 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         ),
         (GOOD + "[publish]\nendpoint = 'ipc://*'", "publish.endpoint", "not '*'"),
         (GOOD + "[ask]\nendpoint = 'ipc://@graspd'", "ask.endpoint", "no file mode"),
-        (GOOD + "[ask]\nfile_mode = '0888'", "ask.file_mode", "should match pattern"),
+        (GOOD + "[publish]\nfile_mode = '0888'", "publish.file_mode", "should match pattern"),
         (GOOD + '[publish]\nendpoint = "ipc:///tmp/\\u0000"', "publish.endpoint", "NUL"),
         (GOOD + '[model]\npath = "\\u0000.onnx"', "model.path", "NUL"),
         (GOOD + "[model]\nname = ''", "model.name", "at least 1"),
-        (GOOD + "[tactile.faults]\nslow_every = 2", "tactile.faults", "graspd twin"),
-        (GOOD + "rate_hz = 1e6", "tactile.rate_hz", "less than or equal to 100000"),
         (
             PALM + "[gate]\nmode = 'every'",
             "scene",
@@ -102,11 +111,6 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (SPI + "sped = 1", "tactile.sped", "there are: driver, port, sensors, baud"),
         (SPI + "baud = 9600", "tactile.baud", "greater than or equal to 115200"),
         (CAN + "bitrate = '1M'", "tactile.bitrate", "valid integer"),
-        (
-            CAN + "format = 'syntouch'",
-            "tactile.format",
-            "no such key; SynTouch's is the only format",
-        ),
         (
             "[hand]\nfingers = ['ff', 'mf', 'rf', 'th']\n" + CAN,
             "scene",
@@ -118,7 +122,6 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
             "joints.driver palm needs tactile.driver palm",
         ),
         (CAN + "sensors = ['th', 'ff']", "scene", "tactile.sensors must name every finger"),
-        (CAN + "data_bitrate = 5_000_000", "tactile.data_bitrate", "classic CAN only"),
         (SPI.replace("/dev/ttyACM0", "") + "", "tactile.port", "at least 1"),
         ("[tactile]\ndriver = 'palm'\nsource = 'hand.palm'", "tactile.source", "'^udp://'"),
         (PALM + "only_from = 'the-relay'", "tactile.only_from", "does not appear to be an IPv4"),
@@ -138,6 +141,14 @@ def test_a_mistake_is_one_line_naming_file_and_key(
     assert message.startswith(f"{path}: {key}: ")
     assert says in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(("section", "key"), GONE)
+def test_a_key_that_is_gone_says_what_to_do(tmp_path: Path, section: str, key: str) -> None:
+    path = write(tmp_path, f"{BEFORE[section]}{key} = 1\n")
+    with pytest.raises(SceneError) as error:
+        load(path)
+    assert str(error.value).endswith(f"{key}: no such key; {GONE[section, key]}")
 
 
 def test_two_mistakes_are_two_lines(tmp_path: Path) -> None:
