@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
@@ -26,7 +26,6 @@ from graspd.daemon.process.text import (
     coloured,
     complain,
     printable,
-    progress,
     write_json,
     write_lines,
 )
@@ -40,11 +39,10 @@ from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from graspd.daemon.judge.decision import GateLimits, HandLimits
-    from graspd.daemon.measure.cost import Footprint
 
 TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
 
-WRONG, FAILED = 2, 1
+WRONG = 2
 USUAL_PERIOD_NS = 10_000_000
 """Time between readings where only the device knows it, ns."""
 COIN = 0.5
@@ -58,25 +56,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", type=Path, nargs="+", help="scene file (TOML)")
     parser.add_argument("--json", action="store_true", help="one JSON object per scene on stdout")
-    parser.add_argument(
-        "--cost", action="store_true", help="measure it too; of several scenes, as one table"
-    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the scenes, their models and files; 0 if all are right, 1 if only a cost is not known.
+    """Check the scenes, their models and files; 0 if all are right.
     Whether sockets can be had and devices work is for `graspd doctor`."""
-    costs: list[tuple[Path, Footprint]] = []
-    codes = [_check(path, args, costs) for path in args.scene]
-    if len(codes) > 1 and costs and not args.json:
-        from graspd.daemon.measure.cost import markdown
-
-        write_lines(*markdown(costs))
-    return max(codes)
+    return max([_check(path, as_json=args.json) for path in args.scene])
 
 
-def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footprint]]) -> int:
-    """Check one scene and print the result; add its cost to `costs`. Return the exit code."""
+def _check(path: Path, *, as_json: bool) -> int:
+    """Check one scene and print the result. Return the exit code."""
     try:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
@@ -99,27 +88,12 @@ def _check(path: Path, args: argparse.Namespace, costs: list[tuple[Path, Footpri
         "left_out": _what_is_left_out(wanted, model, limits),
         "warnings": [*_warnings(wanted), *assembly.keep_digest(model)],
     }
-    cost_lines: Iterable[str] = ()
-    if args.cost:
-        from graspd.daemon.measure import cost
-
-        try:
-            progress(f"measuring what {path} costs, some seconds")
-            footprint = cost.measure(path)
-        except cost.CostError as error:
-            complain(error)
-            return FAILED
-        finally:
-            progress("")
-        costs.append((path, footprint))
-        document["cost"] = footprint
-        cost_lines = cost.lines(footprint)
     for warning in document["warnings"]:
         complain(f"{path}: {warning}")
-    if args.json:
+    if as_json:
         write_json(document)
-    elif not args.cost or len(args.scene) == 1:
-        write_lines(*_lines(document), *cost_lines)
+    else:
+        write_lines(*_lines(document))
     return 0
 
 

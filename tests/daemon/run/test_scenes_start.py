@@ -208,7 +208,7 @@ def test_what_check_calls_fine_starts(place: tuple[Path, int], drawn: dict[str, 
     path = folder / "scene.toml"
     path.write_text(as_toml(drawn))
     note(path.read_text())
-    fine = check.run(Namespace(scene=[path], json=True, cost=False)) == 0
+    fine = check.run(Namespace(scene=[path], json=True)) == 0
     event(f"fine: {fine}")
     if fine:
         start(path)
