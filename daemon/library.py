@@ -22,7 +22,7 @@ from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
-from graspd.models import own, trial, zoo
+from graspd.models import trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.judge.grasp_judge import Examined, GraspJudge
 
@@ -175,7 +175,7 @@ def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
 
 def _path(model: str | os.PathLike[str], fingers: Sequence[Finger] = ()) -> Path:
     if isinstance(model, str) and not model.endswith(".onnx"):
-        return own.find(zoo.for_hand(model, fingers) if fingers else model)
+        return zoo.find(zoo.for_hand(model, fingers) if fingers else model)
     return Path(model)
 
 

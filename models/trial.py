@@ -6,10 +6,12 @@ takes 0.2 s. Models of the zoo, known by the digest in their card, need none.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +48,20 @@ def load(path: Path, file: ModelFile | None = None) -> TactileModel:
         _try(path, file.data)
         passed.append(file.sha256)
     return TactileModel(path, file)
+
+
+def card(path: Path) -> dict[str, Any]:
+    """Return the card beside a model file; without a card, one made of its contract.
+
+    Raises `ModelError` if the daemon would refuse the model, or if the card is of another file.
+    """
+    file = read(path)
+    contract = json.loads(load(path, file).contract.to_json())
+    about = path.with_suffix(".json")
+    if not about.exists():
+        size = {"sha256": file.sha256, "size_bytes": len(file.data)}
+        return {"what": "no card came with it", "contract": contract, "file": size}
+    return {**zoo.read_card(about), "contract": contract}
 
 
 def _try(path: Path, content: bytes) -> None:

@@ -26,7 +26,7 @@ from graspd.daemon.scene.scene import GateMode
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver, DriverError, LinkError
 from graspd.extras import require
-from graspd.models import own, trial, zoo
+from graspd.models import trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
 from graspd.models.trust.risk import RiskLimits
@@ -47,7 +47,7 @@ def model_path(scene: Scene) -> Path:
     if scene.model.path is not None:
         return scene.model.path
     name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
-    return own.find(zoo.for_hand(name, scene.hand.fingers))
+    return zoo.find(zoo.for_hand(name, scene.hand.fingers))
 
 
 def load_model(scene: Scene) -> TactileModel:
@@ -63,7 +63,7 @@ def keep_digest(model: TactileModel) -> Iterator[str]:
     about = model.path.with_suffix(".json")
     if not zoo.ships(model.path, model.sha256) and not about.exists():
         try:
-            write_atomically(about, json.dumps(own.card(model.path)).encode(), mode=0o644)
+            write_atomically(about, json.dumps(trial.card(model.path)).encode(), mode=0o644)
         except OSError as error:
             yield f"{about}: cannot keep the model's digest, to notice a change: {error.strerror}"
 

@@ -33,7 +33,6 @@ from graspd.daemon.scene import drivers as scene_drivers
 from graspd.daemon.scene.scene import Realtime, Record, RiskSection
 from graspd.drivers.base import DriverError
 from graspd.drivers.udp import Endpoint
-from graspd.models import zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
 
@@ -159,14 +158,6 @@ def _try_keys(wanted: scene.Scene) -> None:
         raise KeysError("\n".join(refused))
 
 
-def _model_name(wanted: scene.Scene, model: TactileModel) -> str:
-    """Return a model's name; for an added one also the name that it was trained by."""
-    trained, added = model.contract.name, wanted.model.name
-    if added is None or added in zoo.names() or added == trained:
-        return trained
-    return f"{added}, trained as {trained}"
-
-
 def _what_is_in(
     wanted: scene.Scene, model: TactileModel, limits: HandLimits | None, period_ns: int | None
 ) -> dict[str, str]:
@@ -180,7 +171,7 @@ def _what_is_in(
         "hand": f"{wanted.hand.name}: {', '.join(wanted.hand.fingers)}",
         "tactile": _section(wanted.tactile),
         "model": (
-            f"{_model_name(wanted, model)} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
+            f"{contract.name} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
             f"{wanted.model.slip_threshold:g} on{rejects}"
         ),
         "gate": _gate(wanted, limits),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
@@ -14,6 +15,7 @@ from graspd.models.contract import ModelError
 ZOO = Path(__file__).resolve().parent
 CARD_MAX_BYTES = 16 << 20
 """A card has 0.1 MB."""
+NAME_MAX = 64
 
 
 def names() -> list[str]:
@@ -78,5 +80,15 @@ def ships(path: Path, sha256: str) -> bool:
 def find(name: str) -> Path:
     """Path of a model by its name. Raises `ModelError` listing the names that exist."""
     if name not in names():
-        raise ModelError(f"no model '{name}' in the zoo; there are: {', '.join(names()) or 'none'}")
+        import difflib  # only where it is needed
+
+        near = difflib.get_close_matches(name, names(), n=1)
+        meant = f"did you mean {near[0]}?" if near else "a model of your own is named by its file"
+        raise ModelError(f"no model '{name}' in the zoo; there are: {', '.join(names())}; {meant}")
     return ZOO / f"{name}.onnx"
+
+
+def is_name(text: str) -> bool:
+    """Return True if a model may have this name: it must be a file name, not a path."""
+    whole = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", text) is not None
+    return whole and len(text) <= NAME_MAX and not text.endswith(".onnx")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import shlex
+import json
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from graspd.models import own, zoo
+from graspd.models import zoo
 from graspd.models.training.commands.common import (
     WrongInputError,
     add_shared_arguments,
@@ -122,7 +122,7 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
     )
     sys.stdout.write(f"{file}: {figures}, {seconds:.0f} s\n")
     if plan.lab_files or plan.name:
-        say("train", f"for a scene: graspd models add {shlex.quote(str(file))} --name {plan.model}")
+        say("train", f"for a scene, below [model]: path = {json.dumps(str(file.absolute()))}")
 
 
 def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
@@ -152,8 +152,8 @@ def _plan(args: argparse.Namespace) -> TrainingPlan:
 def _name(text: str) -> str:
     if text in zoo.names():
         raise argparse.ArgumentTypeError(f"graspd ships a model {text!r}: choose another name")
-    if not own.is_name(text):
+    if not zoo.is_name(text):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is no name: up to {own.NAME_MAX} letters, digits, '.', '_' and '-'"
+            f"{text!r} is no name: up to {zoo.NAME_MAX} letters, digits, '.', '_' and '-'"
         )
     return text

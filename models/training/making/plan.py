@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from graspd.models.bts3 import NEW_SESSION, TABLES, WHOLE
-from graspd.models.own import NAME_MAX
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import ENOUGH_GRASPS, Grasps, lab_table_names
 from graspd.models.training.data.protocols import EvalProtocol, TooFewGraspsError, splits
 from graspd.models.training.evaluating.broken import left_out
 from graspd.models.training.evaluating.jobs import Job, jobs_of
 from graspd.models.training.systems.registry import SessionFeatures, System
+from graspd.models.zoo import NAME_MAX
 
 FEWEST_FOLDS = 2
 FEW_OBJECTS = 10

@@ -124,7 +124,6 @@ def test_what_is_mistyped_is_answered_with_the_nearest(arguments: list[str], mea
         ("watch A B --web --port 8", "watch A --port 8 B --web"),
         ("check A B --json", "check A --json B"),
         ("export-grasps A B --out X", "export-grasps A --out X B"),
-        ("models add A --name X", "models add --name X A"),
         ("evaluate svm cnn1 --jobs 2", "evaluate svm --jobs 2 cnn1"),
         ("report stability svm mlp --quick", "report stability svm --quick mlp"),
     ],

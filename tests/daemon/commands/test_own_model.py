@@ -1,9 +1,8 @@
-"""A lab with grasps of its own: table, training, the model by its name in a scene, verdicts."""
+"""A lab with grasps of its own: table, training, the model by its file in a scene, verdicts."""
 
 from __future__ import annotations
 
 import json
-import shlex
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,6 @@ def test_a_table_becomes_a_model_that_a_scene_names(
 ) -> None:
     for package in ("torch", "rich"):
         pytest.importorskip(package, reason="needs the extra `train`")
-    monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "monday.csv", table("monday", 60, 1))
 
@@ -26,25 +24,22 @@ def test_a_table_becomes_a_model_that_a_scene_names(
     assert trained.returncode == 0, trained.stderr
     *warnings, last = trained.stderr.splitlines()
     assert any("not calibrated by the session" in line for line in warnings)
-    command = last.removeprefix("graspd train: for a scene: graspd ")
-    assert command == "models add runs/svm-monday/svm-monday.onnx --name svm-monday"
+    line = last.removeprefix("graspd train: for a scene, below [model]: ")
+    model = tmp_path / "runs" / "svm-monday" / "svm-monday.onnx"
+    assert line == f'path = "{model}"'
 
-    added = graspd(*shlex.split(command), "--user")
-    assert added.returncode == 0, added.stderr
-    assert added.stdout.endswith('in a scene, below [model]: name = "svm-monday"\n')
     scene = tmp_path / "right.toml"
     scene.write_text(
-        '[tactile]\ndriver = "replay"\nrecordings = ["monday.csv"]\n[model]\nname = "svm-monday"\n'
+        f'[tactile]\ndriver = "replay"\nrecordings = ["monday.csv"]\n[model]\n{line}\n'
     )
     checked = graspd("check", scene)
     assert checked.returncode == 0, checked.stderr
-    sha256 = read(tmp_path / "runs" / "svm-monday" / "svm-monday.onnx").sha256
+    sha256 = read(model).sha256
     assert f"svm-monday ({sha256[:12]})" in checked.stdout
 
-    replayed = graspd("replay", "monday.csv", "--model", "svm-monday", "--json")
+    replayed = graspd("replay", "monday.csv", "--model", model, "--json")
     assert replayed.returncode == 0, replayed.stderr
     verdicts = [json.loads(line) for line in replayed.stdout.splitlines()]
     assert len(verdicts) == 60
     assert {verdict["model_sha"] for verdict in verdicts} == {sha256[:12]}
     assert {"stable", "slip"} <= {verdict["verdict"] for verdict in verdicts}
-    assert "svm-monday (own)" in graspd("models").stdout

@@ -285,7 +285,7 @@ def test_a_model_is_named_and_its_end_says_how_a_scene_gets_it(tmp_path: Path) -
         done = train(*options, *words)
         assert done.stdout.startswith(f"{out / name}.onnx: cv F1 ")
         assert done.stderr.splitlines()[-1] == (
-            f"graspd train: for a scene: graspd models add {out / name}.onnx --name {name}"
+            f'graspd train: for a scene, below [model]: path = "{out / name}.onnx"'
         )
         assert TactileModel(out / f"{name}.onnx").contract.name == name
         command = json.loads((out / f"{name}.json").read_text())["command"]
