@@ -49,7 +49,6 @@ COMMANDS = {
         "graspd.models.training.reports.command",
         "measure error, time and exactness of the models (extras: train, report)",
     ),
-    "completion": (".texts", "print what makes a shell complete commands"),
     "manual": (".texts", "print the manual page: graspd manual | man -l -"),
 }
 """Commands by name: a module with `add_arguments(parser)` and `run(args) -> int`, and help.

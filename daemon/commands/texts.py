@@ -1,4 +1,4 @@
-"""`graspd scene`, `schema`, `manual` and `completion`: print a text that is ready."""
+"""`graspd scene`, `schema` and `manual`: print a text that is ready."""
 
 from __future__ import annotations
 
@@ -10,20 +10,12 @@ from pathlib import Path
 from graspd.daemon.publish.messages import schema
 from graspd.daemon.scene import explained
 
-FILES = Path(__file__).parent / "shell"
+MANUAL = Path(__file__).parent / "shell" / "graspd.1"
 """Made of the command line's parsers by `python -m tests.daemon.commands.shell_files`."""
-SHELLS = ("bash", "zsh", "fish")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `parser.prog`; only `scene` and `completion` have any."""
-    if parser.prog == "graspd completion":
-        parser.add_argument(
-            "shell",
-            choices=SHELLS,
-            help='which shell: eval "$(graspd completion bash)", in zsh after compinit; '
-            "graspd completion fish | source",
-        )
+    """Declare the arguments of `parser.prog`; only `scene` has any."""
     if parser.prog != "graspd scene":
         return
     what = parser.add_mutually_exclusive_group(required=True)
@@ -52,10 +44,8 @@ def run(args: argparse.Namespace) -> int:
             text = explained.schema_text() if args.schema else explained.page()
         case "schema":
             text = schema_text()
-        case "manual":
-            text = (FILES / "graspd.1").read_text()
         case _:
-            text = (FILES / f"graspd.{args.shell}").read_text()
+            text = MANUAL.read_text()
     sys.stdout.write(text)
     return 0
 

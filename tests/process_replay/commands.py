@@ -86,7 +86,6 @@ COMMANDS: Final[Mapping[str, str]] = {
     "export-grasps-there": "export-grasps recorded.mcap --out grasps.csv",
     "export-grasps-table": "export-grasps table.csv --out other.csv",
     "data-absent": "data --from nowhere",
-    "completion": "completion bash",
     "manual": "manual",
     "report-unknown": "report accuracy",
     "watch-wrong-port": "watch --port 0",
@@ -96,7 +95,7 @@ COMMANDS: Final[Mapping[str, str]] = {
         for words in (
             *("run", "replay", "watch", "scene", "check", "doctor", "twin", "data", "schema"),
             *("models", "session", "export-grasps", "keys", "train", "evaluate", "report"),
-            *("completion", "manual", "twin spi", "twin can", "twin palm", "twin joints"),
+            *("manual", "twin spi", "twin can", "twin palm", "twin joints"),
             *("session show", "session reset", "session seed", "keys make", "keys list"),
         )
     },

@@ -1,6 +1,6 @@
 """Settings of classifiers, networks and their training.
 
-No library of the training is imported here, so that help and completion list every system.
+No library of the training is imported here, so that the help lists every system.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Make the manual page and what completes commands, of the parsers of the command line.
+"""Make the manual page of the parsers of the command line.
 
-`python -m tests.daemon.commands.shell_files` writes them to `deploy/shell`.
+`python -m tests.daemon.commands.shell_files` writes it to `deploy/shell`.
 """
 
 from __future__ import annotations
@@ -10,15 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-import shtab
 from argparse_manpage.manpage import Manpage
 
 from graspd.daemon.cli import whole_parser
 from graspd.daemon.commands.arguments import Parser
-from graspd.daemon.commands.texts import SHELLS
-from graspd.models import zoo
 
-FOLDER: Final = Path(__file__).parents[3] / "deploy" / "shell"
+PAGE: Final = Path(__file__).parents[3] / "deploy" / "shell" / "graspd.1"
 SECTIONS: Final = {
     "exit status": """.TP
 .B 0
@@ -70,29 +67,6 @@ def manual() -> str:
     return str(page)
 
 
-def completion(shell: str) -> str:
-    """Return the script for a shell; values without choices are completed as file names."""
-    whole = whole_parser()
-    for parser in parsers(whole):
-        for action in parser.actions:
-            if action.choices is not None or action.nargs == 0:
-                continue
-            if action.dest == "model":
-                action.choices = zoo.names()
-            else:
-                action.complete = shtab.FILE  # type: ignore[attr-defined]
-    script: str = shtab.complete(whole, shell, root_prefix="graspd")
-    return script
-
-
-def files() -> Iterator[tuple[Path, str]]:
-    """Yield each file of the folder and what should be in it."""
-    yield FOLDER / "graspd.1", manual()
-    for shell in SHELLS:
-        yield FOLDER / f"graspd.{shell}", completion(shell)
-
-
 if __name__ == "__main__":
     os.environ["COLUMNS"] = "80"
-    for path, text in files():
-        path.write_text(text)
+    PAGE.write_text(manual())

@@ -1,4 +1,4 @@
-"""The command line as people type it: help, what is mistyped, versions, completion, the manual."""
+"""The command line as people type it: help, what is mistyped, versions, the manual."""
 
 from __future__ import annotations
 
