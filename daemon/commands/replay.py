@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,8 @@ from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.run.day_table import PUBLISHED, DayTable
 from graspd.daemon.run.loop import Loop, LoopTiming
-from graspd.daemon.run.replaying import Comparison, Controller, trained_on
-from graspd.daemon.run.summary import (
-    WITHOUT_LEARNING,
-    WITHOUT_SESSION,
-    Printer,
-    RunSummary,
-    trained_on_line,
-)
+from graspd.daemon.run.replaying import Controller, trained_on
+from graspd.daemon.run.summary import Printer, trained_on_line
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.session import file as session_file
@@ -188,7 +182,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         shown = Printer(as_json=args.json)
         if isinstance(source, Tables):
             shown.result.trained_on = trained_on(args.recordings, model)
-        told = [shown, *_comparisons(args, source, parts, shown.result)]
+        told = [shown]
     controller = Controller(only_lifted=args.only_lifted)
     if args.outcomes:
         told.append(controller)
@@ -308,29 +302,6 @@ def _restore_session(
     if args.session in (RUNNING, OFF) or pipeline.session is None:
         return
     session_file.restore(Path(args.session), fingers, pipeline.session)
-
-
-def _comparisons(
-    args: argparse.Namespace, source: Source, parts: Parts, result: RunSummary
-) -> Iterator[Companion]:
-    """Yield judges of the same grasps: without a session, and without learning from outcomes."""
-    wanted, pipeline = parts.scene, parts.pipeline
-    # They judge each reading that the replay judges: without joints they cannot choose it.
-    update = {
-        "gate": wanted.gate.model_copy(update={"mode": "every"}),
-        "learn": wanted.learn.model_copy(update={"enabled": False}),
-        "risk": None,
-    }
-    alone = wanted.model_copy(update=update)
-    if pipeline.session is not None and args.session != OFF:
-        other = assembly.load_model(wanted)
-        judge = assembly.build_pipeline(alone, other, pipeline.clock, learns=False)
-        yield Comparison(WITHOUT_SESSION, judge, result)
-    if pipeline.trust is not None and (args.outcomes or not isinstance(source, Tables)):
-        other, learns = assembly.load_model(wanted), wanted.session.learn
-        judge = assembly.build_pipeline(alone, other, pipeline.clock, learns=learns)
-        _restore_session(args, source, judge, wanted.hand.fingers)
-        yield Comparison(WITHOUT_LEARNING, judge, result)
 
 
 def _endpoint(text: str) -> str:

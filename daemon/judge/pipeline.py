@@ -231,10 +231,6 @@ class Pipeline:
             self._note(lift, worth, stable=stable)
         return judgement
 
-    def watch(self, reading: TactileReading) -> None:
-        """Take in a reading that is not to be judged: what repeats it later is not fresh."""
-        self._health.check(reading)
-
     def silence(self, last_t_ns: int) -> Judgement:
         """Return the judgement when no reading came for too long since that of `last_t_ns`."""
         moment = self.hand.silent()

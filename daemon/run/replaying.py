@@ -1,4 +1,4 @@
-"""Companions of a replay: one tells outcomes, the other judges again in another way."""
+"""The controller of a replay, which tells outcomes, and tables that a model was trained on."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
 from graspd.daemon.publish.messages import OBJECT_PATTERN
-from graspd.daemon.run.summary import RunSummary
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.models.runtime import TactileModel
 
@@ -71,36 +69,6 @@ class Controller(Companion):
 def _sent(object_name: str | None) -> str | None:
     """Return the name if outcomes allow it, else None; tables may have any text."""
     return object_name if re.fullmatch(OBJECT_PATTERN, object_name or "") else None
-
-
-class Comparison(Companion):
-    """Judge each grasp a second time with another pipeline, to compare the two in the summary.
-
-    Nothing of it is published.
-    """
-
-    def __init__(self, how: str, pipeline: Pipeline, result: RunSummary) -> None:
-        """`how`: name of the second way, the key of `RunSummary.compared` in `result`.
-
-        `pipeline`: the second judge; one without a gate, which takes each reading for a grasp.
-        """
-        self._how = how
-        self._pipeline = pipeline
-        self._result = result
-        self._grasp: int | None = None
-
-    def on_verdict(self, published: PublishedVerdict) -> None:
-        """Judge the reading again if its verdict is the first on a grasp; else only watch it."""
-        verdict, reading = published.verdict, published.reading
-        if reading is None:
-            return
-        if not verdict.judged or verdict.grasp == self._grasp:
-            self._pipeline.watch(reading)
-            return
-        self._grasp = verdict.grasp
-        slipped = None if reading.annotation is None else reading.annotation.slipped
-        judgement = self._pipeline.judge(reading)
-        self._result.compare(self._how, judgement, slipped, published.grasp)
 
 
 def trained_on(recordings: Sequence[Path], model: TactileModel) -> list[str]:

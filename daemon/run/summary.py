@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import msgspec
 
-from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.process.text import Colour, coloured, printable
 from graspd.daemon.publish.companion import Companion, PublishedVerdict
@@ -28,7 +27,6 @@ WINDOW: Final = 50
 """Number of `stable` lifts in a row among which the most slips are counted."""
 WAITING_MAX: Final = 1024
 """Most grasps that wait for their outcome."""
-WITHOUT_SESSION, WITHOUT_LEARNING = "without session calibration", "without learning"
 WORTH: Final = {
     "coverage": "coverage",
     "slips_among_stable": "slips among stable",
@@ -155,10 +153,9 @@ class RunSummary:
 
     def __init__(self) -> None:
         self.tally = Tally()
-        self.compared = {WITHOUT_SESSION: Tally(), WITHOUT_LEARNING: Tally()}
-        """Tallies of the same grasps judged in another way; empty if not tried."""
         self.trained_on: Sequence[str] = ()
-        self._waiting: dict[GraspId, list[tuple[Tally, Decision]]] = {}
+        self._waiting: dict[GraspId, Decision] = {}
+        """Decisions on grasps whose outcome may still come, the oldest first."""
         self.repaired = 0
         """Number of verdicts with at least one repaired electrode."""
         self.latency = LatencyHistogram()
@@ -188,54 +185,31 @@ class RunSummary:
                 self.again += 1
                 return
             self._judged_grasp = grasp
-        self._add(self.tally, grasp, verdict.verdict, verdict.reasons, slipped)
+        self.tally.add(verdict.verdict, verdict.reasons, slipped)
+        if slipped is None:
+            self._waiting.setdefault(grasp, verdict.verdict)
+            if len(self._waiting) > WAITING_MAX:
+                del self._waiting[next(iter(self._waiting))]
         self.repaired += verdict.valid and bool(verdict.repaired)
-
-    def compare(self, how: str, judgement: Judgement, slipped: bool | None, grasp: GraspId) -> None:
-        tally = self.compared[how]
-        self._add(tally, grasp, judgement.decision, judgement.reasons, slipped)
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> None:
         """Count the outcome of a grasp after its verdict; only the first counts."""
-        for tally, decision in self._waiting.pop(grasp, ()):
-            tally.outcome(decision, slipped=slipped)
-
-    def _add(
-        self,
-        tally: Tally,
-        grasp: GraspId,
-        decision: Decision,
-        reasons: Iterable[Reason],
-        slipped: bool | None,
-    ) -> None:
-        tally.add(decision, reasons, slipped)
-        if slipped is None:
-            self._waiting.setdefault(grasp, []).append((tally, decision))
-            if len(self._waiting) > WAITING_MAX:
-                del self._waiting[next(iter(self._waiting))]
+        decision = self._waiting.pop(grasp, None)
+        if decision is not None:
+            self.tally.outcome(decision, slipped=slipped)
 
     def as_dict(self, wall_s: float, trust: Trust | None) -> dict[str, Any]:
         """Return everything as values for JSON. `wall_s`: time of the replay, s."""
-        compared = {how: tally.as_dict() for how, tally in self._compared(trust)}
         return {
             **self.tally.as_dict(),
             "gated": self._gated(),
             "repaired": self.repaired,
-            "without_session": compared.get(WITHOUT_SESSION),
-            "without_learning": compared.get(WITHOUT_LEARNING),
             "outcomes": 0 if trust is None else trust.learner.outcomes,
             "risk": None if trust is None else msgspec.to_builtins(trust.report()),
             "trained_on": list(self.trained_on),
             "latency_us": self.latency.spread_us(),
             "wall_s": wall_s,
         }
-
-    def _compared(self, trust: Trust | None) -> Iterator[tuple[str, Tally]]:
-        """Yield the other ways that were tried; "without learning" needs outcomes."""
-        for how, tally in self.compared.items():
-            learned = trust is not None and bool(trust.lifts.told)
-            if tally.decisions and (learned or how != WITHOUT_LEARNING):
-                yield how, tally
 
     def _gated(self) -> dict[str, int] | None:
         if not self.readings:
@@ -257,9 +231,6 @@ class RunSummary:
             lines.append("no outcome of a lift is known, so there is no score")
         if self.repaired:
             lines.append(f"{self.repaired} of them with repaired electrodes")
-        for how, tally in self._compared(trust):
-            lines.append(f"{how}: {tally.counts()}")
-            lines += [f"  {line}" for line in tally.lines()]
         lines += _learned(trust)
         if self.trained_on:
             lines.append(trained_on_line("the model", self.trained_on))

@@ -9,9 +9,8 @@ import pytest
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.outbox import BUCKETS, Deadlines, LatencyHistogram
-from graspd.daemon.run.summary import WITHOUT_LEARNING, RunSummary, Tally
+from graspd.daemon.run.summary import RunSummary, Tally
 from graspd.daemon.trust.lift_book import GraspId
-from graspd.daemon.trust.trust import Trust
 from tests.daemon.fakes import MS, reading
 from tests.kit.messages import GOLDEN_VERDICT
 
@@ -171,17 +170,3 @@ def test_a_grasp_of_another_start_is_another_grasp() -> None:
     assert summary.tally.labelled == 0
     summary.outcome(GraspId("a" * 32, 1), slipped=False)
     assert (summary.tally.held, summary.tally.slipped) == (1, 0)
-
-
-def test_without_learning_is_shown_where_something_was_learned() -> None:
-    summary, trust = RunSummary(), Trust("model", 2)
-    grasp = GraspId("boot", 1)
-    summary.add(verdict(Decision.STABLE), True)
-    summary.compared[WITHOUT_LEARNING].add(Decision.SLIP, (), slipped=True)
-    assert not any("without learning" in line for line in summary.lines(1.0, trust))
-    trust.note(grasp, trust.judge(grasp, 0.1, -2.0, np.zeros(2)), stable=True)
-    trust.outcome(grasp, slipped=True)
-    lines = summary.lines(1.0, trust)
-    assert "without learning: 0 stable, 1 slip, 0 unknown" in lines
-    assert "learned from 1 outcomes" in lines
-    assert summary.as_dict(1.0, trust)["without_learning"]["verdicts"]["slip"] == 1
