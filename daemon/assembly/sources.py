@@ -76,8 +76,10 @@ class Tables(Source):
         """
         self._paths = [path.absolute() for path in paths]
         self._driver = partial(ReplayDriver, self._paths, rate_hz=rate_hz, loop=loop, strict=strict)
-        tactile = {"driver": "replay", "recordings": self._paths}
-        changes = {"tactile": tactile, "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS}}
+        changes: dict[str, dict[str, Any]] = {
+            "tactile": {"driver": "replay", "recordings": self._paths},
+            "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS},
+        }
         super().__init__({**sections, **changes}, Path("command line"))
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:

@@ -224,7 +224,7 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
     when = "when asked, " if limits.on_request else ""
     joints = "" if limits.joints is None else f", joints below {limits.joints.rad_per_s:g} rad/s"
     fingers = ", ".join(gate.fingers or wanted.hand.fingers)
-    what = f"median of three fresh readings, {age}"
+    what = f"median of 3 fresh readings, {age}"
     return f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}"
 
 

@@ -199,7 +199,7 @@ def running(
     endpoint = endpoint or f"ipc://{folder}/v"
     scene = folder / "scene.toml"
     scene.write_text(f'{sections}[publish]\nendpoint = "{endpoint}"\n{publish}')
-    program = GRASPD
+    program: Sequence[str] = GRASPD
     if high_water_mark is not None:
         program = graspd_with("graspd.daemon.publish.sockets", HIGH_WATER_MARK=high_water_mark)
     command = [*program, "run", str(scene)]

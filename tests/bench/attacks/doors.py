@@ -123,8 +123,15 @@ def hand(
     )
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    options = {"publish": publish, "high_water_mark": high_water_mark}
-    with running(folder, sections, endpoint=endpoint, keys=keys, **options) as (process, friend):
+    started = running(
+        folder,
+        sections,
+        publish=publish,
+        high_water_mark=high_water_mark,
+        endpoint=endpoint,
+        keys=keys,
+    )
+    with started as (process, friend):
         if friend.take(PATIENCE_S) is None:
             raise TimeoutError("the daemon says nothing")
         for _ in range(100):
