@@ -10,9 +10,6 @@ from enum import IntEnum
 
 from graspd.daemon.process.logs import JOURNAL_ERROR, is_journal
 
-PROGRESS_MAX = 78
-"""Longest progress line, characters; a wrapped line could not be erased."""
-
 
 class Colour(IntEnum):
     """Colours of a terminal (ECMA-48, SGR)."""
@@ -69,10 +66,3 @@ def write_json(content: object) -> None:
 def write_lines(*lines: str) -> None:
     """Write lines to stdout. Pass untrusted text through `printable` first."""
     sys.stdout.writelines(f"{line}\n" for line in lines)
-
-
-def progress(doing: str) -> None:
-    """Show progress on a terminal, in place of the text before; "" erases it."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K{printable(doing, PROGRESS_MAX)}")
-        sys.stderr.flush()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import resource
 import signal
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from graspd.daemon.process.signals import StopSignal
-from graspd.daemon.process.text import printable, progress
+from graspd.daemon.process.text import printable
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit import inside
@@ -245,16 +244,6 @@ def test_a_path_does_not_move_the_cursor_either(tmp_path: Path) -> None:
 )
 def test_what_could_hide_is_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
-
-
-def test_what_is_being_done_is_shown_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    for is_terminal, expected in ((True, "\r\x1b[Khalf\\nway\r\x1b[K"), (False, "")):
-        stderr = io.StringIO()
-        monkeypatch.setattr(stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
-        monkeypatch.setattr("sys.stderr", stderr)
-        progress("half\nway")
-        progress("")
-        assert stderr.getvalue() == expected
 
 
 def test_a_signal_is_waited_for_above_descriptor_1024() -> None:
