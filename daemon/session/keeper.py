@@ -32,6 +32,7 @@ from graspd.daemon.session.sensors import (
     moved_fingers,
     numbers,
 )
+from graspd.daemon.trust.trust import TrustState
 from graspd.drivers.base import Driver
 
 log = logging.getLogger("graspd")
@@ -73,8 +74,8 @@ class SessionKeeper(SensorWatch):
         self._fingers = tuple(fingers)
         self._folder = folder
         self._clock = clock
-        self._unused = KeptSession(None, self._fingers, {})
-        """State that was kept and that this run does not use."""
+        self._unused: TrustState | None = None
+        """State of learning that was kept, where this run does not learn."""
         self._others: tuple[KeptSession, ...] = ()
         """Sessions of other fingers, models or sensors, the last used first."""
         self._warned = False
@@ -158,11 +159,8 @@ class SessionKeeper(SensorWatch):
             self._waiting.popleft()(reply)
 
     def _now(self) -> KeptSession:
-        statistics, trust = self._unused.statistics, self._unused.trust
-        if self._session is not None:
-            statistics = self._session.state()
-        if self._trust is not None:
-            trust = self._trust.state()
+        statistics = None if self._session is None else self._session.state()
+        trust = self._unused if self._trust is None else self._trust.state()
         rest = None if self._rest is None else tuple(self._rest.ravel().tolist())
         return KeptSession(statistics, self._fingers, numbers(self._serials), trust, rest)
 
@@ -195,12 +193,11 @@ class SessionKeeper(SensorWatch):
         try:
             of_fingers(kept, self._fingers)
             if self._session is None:
-                self._unused = replace(self._unused, statistics=kept.statistics)
-            elif self._read_rest is not None and is_of_unknown_sensors(kept):
+                return kept.statistics is None
+            if self._read_rest is not None and is_of_unknown_sensors(kept):
                 log.warning(SEEDED, FIT_GRASPS)
                 return False
-            else:
-                restore_kept(kept, self._fingers, self._session)
+            restore_kept(kept, self._fingers, self._session)
         except SessionFileError as error:
             log.warning("%s; it stays kept", error)
             return False
@@ -213,7 +210,7 @@ class SessionKeeper(SensorWatch):
             if each.trust is None or not is_of_sensors(each, used):
                 continue
             if self._trust is None:
-                self._unused = replace(self._unused, trust=each.trust)
+                self._unused = each.trust
                 return each
             try:
                 self._trust.restore(each.trust)
@@ -261,7 +258,7 @@ class SessionKeeper(SensorWatch):
         leaving = self._now()
         if not leaving.is_empty:
             self._others = tuple(newest_of_each([leaving, *self._others])[: KEPT_MAX - 1])
-        self._unused, self._rest = KeptSession(None, self._fingers, {}), None
+        self._unused = self._rest = None
         if former is None or not self._take_up(former, tared=tared):
             self._sensors_exchanged()
         self._save_due_ns = self._clock()
@@ -279,7 +276,7 @@ class SessionKeeper(SensorWatch):
         except ValueError as error:
             log.warning("what was kept of these sensors %s; a new session begins", error)
             return False
-        self._unused = replace(former, trust=trust)
+        self._unused = trust
         self._serials, self._rest = numbers(former.serials), self._rest_of(former.rest)
         grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
         log.warning("these sensors were there before: their session%s goes on", grasps)
