@@ -94,7 +94,7 @@ class GraspModel:
             for values in self._counts(session):
                 examined = self._examine(values)
                 self._judge.observe(examined, self._judge.weigh(examined))
-        if not calibration.now.calibrated:
+        if not calibration.calibrated:
             warnings.warn(
                 f"{self.name} does not know the sensors of this day: its probabilities mean little "
                 "on any day but those of its training. Give session= "

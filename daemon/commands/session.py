@@ -137,7 +137,7 @@ def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession |
             restore_kept(kept, wanted.hand.fingers, session)
     except SessionFileError as error:
         complain(f"{error}; a new session begins")
-    return session.now.calibrated
+    return session.calibrated
 
 
 def _lines(
@@ -206,7 +206,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
         grasps, state = outcomes, None
         if session is not None:
             grasps, state = session.grasps, session.state()
-            if not session.now.calibrated:
+            if not session.calibrated:
                 raise DriverError(
                     f"{grasps} grasps of {readings} readings are too few, or they are no grasps"
                 )

@@ -246,7 +246,7 @@ class Pipeline:
         findings |= self.hand.health()
         if self._opinion.refusal is Refusal.MODEL_FAILED:
             findings["model"] = Reason.MODEL_FAILED
-        if self.session is not None and not self.session.now.calibrated:
+        if self.session is not None and not self.session.calibrated:
             findings["session"] = Reason.NOT_CALIBRATED
         return findings
 
@@ -302,7 +302,7 @@ class Pipeline:
 
         A judgement that is not `stable` is kept, to hold down later ones.
         """
-        calibrated = None if self.session is None else self.session.now.calibrated
+        calibrated = None if self.session is None else self.session.calibrated
         objections = unusable
         if opinion.refusal is not None:
             objections = (*unusable, Reason(opinion.refusal))

@@ -293,7 +293,7 @@ class Outbox:
             drivers=drivers,
             repaired=dict(self._repaired),
             session_grasps=None if session is None else session.grasps,
-            session_calibrated=None if session is None else session.now.calibrated,
+            session_calibrated=None if session is None else session.calibrated,
             gate=hand.state,
             tared=None if hand.tared is None else list(hand.tared),
             health=health,

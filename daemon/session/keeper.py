@@ -240,7 +240,7 @@ class SessionKeeper(SensorWatch):
     def _fits(self, seeded: KeptSession) -> bool:
         """Return True if the grasps of this session, still a young one, fit a seeded one."""
         session, known = self._session, seeded.statistics
-        if session is None or session.now.calibrated or session.grasps < FIT_GRASPS:
+        if session is None or session.calibrated or session.grasps < FIT_GRASPS:
             return False
         return known is not None and fits(known, session.state(), len(self._fingers))
 

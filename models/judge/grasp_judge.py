@@ -21,7 +21,7 @@ from graspd.models.inputs import SPREAD_FLOOR_COUNTS, InputBuilder, SessionBuild
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from graspd.models.judge.session import Calibration, SessionCalibration
+    from graspd.models.judge.session import SessionCalibration
 
 FLAT_SPREAD_COUNTS = 70.0
 """Smallest standard deviation over the electrodes of a finger that touches and works, counts.
@@ -145,7 +145,7 @@ class GraspJudge:
         self, counts: NDArray[np.uint16], broken: NDArray[np.bool_] | None = None
     ) -> Examined:
         """Return the counts to judge, or why they must not be; see `judge`."""
-        session = None if self.session is None else self.session.now
+        session = self.session
         values = counts.astype(np.float64)
         if _is_flat(values, broken):
             return Examined(counts, Refusal.FLAT)
@@ -191,7 +191,7 @@ class GraspJudge:
         if not (sound and abs(p_stable + p_slip - 1.0) < 1e-3):
             return Opinion(None, Refusal.MODEL_FAILED, repaired)
         margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
-        temperature = 1.0 if self.session is None else self.session.now.temperature
+        temperature = 1.0 if self.session is None else self.session.temperature
         if temperature != 1.0:
             # Counted from the threshold, so that it stays on the same side.
             log_odds = self._log_threshold + (margin - self._log_threshold) / temperature
@@ -202,7 +202,7 @@ class GraspJudge:
         """Write the network's input for counts (fingers, 24); return each finger's spread."""
         inputs, session = self._network.inputs, self.session
         if session is not None and isinstance(inputs, SessionBuilder):
-            inputs.use(session.now.features_mean, session.now.features_spread)
+            inputs.use(session.features_mean, session.features_spread)
         return inputs.build(counts, self._network.input)
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
@@ -214,7 +214,7 @@ def _as_read(
     counts: NDArray[np.uint16],
     values: NDArray[np.float64],
     broken: NDArray[np.bool_],
-    session: Calibration | None,
+    session: SessionCalibration | None,
 ) -> NDArray[np.generic]:
     """Return counts with `broken` electrodes as today's sensors would read their `values`."""
     expected = values if session is None else session.from_training(values)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,9 +11,11 @@ from graspd.models.inputs import raw_features
 from graspd.models.session_statistics import SessionState, SessionStatistics, is_odd
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
-    """Statistics of a session after some grasps; each further grasp makes new ones."""
+class SessionCalibration:
+    """Learns from the grasps of a session, without labels, what its sensors read.
+
+    Arrays are never changed in place: after each grasp there are new ones.
+    """
 
     features_mean: NDArray[np.float64]
     """Mean of the raw features of a session model, shape (fingers * 26,)."""
@@ -23,33 +23,14 @@ class Calibration:
     """Standard deviation of the raw features, shape (fingers * 26,)."""
     counts_mean: NDArray[np.float64]
     """Mean of each electrode in this session, counts, shape (fingers, 24)."""
-    counts_spread: NDArray[np.float64]
-    """Standard deviation of each electrode in this session, shape (fingers, 24)."""
-    training_mean: NDArray[np.float64]
-    """Mean of each electrode in the training, counts, shape (fingers, 24)."""
     scale: NDArray[np.float64]
-    """Spread in the training over that of the session, shape (fingers, 24)."""
+    """Spread of each electrode in the training over that of the session, shape (fingers, 24)."""
     calibrated: bool
     """True if the session has the grasps that the model asks for, and is not `odd`."""
     odd: bool
     """True if the session cannot have come from grasps of these fingers: see `is_odd`."""
     temperature: float
     """Divisor of the network's log-odds of slip, above 1 while the session has few grasps."""
-
-    def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
-        """Return counts (fingers, 24) as the training's sensors would read them."""
-        deviation = counts.astype(np.float64) - self.counts_mean
-        values: NDArray[np.float64] = self.training_mean + deviation * self.scale
-        return values
-
-    def from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `to_training`."""
-        counts: NDArray[np.float64] = self.counts_mean + (values - self.training_mean) / self.scale
-        return counts
-
-
-class SessionCalibration:
-    """Learns the statistics of a session from its grasps, without labels; `now` has the latest."""
 
     def __init__(
         self,
@@ -63,19 +44,29 @@ class SessionCalibration:
         mean and standard deviation of each electrode, counts, shape (fingers, 24).
         """
         self._takes = takes
-        self._training_mean = counts_mean
-        self._training_spread = counts_spread
+        self._training = counts_mean, counts_spread
         self._statistics = SessionStatistics(
             np.concatenate((takes.mean, counts_mean.ravel())),
             np.concatenate((takes.spread, counts_spread.ravel())),
             takes.prior_grasps,
         )
-        self.now = self._calibration()
+        self._settle()
 
     @property
     def grasps(self) -> int:
         """Grasps of this session that were taken in."""
         return self._statistics.grasps
+
+    def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
+        """Return counts (fingers, 24) as the training's sensors would read them."""
+        deviation = counts.astype(np.float64) - self.counts_mean
+        values: NDArray[np.float64] = self._training[0] + deviation * self.scale
+        return values
+
+    def from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `to_training`."""
+        counts: NDArray[np.float64] = self.counts_mean + (values - self._training[0]) / self.scale
+        return counts
 
     def observe(self, counts: NDArray[np.generic], *, slip: bool | None = None) -> None:
         """Take in the counts of a grasp, shape (fingers, 24).
@@ -84,12 +75,12 @@ class SessionCalibration:
         """
         values = np.concatenate((raw_features(counts), counts.ravel()))
         if self._statistics.observe(values, slip=slip):
-            self.now = self._calibration()
+            self._settle()
 
     def reset(self) -> None:
         """Start again: a sensor was exchanged."""
         self._statistics.reset()
-        self.now = self._calibration()
+        self._settle()
 
     def state(self) -> SessionState:
         """Return what `restore` needs."""
@@ -101,25 +92,17 @@ class SessionCalibration:
         if ((counts < 0.0) | (counts > COUNT_MAX)).any():
             raise ValueError("holds means that no counts have")
         self._statistics.restore(state)
-        self.now = self._calibration()
+        self._settle()
 
-    def _calibration(self) -> Calibration:
-        features, shape = len(self._takes.mean), self._training_mean.shape
+    def _settle(self) -> None:
         mean, spread = self._statistics.mean, self._statistics.spread
-        counts_mean = mean[features:].reshape(shape)
+        features, shape = len(self._takes.mean), self._training[0].shape
+        self.features_mean, self.features_spread = mean[:features], spread[:features]
+        self.counts_mean = mean[features:].reshape(shape)
         counts_spread = spread[features:].reshape(shape)
+        self.scale = self._training[1] / counts_spread
         enough = self.grasps >= self._takes.calibrated_from
-        training = self._training_mean, self._training_spread
-        odd = is_odd(counts_mean, counts_spread, *training, enough=enough)
-        steps, grasps = self._takes.sharpness, 0 if odd else self.grasps
-        return Calibration(
-            features_mean=mean[:features],
-            features_spread=spread[:features],
-            counts_mean=counts_mean,
-            counts_spread=counts_spread,
-            training_mean=self._training_mean,
-            scale=self._training_spread / counts_spread,
-            calibrated=enough and not odd,
-            odd=odd,
-            temperature=next(s.temperature for s in reversed(steps) if s.grasps <= grasps),
-        )
+        self.odd = is_odd(self.counts_mean, counts_spread, *self._training, enough=enough)
+        self.calibrated = enough and not self.odd
+        steps, grasps = self._takes.sharpness, 0 if self.odd else self.grasps
+        self.temperature = next(s.temperature for s in reversed(steps) if s.grasps <= grasps)

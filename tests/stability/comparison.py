@@ -109,7 +109,7 @@ class Comparison:
         self.reference = reference
         self._state = state
         session = self._pipeline().session
-        self._session = None if session is None else session.now
+        self._session = session
         if self._session is not None and isinstance(model.inputs, SessionBuilder):
             model.inputs.use(self._session.features_mean, self._session.features_spread)
         wanted = model.contract.input

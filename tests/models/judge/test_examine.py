@@ -12,7 +12,6 @@ from graspd.drivers.twins.grasps import synthetic
 from graspd.models import zoo
 from graspd.models.contract import SeenCounts
 from graspd.models.judge.grasp_judge import GraspJudge, Refusal
-from graspd.models.judge.session import Calibration
 from graspd.models.runtime import TactileModel
 
 NOTHING = np.zeros((3, 24), dtype=np.bool_)
@@ -72,17 +71,6 @@ def of_sessions() -> GraspJudge:
     return GraspJudge.of(TactileModel(zoo.find("small-session")))
 
 
-def same_sensors(centre: NDArray[np.float64], **known: bool) -> Calibration:
-    """A session whose sensors are those of the training."""
-    nothing, ones = np.zeros(0), np.ones((3, 24))
-    return Calibration(
-        *(nothing, nothing, centre, ones, centre, ones),
-        calibrated=known.get("calibrated", True),
-        odd=known.get("odd", False),
-        temperature=1.0,
-    )
-
-
 @pytest.mark.parametrize(
     ("stretched", "known", "judged", "learned"),
     [
@@ -107,8 +95,9 @@ def test_a_session_judges_what_is_near_and_learns_from_what_is_twice_as_far(
     direction = np.random.default_rng(2).normal(size=72)
     direction *= 0.9 * seen.distance_max * np.sqrt(72) / np.linalg.norm(direction)
     counts = np.clip(centre + stretched * (direction @ spread.T).reshape(3, 24), 1, 4094)
-    assert of_sessions.session is not None
-    of_sessions.session.now = same_sensors(centre, **known)
+    session = of_sessions.session
+    assert session is not None
+    session.calibrated, session.odd = known.get("calibrated", True), known.get("odd", False)
     found = of_sessions.examine(np.rint(counts).astype(np.uint16), NOTHING)
     assert found.refusal == (None if judged else Refusal.NEVER_SEEN)
     assert (found.grasp is not None) == learned

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from graspd.models import zoo
 from graspd.models.contract import SessionInput, Sharpness
 from graspd.models.judge.grasp_judge import Examined, GraspJudge, Refusal
-from graspd.models.judge.session import Calibration, SessionCalibration
+from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FakeModel
 
@@ -37,22 +36,11 @@ def judge_of(model: FakeModel, threshold: float = 0.5) -> GraspJudge:
     return GraspJudge.of(model, threshold)  # type: ignore[arg-type]
 
 
-def session(now: Calibration) -> SessionCalibration:
-    """A session that is calibrated like this."""
-    takes = SessionInput((0.0,) * 78, (1.0,) * 78, 5.0, 1.0, 20.0, (Sharpness(0.0, 1.0),))
-    made = SessionCalibration(takes, np.ones((3, 24)), np.ones((3, 24)))
-    made.now = now
-    return made
-
-
-def calibration(temperature: float) -> Calibration:
-    nothing, shape = np.zeros(0), np.ones((3, 24))
-    return Calibration(
-        *(nothing, nothing, shape, shape, shape, shape),
-        calibrated=True,
-        odd=False,
-        temperature=temperature,
-    )
+def session(temperature: float) -> SessionCalibration:
+    """A session without grasps that softens by this."""
+    softens = (Sharpness(0.0, temperature),)
+    takes = SessionInput((0.0,) * 78, (1.0,) * 78, 5.0, 1.0, 20.0, softens)
+    return SessionCalibration(takes, np.ones((3, 24)), np.ones((3, 24)))
 
 
 @pytest.mark.parametrize("p_slip", [0.01, 0.2, 0.5, 0.8, 0.99])
@@ -103,7 +91,7 @@ def test_a_young_session_is_less_sure_and_on_the_same_side(
     threshold: float, p_slip: float, temperature: float
 ) -> None:
     judge = judge_of(FakeModel(p_slip), threshold)
-    judge.session = session(calibration(temperature))
+    judge.session = session(temperature)
     opinion = judge.weigh(Examined(COUNTS))
     assert opinion.p_slip is not None
     expected = logit(threshold) + (logit(p_slip) - logit(threshold)) / temperature
@@ -149,13 +137,8 @@ def test_a_finger_without_an_image_is_not_judged(swing: int, flat: bool) -> None
 
 def test_a_session_model_is_asked_about_what_its_session_standardises() -> None:
     judge = GraspJudge.of(TactileModel(zoo.find("small-session")))
-    judge.session = session(
-        dataclasses.replace(
-            calibration(1.0),
-            features_mean=np.arange(78.0),
-            features_spread=np.linspace(1.0, 900.0, 78),
-        )
-    )
+    judge.session = known = session(1.0)
+    known.features_mean, known.features_spread = np.arange(78.0), np.linspace(1.0, 900.0, 78)
     assert judge.weigh(Examined(COUNTS)).p_slip is not None
     z = (COUNTS - COUNTS.mean(axis=1, keepdims=True)) / COUNTS.std(axis=1, keepdims=True)
     features = np.concatenate((z.ravel(), COUNTS.mean(axis=1), COUNTS.std(axis=1)))

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspd.models.contract import SessionInput, Sharpness
-from graspd.models.judge.session import Calibration, SessionCalibration
+from graspd.models.judge.session import SessionCalibration
 
 MEAN, SPREAD = 2000.0, 100.0
 """Of every electrode in the training, counts."""
@@ -46,10 +46,10 @@ def test_a_session_is_calibrated_and_sharp_after_the_grasps_of_its_card(
     for counts in grasps(number):
         session.observe(counts)
     assert session.grasps == number
-    assert (session.now.calibrated, session.now.odd) == (calibrated, False)
-    assert session.now.temperature == temperature
+    assert (session.calibrated, session.odd) == (calibrated, False)
+    assert session.temperature == temperature
     session.reset()
-    assert (session.grasps, session.now.calibrated, session.now.temperature) == (0, False, 2.5)
+    assert (session.grasps, session.calibrated, session.temperature) == (0, False, 2.5)
 
 
 @pytest.mark.parametrize("spread", [SPREAD, 1.0], ids=["far away", "standing still"])
@@ -58,37 +58,29 @@ def test_what_cannot_have_been_grasps_is_never_calibrated_nor_sharp(spread: floa
     for counts in grasps(50, 3200.0 if spread == SPREAD else MEAN, spread):
         session.observe(counts)
     assert session.grasps > 40, "a reading that stands still is no new grasp"
-    assert (session.now.odd, session.now.calibrated) == (True, False)
-    assert session.now.temperature == 2.5
+    assert (session.odd, session.calibrated) == (True, False)
+    assert session.temperature == 2.5
 
 
 def test_a_count_is_mapped_by_its_distance_from_the_mean_in_spreads() -> None:
-    nothing = np.zeros(0)
-    calibration = Calibration(
-        *(nothing, nothing, np.full(SHAPE, 1500.0), np.full(SHAPE, 50.0)),
-        training_mean=np.full(SHAPE, MEAN),
-        scale=np.full(SHAPE, SPREAD / 50.0),
-        calibrated=True,
-        odd=False,
-        temperature=1.0,
-    )
+    session = new_session()
+    session.counts_mean = np.full(SHAPE, 1500.0)
+    session.scale = np.full(SHAPE, SPREAD / 50.0)
     counts = np.full(SHAPE, 1600, dtype=np.uint16)  # two spreads of 50 above 1500
-    assert (calibration.to_training(counts) == MEAN + 2 * SPREAD).all()
-    assert (calibration.from_training(calibration.to_training(counts)) == counts).all()
+    assert (session.to_training(counts) == MEAN + 2 * SPREAD).all()
+    assert (session.from_training(session.to_training(counts)) == counts).all()
 
 
 def test_the_statistics_are_those_of_the_grasps_and_of_one_grasp_of_the_training() -> None:
     session, seen = new_session(), grasps(200, mean=2300.0, spread=60.0)
     for counts in seen:
         session.observe(counts)
-    now = session.now
-    assert now.counts_mean.shape == now.counts_spread.shape == SHAPE
-    np.testing.assert_allclose(now.counts_mean, (seen.sum(axis=0) + MEAN) / 201)
-    np.testing.assert_allclose(now.counts_spread, 60.0, rtol=0.5)
-    np.testing.assert_allclose(now.scale, SPREAD / now.counts_spread)
-    assert now.features_mean.shape == now.features_spread.shape == (78,)
+    assert session.counts_mean.shape == SHAPE
+    np.testing.assert_allclose(session.counts_mean, (seen.sum(axis=0) + MEAN) / 201)
+    np.testing.assert_allclose(SPREAD / session.scale, 60.0, rtol=0.5)
+    assert session.features_mean.shape == session.features_spread.shape == (78,)
     means = seen.mean(axis=2)  # the features after the 72 z-values
-    np.testing.assert_allclose(now.features_mean[72:75], means.sum(axis=0) / 201)
+    np.testing.assert_allclose(session.features_mean[72:75], means.sum(axis=0) / 201)
 
 
 @pytest.mark.parametrize(
@@ -109,4 +101,4 @@ def test_kept_means_are_those_of_counts(mean: float, possible: bool, place: int)
         assert other.grasps == 0
     else:
         other.restore(kept)
-        assert (other.grasps, other.now.temperature) == (5, 1.0)
+        assert (other.grasps, other.temperature) == (5, 1.0)
