@@ -11,8 +11,8 @@ SURE_MS = LONG_NS / 1e6
 """Time without motion, ms, after which a slow slide is excluded."""
 LIKELY = 0.25
 """Largest `p_slip` with which `stable` is shown as a promise."""
-UNCOVERED = Line("risk", "covers only lifts that are told: none was announced")
-NO_OUTCOME = "no outcome told yet"
+UNCOVERED = Line("risk", "covers only announced lifts, and none was announced")
+NO_OUTCOME = "no outcome reported yet"
 SUPERVISED = Line(
     "supervised", "lift only while a person watches, and tell the outcome: it teaches"
 )
@@ -30,7 +30,7 @@ def doubt(verdict: Verdict) -> str | None:
     if risk.target is None:
         return "no target is set that would keep slips among `stable` few: [risk]"
     if risk.lifts * risk.target < 1.0:
-        return f"too few `stable` lifts are told yet to show the target, {percent(risk.target)}"
+        return f"too few `stable` lifts are reported yet to show the target, {percent(risk.target)}"
     if risk.slips > risk.lifts * risk.target:
         return "more `stable` lifts slipped than the target so far"
     return None
@@ -44,7 +44,7 @@ def rests_on(verdict: Verdict) -> str:
         return said + NO_OUTCOME
     said += f"rests on {counted(verdict.outcomes, 'lift')}; "
     slipped = f"of {risk.lifts} `stable` ones {risk.slips} slipped"
-    said += slipped if risk.lifts else "no `stable` one told yet"
+    said += slipped if risk.lifts else "no `stable` one reported yet"
     return said + ("" if risk.target is None else f", target {percent(risk.target)}")
 
 
@@ -59,13 +59,13 @@ def stillness(still_ms: float | None) -> str:
 
 
 def lift(verdict: Verdict, ended: str | None) -> str:
-    """Return `held`, `slipped` or `not told`; `-`: the verdict did not permit a lift.
+    """Return `held`, `slipped` or `not reported`; `-`: the verdict did not permit a lift.
 
-    `ended`: outcome told, `stable` or `slip`; None: not told.
+    `ended`: outcome, `stable` or `slip`; None: not reported.
     """
     if ended is not None:
         return "held" if ended == "stable" else "slipped"
-    return "not told" if verdict.verdict is Decision.STABLE or verdict.supervised else "-"
+    return "not reported" if verdict.verdict is Decision.STABLE or verdict.supervised else "-"
 
 
 def percent(share: float) -> str:
@@ -83,12 +83,12 @@ def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
     risk = None if verdict is None else verdict.risk
     lines = []
     if status is not None and status.lifts is not None:
-        lines.append(Line("never told", counted(status.lifts.unreported, "lift")))
+        lines.append(Line("never reported", counted(status.lifts.unreported, "lift")))
         if status.lifts.covered is False:
             lines.append(UNCOVERED)
     if risk is not None:
         lines.append(Line("warm-up left", counted(risk.warm_up_left, "outcome")))
-        lines.append(Line("still out", counted(risk.outstanding, "lift")))
+        lines.append(Line("outstanding", counted(risk.outstanding, "lift")))
         lines.append(Line("announced", f"{counted(risk.announced, 'lift')}, {risk.awaited} out"))
     learner = None if status is None else status.learner
     if learner is not None:

@@ -95,7 +95,7 @@ class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
     grasp: int
     ago_s: float
     lift: str
-    """`held`, `slipped`, `not told`, or `-`."""
+    """`held`, `slipped`, `not reported`, or `-`."""
     supervised: bool
     held: bool
 

@@ -67,7 +67,7 @@ def can_draw() -> bool:
 
 
 def show(hands: Sequence[HandFeed]) -> None:
-    """Draw on the terminal until told to stop."""
+    """Draw on the terminal until `q`, Ctrl-C or SIGTERM."""
     console = Console(highlight=False)
     with StopSignal() as stop, Suspension() as suspension:
         keyboard = Keyboard(stop)

@@ -325,7 +325,7 @@ def _state(status: Status) -> str:
 
 
 def _health(status: Status) -> list[Line]:
-    """Return a line for each reason, with all parts that it is said of."""
+    """Return a line for each reason, with all its parts."""
     lines = [Line("overloaded", OVERLOADED)] if status.overloaded else []
     parts: dict[Reason, list[str]] = {}
     for part, reason in status.health.items():

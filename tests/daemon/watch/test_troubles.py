@@ -154,7 +154,7 @@ def test_where_to_examine_names_the_scene(endpoint: str, scene: str | None, comm
         ),
         (
             {"outcomes": 1, "risk": structs.replace(NOTHING_TOLD, target=0.05)},
-            NETWORK + ", rests on 1 lift; no `stable` one told yet, target 5 %",
+            NETWORK + ", rests on 1 lift; no `stable` one reported yet, target 5 %",
         ),
         (
             {"risk": structs.replace(RISK, target=None)},
@@ -162,9 +162,9 @@ def test_where_to_examine_names_the_scene(endpoint: str, scene: str | None, comm
         ),
         (
             {"risk": NOTHING_TOLD, "outcomes": 0},
-            NETWORK + ", no outcome told yet",
+            NETWORK + ", no outcome reported yet",
         ),
-        ({"risk": None, "outcomes": 0, "p_slip_model": None}, "no outcome told yet"),
+        ({"risk": None, "outcomes": 0, "p_slip_model": None}, "no outcome reported yet"),
     ],
 )
 def test_a_verdict_says_what_it_rests_on(change: dict[str, Any], evidence: str) -> None:

@@ -133,8 +133,8 @@ def test_a_verdict_without_a_calibrated_session_is_less_sure() -> None:
     ("change", "why"),
     [
         ({"p_slip": 0.251}, "a slip is too likely for a promise"),
-        ({"risk": None, "outcomes": 0}, "no outcome told yet"),
-        ({"risk": NOTHING_TOLD, "outcomes": 0}, "no outcome told yet"),
+        ({"risk": None, "outcomes": 0}, "no outcome reported yet"),
+        ({"risk": NOTHING_TOLD, "outcomes": 0}, "no outcome reported yet"),
         ({"risk": NOTHING_TOLD}, "too few `stable` lifts"),
         ({"risk": risk(lifts=9, slips=0)}, "too few `stable` lifts"),
         ({"risk": risk(target=None, bound=None)}, "no target is set"),
@@ -199,10 +199,10 @@ def test_learning_shows_untold_lifts_first() -> None:
         (b"verdict.right", verdict(0, Decision.STABLE)),
     ).snapshot(0)
     assert seen.learning == [
-        Line("never told", "3 lifts"),
-        Line("risk", "covers only lifts that are told: none was announced"),
+        Line("never reported", "3 lifts"),
+        Line("risk", "covers only announced lifts, and none was announced"),
         Line("warm-up left", "0 outcomes"),
-        Line("still out", "1 lift"),
+        Line("outstanding", "1 lift"),
         Line("announced", "40 lifts, 1 out"),
         Line("learner", "on"),
         Line("learned from", "57 outcomes"),
@@ -273,9 +273,9 @@ def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
     view.take(b"outcome.right", outcome(10, "slip", BOOT), 0)
     seen = view.snapshot(11_000 * MS)
     assert [(last.grasp, last.verdict, last.lift) for last in seen.grasps] == [
-        *((11, "stable", "not told"), (10, "unknown", "slipped"), (9, "slip", "-")),
-        *((8, "stable", "held"), (7, "stable", "not told"), (6, "stable", "not told")),
-        *((5, "stable", "not told"), (4, "stable", "not told")),
+        *((11, "stable", "not reported"), (10, "unknown", "slipped"), (9, "slip", "-")),
+        *((8, "stable", "held"), (7, "stable", "not reported"), (6, "stable", "not reported")),
+        *((5, "stable", "not reported"), (4, "stable", "not reported")),
     ]
     assert [last.ago_s for last in seen.grasps[:3]] == [0.0, 1.0, 2.0]
 

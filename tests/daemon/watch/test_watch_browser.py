@@ -118,7 +118,7 @@ def test_a_stable_that_lifts_have_not_earned_is_hollow(
         reads("verdict", "LEANS TO STABLE"),
         "document.title == 'leans to stable - graspd'",
         is_of(CARD),
-        reads("evidence", "slip probability by the network alone 30 %, no outcome told yet"),
+        reads("evidence", "slip probability by the network alone 30 %, no outcome reported yet"),
         says("p", "slip probability 44 %"),
         "!document.querySelector('.why').innerText.startsWith('lift')",
     )
