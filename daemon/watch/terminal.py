@@ -1,4 +1,4 @@
-"""The terminal view: tables, drawn until `q`, Ctrl-C or SIGTERM; Ctrl-Z stops it."""
+"""The terminal view: tables, drawn until `q`, Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import termios
 import time
 import tty
 from collections.abc import Iterator, Sequence
-from types import FrameType
-from typing import Self
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
@@ -69,49 +67,13 @@ def can_draw() -> bool:
 def show(hands: Sequence[HandFeed]) -> None:
     """Draw on the terminal until `q`, Ctrl-C or SIGTERM."""
     console = Console(highlight=False)
-    with StopSignal() as stop, Suspension() as suspension:
+    signal.signal(signal.SIGTSTP, signal.SIG_IGN)  # the last verdict would stay on the screen
+    with StopSignal() as stop:
         keyboard = Keyboard(stop)
-        while True:
-            with (
-                keyboard.unbuffered(),
-                Live(console=console, screen=True, auto_refresh=False) as live,
-            ):
-                for seen in snapshots(hands, lambda: keyboard.wait() or suspension.asked):
-                    chosen = keyboard.tabs % len(hands)
-                    picture = draw(seen, console.width, chosen, keyboard.spaces)
-                    live.update(picture, refresh=True)
-            if stop.received is not None or not suspension.asked:
-                return
-            now = time.strftime("%H:%M:%S")
-            console.print(f"graspd watch stopped at {now}: unknown until it goes on (fg)")
-            suspension.stop()
-
-
-class Suspension:
-    """Ctrl-Z: the last verdict must not stay on the screen while nothing is drawn."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __enter__(self) -> Self:
-        """Take over SIGTSTP, unless it is ignored."""
-        self._former = signal.getsignal(signal.SIGTSTP)
-        if self._former is not signal.SIG_IGN:
-            signal.signal(signal.SIGTSTP, self._ask)
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        signal.signal(signal.SIGTSTP, self._former)
-
-    def stop(self) -> None:
-        """Stop the process; return when it is continued."""
-        self.asked = False
-        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGTSTP)
-        signal.signal(signal.SIGTSTP, self._ask)
-
-    def _ask(self, _number: int, _frame: FrameType | None) -> None:
-        self.asked = True
+        with keyboard.unbuffered(), Live(console=console, screen=True, auto_refresh=False) as live:
+            for seen in snapshots(hands, keyboard.wait):
+                chosen = keyboard.tabs % len(hands)
+                live.update(draw(seen, console.width, chosen, keyboard.spaces), refresh=True)
 
 
 class Keyboard:
