@@ -162,6 +162,8 @@ class LinkCause(Enum):
     """The device samples other electrodes or rates than the scene needs, or than before."""
     SERIALS = auto()
     """The device gives different serial numbers each time it is asked."""
+    CLOCK = auto()
+    """The device's clock stands, falls back, or is too fast or slow."""
 
 
 _CAUSES: dict[int | None, LinkCause] = {
@@ -188,7 +190,6 @@ class DeviceFault(Enum):
     SENSOR_WORDS = auto()
     """Words from a sensor reached the device damaged."""
     SWEEP_TOO_LONG = auto()
-    CLOCK_NOT_TRUSTED = auto()
     BUS_ERROR = auto()
 
 

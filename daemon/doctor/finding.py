@@ -77,12 +77,12 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.PORT_HELD: _LOSS
     | _NOISE
     | {Cause.LINK_LOST, Cause.DAMAGED, Cause.CLOCK, Cause.RESTARTED},
-    Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.CLOCK, Cause.REPEATED, Cause.RESTARTED},
+    Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.REPEATED, Cause.RESTARTED},
     Cause.DAMAGED: _LOSS | _NOISE | {Cause.CLOCK, Cause.RESTARTED},
     Cause.BUS_ERRORS: _LOSS | {Cause.LINK_LOST},
     Cause.COMPUTER_BUSY: _LOSS | {Cause.CLOCK, Cause.OUT_OF_ORDER, Cause.RESTARTED},
     Cause.SENSOR_WORDS: frozenset({Cause.RESTARTED, Cause.ELECTRODE_UNREAD}),
-    Cause.CLOCK: frozenset({Cause.REPEATED, Cause.RESTARTED}),
+    Cause.CLOCK: _LOSS | {Cause.LINK_LOST, Cause.REPEATED, Cause.RESTARTED},
     Cause.OUT_OF_ORDER: _LOSS | {Cause.RESTARTED},
     Cause.REPEATED: _LOSS | {Cause.RESTARTED},
     Cause.RESTARTED: _LOSS,

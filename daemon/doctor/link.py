@@ -204,6 +204,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
         Cause.SENSOR_WORDS,
         "Serial numbers are misread. Check supply, ground, MISO and its pull-up.",
     ),
+    LinkCause.CLOCK: Trouble(Cause.CLOCK, CLOCK_ADVICE),
     DeviceFault.BUS_ERROR: BUS_ERRORS,
     DeviceFault.OLD_FIRMWARE: Trouble(Cause.FIRMWARE_OLD, FLASH),
     DeviceFault.NO_SENSOR: Trouble(
@@ -226,7 +227,6 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     DeviceFault.SWEEP_TOO_LONG: Trouble(
         Cause.SETTINGS, "Set a longer period or a shorter sequence, and flash it."
     ),
-    DeviceFault.CLOCK_NOT_TRUSTED: Trouble(Cause.CLOCK, CLOCK_ADVICE),
 }
 """Cause and advice for each fault that a driver reports."""
 

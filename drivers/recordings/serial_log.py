@@ -77,7 +77,6 @@ class SerialLog(LinkLogDriver[Record]):
     def begin(self) -> None:
         self.stream = Conversation("link log", self._fingers, self._sensors)
         self.stream.opened(0)
-        self._idle_ns = 0
 
     def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:
         event, data = record
@@ -88,6 +87,5 @@ class SerialLog(LinkLogDriver[Record]):
         if event is LineEvent.OPENED:
             conversation.opened(t_ns)
         elif conversation.link.state is not LinkState.WAITING:
-            readings = conversation.receive(data, t_ns, self._idle_ns)
-        self._idle_ns = t_ns
+            readings = conversation.receive(data, t_ns)
         return readings

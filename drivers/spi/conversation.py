@@ -23,7 +23,7 @@ from graspd.drivers.spi.messages import (
     encode,
     layout_of,
 )
-from graspd.drivers.spi.sweeps import BridgeCounters, SweepDecoder
+from graspd.drivers.spi.sweeps import BridgeCounters, ClockError, DeviceClock, SweepDecoder
 
 NAME: Final = "spi"
 GREETING_NS = 500_000_000
@@ -160,11 +160,10 @@ class Conversation:
                 self._pings[message.nonce] = t_ns
                 self._pings_sent += 1
 
-    def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
-        """Return the readings that `chunk` completes, oldest first. Never raises.
+    def receive(self, chunk: bytes, arrival_ns: int) -> list[Reading]:
+        """Return the readings that `chunk`, read at `arrival_ns`, completes, oldest first.
 
-        `arrival_ns`: when the bytes were read. `idle_ns`: last earlier time at which no byte
-        waited to be read, so that all of them arrived after it.
+        Never raises.
         """
         readings: list[Reading] = []
         for kind, payload in self._parser.feed(chunk):
@@ -177,7 +176,7 @@ class Conversation:
                 self.counters.bad_frames += kind in _FROM_BRIDGE
                 self.counters.unknown_frames += kind not in _FROM_BRIDGE
             elif isinstance(message, Sweep):
-                reading = self._on_sweep(message, arrival_ns, idle_ns)
+                reading = self._on_sweep(message, arrival_ns)
                 if reading is not None:
                     readings.append(reading)
             elif isinstance(message, Hello):
@@ -220,15 +219,23 @@ class Conversation:
         if sent_ns is None:
             return  # an answer that came twice or too late
         if self._sweeps is None:
-            self._greet(hello, arrival_ns)
+            self._greet(hello, sent_ns, arrival_ns)
         elif self._sweeps.hello.sampling != hello.sampling:
             self.lost(LinkCause.SETTINGS, "the bridge changed what it samples", arrival_ns)
         elif not self._is_confirmed(hello.serials):
             # A serial number was misread, or a sensor exchanged: after STOP the bridge reads again.
             self.lost(LinkCause.SERIALS, "the bridge names other sensors", arrival_ns)
-        if self._sweeps is not None:
+        else:
             self._take(hello)
-            self._sweeps.clock.round_trip(hello.tick, sent_ns, arrival_ns)
+            try:
+                self._sweeps.clock.round_trip(hello.tick, sent_ns, arrival_ns)
+            except ClockError as error:
+                self._on_wrong_clock(error, arrival_ns)
+
+    def _on_wrong_clock(self, error: ClockError, now_ns: int) -> None:
+        """Lose the link: the next greeting begins with another clock."""
+        self.counters.clock_faults += 1
+        self.lost(LinkCause.CLOCK, f"the bridge's clock {error}", now_ns)
 
     def _is_confirmed(self, serials: tuple[str, ...]) -> bool:
         """Return True if two HELLOs in a row had these serial numbers."""
@@ -247,7 +254,7 @@ class Conversation:
         elif self._pings_sent < GREETING_TRIES:
             self._ping_due_ns = now_ns
 
-    def _greet(self, hello: Hello, now_ns: int) -> None:
+    def _greet(self, hello: Hello, sent_ns: int, now_ns: int) -> None:
         """Start the sweeps if the bridge fits the scene and its serial numbers are confirmed."""
         needed = max(self._sensors) + 1
         if hello.sensors < needed:
@@ -265,7 +272,8 @@ class Conversation:
             self._ping_due_ns = now_ns + PING_PERIOD_NS
             self._silence_ns = longest_silence_ns(hello.period_ns)
             self._silent_at_ns = now_ns + self._silence_ns
-            self._sweeps = SweepDecoder(hello, self._sensors, self.counters)
+            clock = DeviceClock(hello.tick_hz, hello.tick, sent_ns, now_ns)
+            self._sweeps = SweepDecoder(hello, self._sensors, self.counters, clock)
 
     def _take(self, hello: Hello) -> None:
         self.hello = hello
@@ -275,11 +283,15 @@ class Conversation:
         }
         self.serials = {finger: serial for finger, serial in serials.items() if serial}
 
-    def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
+    def _on_sweep(self, sweep: Sweep, arrival_ns: int) -> TactileReading | None:
         if self._sweeps is None:
             self.counters.stale_sweeps += 1
             return None
-        reading = self._sweeps.reading(sweep, arrival_ns, idle_ns)
+        try:
+            reading = self._sweeps.reading(sweep, arrival_ns)
+        except ClockError as error:
+            self._on_wrong_clock(error, arrival_ns)
+            return None
         if reading is None:
             return None
         self._silent_at_ns = arrival_ns + self._silence_ns
@@ -320,10 +332,10 @@ def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
 
 def _about_time(sweeps: SweepDecoder) -> dict[str, Fact]:
     clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
-    trust = Fact("trusted") if clock.trusted else Fact("not trusted", DeviceFault.CLOCK_NOT_TRUSTED)
-    facts = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}
-    if clock.round_trip_ns is not None:
-        facts["round trip"] = Fact(f"{clock.round_trip_ns / 1e6:.2f} ms")
+    facts = {
+        "clock rate": Fact(f"{tick_hz} Hz"),
+        "round trip": Fact(f"{clock.round_trip_ns / 1e6:.2f} ms"),
+    }
     if sweeps.longest_ticks:
         longest_ms, period_ms = 1e3 * sweeps.longest_ticks / tick_hz, sweeps.hello.period_ns / 1e6
         fits, fault = "at most, of", None

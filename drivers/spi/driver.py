@@ -69,7 +69,7 @@ class SpiBridgeDriver(Opened):
         self._fingers, self._sensors = fingers, sensors
         self._clock = clock
         self._line = SerialLine(port, baud)
-        self._idle_ns = self._poll_due_ns = 0
+        self._poll_due_ns = 0
         self.conversation = self._begin()
 
     def _begin(self) -> Conversation:
@@ -135,9 +135,7 @@ class SpiBridgeDriver(Opened):
         except LinkError as error:
             self._lose(error)
             return ()
-        readings = self.conversation.receive(chunk, self._clock(), self._idle_ns)
-        if self._line.drained:
-            self._idle_ns = began_ns
+        readings = self.conversation.receive(chunk, self._clock())
         self._send()
         return readings
 
@@ -147,7 +145,7 @@ class SpiBridgeDriver(Opened):
         except LinkError as error:
             self._lose(error)
             return
-        self._idle_ns = self._poll_due_ns = now_ns = self._clock()
+        self._poll_due_ns = now_ns = self._clock()
         self.conversation.opened(now_ns)
         self._send()
 
@@ -185,8 +183,6 @@ class SerialLine:
 
     def __init__(self, port: str, baud: int) -> None:
         self.port = port
-        self.drained = True
-        """True if the last `read` took all bytes that waited."""
         self.tap: Callable[[LineEvent, bytes], None] | None = None
         """Called with the bytes of each read, and before each write with its bytes."""
         self.descriptor: int | None = None
@@ -250,14 +246,12 @@ class SerialLine:
     def read(self) -> bytes:
         """Return all bytes that have arrived. Raises `LinkError`."""
         port, data = self._opened(), b""
-        self.drained = False
+        least = SHORT_BYTES if isinstance(port, PolledSerial) else 1
         try:
             for _ in range(READS_MAX):
                 chunk = port.read(READ_BYTES)
-                is_short = isinstance(port, PolledSerial) and len(chunk) < SHORT_BYTES
-                self.drained = is_short or not chunk
                 data += chunk
-                if self.drained:
+                if len(chunk) < least:
                     break
         except FAILURES as error:
             if not data:  # else the next call raises, after these bytes

@@ -31,10 +31,6 @@ DRIFT_MAX = 500e-6
 
 Crystals keep 100 ppm, and the host's own clock may be adjusted by 500 ppm.
 """
-PROOF_NS = 8_000_000_000
-"""Time, ns, for which PINGs must agree after a fault; a wrong rate shows only slowly."""
-UNKNOWN_DELAY_NS = 20_000_000
-"""Assumed delay while the clock is not trusted, ns: 16 ms in a USB adapter, 4 ms elsewhere."""
 AGE_MAX_NS = 10_000_000_000
 """Greatest age of a mapped time, ns; buffers on the way hold a few seconds at most."""
 
@@ -69,9 +65,7 @@ class BridgeCounters(FrameCounters):
     host_tx_dropped: int = 0
     """Frames to the bridge that were dropped because the port's buffer was full."""
     clock_faults: int = 0
-    """Times that the bridge's clock stopped being trusted."""
-    clock_fallbacks: int = 0
-    """Readings whose time is estimated from their arrival, as the clock was not trusted."""
+    """Times that the link was lost because the bridge's clock was wrong."""
     bridge_overruns: int = 0
     bridge_tx_dropped: int = 0
     bridge_rx_errors: int = 0
@@ -81,10 +75,12 @@ class BridgeCounters(FrameCounters):
 class SweepDecoder:
     """Decoder of sweeps into readings, from one START to the loss of the link."""
 
-    def __init__(self, hello: Hello, sensors: Sequence[int], counters: BridgeCounters) -> None:
+    def __init__(
+        self, hello: Hello, sensors: Sequence[int], counters: BridgeCounters, clock: DeviceClock
+    ) -> None:
         """`hello`: describes the sampling. `sensors`: number of each row's sensor, from 0."""
         self.hello = hello
-        self.clock = DeviceClock(hello.tick_hz, counters)
+        self.clock = clock
         self.longest_ticks = 0
         self._sensors = tuple(sensors)
         self._counters = counters
@@ -100,15 +96,18 @@ class SweepDecoder:
                 self._source[:, channel - E1] = slot * hello.sensors + np.array(sensors)
                 self._marks[:, channel - E1] = ElectrodeFault.NONE
 
-    def reading(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
-        """Return the reading of a sweep; None if the sweep is old or does not fit the HELLO."""
+    def reading(self, sweep: Sweep, arrival_ns: int) -> TactileReading | None:
+        """Return the reading of a sweep; None if the sweep is old or does not fit the HELLO.
+
+        Raises `ClockError`.
+        """
         if sweep.words.shape != (self.hello.slots, self.hello.sensors):
             self._counters.bad_frames += 1
             return None
         if not self._is_next(sweep):
             return None
         self.longest_ticks = max(self.longest_ticks, sweep.tick_end - sweep.tick_start)
-        t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
+        t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns)
         words = sweep.words.ravel().astype(np.intp)[self._source]
         interrupted, self._interrupted = self._interrupted, False
         marks = self._marks_of(sweep)
@@ -144,6 +143,10 @@ class SweepDecoder:
         return marks
 
 
+class ClockError(ValueError):
+    """The clock of a bridge stands, falls back, or is too fast or slow."""
+
+
 class _Bound(NamedTuple):
     """A PING that bounds the host time, ns, at which the clock showed `tick`."""
 
@@ -157,91 +160,51 @@ class DeviceClock:
     The clock showed the tick of an answered PING not before the PING was sent, and not after its
     answer came. Both bounds move on with the ticks and widen by `DRIFT_MAX`; a PING that gives a
     narrower one replaces it. A reading has the earliest time that its tick can have had: it may
-    look too old, never too new (deploy/MEASURED.md).
-
-    Ticks are not trusted before the first answered PING. If the bounds cross, or if the clock
-    stands, falls back or is ahead of its arrivals, they are not trusted until PINGs have agreed for
-    `PROOF_NS`. The time is then `UNKNOWN_DELAY_NS` before the last time at which no byte waited to
-    be read. A time is never later than the arrival, and at most `AGE_MAX_NS` before it.
+    look too old, never too new (deploy/MEASURED.md). Its time is not before that of the reading
+    before, and at most `AGE_MAX_NS` before its arrival.
     """
 
-    def __init__(self, tick_hz: int, counters: BridgeCounters) -> None:
-        """`tick_hz`: nominal rate, Hz, above 0."""
-        self.counters = counters
-        self.round_trip_ns: int | None = None
-        """Shortest round trip of a PING, ns; None before the first."""
+    def __init__(self, tick_hz: int, tick: int, sent_ns: int, received_ns: int) -> None:
+        """Take the nominal rate, Hz, above 0, and the first PING, as in `round_trip`."""
+        self.round_trip_ns = received_ns - sent_ns
+        """Shortest round trip of a PING, ns."""
         self._ns_per_tick = 1e9 / tick_hz
-        self._bounds: tuple[_Bound, _Bound] | None = None
-        """The narrowest earliest and latest bound since the clock is believed."""
-        self._proven_ns = 0
-        """Host time from which PINGs that agree make the clock trusted."""
-        self._is_proven = True
-        self._last_tick = -1
-        self._last_ns = -AGE_MAX_NS
-
-    @property
-    def trusted(self) -> bool:
-        """True if times come from the ticks now."""
-        return self._bounds is not None and self._is_proven
+        self._earliest, self._latest = _Bound(tick, sent_ns), _Bound(tick, received_ns)
+        self._last = self._earliest
 
     def round_trip(self, tick: int, sent_ns: int, received_ns: int) -> None:
-        """Add an answered PING: host time before it was sent, and after its answer came."""
-        took_ns = received_ns - sent_ns
-        shortest_ns = self.round_trip_ns
-        self.round_trip_ns = took_ns if shortest_ns is None else min(took_ns, shortest_ns)
-        sent, received = _Bound(tick, sent_ns), _Bound(tick, received_ns)
-        if self._bounds is not None:
-            earliest, latest = self._bounds
-            if (
-                self._moved_ns(earliest, tick, -1) > received_ns
-                or self._moved_ns(latest, tick, 1) < sent_ns
-            ):
-                self._distrust()
-        if self._bounds is None:
-            self._proven_ns = received_ns + PROOF_NS
-            self._bounds = sent, received
-        earliest, latest = self._bounds
-        self._bounds = (
-            max(earliest, sent, key=lambda bound: self._moved_ns(bound, tick, -1)),
-            min(latest, received, key=lambda bound: self._moved_ns(bound, tick, 1)),
-        )
-        self._is_proven |= sent_ns >= self._proven_ns
+        """Add an answered PING: host time before it was sent, and after its answer came.
 
-    def host_ns(self, tick: int, arrival_ns: int, idle_ns: int) -> int:
-        """Return the host time, ns, of a reading's `tick`.
-
-        `arrival_ns`: when the reading arrived. `idle_ns`: last earlier time at which no byte
-        waited to be read.
+        Raises `ClockError` if it contradicts the ones before.
         """
-        if tick <= self._last_tick:
-            self._distrust()
-        self._last_tick = tick
-        mapped_ns = self._mapped_ns(tick, arrival_ns)
-        if mapped_ns is None:
-            self.counters.clock_fallbacks += 1
-            mapped_ns = min(idle_ns, arrival_ns) - UNKNOWN_DELAY_NS
-        # The reading was made after the one before, so it is not older.
-        mapped_ns = max(mapped_ns, self._last_ns, arrival_ns - AGE_MAX_NS)
-        self._last_ns = min(mapped_ns, arrival_ns)
-        return self._last_ns
+        self.round_trip_ns = min(self.round_trip_ns, received_ns - sent_ns)
+        if self._earliest_ns(tick) > received_ns or self._latest_ns(tick) < sent_ns:
+            raise ClockError("is too fast or too slow")
+        if self._earliest_ns(tick) + self._ns_per_tick <= sent_ns:
+            self._earliest = _Bound(tick, sent_ns)
+        if self._latest_ns(tick) - self._ns_per_tick >= received_ns:
+            self._latest = _Bound(tick, received_ns)
 
-    def _mapped_ns(self, tick: int, arrival_ns: int) -> int | None:
-        if self._bounds is None or not self._is_proven:
-            return None
-        earliest_ns = self._moved_ns(self._bounds[0], tick, -1)
+    def host_ns(self, tick: int, arrival_ns: int) -> int:
+        """Return the host time, ns, of a reading's `tick`. Raises `ClockError`."""
+        if tick <= self._last.tick:
+            raise ClockError("stands or falls back")
+        earliest_ns = self._earliest_ns(tick)
         if earliest_ns > arrival_ns:
-            self._distrust()
-            return None
-        return earliest_ns
+            raise ClockError("is ahead of its readings")
+        t_ns = max(earliest_ns, self._last.t_ns, arrival_ns - AGE_MAX_NS)
+        self._last = _Bound(tick, t_ns)
+        return t_ns
 
-    def _moved_ns(self, bound: _Bound, tick: int, side: int) -> int:
-        """Return a bound of the time of `tick`; `side`: -1 the earliest, 1 the latest."""
+    def _earliest_ns(self, tick: int) -> int:
+        passed_ns, slack_ns = self._passed_ns(self._earliest, tick)
+        return self._earliest.t_ns + math.floor(passed_ns - slack_ns)
+
+    def _latest_ns(self, tick: int) -> int:
+        passed_ns, slack_ns = self._passed_ns(self._latest, tick)
+        return self._latest.t_ns + math.ceil(passed_ns + slack_ns)
+
+    def _passed_ns(self, bound: _Bound, tick: int) -> tuple[float, float]:
+        """Return the nominal time since a bound, and the most by which it is wrong, ns."""
         passed_ns = (tick - bound.tick) * self._ns_per_tick
-        slack_ns = abs(passed_ns) * DRIFT_MAX + self._ns_per_tick  # ticks are whole
-        return bound.t_ns + math.floor(passed_ns + side * slack_ns)
-
-    def _distrust(self) -> None:
-        self.counters.clock_faults += self._is_proven
-        self._is_proven = False
-        self._bounds = None
-        self._last_ns = -AGE_MAX_NS
+        return passed_ns, abs(passed_ns) * DRIFT_MAX + self._ns_per_tick  # ticks are whole

@@ -12,7 +12,7 @@ from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.can.samples import SampleAssembler
 from graspd.drivers.joints import JointMessage, JointStream
 from graspd.drivers.recordings.csv_player import ReplayDriver
-from graspd.drivers.spi.sweeps import BridgeCounters, SweepDecoder
+from graspd.drivers.spi.sweeps import BridgeCounters, DeviceClock, SweepDecoder
 from tests.drivers.spi.bridge_bench import hello, sweep
 
 PERIOD_NS = 10_000_000
@@ -41,10 +41,9 @@ def test_samples_after_a_lost_bus_interrupt() -> None:
 def test_a_bridge_that_is_started_again_interrupts() -> None:
     counters, readings = BridgeCounters(), []
     for _ in range(2):
-        decoder = SweepDecoder(hello(0), (0, 1, 2), counters)
+        decoder = SweepDecoder(hello(0), (0, 1, 2), counters, DeviceClock(1_000_000, 0, 0, 0))
         for number in range(3):
-            t_ns = number * PERIOD_NS
-            reading = decoder.reading(sweep(number, (number + 1) * 10_000), t_ns, t_ns)
+            reading = decoder.reading(sweep(number, number * 10_000), (number + 1) * PERIOD_NS)
             assert reading is not None
             readings.append(reading)
     assert interrupted(list(readings)) == [3]

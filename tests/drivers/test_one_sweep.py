@@ -20,6 +20,7 @@ from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.frames import CanCounters, CanFrame, encode_sample
 from graspd.drivers.can.stream import SampleDecoder
 from graspd.drivers.joints import JointMessage, JointStream
+from graspd.drivers.link import LinkState
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
 from graspd.drivers.recordings.serial_log import SerialLog, encode_records, parse_records
@@ -97,14 +98,21 @@ def bus_log(_first: int) -> Feed:
 
 def spi_sweep(unit: Unit) -> bytes:
     words = np.full((24, 3), int.from_bytes(WORDS[number_of(unit.index, unit.boot)]), np.uint16)
-    tick = 1_000_000 + unit.index * 10_000
+    tick = 2000 + unit.index * 1000
     return encode(Sweep(unit.index, tick, tick + 1900, 7, words))
 
 
 def bridge(_first: int) -> Feed:
     """Through a conversation."""
     conversation = greeted()
-    return lambda unit: conversation.receive(spi_sweep(unit), T0 + unit.at * MS, T0)
+
+    def feed(unit: Unit) -> Sequence[Reading]:
+        nonlocal conversation
+        if conversation.link.state is LinkState.WAITING:  # the clock of a new start falls back
+            conversation = greeted()
+        return conversation.receive(spi_sweep(unit), T0 + (unit.at + 10) * MS)
+
+    return feed
 
 
 def bridge_log(_first: int) -> Feed:
@@ -118,7 +126,7 @@ def bridge_log(_first: int) -> Feed:
     for nonce in (1, 2):
         feed(LineEvent.SENT, encode(Ping(nonce)), T0)
         feed(LineEvent.RECEIVED, encode(hello(nonce, 1000)), T0)
-    return lambda unit: feed(LineEvent.RECEIVED, spi_sweep(unit), T0 + unit.at * MS)
+    return lambda unit: feed(LineEvent.RECEIVED, spi_sweep(unit), T0 + (unit.at + 10) * MS)
 
 
 @dataclass(frozen=True)

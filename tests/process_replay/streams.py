@@ -160,7 +160,7 @@ class _Line:
         for piece in pieces:
             self._write(LineEvent.RECEIVED, now_ns, piece)
             if self._host.link.state is not LinkState.WAITING:
-                yield from self._host.receive(piece, now_ns, now_ns - MS)
+                yield from self._host.receive(piece, now_ns)
 
 
 def _hello(nonce: int, now_ns: int) -> Hello:

@@ -192,7 +192,6 @@ def test_joining_in_the_middle_of_a_sweep_is_no_trouble(number: int, findings: i
         (DeviceFault.NO_SENSOR, Level.ERROR, Cause.SENSOR_ABSENT, "MISO"),
         (DeviceFault.SENSOR_WORDS, Level.WARNING, Cause.SENSOR_WORDS, "by chip select"),
         (DeviceFault.SWEEP_TOO_LONG, Level.WARNING, Cause.SETTINGS, "longer period"),
-        (DeviceFault.CLOCK_NOT_TRUSTED, Level.WARNING, Cause.CLOCK, "Flash"),
         (DeviceFault.BUS_ERROR, Level.WARNING, Cause.BUS_ERRORS, "terminators"),
     ],
 )

@@ -124,8 +124,10 @@ def said(conversation: Conversation, now_ns: int) -> list[Message]:
 
 
 def hear(conversation: Conversation, message: Message, now_ns: int) -> list[TactileReading]:
-    """The readings that a message makes."""
-    return tactile(conversation.receive(encode(message), now_ns, now_ns))
+    """The readings that a message makes; a sweep comes when it is over, or at `now_ns` if later."""
+    if isinstance(message, Sweep):
+        now_ns = max(now_ns, T0 + 1000 * message.tick_end)
+    return tactile(conversation.receive(encode(message), now_ns))
 
 
 def opened(nonce: int = 41, sensors: Sequence[str] | None = None) -> Conversation:

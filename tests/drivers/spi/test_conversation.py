@@ -82,7 +82,7 @@ def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
     conversation = greeted(hello(0, period_ms=period_ms))
     assert said(conversation, T0) == [Start()]
     heard_ns = T0 + 7 * MS
-    assert len(hear(conversation, sweep(0, 10**9), heard_ns)) == 1
+    assert len(hear(conversation, sweep(0, 1), heard_ns)) == 1
     assert state(conversation) is LinkState.UP
     said(conversation, heard_ns + silence_ms * MS - 1)
     assert state(conversation) is LinkState.UP
@@ -116,7 +116,7 @@ def test_a_board_that_was_reset_by_opening_it_is_asked_again_at_once() -> None:
 def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again() -> None:
     conversation = greeted()
     sent = [encode(message) for message in (sweep(0, 10_000), hello(0), sweep(1, 20_000))]
-    assert len(conversation.receive(b"".join(sent), T0, T0)) == 1
+    assert len(conversation.receive(b"".join(sent), T0 + S)) == 1
     assert conversation.link.reason == "the bridge was reset"
     assert conversation.counters.restarts == 1
 
@@ -200,7 +200,6 @@ def test_people_are_told_what_is_known() -> None:
         "link": "greeting",
         "why": "unplugged",
         **about,
-        "clock": "trusted",
         "clock rate": "1000000 Hz",
         "round trip": "2.00 ms",
     }
@@ -255,7 +254,7 @@ def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words()
 def test_a_frame_makes_no_sense_or_its_type_is_unknown(kind: int, bad: int) -> None:
     conversation = opened()
     digest = 0 if kind == 1 else DIGEST
-    assert conversation.receive(encode_frame(kind, b"x", digest), T0, T0) == []
+    assert conversation.receive(encode_frame(kind, b"x", digest), T0) == []
     counters = conversation.counters
     assert (counters.frames, counters.bad_frames, counters.unknown_frames) == (1, bad, 1 - bad)
 
@@ -359,11 +358,13 @@ def test_a_sensor_that_does_not_answer_is_none_that_was_exchanged() -> None:
     conversation = opened()
     for _ in range(2):
         told(conversation, SERIALS, T0)
-    now_ns = T0
+    about, now_ns = hello(0, period_ms=50), T0
     for serials in (("A", "", "C"), SERIALS):
         now_ns += 247 * MS
-        assert len(hear(conversation, sweep(now_ns // MS % 1000, now_ns), now_ns)) == 1
-        told(conversation, serials, now_ns)
+        made = sweep(now_ns // MS % 1000, (now_ns - T0) // 1000 - 2000)
+        assert len(hear(conversation, made, now_ns)) == 1
+        tick = (now_ns - T0) // 1000
+        answer(conversation, dataclasses.replace(about, tick=tick, serials=serials), now_ns)
         assert conversation.counters.link_losses == 0
         known = zip(("ff", "mf", "th"), serials, strict=True)
         assert conversation.serials == {finger: serial for finger, serial in known if serial}
