@@ -101,7 +101,6 @@ class _Sweep:
         start = place * self._width
         self.words[start : start + self._width] = words
         self.have |= 1 << place
-        self.last = max(self.last, place)
 
 
 class SampleAssembler:
@@ -166,6 +165,8 @@ class SampleAssembler:
             self._counters.unsynchronised_frames += 1
             return ()
         timing = clock.timing(place, sweep.last, until_ns)
+        if place == sweep.last + 1 and timing is not Timing.LATE:
+            return self._store(place, words, t_ns)  # the usual case, by the same table
         held = sweep.held(place, words)
         fate = classify(place, sweep.last, timing, held, is_over=sweep.is_over)
         if fate is Fate.PLACED:
@@ -201,6 +202,7 @@ class SampleAssembler:
     def _store(self, place: int, words: bytes, t_ns: int) -> Sequence[TactileReading]:
         self._clock.advance(place, t_ns, begins=self._sweep.last < 0)
         self._sweep.put(place, words)
+        self._sweep.last = place
         return self._finish() if place == ELECTRODES - 1 else ()
 
     def _finish(self, *, begins: bool = False) -> Sequence[TactileReading]:

@@ -85,7 +85,8 @@ class SweepClock:
             follows = place == (self._seen + 1) % ELECTRODES
             self._run = self._run + 1 if follows else 1
             self._seen = place
-        self._widest_ns = max(self._widest_ns, t_ns - self._at_ns)
+        if t_ns - self._at_ns > self._widest_ns:
+            self._widest_ns = t_ns - self._at_ns
         self._at_ns = t_ns
         return begins
 
@@ -110,7 +111,8 @@ class SweepClock:
     def advance(self, place: int, t_ns: int, *, begins: bool) -> None:
         """Take the time of a sample at the furthest place of the current sweep so far."""
         origin_ns = t_ns - self._position[place] * (self.period_ns or 0)
-        self._origin_ns = origin_ns if begins else min(self._origin_ns, origin_ns)
+        if begins or origin_ns < self._origin_ns:
+            self._origin_ns = origin_ns
         self.t_ns = t_ns
 
     def next_end_ns(self, last: int, *, is_over: bool) -> int | None:

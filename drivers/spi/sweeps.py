@@ -170,7 +170,7 @@ class DeviceClock:
         """Shortest round trip of a PING, ns."""
         self._ns_per_tick = 1e9 / tick_hz
         self._earliest, self._latest = _Bound(tick, sent_ns), _Bound(tick, received_ns)
-        self._last = self._earliest
+        self._last_tick, self._last_ns = tick, sent_ns
 
     def round_trip(self, tick: int, sent_ns: int, received_ns: int) -> None:
         """Add an answered PING: host time before it was sent, and after its answer came.
@@ -187,24 +187,21 @@ class DeviceClock:
 
     def host_ns(self, tick: int, arrival_ns: int) -> int:
         """Return the host time, ns, of a reading's `tick`. Raises `ClockError`."""
-        if tick <= self._last.tick:
+        if tick <= self._last_tick:
             raise ClockError("stands or falls back")
         earliest_ns = self._earliest_ns(tick)
         if earliest_ns > arrival_ns:
             raise ClockError("is ahead of its readings")
-        t_ns = max(earliest_ns, self._last.t_ns, arrival_ns - AGE_MAX_NS)
-        self._last = _Bound(tick, t_ns)
-        return t_ns
+        self._last_tick = tick
+        self._last_ns = max(earliest_ns, self._last_ns, arrival_ns - AGE_MAX_NS)
+        return self._last_ns
 
     def _earliest_ns(self, tick: int) -> int:
-        passed_ns, slack_ns = self._passed_ns(self._earliest, tick)
+        passed_ns = (tick - self._earliest.tick) * self._ns_per_tick
+        slack_ns = abs(passed_ns) * DRIFT_MAX + self._ns_per_tick  # ticks are whole
         return self._earliest.t_ns + math.floor(passed_ns - slack_ns)
 
     def _latest_ns(self, tick: int) -> int:
-        passed_ns, slack_ns = self._passed_ns(self._latest, tick)
+        passed_ns = (tick - self._latest.tick) * self._ns_per_tick
+        slack_ns = abs(passed_ns) * DRIFT_MAX + self._ns_per_tick
         return self._latest.t_ns + math.ceil(passed_ns + slack_ns)
-
-    def _passed_ns(self, bound: _Bound, tick: int) -> tuple[float, float]:
-        """Return the nominal time since a bound, and the most by which it is wrong, ns."""
-        passed_ns = (tick - bound.tick) * self._ns_per_tick
-        return passed_ns, abs(passed_ns) * DRIFT_MAX + self._ns_per_tick  # ticks are whole
