@@ -184,14 +184,14 @@ def test_the_last_verdict_stays_until_the_next_grasp_and_then_in_the_list(
     see(browser, "stable", reads("was", ""))
     talker.decision = Decision.UNKNOWN
     past = reads("was", "past: stable, slip probability 25 %")
-    see(browser, "waiting", past, says("judged", ", past; lift: not told"))
+    see(browser, "waiting", past, says("judged", ", past; lift: not reported"))
     talker.more = {"grasp": 8}
     browser.wait_for("document.querySelector('.was').innerText == ''")
     talker.more = {"grasp": 8, "supervised": True}
     talker.decision = Decision.SLIP
     grasps = [
-        "8\t✕slip\tslip probability 75 %\tnot told, supervised",
-        "7\t●stable\tslip probability 25 %\tnot told",
+        "8\t✕slip\tslip probability 75 %\tnot reported, supervised",
+        "7\t●stable\tslip probability 25 %\tnot reported",
     ]
     learning = says("learning", "slips of `stable`\t2 of 41 lifts, at most 9.5")
     see(browser, "slip", reads("grasps", "\n".join(grasps)), learning)

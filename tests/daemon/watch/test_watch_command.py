@@ -41,7 +41,6 @@ class Terminal:
 
     def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
         self.kind = "xterm-256color"
-        """What runs the command; alone in its session, Ctrl-C is for it."""
         self._arguments = arguments
         self._size = struct.pack("HHHH", lines, columns, 0, 0)
         self.output = b""
