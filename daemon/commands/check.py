@@ -19,7 +19,8 @@ from graspd.daemon.commands.models import f1_percent
 from graspd.daemon.doctor.computer import NETWORK
 from graspd.daemon.doctor.finding import Level
 from graspd.daemon.doctor.surroundings import socket_findings
-from graspd.daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
+from graspd.daemon.judge.motion_limits import MotionLimits, SlowNoise, Tails
+from graspd.daemon.judge.stillness import centred
 from graspd.daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
 from graspd.daemon.process.text import (
     Colour,
@@ -268,11 +269,11 @@ def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, Oper
     noise = Noise.of(variance, correlations[:, np.newaxis])
     # The squares of noise and motion add up: how much motion brings the sum to the limit?
     slope = noise.slope[short].item() / math.sqrt(_extent(short, step_ns))
-    (limit,) = fast_limit(tails.alone, [slope])
-    fast = slope * math.sqrt(limit**2 - 1.0)
     square, extent = noise.variance[long].item() * (long - 1), _extent(long, step_ns)
-    (limit,) = slow_limit(tails.slow, extent, [square], noise.spread[long].tolist())
-    slow = MEAN_ABS * math.sqrt((limit**2 - 1.0) * square / extent)
+    limits = MotionLimits(1, tails)
+    limits.lay([0.0], [slope], [0.0], SlowNoise(extent, [square], noise.spread[long].tolist()))
+    fast = slope * math.sqrt(limits.fast[0] ** 2 - 1.0)
+    slow = MEAN_ABS * math.sqrt((limits.slow[0] ** 2 - 1.0) * square / extent)
     return (
         OperatingPoint(max(SHORT_NS, short * step_ns), fast),
         OperatingPoint(max(LONG_NS, long * step_ns), slow),

@@ -1,16 +1,11 @@
 """The gate: the moment between "the fingers have closed" and "the hand lifts", as a state machine.
 
-    idle -> closing -> settled -> judged
-              ^           |         |     moved, changed, lost a finger, or a gap in the readings:
-              +-----------+---------+     back to closing
-    closing, settled, judged -> released -> idle   (or, touched at once again, -> closing)
-
 A grasp lasts from the first touch until nothing touches. It is judged when all fingers touch and
 have kept still until nothing can slide unseen; with `early`, first when nothing moves fast. It
 settles by the strict limit of motion and goes on by the loose one, so that the verdict on a hand
 that holds does not come and go. From then on it is refreshed many times a second and when the
 controller asks. Times are those of the readings, so a stall or a burst of old readings settles
-nothing.
+nothing. `phase.TRANSITIONS` has all ways from one state to the next.
 """
 
 from __future__ import annotations
@@ -22,15 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import ELECTRODES, Finger
+from graspd.daemon.judge import phase as ways
 from graspd.daemon.judge.decision import HandLimits
-from graspd.daemon.judge.reasons import (
-    FingerState,
-    GateCause,
-    GateChange,
-    GateState,
-    Moment,
-    Reason,
-)
+from graspd.daemon.judge.phase import Phase, Transition
+from graspd.daemon.judge.reasons import FingerState, GateState, Moment, Reason
 from graspd.daemon.judge.stillness import ONES, Motion, MotionLimits
 from graspd.daemon.judge.windows import LONG_NS, SHORT_NS
 
@@ -39,6 +29,111 @@ REFRESH_NS = 50_000_000
 however slow the readings are, and though one of them is lost."""
 STANDS_NS = 100_000_000
 """Age above which a verdict no longer stands, ns."""
+JUST_SHORT_NS = LONG_NS - 1_000_000
+"""Longest stillness, ns, of a hand of which something may slide slowly."""
+
+
+class Stillness:
+    """For how long all required fingers have touched and kept still."""
+
+    def __init__(self) -> None:
+        self.touches = False
+        """True if all required fingers touch."""
+        self.lasts_ns = 0
+        """Time of touch and stillness; less than the long window if something may slide."""
+        self.sure = False
+        """True if it has settled with slow slides excluded: the loose limit holds from then on."""
+        self.early = False
+        """True if it was judged while something might slide slowly: it is judged again, unasked."""
+        self.moved_since_ns: int | None = None
+        """Time since which a judged grasp has moved. None: it does not move."""
+        self._touched_ns = 0
+        """Time at which all required fingers touched; means nothing unless `touches`."""
+        self._since_ns: int | None = None
+        """Time since which touch and stillness have lasted. None: something moves."""
+
+    def touch(self, t_ns: int, touches: bool) -> None:
+        """Take in whether all required fingers touch."""
+        if touches and not self.touches:
+            self._touched_ns = t_ns
+        self.touches = touches
+
+    def follow(self, t_ns: int, disturbed: bool, is_sure: bool) -> None:
+        """Take in whether something is against it, and whether slow slides are excluded.
+
+        The windows say for how long nothing has moved; the touch must have lasted as long.
+        """
+        if disturbed:
+            self._since_ns, self.lasts_ns = None, 0
+            return
+        since_ns = self._since_ns
+        if since_ns is None:
+            since_ns = max(t_ns - SHORT_NS, self._touched_ns)
+        if is_sure:
+            since_ns = min(since_ns, max(t_ns - LONG_NS, self._touched_ns))
+        else:
+            since_ns = max(since_ns, t_ns - JUST_SHORT_NS)
+        self._since_ns, self.lasts_ns = since_ns, max(t_ns - since_ns, 0)
+
+    def settle(self) -> None:
+        """Go on by the loose limit if slow slides are excluded."""
+        self.sure = self.sure or self.lasts_ns >= LONG_NS
+
+    def unsettle(self) -> None:
+        """Have the grasp settle again by the strict limit."""
+        self.sure = self.early = False
+        self.moved_since_ns = None
+
+    def restart(self, t_ns: int) -> None:
+        """Count from `t_ns` on."""
+        self._since_ns, self.lasts_ns = None, 0
+        self._touched_ns = min(self._touched_ns, t_ns)
+
+
+class Question:
+    """Whether the network is to judge: the controller asks, or the verdict grows old."""
+
+    def __init__(self, on_request: bool, lasts_ns: int) -> None:
+        """`on_request`: only when asked. `lasts_ns`: time after which a question is dropped."""
+        self._on_request = on_request
+        self._lasts_ns = lasts_ns
+        self.asked = False
+        """True while the controller waits for a judgement."""
+        self._until_ns: int | None = None
+        """None until the first reading after the question."""
+        self._judged_ns = 0
+        """Time of the last judgement."""
+
+    def ask(self) -> None:
+        """Take in a question; its time runs from the next reading on."""
+        self.asked, self._until_ns = True, None
+
+    def follow(self, t_ns: int) -> None:
+        """Drop a question that has waited for too long."""
+        if self._until_ns is None:
+            self._until_ns = t_ns + self._lasts_ns
+        elif t_ns > self._until_ns:
+            self.asked = False
+
+    @property
+    def is_asked(self) -> bool:
+        """True if a settled grasp is to be judged."""
+        return self.asked or not self._on_request
+
+    def is_due(self, t_ns: int, fresh: bool) -> bool:
+        """Return True if a judged grasp is to be judged again."""
+        age_ns = t_ns - self._judged_ns
+        return age_ns > STANDS_NS or (fresh and (self.asked or age_ns >= REFRESH_NS))
+
+    def answer(self, t_ns: int, *, first: bool) -> bool:
+        """Note a judgement; return False if it only refreshes one that was not the `first`."""
+        answers = first or (self.asked and self._on_request)
+        self._judged_ns, self.asked = t_ns, False
+        return answers
+
+    def restart(self) -> None:
+        """Count the time of a question from the next reading on: time went back."""
+        self._until_ns = None
 
 
 class Gate:
@@ -51,51 +146,28 @@ class Gate:
         self.required = frozenset(fingers).intersection(required)
         """Fingers that must touch."""
         self._limits = limits.gate
-        self._on_request = limits.on_request
-        self.motion = Motion(len(fingers), self._limits.false_alarms, early=self._limits.early)
-        self.state = GateState.IDLE
-        self.grasp = 0
-        """Touches until now; the number of the current grasp."""
-        self.in_contact = False
-        """True if all required fingers touch."""
+        self._settles_ns = SHORT_NS if limits.gate.early else LONG_NS
+        self.motion = Motion(len(fingers), limits.gate.false_alarms, early=limits.gate.early)
+        self.phase, self._still = Phase(), Stillness()
+        self._question = Question(limits.on_request, limits.gate.request_ns)
         self._reference = np.zeros((len(fingers), ELECTRODES), dtype=np.float32)
         """Shape (fingers, 24): counts where it had settled; means nothing before."""
-        self._judged_ns = 0
-        """Time of the last judgement."""
         self._last_ns: int | None = None
         """Time of the last reading."""
-        self._touched_ns = 0
-        """Time at which all required fingers touched; means nothing unless `in_contact`."""
-        self._still_since_ns: int | None = None
-        """Time since which touch and stillness have lasted. None: something moves."""
-        self._moved_since_ns: int | None = None
-        """Time since which a judged grasp has moved. None: it does not move."""
-        self._sure = False
-        """True if it has settled with slow slides excluded: the loose limit holds from then on."""
-        self._early = False
-        """True if it was judged while something might slide slowly: it is judged again, unasked."""
-        self._released_ns = 0
+        self._opened_ns = 0
         """Time of the end of the last touch."""
-        self._asked = False
-        """True while the controller waits for a judgement."""
-        self._asked_until_ns: int | None = None
-        """None until the first reading after the question."""
         self._objections: tuple[Reason, ...] = (Reason.NO_CONTACT,)
         """Reasons of the last reading against settling."""
-        self._changes: list[GateChange] = []
-        """Those since the last moment: three of a reading, and one of a restart before it."""
         unknown: dict[Finger, float | None] = dict.fromkeys(fingers)
         self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
         """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
-        self._asked = True
-        self._asked_until_ns = None
+        self._question.ask()
 
     def skip(self, t_ns: int) -> None:
         """Take in the time of a reading that cannot be used, ns."""
-        last_ns = self._last_ns
-        if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gap_ns:
+        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._limits.gap_ns:
             self.restart(t_ns)
 
     def observe(
@@ -111,7 +183,8 @@ class Gate:
         `usable`: electrodes that can be used, shape (fingers, 24); None: all. `touches` is True if
         any finger touches.
         """
-        self.skip(t_ns)
+        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._limits.gap_ns:
+            self.restart(t_ns)
         self._last_ns = t_ns
         self.motion.add(t_ns, counts, usable, wanted=touches or not self.required)
 
@@ -133,29 +206,28 @@ class Gate:
         grasp is judged only `in_time` and by `fresh` values, or by the newest once the verdict is
         too old to stand. `fingers` goes into the moment as it is.
         """
-        self._follow_question(t_ns)
-        in_contact = self.required.issubset(touching)
-        if in_contact and not self.in_contact:
-            self._touched_ns = t_ns
-        self.in_contact = in_contact
-        reasons = self._disturbances(objections)
-        self._follow_stillness(t_ns, bool(reasons))
+        phase, still, motion = self.phase, self._still, self.motion
+        if self._question.asked:
+            self._question.follow(t_ns)
+        still.touch(t_ns, self.required.issubset(touching))
+        limits = motion.loose if still.sure else motion.strict
+        reasons = self._disturbances(objections, limits)
+        still.follow(t_ns, bool(reasons), limits.sure)
         self._follow_contact(t_ns, bool(touching))
-        state = self.state
-        if state is GateState.JUDGED:
-            reasons += self._follow_judged(t_ns, median.astype(np.float32), usable)
-        elif state is GateState.SETTLED and (reasons or not self._is_still):
-            cause = GateCause.MOVED if self.in_contact else GateCause.CONTACT_LOST
-            self._enter(GateState.CLOSING, t_ns, cause)
-        elif state is GateState.CLOSING and not reasons and self._is_still:
-            self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
-        if self.state is GateState.CLOSING and not reasons:
-            reasons = (Reason.MOVING if self.motion.slides else Reason.SETTLING,)
+        is_still = still.lasts_ns >= self._settles_ns
+        if phase.state is GateState.JUDGED:
+            reasons += self._follow_judged(t_ns, median, usable, limits)
+        elif phase.state is GateState.SETTLED and (reasons or not is_still):
+            self._go(ways.MOVED if still.touches else ways.LET_GO, t_ns)
+        elif phase.state is GateState.CLOSING and not reasons and is_still:
+            self._go(ways.STILL, t_ns)
+        if phase.state is GateState.CLOSING and not reasons:
+            reasons = (Reason.MOVING if motion.slides else Reason.SETTLING,)
         self._objections = reasons
-        if in_time and self._wants_judgement(fresh=fresh):
-            judged = self._judge(t_ns, median)
-            return self.moment(touching, fingers, judges=True, judged=judged)
-        return self.moment(touching, fingers)
+        judges = judged = False
+        if in_time and not reasons and self._is_due(t_ns, fresh):
+            judges, judged = True, self._judge(t_ns, median)
+        return self.moment(touching, fingers, judges=judges, judged=judged)
 
     def moment(
         self,
@@ -166,24 +238,27 @@ class Gate:
         judged: bool = False,
     ) -> Moment:
         """Return where in a grasp the hand is, and forget the changes that led there."""
-        is_judged, reasons = self.state is GateState.JUDGED, self._objections
+        phase, still = self.phase, self._still
+        is_judged, reasons = phase.state is GateState.JUDGED, self._objections
         if not (reasons or is_judged):
-            reasons = (Reason.SETTLING if self._is_asked else Reason.NOT_ASKED,)
-        changes, self._changes = self._changes, []
-        motion, motion_limits = self._nearest_to_limit()
+            is_asked = still.early or self._question.is_asked
+            reasons = (Reason.SETTLING if is_asked else Reason.NOT_ASKED,)
+        changes, phase.changes = phase.changes, []
+        motion, motion_limits = self._nearest_to_limit() if self.motion.looked else self._not_looked
+        strict = self.motion.strict
         return Moment(
-            grasp=self.grasp,
-            state=self.state,
+            grasp=phase.grasp,
+            state=phase.state,
             judges=judges,
             judged=judged,
-            in_contact=self.in_contact,
+            in_contact=still.touches,
             settled=is_judged and not reasons,
             reasons=reasons,
             touching=touching,
             changes=tuple(changes),
-            still_ms=self._still_ns / 1e6,
-            early=is_judged and self._early,
-            steady=self._keeps_to(self.motion.strict),
+            still_ms=still.lasts_ns / 1e6,
+            early=is_judged and still.early,
+            steady=strict.early if still.early else strict.sure,
             motion=motion,
             motion_limits=motion_limits,
             fingers=fingers,
@@ -192,70 +267,97 @@ class Gate:
     def restart(self, t_ns: int) -> None:
         """Have the grasp settle again: readings are missing, or time went back."""
         if self._last_ns is not None and t_ns < self._last_ns:
-            self._released_ns = t_ns
-            self._asked_until_ns = None
+            self._opened_ns = t_ns
+            self._question.restart()
         self._last_ns = t_ns
-        self._still_since_ns = None
-        self._touched_ns = min(self._touched_ns, t_ns)
+        self._still.restart(t_ns)
         self.motion.reset()
         self._objections = (Reason.SEQUENCE_GAP,)
-        if self.state in (GateState.SETTLED, GateState.JUDGED):
-            self._enter(GateState.CLOSING, t_ns, GateCause.GAP)
+        self._go(ways.GAP, t_ns)
 
-    @property
-    def _is_asked(self) -> bool:
-        return self._asked or self._early or not self._on_request
+    def _go(self, way: Transition, t_ns: int) -> None:
+        if self.phase.take(way, t_ns):
+            if way.to in (GateState.SETTLED, GateState.JUDGED):
+                self._still.settle()
+            else:
+                self._still.unsettle()
 
-    @property
-    def _still_ns(self) -> int:
-        """Time of touch and stillness, ns; less than the long window if something may slide."""
-        if self._still_since_ns is None or self._last_ns is None:
-            return 0
-        return max(self._last_ns - self._still_since_ns, 0)
+    def _disturbances(
+        self, objections: tuple[Reason, ...], limits: MotionLimits
+    ) -> tuple[Reason, ...]:
+        if not self._still.touches:
+            not_tared = (Reason.NOT_TARED,) if Reason.NOT_TARED in objections else ()
+            return (*not_tared, Reason.NO_CONTACT)
+        if not self.motion.known:
+            return (*objections, Reason.SEQUENCE_GAP)
+        return objections if limits.early else (*objections, Reason.MOVING)
 
-    @property
-    def _is_still(self) -> bool:
-        """True if the hand has kept still for long enough to be judged."""
-        return self._still_ns >= (SHORT_NS if self._limits.early else LONG_NS)
+    def _follow_contact(self, t_ns: int, touches: bool) -> None:
+        phase = self.phase
+        if phase.state is GateState.RELEASED and t_ns - self._opened_ns >= self._limits.release_ns:
+            self._go(ways.FORGOTTEN, t_ns)
+        if touches and phase.state in ways.TOUCHED.states:
+            phase.grasp += 1
+            self._go(ways.TOUCHED, t_ns)
+        elif not touches and phase.state in ways.OPENED.states:
+            self._opened_ns = t_ns
+            self._go(ways.OPENED, t_ns)
 
-    @property
-    def _motion_limits(self) -> MotionLimits:
-        """Limits of motion now: loose once the grasp is sure, else strict."""
-        return self.motion.loose if self._sure else self.motion.strict
+    def _follow_judged(
+        self,
+        t_ns: int,
+        median: NDArray[np.uint16],
+        usable: NDArray[np.bool_] | None,
+        limits: MotionLimits,
+    ) -> tuple[Reason, ...]:
+        """Check that the judged grasp is still the same; return what else is against it."""
+        still = self._still
+        if not still.touches:
+            self._go(ways.LET_GO, t_ns)
+            return ()
+        # Whole numbers below 2**16: float32 adds 24 of them exactly.
+        distance = np.abs(median.astype(np.float32) - self._reference)
+        if usable is None:
+            means = (distance @ ONES) / np.float64(ELECTRODES)
+        else:
+            means = (distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1)
+        if max(means.tolist()) > self._limits.change_counts:
+            self._go(ways.CHANGED, t_ns)
+            return ()
+        if limits.early if still.early else limits.sure:
+            still.moved_since_ns = None
+            if still.early and still.lasts_ns >= LONG_NS:
+                self._go(ways.SURE, t_ns)
+            return ()
+        if still.moved_since_ns is None:
+            still.moved_since_ns = t_ns
+        elif t_ns - still.moved_since_ns >= 2 * LONG_NS:
+            self._go(ways.MOVED, t_ns)
+        return (Reason.MOVING,) if limits.early else ()
 
-    def _keeps_to(self, limits: MotionLimits) -> bool:
-        """Return True if nothing moves by which a judged grasp would not stand."""
-        return limits.early if self._early else limits.sure
-
-    def _wants_judgement(self, *, fresh: bool) -> bool:
+    def _is_due(self, t_ns: int, fresh: bool) -> bool:
         """Return True if this reading is the one to judge."""
-        if self._objections:
-            return False
-        if self.state is GateState.JUDGED:
-            age_ns = (self._last_ns or 0) - self._judged_ns
-            return age_ns > STANDS_NS or (fresh and (self._asked or age_ns >= REFRESH_NS))
-        return fresh and self.state is GateState.SETTLED and self._is_asked
+        if self.phase.state is GateState.JUDGED:
+            return self._question.is_due(t_ns, fresh)
+        is_asked = self._still.early or self._question.is_asked
+        return fresh and is_asked and self.phase.state is GateState.SETTLED
 
     def _judge(self, t_ns: int, median: NDArray[np.uint16]) -> bool:
         """Enter `judged`, or stay there; return False if that only refreshes a judgement."""
-        refreshes = self.state is GateState.JUDGED and not (self._asked and self._on_request)
-        self._judged_ns = t_ns
-        self._asked = False
-        if self.state is not GateState.JUDGED:
+        first = self.phase.state is not GateState.JUDGED
+        if first:
             # Kept when it is judged again: else a grasp that creeps would never be another.
             self._reference = median.astype(np.float32)
-            self._early = self._still_ns < LONG_NS
-            self._moved_since_ns = None
-            self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
-        return not refreshes
+            self._still.early = self._still.lasts_ns < LONG_NS
+            self._still.moved_since_ns = None
+            self._go(ways.ANSWERED, t_ns)
+        return self._question.answer(t_ns, first=first)
 
     def _nearest_to_limit(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
         """Per finger: motion in the window closer to its limit, and that limit."""
         motion: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
-        now, most = self.motion, self._motion_limits
-        if not now.looked:
-            return self._not_looked
+        now, most = self.motion, self.motion.loose if self._still.sure else self.motion.strict
         windows = now.fast, most.fast, now.slow, most.slow
         for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * slide_limit:
@@ -263,88 +365,3 @@ class Gate:
             motion[finger] = round(moves, 2) if moves < math.inf else None
             limits[finger] = round(limit, 2)
         return motion, limits
-
-    def _follow_question(self, t_ns: int) -> None:
-        if not self._asked:
-            return
-        if self._asked_until_ns is None:
-            self._asked_until_ns = t_ns + self._limits.request_ns
-        elif t_ns > self._asked_until_ns:
-            self._asked = False
-
-    def _disturbances(self, objections: tuple[Reason, ...]) -> tuple[Reason, ...]:
-        if not self.in_contact:
-            not_tared = tuple(reason for reason in objections if reason is Reason.NOT_TARED)
-            return (*not_tared, Reason.NO_CONTACT)
-        if not self.motion.known:
-            return (*objections, Reason.SEQUENCE_GAP)
-        return objections if self._motion_limits.early else (*objections, Reason.MOVING)
-
-    def _follow_stillness(self, t_ns: int, disturbed: bool) -> None:
-        """The windows say for how long nothing has moved; the touch must have lasted as long."""
-        if disturbed:
-            self._still_since_ns = None
-            return
-        since_ns = self._still_since_ns
-        if since_ns is None:
-            since_ns = max(t_ns - SHORT_NS, self._touched_ns)
-        if self._motion_limits.sure:
-            since_ns = min(since_ns, max(t_ns - LONG_NS, self._touched_ns))
-        else:
-            since_ns = max(since_ns, t_ns - LONG_NS + 1_000_000)  # a ms short of it
-        self._still_since_ns = since_ns
-
-    def _follow_contact(self, t_ns: int, touches: bool) -> None:
-        release_ns = self._limits.release_ns
-        if self.state is GateState.RELEASED and t_ns - self._released_ns >= release_ns:
-            self._enter(GateState.IDLE, t_ns, GateCause.TIME)
-        if touches and self.state in (GateState.IDLE, GateState.RELEASED):
-            self.grasp += 1
-            self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT)
-        if not touches and self.state not in (GateState.IDLE, GateState.RELEASED):
-            self._released_ns = t_ns
-            self._enter(GateState.RELEASED, t_ns, GateCause.CONTACT_LOST)
-
-    def _follow_judged(
-        self, t_ns: int, counts: NDArray[np.float32], usable: NDArray[np.bool_] | None
-    ) -> tuple[Reason, ...]:
-        """Check that the judged grasp is still the same; return what else is against it."""
-        if not self.in_contact:
-            self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT_LOST)
-            return ()
-        distance = _mean_distance(counts, self._reference, usable)
-        if max(distance.tolist()) > self._limits.change_counts:
-            self._enter(GateState.CLOSING, t_ns, GateCause.CHANGED)
-            return ()
-        limits = self._motion_limits
-        if self._keeps_to(limits):
-            self._moved_since_ns = None
-            if self._early and self._still_ns >= LONG_NS:
-                self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
-            return ()
-        if self._moved_since_ns is None:
-            self._moved_since_ns = t_ns
-        elif t_ns - self._moved_since_ns >= 2 * LONG_NS:
-            self._enter(GateState.CLOSING, t_ns, GateCause.MOVED)
-        return (Reason.MOVING,) if limits.early else ()
-
-    def _enter(self, state: GateState, t_ns: int, cause: GateCause) -> None:
-        self._changes.append(GateChange(t_ns, self.grasp, self.state, state, cause))
-        self.state = state
-        if state in (GateState.SETTLED, GateState.JUDGED):
-            self._sure = self._sure or self._still_ns >= LONG_NS
-        else:
-            self._early, self._sure, self._moved_since_ns = False, False, None
-
-
-def _mean_distance(
-    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_] | None
-) -> NDArray[np.float64]:
-    """Return the mean distance of each finger's `usable` electrodes, counts, shape (fingers,).
-
-    Counts, shape (fingers, 24), are whole numbers below 2**16: float32 adds 24 of them exactly.
-    """
-    distance = np.abs(one - other)
-    if usable is None:
-        return np.asarray((distance @ ONES) / np.float64(ELECTRODES))
-    return np.asarray((distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1))

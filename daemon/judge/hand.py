@@ -21,7 +21,6 @@ from graspd.daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from graspd.daemon.judge.gate import Gate
 from graspd.daemon.judge.health import NO_COUNT, Checked
 from graspd.daemon.judge.reasons import OPEN, FingerState, GateState, Moment, Reason
-from graspd.daemon.judge.stillness import Motion
 from graspd.drivers.base import JointReading
 
 if TYPE_CHECKING:
@@ -166,12 +165,12 @@ class HandTracker:
     @property
     def state(self) -> GateState:
         """State of the gate."""
-        return self.gate.state
+        return self.gate.phase.state
 
     @property
     def grasp(self) -> int:
         """Number of the current grasp; 0 before the first."""
-        return self.gate.grasp
+        return self.gate.phase.grasp
 
     def read_rest(self) -> NDArray[np.float64]:
         """Return the resting counts, shape (fingers, 24); 0: not known."""
@@ -200,12 +199,12 @@ class HandTracker:
 
     def holds(self, grasp: int) -> bool:
         """Return True while this grasp lasts."""
-        return grasp == self.gate.grasp and self.gate.state not in OPEN
+        return grasp == self.gate.phase.grasp and self.gate.phase.state not in OPEN
 
     def count_from(self, grasp: int) -> None:
         """Give the next grasp the number after this, unless one is held."""
-        if self.gate.state in OPEN:
-            self.gate.grasp = grasp
+        if self.gate.phase.state in OPEN:
+            self.gate.phase.grasp = grasp
 
     def ask(self) -> None:
         """Judge the current grasp once it has settled: the controller waits for the verdict."""
@@ -279,15 +278,20 @@ class HandTracker:
         self, t_ns: int, touching: list[bool], tared: list[bool]
     ) -> dict[Finger, FingerState | None]:
         """Return what each finger feels by the reading just observed."""
-        motion = self.gate.motion
+        motion, loose = self.gate.motion, self.gate.motion.loose
         feelings: dict[Finger, FingerState | None] = {}
         for place, finger in enumerate(self._fingers):
             word = self._words[place]
-            if touching[place]:
-                feelings[finger] = word.touch(t_ns, _moves(motion, place))
-            else:
+            if not touching[place]:
                 word.let_go()
                 feelings[finger] = FingerState.FREE if tared[place] else None
+                continue
+            fast, slow = motion.fast[place], motion.slow[place]
+            is_known = fast < math.inf and slow < math.inf
+            if loose.fast[place] < fast < math.inf or loose.slow[place] < slow < math.inf:
+                feelings[finger] = word.touch(t_ns, True)
+            else:  # what is known keeps to its limit
+                feelings[finger] = word.touch(t_ns, False if is_known else None)
         return feelings
 
     def _follow_time(self, t_ns: int) -> None:
@@ -306,14 +310,3 @@ class HandTracker:
 
     def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
         return tuple(compress(self._fingers, which.tolist()))
-
-
-def _moves(motion: Motion, finger: int) -> bool | None:
-    """Return True if a finger moves beyond a loose limit.
-
-    None: that is not known of both windows, and what is known keeps to its limit.
-    """
-    fast, slow, loose = motion.fast[finger], motion.slow[finger], motion.loose
-    if loose.fast[finger] < fast < math.inf or loose.slow[finger] < slow < math.inf:
-        return True
-    return False if fast < math.inf and slow < math.inf else None

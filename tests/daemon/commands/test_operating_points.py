@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from graspd.daemon.commands.check import operating_points
-from graspd.daemon.judge.stillness import Motion, Tails
+from graspd.daemon.judge.motion_limits import Tails
+from graspd.daemon.judge.stillness import Motion
 
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
 """Of real held touches: by the differences of sweeps, over the root of 2; at one sweep."""

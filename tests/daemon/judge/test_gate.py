@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graspd.daemon.judge import phase
 from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import GateChange, GateState, Reason
 from graspd.drivers.base import JointReading, TactileReading
+from tests.conftest import ROOT
 from tests.daemon.fakes import FINGERS, sound
 
 START_NS = 10**12
@@ -31,7 +33,7 @@ ALLOWED = {
     *((GateState.SETTLED, GateState.JUDGED), (GateState.JUDGED, GateState.RELEASED)),
     *((GateState.RELEASED, GateState.IDLE), (GateState.SETTLED, GateState.CLOSING)),
     (GateState.JUDGED, GateState.CLOSING),
-    # Not in the drawing, but in its words: a grasp ends when nothing touches any more, and begins
+    # A grasp ends when nothing touches any more, and begins
     # with a touch; what was judged early is judged again.
     *((GateState.CLOSING, GateState.RELEASED), (GateState.SETTLED, GateState.RELEASED)),
     *((GateState.RELEASED, GateState.CLOSING), (GateState.JUDGED, GateState.SETTLED)),
@@ -332,7 +334,7 @@ def test_gate_follows(scenario: Scenario) -> None:
     played = play(scenario)
     assert played.story == scenario.changes
     assert len(played.judged) == scenario.judged
-    assert played.hand.gate.grasp == scenario.grasp
+    assert played.hand.gate.phase.grasp == scenario.grasp
     if scenario.settled_s is not None:
         earliest, latest = scenario.settled_s
         assert earliest <= played.first_s(GateState.SETTLED) <= latest
@@ -349,3 +351,17 @@ def check_chain(changes: list[GateChange]) -> None:
         assert change.former is state
         assert (state, change.state) in ALLOWED
         state = change.state
+
+
+def test_the_page_on_judging_has_all_transitions() -> None:
+    page = (ROOT / "deploy" / "JUDGING.md").read_text()
+    assert "\n".join(phase.lines()) in page
+
+
+def test_no_way_begins_at_another_state() -> None:
+    for way in phase.TRANSITIONS:
+        for state in set(GateState) - set(way.states):
+            now = phase.Phase()
+            now.state = state
+            assert not now.take(way, 0)
+            assert (now.state, now.changes) == (state, [])

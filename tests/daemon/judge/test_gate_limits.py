@@ -260,7 +260,7 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
         changes += now.changes
     check_chain(changes)
     begun = [change for change in changes if change.cause is GateCause.CONTACT]
-    assert [change.grasp for change in begun] == list(range(1, gate.grasp + 1))
+    assert [change.grasp for change in begun] == list(range(1, gate.phase.grasp + 1))
     assert {change.state for change in changes} == set(GateState), "the walk saw all of it"
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.stillness import Motion, Tails, creep, fast_limit
+from graspd.daemon.judge.motion_limits import MotionLimits, Tails, creep
+from graspd.daemon.judge.stillness import Motion
 from graspd.daemon.judge.windows import STEPS, Noise
 from tests.drivers.twins.slides import STANDSTILL_S, held
 
@@ -156,7 +157,7 @@ def test_a_value_that_is_held_is_believed_in_its_fourth_sweep() -> None:
     fallen[0, 0] -= 120
     for number in range(1, 5):
         motion.add(number * 10_000_000, fallen, None)
-        believed.append(motion.clean[0, 0] == fallen[0, 0])
+        believed.append(motion.spikes.clean[0, 0] == fallen[0, 0])
     assert believed == [False, False, False, True]
 
 
@@ -172,7 +173,7 @@ def test_four_electrodes_that_jump_by_more_than_twenty_counts_are_spikes(
     jumped = sweep.copy()
     jumped[1, :electrodes] += np.uint16(counts)
     motion.add(10_000_000, jumped, None)
-    assert (motion.clean == (jumped if believed else sweep)).all()
+    assert (motion.spikes.clean == (jumped if believed else sweep)).all()
 
 
 def test_an_electrode_that_jumps_and_stays_has_moved_however_constant_it_is() -> None:
@@ -204,8 +205,9 @@ def test_electrodes_that_are_lost_for_longer_tell_nothing_until_a_window_has_pas
 def test_memory_is_bounded_however_fast_readings_come() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(0.5, 20_000.0, 3.5, 14)
     fed(motion, counts, 20_000.0)
-    assert motion.number <= STEPS
-    assert motion.first + motion.number <= len(motion.steps)
+    ring = motion.ring
+    assert ring.number <= STEPS
+    assert ring.first + ring.number <= len(ring.steps)
 
 
 def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
@@ -215,7 +217,7 @@ def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
     for number in range(26):
         sweep[0, 0] = 2000 + 10 * (number % 2)  # the others read the same all the time
         motion.add(number * 10_000_000, sweep.copy(), all_but_one if number > 20 else None)
-    assert motion.block[0, 0] > 0.0
+    assert motion.blocks.sums[0, 0] > 0.0
 
 
 def test_a_finger_that_is_lost_as_a_whole_is_not_known_and_no_error() -> None:
@@ -233,7 +235,8 @@ def test_no_such_share_of_false_alarms_can_be_wanted(share: float) -> None:
 
 
 def test_nearly_half_of_the_sweeps_may_be_false_alarms() -> None:
-    assert Motion(3, 0.49).strict == Motion(3, 0.01).strict, "nothing is known yet"
+    strict = Motion(3, 0.49).strict
+    assert (strict.fast, strict.early, strict.sure) == ([1.0] * 3, False, False), "nothing is known"
 
 
 def test_no_finger_may_waver_so_much_that_motion_passes_for_noise() -> None:
@@ -283,8 +286,9 @@ def test_the_limit_of_slopes_is_what_19_of_20_real_touches_kept_to(
     variance = np.array([SIGMA_COUNTS**2 / (1.0 - CORRELATION)])
     noise = Noise.of(variance, np.array([[CORRELATION], [0.03]]))
     by_noise = noise.slope[sweeps] / np.sqrt((times_s**2).sum())
-    (limit,) = fast_limit(Tails.of(1, 0.05, early=True).alone, by_noise.tolist())
-    assert limit * by_noise[0] == pytest.approx(counts_per_s, rel=0.1)
+    limits = MotionLimits(1, Tails.of(1, 0.05, early=True))
+    limits.lay([0.0], by_noise.tolist())
+    assert limits.fast[0] * by_noise[0] == pytest.approx(counts_per_s, rel=0.1)
 
 
 def test_a_held_touch_creeps_as_measured() -> None:

@@ -1,0 +1,122 @@
+"""How much fingers that hold move: the limits of motion, in units of each finger's noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import NamedTuple
+
+from graspd.biotac import ELECTRODES
+from graspd.daemon.judge.windows import MEAN_ABS
+
+SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
+"""Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
+CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
+"""A held touch relaxes: median speed of its electrodes, root mean square, and standard deviation of
+its logarithm. With the noise it is what 44 held touches of one sensor showed, in windows of 50 to
+240 ms."""
+FAST_SHARE = 0.1
+"""Share of the false alarms that the short window may have where the long one decides."""
+LOOSE_SHARE = 0.1
+"""Share of `false_alarms` by which the loose limit is laid, as noise and creep alone pass it. The
+pressure of a real hold wanders as well: together they pass it in `false_alarms` of the time."""
+
+
+class Tails(NamedTuple):
+    """How far a finger that holds may be above what is usual, in standard deviations."""
+
+    slow: float
+    """In the long window."""
+    fast: float
+    """In the short window where the long one decides."""
+    alone: float
+    """In the short window where it decides alone."""
+
+    @classmethod
+    def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
+        """Return them by `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
+        if not 0.0 < false_alarms < 0.5:
+            raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
+        finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
+        slow, fast = (-NormalDist().inv_cdf(share) for share in (finger, FAST_SHARE * finger))
+        return cls(slow, fast, slow if early else fast)
+
+
+class SlowNoise(NamedTuple):
+    """What noise makes of the long window."""
+
+    extent: float
+    """Sum of the squares of the times around their mean, s**2."""
+    squares: list[float]
+    """That of each finger's noise, counts**2."""
+    spreads: list[float]
+    """Those of `Noise`."""
+
+
+class MotionLimits:
+    """Largest motion of each finger, in units of its noise, and whether all fingers are within."""
+
+    def __init__(self, fingers: int, tails: Tails) -> None:
+        self._alone, self._beside = _usual(tails.alone), _usual(tails.fast)
+        self._tail, self._creep = tails.slow, creep(tails.slow) ** 2
+        self._ones = [1.0] * fingers
+        self.forget()
+
+    def forget(self) -> None:
+        """Say that no motion is known, so that nothing is within."""
+        self.fast = self.slow = self._ones
+        """Largest motion of each finger over the short and over the long window."""
+        self.early = self.sure = False
+        """True if all fingers keep within `fast`; within both: slow slides are excluded too."""
+
+    def lay(
+        self,
+        fast: Sequence[float],
+        fast_noise: Sequence[float],
+        slow: Sequence[float] = (),
+        slow_noise: SlowNoise | None = None,
+    ) -> None:
+        """Lay the limits of fingers that move so; `slow_noise` is None before a long window.
+
+        `fast`, `slow`: motion in units of noise. `fast_noise`: mean absolute slopes that noise
+        makes, counts/s.
+        """
+        self.fast, self.early = self._keeps_to(self._alone, fast, fast_noise)
+        if slow_noise is None:
+            self.slow, self.sure = self._ones, False
+            return
+        self.sure = self.early
+        if self._beside != self._alone:
+            _, self.sure = self._keeps_to(self._beside, fast, fast_noise)
+        extent, squares, spreads = slow_noise
+        self.slow = []
+        for move, noise, spread in zip(slow, squares, spreads, strict=True):
+            usual, most = CREEP_COUNTS_PER_S**2 * (extent / noise), self._creep * (extent / noise)
+            # Noise and creep know nothing of each other: their deviations add up as squares do.
+            above = math.hypot(self._tail * spread * (1.0 + usual), most - usual)
+            limit = math.sqrt(1.0 + usual + above)
+            self.slow.append(limit)
+            self.sure = self.sure and move <= limit
+
+    def _keeps_to(
+        self, tail: tuple[float, float], fast: Sequence[float], fast_noise: Sequence[float]
+    ) -> tuple[list[float], bool]:
+        """Return the limits of mean absolute slopes, and whether all fingers are within."""
+        (usual, creeps), limits, within = tail, list[float](), True
+        for move, noise in zip(fast, fast_noise, strict=True):
+            limit = math.hypot(usual, creeps / noise)
+            limits.append(limit)
+            within = within and move <= limit
+        return limits, within
+
+
+def creep(tail: float) -> float:
+    """Return the speed of a held touch, counts/s, `tail` standard deviations above the median."""
+    return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
+
+
+def _usual(tail: float) -> tuple[float, float]:
+    """Return a finger's mean absolute slope at a tail: by its noise, in units of it, and by creep,
+    counts/s."""
+    return math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)

@@ -1,0 +1,64 @@
+"""The states of the gate, and all ways from one to another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from graspd.daemon.judge.reasons import GateCause as Cause
+from graspd.daemon.judge.reasons import GateChange, GateState
+
+IDLE, CLOSING, SETTLED, JUDGED, RELEASED = GateState
+
+
+class Transition(NamedTuple):
+    """One way from states to another."""
+
+    states: tuple[GateState, ...]
+    """Where it begins."""
+    when: str
+    """What makes the gate take it."""
+    to: GateState
+    cause: Cause
+
+
+TOUCHED = Transition((IDLE, RELEASED), "a finger touches", CLOSING, Cause.CONTACT)
+STILL = Transition((CLOSING,), "all fingers touch and have kept still", SETTLED, Cause.STILL)
+ANSWERED = Transition((SETTLED,), "it is judged", JUDGED, Cause.JUDGED)
+SURE = Transition((JUDGED,), "judged `early`, and now nothing slides", SETTLED, Cause.STILL)
+MOVED = Transition((SETTLED, JUDGED), "it moves; judged: for 480 ms", CLOSING, Cause.MOVED)
+CHANGED = Transition((JUDGED,), "a finger reads 40 counts more or less", CLOSING, Cause.CHANGED)
+LET_GO = Transition((SETTLED, JUDGED), "some finger lets go", CLOSING, Cause.CONTACT_LOST)
+GAP = Transition((SETTLED, JUDGED), "readings are missing", CLOSING, Cause.GAP)
+OPENED = Transition((CLOSING, SETTLED, JUDGED), "nothing touches", RELEASED, Cause.CONTACT_LOST)
+FORGOTTEN = Transition((RELEASED,), "nothing touches for 100 ms", IDLE, Cause.TIME)
+TRANSITIONS = TOUCHED, STILL, ANSWERED, SURE, MOVED, CHANGED, LET_GO, GAP, OPENED, FORGOTTEN
+"""All of them, as deploy/JUDGING.md shows them."""
+
+
+class Phase:
+    """State of the gate, the number of the grasp, and the changes that no moment has told yet."""
+
+    def __init__(self) -> None:
+        self.state = IDLE
+        self.grasp = 0
+        """Touches until now; the number of the current grasp."""
+        self.changes: list[GateChange] = []
+        """Since the last moment: three of a reading, and one of a restart before it."""
+
+    def take(self, way: Transition, t_ns: int) -> bool:
+        """Take a way at a reading of `t_ns`; False: it does not begin at the state of now."""
+        former = self.state
+        if former not in way.states:
+            return False
+        self.state = way.to
+        self.changes.append(GateChange(t_ns, self.grasp, former, way.to, way.cause))
+        return True
+
+
+def lines() -> Iterator[str]:
+    """Yield the transitions as a table of Markdown, for deploy/JUDGING.md."""
+    yield "| from | when | to | `cause` |"
+    yield "|---|---|---|---|"
+    for states, when, to, cause in TRANSITIONS:
+        yield f"| {', '.join(f'`{state}`' for state in states)} | {when} | `{to}` | `{cause}` |"
