@@ -106,6 +106,8 @@ class StepRing:
         """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
         self.sweeps = 0
         """Sweeps of the step at hand."""
+        self.crowded = False
+        """True if the step of the last sweep has too many: they came late and all at once."""
         self.last_ns: int | None = None
         """Time of the last sweep that ended a step. None: there is none."""
         self._all_usable_since_ns = 0
@@ -148,6 +150,7 @@ class StepRing:
         self._total = self._total + sweep if self.sweeps else sweep
         self._total_ns += t_ns - since_ns
         self.sweeps += 1
+        self.crowded = self.sweeps > STEP_SWEEPS_MAX
         if self.number and t_ns - since_ns < STEP_NS:
             return False
         if self.number == STEPS:
@@ -332,10 +335,9 @@ class Motion:
         ended = ring.add(t_ns, self.spikes.add(sweep))
         if ended:
             self.blocks.learn(ring)
-        may_look = ended or not (self.looked or ring.sweeps > STEP_SWEEPS_MAX)
-        if wanted and may_look:
+        if wanted and not ring.crowded and (ended or not self.looked):
             self._look()
-        elif self.looked and (ended or ring.sweeps > STEP_SWEEPS_MAX):
+        elif self.looked and (ended or ring.crowded):
             self._say_unknown()
 
     def _look(self) -> None:
