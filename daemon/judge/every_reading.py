@@ -52,10 +52,6 @@ class EveryReading:
         """Give the next grasp the number after this."""
         self.grasp = grasp
 
-    def holds(self, _grasp: int) -> bool:
-        """Return False: a grasp of a table is over with its reading."""
-        return False
-
     def health(self) -> dict[str, Reason]:
         """Return nothing: there is neither tare nor joints."""
         return {}

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from graspd.biotac import ELECTRODES, Finger
 from graspd.daemon.judge import phase as ways
 from graspd.daemon.judge.decision import HandLimits
+from graspd.daemon.judge.motion_limits import MotionLimits
 from graspd.daemon.judge.phase import Phase, Transition
 from graspd.daemon.judge.reasons import FingerState, GateState, Moment, Reason
-from graspd.daemon.judge.stillness import ONES, Motion, MotionLimits
+from graspd.daemon.judge.stillness import ONES, Motion
 from graspd.daemon.judge.windows import LONG_NS, SHORT_NS
 
 REFRESH_NS = 50_000_000

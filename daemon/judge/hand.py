@@ -197,10 +197,6 @@ class HandTracker:
         self._fresh.reset()
         self.restart()
 
-    def holds(self, grasp: int) -> bool:
-        """Return True while this grasp lasts."""
-        return grasp == self.gate.phase.grasp and self.gate.phase.state not in OPEN
-
     def count_from(self, grasp: int) -> None:
         """Give the next grasp the number after this, unless one is held."""
         if self.gate.phase.state in OPEN:

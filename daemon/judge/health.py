@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
-from graspd.models.electrodes import any_of, too_many
+from graspd.models.electrodes import too_many
 
 REASON_OF_FAULT: dict[ElectrodeFault, Reason] = {
     ElectrodeFault.MISSING: Reason.SENSOR_MISSING,
@@ -80,6 +80,9 @@ class Checked:
     """True for electrodes whose counts mean nothing, shape (fingers, 24). None: all are sound."""
 
 
+SOUND = Checked((), None)
+
+
 class Health:
     """Finds broken electrodes and repeated sweeps by comparing each reading with those before."""
 
@@ -134,12 +137,14 @@ class Health:
         if repeats:
             also = (Reason.SATURATED,) if too_many(railed) else ()
             return Checked((Reason.FROZEN, *also), broken)
+        if 1 not in broken.tobytes():
+            return SOUND
         if too_many(broken):
             reasons = [*_fault_reasons(faults)]
             if railed.any():
                 reasons.append(Reason.SATURATED)
             return Checked((*reasons, Reason.ELECTRODES_BROKEN), broken)
-        return Checked((), broken if any_of(broken) else None)
+        return Checked((), broken)
 
     def electrodes(self) -> dict[tuple[int, int], Reason]:
         """Return why electrodes are broken now, by (finger, electrode 0..23)."""
@@ -168,12 +173,12 @@ class Health:
             self._jumps *= JUMPS_FADE
             remembered = self._jumps >= JUMPS_FORGOTTEN
             self._jumps *= remembered
-            self._has_jumped = any_of(remembered)
-        if any_of(far):
+            self._has_jumped = 1 in remembered.tobytes()
+        if 1 in far.tobytes():
             near = counts - previous + STILL_COUNTS <= 2 * STILL_COUNTS
             if np.count_nonzero(near) >= STILL:  # some finger may keep still
                 jumps = far & (near.sum(axis=1, keepdims=True) >= STILL)
-                self._has_jumped |= any_of(jumps)
+                self._has_jumped |= 1 in jumps.tobytes()
                 self._jumps += jumps
         self._previous = counts
         return railed, differs

@@ -116,6 +116,8 @@ class Pipeline:
             self.hand = HandTracker(fingers, hand)
         self.read_rest = self.hand.read_rest
         """Gives where each electrode rests, counts, shape (fingers, 24); None: a table."""
+        self._moment = self.hand.silent()
+        """Of the last reading."""
         self._opinion = NO_OPINION
         """Answer of the network for the current grasp."""
         self._assessment: Assessment | None = None
@@ -184,12 +186,6 @@ class Pipeline:
             return self.trust.outcome(grasp, slipped=slipped)
         return self.lifts.tell(grasp, slipped=slipped)[0]
 
-    def restart(self) -> None:
-        """Discard the current grasp's verdict."""
-        self._forget_opinion()
-        self._learnt_grasp, self._held, self._to_learn = 0, NOTHING_HELD, None
-        self.hand.restart()
-
     def skip(self) -> None:
         """Note that readings were left out before the next one: anything may have moved."""
         self.hand.interrupt()
@@ -210,6 +206,7 @@ class Pipeline:
         if in_time is None:
             in_time = 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns
         moment, counts = self.hand.step(made_ns, reading.counts, checked, in_time=in_time)
+        self._moment = moment
         examined = None
         if counts is not None:
             examined = self._judge.examine(counts, checked.broken)
@@ -254,7 +251,9 @@ class Pipeline:
         """Take the grasp that was judged last into the session, if it is over.
 
         A grasp is judged only by those before it. Learning takes as long as judging."""
-        if self._to_learn is not None and not self.hand.holds(self._learnt_grasp):
+        now = self._moment
+        is_over = now.state is None or now.state in OPEN or now.grasp != self._learnt_grasp
+        if self._to_learn is not None and is_over:
             self._judge.observe(*self._to_learn)
             self._to_learn = None
 

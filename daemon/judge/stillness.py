@@ -367,11 +367,12 @@ class Motion:
         """Find how steps moved; return the mean absolute slopes that noise makes, counts/s."""
         ring, line = self.ring, centred(times_s)
         extent = float(line.dot(line))
-        by_noise = noise.slope[len(line)] / math.sqrt(extent)
+        by_noise: Times = noise.slope[len(line)] / math.sqrt(extent)
         weights = (line / extent).astype(np.float32)
         slopes = np.abs(weights.dot(ring.steps[begin:end].reshape(len(line), -1)))
         self.fast = (ring.mean(slopes.reshape(-1, ELECTRODES), begin) / by_noise).tolist()
-        return by_noise.tolist()
+        usual: list[float] = by_noise.tolist()
+        return usual
 
     def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> SlowNoise:
         """Find how far steps have spread; return what noise makes of that."""

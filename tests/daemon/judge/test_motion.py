@@ -79,7 +79,7 @@ def test_held_hands_are_still_and_slides_are_not(late: bool) -> None:
     assert sure < 0.1
 
 
-def test_of_too_many_sweeps_at_one_time_nothing_is_known_until_time_goes_on() -> None:
+def test_of_too_many_sweeps_at_one_time_nothing_is_known_until_their_step_is_over() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(3.0, 100.0, 3.5, 4)
     t_ns = fed(motion, counts, 100.0)
     known = []
@@ -88,8 +88,9 @@ def test_of_too_many_sweeps_at_one_time_nothing_is_known_until_time_goes_on() ->
         known.append(motion.known)
     # Ten together, after the one that ended a step.
     assert known == [True] * 11 + [False] * 9
-    motion.add(t_ns + 5_000_000, np.rint(counts[-1]).astype(np.uint16), FINGER)
-    assert motion.known
+    for after_ms, is_known in ((5, False), (10, True)):
+        motion.add(t_ns + after_ms * 1_000_000, np.rint(counts[-1]).astype(np.uint16), FINGER)
+        assert motion.known is is_known
 
 
 def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_a_gap() -> None:
