@@ -44,14 +44,14 @@ class Tails(NamedTuple):
 
 
 class SlowNoise(NamedTuple):
-    """What noise makes of the long window."""
+    """Noise in the long window."""
 
     extent: float
     """Sum of the squares of the times around their mean, s**2."""
     squares: list[float]
-    """That of each finger's noise, counts**2."""
+    """Sum of the squares of each finger's noise, counts**2."""
     spreads: list[float]
-    """Those of `Noise`."""
+    """Values of `Noise.spread`."""
 
 
 class MotionLimits:

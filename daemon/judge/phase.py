@@ -15,9 +15,9 @@ class Transition(NamedTuple):
     """One way from states to another."""
 
     states: tuple[GateState, ...]
-    """Where it begins."""
+    """States at which it begins."""
     when: str
-    """What makes the gate take it."""
+    """Event that makes the gate take it."""
     to: GateState
     cause: Cause
 

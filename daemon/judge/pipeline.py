@@ -117,7 +117,7 @@ class Pipeline:
         self.read_rest = self.hand.read_rest
         """Gives where each electrode rests, counts, shape (fingers, 24); None: a table."""
         self._moment = self.hand.silent()
-        """Of the last reading."""
+        """Moment of the last reading."""
         self._opinion = NO_OPINION
         """Answer of the network for the current grasp."""
         self._assessment: Assessment | None = None

@@ -341,7 +341,7 @@ class Motion:
             self._say_unknown()
 
     def _look(self) -> None:
-        """Work out how the fingers move, as far as the steps go back."""
+        """Work out how the fingers move within the steps."""
         ring, first, number = self.ring, self.ring.first, self.ring.number
         end = first + number
         times_ns = ring.times_ns[first:end]
