@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from graspd.biotac import COUNT_MAX, ELECTRODES, Finger, electrode_columns
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.plan import MCAP, require_mcap
 from graspd.daemon.assembly.sources import Source, Tables
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
@@ -162,8 +163,8 @@ def judge(
 
 def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
     source: Source = Tables(paths, {})
-    if assembly.MCAP in {path.suffix for path in paths}:
-        assembly.require_mcap("judging MCAP")
+    if MCAP in {path.suffix for path in paths}:
+        require_mcap("judging MCAP")
         from graspd.daemon.assembly.recordings import RecordedRun
 
         source = RecordedRun(paths)

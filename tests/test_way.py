@@ -16,8 +16,8 @@ import pytest
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.process.signals import StopSignal
-from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.run.loop import Loop, LoopTiming
 from tests.conftest import ROOT
 from tests.daemon.processes import start, wait_for
@@ -77,9 +77,9 @@ def rounds_of(file: Path) -> list[list[Call]]:
 
     wanted = scene.load(file)
     with ExitStack() as stack:
-        parts = Parts.of(wanted, assembly.load_model(wanted))
+        parts = Parts.of(Plan.of(wanted), assembly.load_model(wanted))
         around = Assembly(parts, stack)
-        around.add_sockets(stack.enter_context(Sockets(wanted)))
+        around.open_sockets()
         around.open_drivers()
         stop, timing = stack.enter_context(StopSignal()), LoopTiming(wanted.max_age_ns)
         outbox = around.build_outbox()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
+from graspd.biotac import Finger
+from graspd.daemon.assembly.plan import Plan, is_mcap
+from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.scene import Scene, SceneError
@@ -22,24 +23,18 @@ from graspd.daemon.scene.drivers import (
     SpiTactile,
     StreamJoints,
 )
-from graspd.daemon.scene.scene import GateMode
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver, DriverError, LinkError
-from graspd.extras import require
 from graspd.models import trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
 from graspd.models.trust.risk import RiskLimits
-
-if TYPE_CHECKING:
-    from graspd.drivers.recordings.csv_rows import Columns
 
 DEFAULT_MODEL = "small-session"
 RECORDED_MAX_AGE_MS = 1000.0
 """Age limit of recorded readings, ms; generous, because a recording has no link to be late on."""
 NO_SILENCE_NS = 3_600_000_000_000
 """Time without a reading, ns, that counts as silence: no pause of a recording does."""
-MCAP = ".mcap"
 
 
 def model_path(scene: Scene) -> Path:
@@ -69,13 +64,14 @@ def keep_digest(model: TactileModel) -> Iterator[str]:
 
 
 def build_pipeline(
-    scene: Scene,
+    plan: Plan,
     model: TactileModel,
     clock: Callable[[], int] = time.monotonic_ns,
     *,
     learns: bool = True,
 ) -> Pipeline:
-    """Build the scene's judge. Raises `ModelError`, `SceneError` or `RecordingError`."""
+    """Build the scene's judge. Raises `ModelError`."""
+    scene = plan.scene
     _refuse_other_fingers(scene, model)
     limits = Limits(
         max_age_ns=scene.max_age_ns,
@@ -87,7 +83,7 @@ def build_pipeline(
         scene.hand.fingers,
         limits,
         clock,
-        hand=hand_limits(scene),
+        hand=plan.hand,
         learns=learns,
         needs_session=scene.session.required,
         trust=_trust(scene, model),
@@ -129,74 +125,6 @@ def _and_sensors(scene: Scene) -> str:
             return ""
 
 
-def gate_mode(scene: Scene) -> GateMode:
-    """Return the gate's mode; without `gate.mode` the recordings decide. Raises `SceneError`."""
-    if scene.gate.mode is not None:
-        return scene.gate.mode
-    if not isinstance(scene.tactile, ReplayTactile) or is_mcap(scene.tactile):
-        return "settled"
-    streams = {columns.is_stream for columns in _columns(scene, scene.tactile)}
-    if len(streams) > 1:
-        raise SceneError("tactile.recordings: both grasp tables and streams; say gate.mode")
-    return "settled" if True in streams else "every"
-
-
-def hand_limits(scene: Scene) -> HandLimits | None:
-    """Return the limits of the gate; None in mode `every`."""
-    mode, gate = gate_mode(scene), scene.gate
-    if mode == "every":
-        return None
-    return HandLimits(
-        on_request=mode == "request",
-        required=gate.fingers,
-        gate=GateLimits(
-            false_alarms=gate.false_alarms,
-            early=gate.early,
-            request_ns=round(gate.request_ms * 1e6),
-        ),
-        joints=JointLimits() if has_joints(scene) else None,
-    )
-
-
-def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
-    from graspd.drivers.recordings.csv_rows import columns_of
-
-    return [columns_of(path, scene.hand.fingers) for path in options.recordings]
-
-
-def is_mcap(options: ReplayTactile) -> bool:
-    """Return True for recordings of graspd.
-
-    Raises `SceneError` if some are CSV files, or if the package that reads MCAP is missing.
-    """
-    kinds = {path.suffix == MCAP for path in options.recordings}
-    if len(kinds) > 1:
-        raise SceneError("tactile.recordings: both CSV and MCAP files")
-    if True in kinds:
-        require_mcap("replaying MCAP")
-    return True in kinds
-
-
-def require_mcap(what: str) -> None:
-    """Raise `SceneError`, with advice, if `what` lacks the package of the extra `record`."""
-    try:
-        require("mcap", what, "record")
-    except ModuleNotFoundError as error:
-        raise SceneError(str(error)) from error
-
-
-def has_joints(scene: Scene) -> bool:
-    """Return True if joint angles come, from their own source or in a recording."""
-    options = scene.tactile
-    if scene.joints is not None or not isinstance(options, ReplayTactile):
-        return scene.joints is not None
-    if not is_mcap(options):
-        return any(columns.joints for columns in _columns(scene, options))
-    from graspd.daemon.record.mcap import header_of
-
-    return any(header_of(path).joints for path in options.recordings)
-
-
 def refuse_absent_processors(scene: Scene) -> None:
     """Raise `SceneError` if this computer lacks a processor of `[realtime]`."""
     number = os.sysconf("SC_NPROCESSORS_CONF")
@@ -205,10 +133,11 @@ def refuse_absent_processors(scene: Scene) -> None:
             raise SceneError(f"realtime.cpus: no processor {cpu}: there are 0 to {number - 1}")
 
 
-def build_drivers(scene: Scene) -> list[Driver]:
+def build_drivers(plan: Plan) -> list[Driver]:
     """Make the drivers, not open yet, the tactile one first. Raises `SceneError`."""
+    scene = plan.scene
     with _section("tactile"):
-        drivers = [_tactile(scene)]
+        drivers = [_tactile(plan)]
     if isinstance(scene.joints, StreamJoints):
         from graspd.drivers.joints import JointStreamDriver
 
@@ -248,10 +177,11 @@ def _section(name: str) -> Iterator[None]:
         raise SceneError(f"[{name}] {error}") from error
 
 
-def _tactile(scene: Scene) -> Driver:
+def _tactile(plan: Plan) -> Driver:
+    scene = plan.scene
     match scene.tactile:
         case ReplayTactile() as options:
-            return _replay(scene, options)
+            return _replay(plan, options)
         case SpiTactile() as options:
             from graspd.drivers.spi.driver import SpiBridgeDriver
 
@@ -277,28 +207,23 @@ def _palm(scene: Scene, options: PalmTactile) -> Driver:
     )
 
 
-def _replay(scene: Scene, options: ReplayTactile) -> Driver:
-    speed = 1.0 if options.pace == "realtime" else None
+def _replay(plan: Plan, options: ReplayTactile) -> Driver:
+    fingers, speed = plan.scene.hand.fingers, 1.0 if options.pace == "realtime" else None
     if is_mcap(options):
-        return _replay_mcap(scene, options, speed)
+        return _replay_mcap(fingers, options, speed)
     from graspd.drivers.recordings.csv_player import ReplayDriver
     from graspd.drivers.recordings.csv_rows import SLIPPED
 
-    if options.outcomes and not all(columns.has_labels for columns in _columns(scene, options)):
+    if options.outcomes and plan.without_outcomes:
         raise ValueError(f"outcomes needs the column `{SLIPPED}` in every recording")
-    return ReplayDriver(
-        options.recordings,
-        scene.hand.fingers,
-        speed=speed,
-        loop=options.loop,
-    )
+    return ReplayDriver(options.recordings, fingers, speed=speed, loop=options.loop)
 
 
-def _replay_mcap(scene: Scene, options: ReplayTactile, speed: float | None) -> Driver:
+def _replay_mcap(fingers: Sequence[Finger], options: ReplayTactile, speed: float | None) -> Driver:
     if options.loop:
         raise ValueError("MCAP files are replayed as they are: no loop")
     if options.outcomes:
         raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
     from graspd.daemon.record.player import McapReplayDriver
 
-    return McapReplayDriver(options.recordings, scene.hand.fingers, speed=speed)
+    return McapReplayDriver(options.recordings, fingers, speed=speed)

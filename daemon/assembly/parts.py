@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan, require_mcap
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Answer, Companion, at_once
 from graspd.daemon.publish.outbox import Outbox, Output
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 class Parts:
     """Drivers and judge of a scene. The drivers are not open yet."""
 
-    scene: Scene
+    plan: Plan
     model: TactileModel
     pipeline: Pipeline
     drivers: list[Driver]
@@ -44,26 +45,30 @@ class Parts:
     boot_id: str | None = None
     """Id of the daemon's start that made the recording; None: this start."""
 
+    @property
+    def scene(self) -> Scene:
+        return self.plan.scene
+
     @classmethod
-    def of(cls, scene: Scene, model: TactileModel) -> Parts:
-        """Make the parts. Raises `SceneError`, `ModelError` or `RecordingError`."""
-        assembly.refuse_absent_processors(scene)
-        pipeline = assembly.build_pipeline(scene, model, learns=scene.session.learn)
-        return cls(scene, model, pipeline, assembly.build_drivers(scene))
+    def of(cls, plan: Plan, model: TactileModel) -> Parts:
+        """Make the parts. Raises `SceneError` or `ModelError`."""
+        assembly.refuse_absent_processors(plan.scene)
+        pipeline = assembly.build_pipeline(plan, model, learns=plan.scene.session.learn)
+        return cls(plan, model, pipeline, assembly.build_drivers(plan))
 
     @classmethod
     def played(
         cls,
-        scene: Scene,
+        plan: Plan,
         model: TactileModel,
         driver: McapReplayDriver | LinkLogDriver[Any],
         boot_id: str | None = None,
     ) -> Parts:
         """Make the parts that judge each reading at the time when `driver` hands it over."""
         pipeline = assembly.build_pipeline(
-            scene, model, lambda: driver.handed_over_ns, learns=scene.session.learn
+            plan, model, lambda: driver.handed_over_ns, learns=plan.scene.session.learn
         )
-        return cls(scene, model, pipeline, [driver], boot_id)
+        return cls(plan, model, pipeline, [driver], boot_id)
 
 
 class Assembly:
@@ -81,10 +86,13 @@ class Assembly:
         parts.pipeline.boot_id = parts.boot_id or self._boot_id
         self._tap: Tap | None = None
 
-    def add_sockets(self, sockets: Sockets) -> None:
-        """Send messages to `sockets`. The caller closes them."""
+    def open_sockets(self, high_water_mark: int | None = None) -> Sockets:
+        """Open the sockets, as `Sockets` does."""
+        sockets = Sockets(self._parts.scene, high_water_mark=high_water_mark)
+        self._stack.callback(sockets.close)
         self._outputs.append(sockets)
         self.companions.append(sockets)
+        return sockets
 
     def open_drivers(self) -> None:
         """Open the drivers; tap a recorded link. Raises `LinkError` or `SceneError`."""
@@ -97,16 +105,16 @@ class Assembly:
             self._stack.callback(driver.close)
             assembly.open_driver(driver)
 
-    def keep_session(self) -> bool:
+    def keep_session(self) -> None:
         """Watch for exchanged sensors; restore and keep the session if the scene asks for it.
 
-        Return False if no session is kept. The last save is when the stack closes.
+        The last save is when the stack closes.
         """
         pipeline, tactile = self._parts.pipeline, self._parts.drivers[0]
         folder = self._session_folder()
         if folder is None:
             self.companions.append(SensorWatch(pipeline, tactile))
-            return False
+            return
         from graspd.daemon.session.keeper import SessionKeeper
 
         self._stack.callback(folder.close)
@@ -114,7 +122,6 @@ class Assembly:
         self._stack.callback(keeper.save)
         self.keep = keeper.keep
         self.companions.insert(0, keeper)  # its answers must come before the socket is read
-        return True
 
     def _session_folder(self) -> SessionFolder | None:
         """Return the folder of sessions, not locked yet; None if no session is kept."""
@@ -130,9 +137,7 @@ class Assembly:
         parts, options = self._parts, self._parts.scene.record
         if options is None:
             return
-        recorder = build_recorder(
-            parts.scene, options, parts.model, parts.pipeline, self._boot_id, self._tap
-        )
+        recorder = build_recorder(parts, options, self._boot_id, self._tap)
         self._stack.callback(recorder.close)
         self._outputs.append(recorder)
         self.companions.append(recorder)
@@ -149,43 +154,36 @@ class Assembly:
         )
 
 
-def build_recorder(
-    scene: Scene,
-    options: Record,
-    model: TactileModel,
-    pipeline: Pipeline,
-    boot_id: str,
-    tap: Tap | None,
-) -> Recorder:
+def build_recorder(parts: Parts, options: Record, boot_id: str, tap: Tap | None) -> Recorder:
     """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
-    assembly.require_mcap("[record]")
+    require_mcap("[record]")
     from graspd.daemon.record.recorder import Recorder
 
     recorder = Recorder(
         options,
-        scene.hand.name,
+        parts.scene.hand.name,
         boot_id,
-        take_header=partial(header_now, pipeline, header_of(scene, model, boot_id)),
+        take_header=partial(
+            header_now, parts.pipeline, header_of(parts.plan, parts.model, boot_id)
+        ),
         tap=tap,
     )
-    pipeline.on_exchange = recorder.exchanged
+    parts.pipeline.on_exchange = recorder.exchanged
     return recorder
 
 
-def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
+def header_of(plan: Plan, model: TactileModel, boot_id: str) -> RecordingHeader:
     """Return the header of a recording, without session and learning."""
     from graspd.daemon.record.mcap import RecordingHeader
 
+    scene = plan.scene
     network = scene.model.model_dump(mode="json", exclude_none=True)
     if scene.model.path is not None:
         network["path"] = str(scene.model.path.absolute())
     sections = {
         "hand": scene.hand.model_dump(mode="json"),
         "model": network,
-        "gate": {
-            **scene.gate.model_dump(mode="json", exclude_none=True),
-            "mode": assembly.gate_mode(scene),
-        },
+        "gate": {**scene.gate.model_dump(mode="json", exclude_none=True), "mode": plan.mode},
         "session": {"learn": scene.session.learn, "required": scene.session.required},
         "learn": scene.learn.model_dump(mode="json"),
     }
@@ -193,7 +191,7 @@ def header_of(scene: Scene, model: TactileModel, boot_id: str) -> RecordingHeade
         sections["risk"] = scene.risk.model_dump(mode="json")
     return RecordingHeader(
         fingers=scene.hand.fingers,
-        joints=assembly.has_joints(scene),
+        joints=plan.joints,
         boot_id=boot_id,
         scene=sections,
         model=model.contract.name,

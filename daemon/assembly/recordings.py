@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.assembly.sources import Source
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
@@ -94,7 +95,7 @@ class RecordedRun(Source):
         if header.file > 0:
             log.warning(BEGINS_WITHIN, self._paths[0])
         driver = McapReplayDriver(self._paths, replayed.hand.fingers, speed=speed)
-        parts = Parts.played(replayed, model, driver, header.boot_id)
+        parts = Parts.played(Plan.of(replayed), model, driver, header.boot_id)
         parts.pipeline.hand.count_from(header.grasps)
         driver.on_event = partial(self._repeat, parts.pipeline)
         return parts

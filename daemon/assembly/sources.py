@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Parts
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
@@ -85,9 +86,9 @@ class Tables(Source):
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
         """Make the parts for the model's fingers."""
         hand = Hand(fingers=model.contract.fingers)
-        wanted = replayed.model_copy(update={"hand": hand})
-        pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session.learn)
-        return Parts(wanted, model, pipeline, [self._driver(hand.fingers, speed=speed)])
+        plan = Plan.of(replayed.model_copy(update={"hand": hand}))
+        pipeline = assembly.build_pipeline(plan, model, learns=replayed.session.learn)
+        return Parts(plan, model, pipeline, [self._driver(hand.fingers, speed=speed)])
 
 
 class LinkLogs(Source):
@@ -115,7 +116,7 @@ class LinkLogs(Source):
             driver = self._driver(replayed, speed)
         except ValueError as error:
             raise SceneError(f"[tactile] {error}") from error
-        return Parts.played(replayed, model, driver)
+        return Parts.played(Plan.of(replayed), model, driver)
 
     def _driver(self, replayed: Scene, speed: float | None) -> LinkLogDriver[Any]:
         tactile, fingers = replayed.tactile, replayed.hand.fingers

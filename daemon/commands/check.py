@@ -15,6 +15,7 @@ import numpy as np
 from graspd.biotac import Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan, require_mcap
 from graspd.daemon.commands.models import f1_percent
 from graspd.daemon.doctor.computer import NETWORK
 from graspd.daemon.doctor.finding import Level
@@ -70,22 +71,22 @@ def _check(path: Path, *, as_json: bool) -> int:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
         assembly.refuse_absent_processors(wanted)
-        assembly.build_pipeline(wanted, model)
-        limits = assembly.hand_limits(wanted)
-        period_ns = _try_drivers(wanted)
+        plan = Plan.of(wanted)
+        assembly.build_pipeline(plan, model)
+        period_ns = _try_drivers(plan)
         _try_keys(wanted)
         for finding in socket_findings(wanted):
             if finding.level is Level.ERROR:
                 raise scene.SceneError(finding.what)
         if wanted.record is not None:
-            assembly.require_mcap("[record]")
+            require_mcap("[record]")
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
         return WRONG
     document: dict[str, Any] = {
         "scene": str(path),
-        "in": _what_is_in(wanted, model, limits, period_ns),
-        "left_out": _what_is_left_out(wanted, model, limits),
+        "in": _what_is_in(wanted, model, plan.hand, period_ns),
+        "left_out": _what_is_left_out(wanted, model, plan.hand),
         "warnings": [*_warnings(wanted), *assembly.keep_digest(model)],
     }
     for warning in document["warnings"]:
@@ -140,11 +141,11 @@ def _absent(tactile: scene_drivers.Tactile) -> str | None:
     )
 
 
-def _try_drivers(wanted: scene.Scene) -> int | None:
+def _try_drivers(plan: Plan) -> int | None:
     """Construct the drivers, open those of files; return the period, ns, None if unknown."""
-    driver, *_ = assembly.build_drivers(wanted)
+    driver, *_ = assembly.build_drivers(plan)
     with contextlib.closing(driver):
-        assembly.open_file(wanted, driver)
+        assembly.open_file(plan.scene, driver)
         return driver.period_ns
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.commands.arguments import within
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
@@ -176,7 +177,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
     sections = [section for section in (wanted.tactile, wanted.joints) if section is not None]
     statistics = ElectrodeStatistics(wanted.hand.fingers)
     findings: list[Finding] = []
-    drivers = assembly.build_drivers(wanted)
+    drivers = assembly.build_drivers(Plan.of(wanted))
     try:
         opened = []
         for driver, section in zip(drivers, sections, strict=False):

@@ -12,6 +12,7 @@ from typing import Any
 from graspd.biotac import TABLE_FINGERS
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.plan import MCAP, require_mcap
 from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
 from graspd.daemon.commands.arguments import UsageError, within
 from graspd.daemon.judge.pipeline import Pipeline
@@ -20,7 +21,6 @@ from graspd.daemon.process.sleep import Sleep
 from graspd.daemon.process.text import complain, printable
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.publish.listener import PublishError
-from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.run.day_table import PUBLISHED, DayTable
 from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.run.replaying import Controller, trained_on
@@ -30,7 +30,7 @@ from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_DAY
-from graspd.drivers.recordings.csv_rows import SLIPPED, columns_of
+from graspd.drivers.recordings.csv_rows import SLIPPED
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError
@@ -195,9 +195,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         around = Assembly(parts, stack)
         sockets = None
         if args.publish is not None:
-            sockets = Sockets(parts.scene, high_water_mark=REPLAY_QUEUE)
-            stack.callback(sockets.close)
-            around.add_sockets(sockets)
+            sockets = around.open_sockets(REPLAY_QUEUE)
         around.open_drivers()
         if sockets is not None and args.wait is not None:
             came = sockets.wait_for_subscriber(args.wait, stop)
@@ -218,9 +216,7 @@ def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool
     fingers = parts.model.contract.fingers
     if args.json or args.verbose or not isinstance(source, Tables) or fingers != TABLE_FINGERS:
         return False
-    if assembly.gate_mode(parts.scene) != "every":
-        return False
-    return all(columns_of(path, fingers).has_labels for path in args.recordings)
+    return parts.plan.mode == "every" and not parts.plan.without_outcomes
 
 
 def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
@@ -237,7 +233,7 @@ def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
 def _source(args: argparse.Namespace) -> Source:
     """Return what plays the recordings. Imports only what this kind of them needs."""
     endings = {path.suffix for path in args.recordings}
-    if endings.isdisjoint({assembly.MCAP, *LINK_LOGS}):
+    if endings.isdisjoint({MCAP, *LINK_LOGS}):
         return _tables(args)
     if args.outcomes or args.min_confidence is not None or _risk(args):
         raise UsageError(
@@ -246,9 +242,9 @@ def _source(args: argparse.Namespace) -> Source:
         )
     if args.loop or args.strict:
         raise UsageError("what graspd has recorded is played as it is: no --loop or --strict")
-    if assembly.MCAP not in endings:
+    if MCAP not in endings:
         return LinkLogs(args.recordings, args.scene)
-    assembly.require_mcap("replaying MCAP")
+    require_mcap("replaying MCAP")
     from graspd.daemon.assembly.recordings import RecordedRun
 
     return RecordedRun(args.recordings)
@@ -284,9 +280,8 @@ def _parts(args: argparse.Namespace, source: Source) -> Parts:
     session = wanted.session.model_copy(update={"learn": learns})
     wanted = wanted.model_copy(update={"session": session})
     parts = source.parts(wanted, assembly.load_model(wanted), args.speed)
-    for path in args.recordings if args.outcomes else ():
-        if not columns_of(path, parts.scene.hand.fingers).has_labels:
-            raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
+    for path in parts.plan.without_outcomes if args.outcomes else ():
+        raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
     if args.session not in (RUNNING, OFF) and parts.pipeline.session is None:
         raise ModelError(f"the model {parts.model.contract.name} keeps no session")
     _restore_session(args, source, parts.pipeline, wanted.hand.fingers)

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import MCAP, Plan, is_mcap
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
@@ -128,7 +129,7 @@ def _document(number: int, kept: KeptSession) -> dict[str, Any]:
 
 def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession | None) -> bool:
     """Return True if a daemon that starts now is calibrated."""
-    pipeline = assembly.build_pipeline(wanted, model)
+    pipeline = assembly.build_pipeline(Plan.of(wanted), model)
     session = pipeline.session
     if session is None:
         return False
@@ -194,13 +195,13 @@ def _learned(state: TrustState | None) -> dict[str, Any] | None:
 
 def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
     """Judge the recordings as the daemon does, tell their outcomes, and keep the session."""
-    is_mcap = any(path.suffix == assembly.MCAP for path in recordings)
-    wanted = _on_recordings(wanted, recordings, "every" if is_mcap else None)
-    pipeline = assembly.build_pipeline(wanted, model)
+    mode: GateMode | None = "every" if any(path.suffix == MCAP for path in recordings) else None
+    plan = Plan.of(_on_recordings(wanted, recordings, mode))
+    pipeline = assembly.build_pipeline(plan, model)
     session, trust = pipeline.session, pipeline.trust
     with SessionFolder(wanted.session_path) as folder:
         before = [kept for kept in folder.load() if isinstance(kept, KeptSession)]
-        judgements = _judge(wanted, pipeline)
+        judgements = _judge(plan, pipeline)
         readings = len(judgements)
         outcomes = 0 if trust is None else trust.learner.outcomes
         grasps, state = outcomes, None
@@ -210,7 +211,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
                 raise DriverError(
                     f"{grasps} grasps of {readings} readings are too few, or they are no grasps"
                 )
-            _check(wanted, model, state)
+            _check(plan, model, state)
         elif not outcomes:
             raise DriverError(f"of {readings} readings none is a grasp whose outcome is known")
         rest = _rest(wanted, model, recordings)
@@ -241,7 +242,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
 
 def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: str | None) -> None:
     """Tell how open lifts ended, as their controller would have; show which are open."""
-    path, trust = wanted.session_path, assembly.build_pipeline(wanted, model).trust
+    path, trust = wanted.session_path, assembly.build_pipeline(Plan.of(wanted), model).trust
     with SessionFolder(path) as folder:
         before = [kept for kept in folder.load() if isinstance(kept, KeptSession)]
         mine = next((kept for kept in before if kept.model == model.sha256), None)
@@ -280,7 +281,7 @@ def _rest(
     wanted: scene.Scene, model: TactileModel, recordings: list[Path]
 ) -> tuple[float, ...] | None:
     """Return where the recorded electrodes rest at the first tare; None: that is not recorded."""
-    played = _on_recordings(wanted, recordings, mode=None)
+    played = Plan.of(_on_recordings(wanted, recordings, mode=None))
     pipeline = assembly.build_pipeline(played, model, learns=False)
     read_rest = pipeline.read_rest
     for reading in () if read_rest is None else _played(played):
@@ -292,12 +293,12 @@ def _rest(
     return None
 
 
-def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> None:
+def _check(plan: Plan, model: TactileModel, state: SessionState) -> None:
     """Raise `DriverError` if most recorded grasps are `never-seen` under the new session."""
-    pipeline = assembly.build_pipeline(wanted, model, learns=False)
+    pipeline = assembly.build_pipeline(plan, model, learns=False)
     if pipeline.session is not None:
         pipeline.session.restore(state)
-    again = _judge(wanted, pipeline)
+    again = _judge(plan, pipeline)
     unlike = sum(Reason.NEVER_SEEN in judgement.reasons for judgement in again)
     if 2 * unlike > len(again):
         trained = sum(file.rows for file in model.contract.datasets)
@@ -319,10 +320,10 @@ def _on_recordings(
     return wanted.model_copy(update=changes)
 
 
-def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
+def _judge(plan: Plan, pipeline: Pipeline) -> list[Judgement]:
     """Judge the recordings; tell each known outcome after its grasp."""
     judgements: list[Judgement] = []
-    for reading in _readings(wanted):
+    for reading in _readings(plan):
         if isinstance(reading, JointReading):
             pipeline.observe_joints(reading)
             continue
@@ -337,16 +338,16 @@ def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
     return judgements
 
 
-def _readings(wanted: scene.Scene) -> Iterator[Reading]:
-    tactile = wanted.tactile
-    if isinstance(tactile, scene_drivers.ReplayTactile) and assembly.is_mcap(tactile):
-        yield from _recorded_grasps(tactile.recordings, wanted.hand.fingers)
+def _readings(plan: Plan) -> Iterator[Reading]:
+    tactile = plan.scene.tactile
+    if isinstance(tactile, scene_drivers.ReplayTactile) and is_mcap(tactile):
+        yield from _recorded_grasps(tactile.recordings, plan.scene.hand.fingers)
     else:
-        yield from _played(wanted)
+        yield from _played(plan)
 
 
-def _played(wanted: scene.Scene) -> Iterator[Reading]:
-    (driver,) = assembly.build_drivers(wanted)
+def _played(plan: Plan) -> Iterator[Reading]:
+    (driver,) = assembly.build_drivers(plan)
     with contextlib.closing(driver):
         assembly.open_driver(driver)
         while not driver.exhausted:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.finding import Cause, Finding, Level, fine
 from graspd.daemon.publish.listener import PublishError, user_id
@@ -47,7 +48,7 @@ def model_finding(wanted: Scene) -> Finding:
         return Finding(Level.ERROR, f"no model at {path}", Cause.MODEL_MISSING, advice)
     try:
         model = assembly.load_model(wanted)
-        assembly.build_pipeline(wanted, model)
+        assembly.build_pipeline(Plan.of(wanted), model)
     except ModelError as problem:
         advice = "Choose another model that fits the hand: see graspd models."
         return Finding(Level.ERROR, str(problem), Cause.MODEL_MISFIT, advice)

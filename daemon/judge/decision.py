@@ -15,6 +15,7 @@ from graspd.daemon.judge.reasons import Decision, Moment, Reason
 from graspd.models.trust.risk import Permission
 
 MEDIAN_SWEEPS: Final = 3
+"""Fresh sweeps whose median is judged: a value that is wrong in one of them does not count."""
 WITHHELD: Final = {
     Permission.ALLOWED: None,
     Permission.WITHHELD: Reason.LOW_CONFIDENCE,
@@ -106,8 +107,6 @@ class HandLimits:
 
     on_request: bool = False
     """True if a settled grasp is judged only when the controller asks."""
-    sweeps: int = MEDIAN_SWEEPS
-    """Sweeps that are judged: 1, the current reading; 3, the median of three fresh sweeps."""
     required: tuple[Finger, ...] | None = None
     """Fingers that must touch. None: all."""
     contact: ContactLimits = field(default_factory=ContactLimits)

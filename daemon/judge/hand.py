@@ -258,9 +258,7 @@ class HandTracker:
             in_time=in_time,
             fresh=fresh,
         )
-        if not moment.judges:
-            return moment, None
-        return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else counts
+        return moment, median if moment.judges else None
 
     def silent(self) -> Moment:
         """Return the state of the grasp when no reading comes; its motion is not known."""

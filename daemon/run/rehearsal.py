@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.scene import Scene
 from graspd.drivers.base import TactileReading
 from graspd.models.contract import SeenCounts
 
@@ -45,14 +45,14 @@ def grasps(training: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
         yield (rest + touch * (typical - rest) + noise).astype(np.uint16)
 
 
-def rehearse(scene: Scene) -> Pipeline:
+def rehearse(plan: Plan) -> Pipeline:
     """Judge a synthetic grasp; return the pipeline used. Raises `ModelError`.
 
     It has a model of its own, because judging changes the scaling of a model's inputs.
     """
     now_ns = 0
-    model = assembly.load_model(scene)
-    pipeline = assembly.build_pipeline(scene, model, lambda: now_ns)
+    model = assembly.load_model(plan.scene)
+    pipeline = assembly.build_pipeline(plan, model, lambda: now_ns)
     for seq, counts in enumerate(grasps(model.contract.seen, GRASP_EVERY)):
         now_ns = (seq + 1) * PERIOD_NS
         faults = np.zeros(counts.shape, dtype=np.uint8)

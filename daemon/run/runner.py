@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import Companion, PublishedVerdict
-from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.run.loop import Ended, Loop, LoopTiming
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.models.contract import ModelError
@@ -31,14 +31,15 @@ log = logging.getLogger("graspd")
 def prepare(path: Path) -> Parts:
     """Read a scene and load its model; with `[realtime]` rehearse. Raises as `Parts.of`."""
     loaded = scene.load(path)
-    parts = Parts.of(loaded, assembly.load_model(loaded))
+    model = assembly.load_model(loaded)
+    parts = Parts.of(Plan.of(loaded), model)
     for warning in assembly.keep_digest(parts.model):
         log.warning("%s", warning)
     if loaded.realtime is not None:
         from graspd.daemon.run.rehearsal import rehearse  # only where a scene wants realtime
 
         try:
-            rehearse(loaded)
+            rehearse(parts.plan)
         except ModelError as error:  # the file has changed; the model in memory is good
             log.warning("no rehearsal: %s", error)
     return parts
@@ -120,7 +121,7 @@ class Runner:
         parts, stack = self._parts, self._stack
         running = parts.scene
         around = Assembly(parts, stack)
-        around.add_sockets(stack.enter_context(Sockets(running)))
+        around.open_sockets()
         around.open_drivers()
         around.keep_session()
         realtime = enter_realtime(running, stack)

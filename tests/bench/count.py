@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.scene.scene import Scene
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
@@ -47,7 +48,7 @@ def judge(kind: str) -> None:
     """Judge the demo's first grasp, and readings of one kind besides; runs within cachegrind."""
     now_ns = 0
     scene = Scene.model_validate(tomllib.loads(SCENE))
-    pipeline = assembly.build_pipeline(scene, assembly.load_model(scene), lambda: now_ns)
+    pipeline = assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene), lambda: now_ns)
     demo = np.array(list(islice(recorded_counts(DEMO_RECORDING), HELD.stop)))
     faults = np.zeros(demo[0].shape, dtype=np.uint8)
     noise = np.random.default_rng(1).normal(0.0, NOISE_COUNTS, (READINGS, *faults.shape))

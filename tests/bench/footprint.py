@@ -91,10 +91,11 @@ def here(path: Path, folder: Path) -> Footprint:
     from graspd.daemon import scene
     from graspd.daemon.assembly import assembly
     from graspd.daemon.assembly.parts import Parts
+    from graspd.daemon.assembly.plan import Plan
     from graspd.daemon.commands import run  # noqa: F401 - what the command loads
 
     wanted = _apart(scene.load(path), folder)
-    parts = Parts.of(wanted, assembly.load_model(wanted))
+    parts = Parts.of(Plan.of(wanted), assembly.load_model(wanted))
     with ExitStack() as stack:
         stack.callback(parts.drivers[0].close)
         assembly.open_file(wanted, parts.drivers[0])
@@ -132,12 +133,11 @@ def _around(parts: Parts, stack: ExitStack) -> Outbox:
     """Build what `graspd run` puts around the judge."""
     from graspd.daemon.assembly.parts import Assembly
     from graspd.daemon.process.signals import StopSignal
-    from graspd.daemon.publish.sockets import Sockets
     from graspd.daemon.run.loop import Loop, LoopTiming
 
     around = Assembly(parts, stack)
     around.keep_session()
-    around.add_sockets(stack.enter_context(Sockets(parts.scene)))
+    around.open_sockets()
     outbox = around.build_outbox()
     stop, timing = stack.enter_context(StopSignal()), LoopTiming(parts.scene.max_age_ns)
     Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from deploy.clients.python.graspd_client import Client, Outcome, Verdict
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
@@ -51,7 +52,7 @@ class Reference:
         assert kept is not None
         assert kept.statistics is not None
         self._statistics = kept.statistics
-        trust = assembly.build_pipeline(wanted, self._model).trust
+        trust = assembly.build_pipeline(Plan.of(wanted), self._model).trust
         assert trust is not None
         self.trust: Trust = trust
 
@@ -60,7 +61,7 @@ class Reference:
 
         With a judge of its own: to the one before it a row that it has had is an old one.
         """
-        pipeline = assembly.build_pipeline(self._scene, self._model, learns=False)
+        pipeline = assembly.build_pipeline(Plan.of(self._scene), self._model, learns=False)
         assert pipeline.session is not None
         pipeline.session.restore(self._statistics)
         assessment = pipeline.judge(sound(counts, time.monotonic_ns())).assessment
@@ -107,7 +108,7 @@ class Bench:
 
     def _seed_session(self) -> None:
         """Statistics that stay what they are: a grasp is then the same whenever it is judged."""
-        pipeline = assembly.build_pipeline(self._scene, assembly.load_model(self._scene))
+        pipeline = assembly.build_pipeline(Plan.of(self._scene), assembly.load_model(self._scene))
         for row in read_rows(DEMO_TABLE, self._scene.hand.fingers):
             pipeline.judge(sound(row.counts, time.monotonic_ns()))
         assert pipeline.session is not None

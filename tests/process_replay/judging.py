@@ -13,6 +13,7 @@ from typing import Any, Final
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import header_now, header_of
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
@@ -65,12 +66,14 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
     """
     clock, wanted = Clock(START_NS), _scene(case)
     model = assembly.load_model(wanted)
-    pipeline = assembly.build_pipeline(wanted, model, clock)
+    pipeline = assembly.build_pipeline(Plan.of(wanted), model, clock)
     pipeline.boot_id = BOOT_ID
     world = _World(case, clock)
     outputs: list[Any] = [world]
     if record_in is not None:
-        outputs.append(_recorder(record_in, clock, pipeline, header_of(wanted, model, BOOT_ID)))
+        outputs.append(
+            _recorder(record_in, clock, pipeline, header_of(Plan.of(wanted), model, BOOT_ID))
+        )
     outbox = Outbox(
         wanted.hand.name,
         wanted.hand.fingers,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly import assembly, plan
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.scene import load as load_scene
 from graspd.daemon.session.file import KeptSession
@@ -106,7 +106,7 @@ def keep_grasps(folder: Path, text: str) -> SessionFolder:
     scene = folder / "before.toml"
     scene.write_text(text)
     wanted = load_scene(scene)
-    session = assembly.build_pipeline(wanted, assembly.load_model(wanted)).session
+    session = assembly.build_pipeline(plan.Plan.of(wanted), assembly.load_model(wanted)).session
     if session is None:
         raise ValueError("the model keeps no session")
     for counts in np.random.default_rng(SEED).integers(500, 3500, (KEPT_GRASPS, 3, 24)):

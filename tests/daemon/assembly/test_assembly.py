@@ -13,6 +13,7 @@ import pytest
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.scene import Scene, SceneError, parse
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
@@ -41,7 +42,7 @@ TRUST = {
 @pytest.mark.parametrize("text", TRUST)
 def test_outcomes_teach_and_a_risk_is_kept_as_the_scene_says(text: str) -> None:
     scene = scene_of(REPLAY, **tomllib.loads(text))
-    trust = assembly.build_pipeline(scene, assembly.load_model(scene), Clock()).trust
+    trust = assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene), Clock()).trust
     if TRUST[text] is None:
         assert trust is None
     else:
@@ -53,12 +54,12 @@ def test_outcomes_teach_and_a_risk_is_kept_as_the_scene_says(text: str) -> None:
 @pytest.mark.parametrize("threshold", [1e-9, 1 - 1e-9])
 def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
     scene = scene_of(REPLAY, model={"slip_threshold": threshold}, gate={"max_age_ms": 1.0})
-    driver = assembly.build_drivers(scene)[0]
+    driver = assembly.build_drivers(Plan.of(scene))[0]
     driver.open()
     (first,) = driver.read_ready()
     driver.close()
     clock = Clock(first.t_ns)
-    pipeline = assembly.build_pipeline(scene, assembly.load_model(scene), clock)
+    pipeline = assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene), clock)
     assert first.t_ns == clock()
     judgement = pipeline.judge(first)  # type: ignore[arg-type]
     assert judgement.decision is (Decision.SLIP if threshold < 0.5 else Decision.STABLE)
@@ -122,7 +123,7 @@ def test_a_model_of_other_fingers_is_refused_and_those_that_fit_are_named(
     scene: Scene, says: str
 ) -> None:
     with pytest.raises(ModelError, match=r"judges the fingers .* the hand has ") as refusal:
-        assembly.build_pipeline(scene, assembly.load_model(scene))
+        assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene))
     assert str(refusal.value).endswith(f": {says}")
 
 
@@ -141,20 +142,21 @@ def test_fingers_in_another_order_are_told_what_to_write_instead(
 ) -> None:
     scene = hand(("th", "ff"), tactile)
     with pytest.raises(ModelError, match="write ") as refusal:
-        assembly.build_pipeline(scene, assembly.load_model(scene))
+        assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene))
     advice = str(refusal.value).partition("write ")[2]
     wanted = tomllib.loads("\n".join(re.findall(r"[a-z]+\.[a-z]+ = \[[^]]*\]", advice)))
     assert wanted["hand"] == {"fingers": ["ff", "th"]}
     # What was wired in the order th, ff stays so.
     as_written = hand(("ff", "th"), tactile | wanted.get("tactile", {}))
-    assembly.build_pipeline(as_written, assembly.load_model(as_written))
+    assembly.build_pipeline(Plan.of(as_written), assembly.load_model(as_written))
     assert (tactile | wanted.get("tactile", {})).get("sensors") == sensors
 
 
 def test_grasps_are_named_by_the_start_that_tells_of_them_also_where_a_former_scene_goes_on() -> (
     None
 ):
-    parts = Parts.of(scene := scene_of(REPLAY), assembly.load_model(scene))
+    scene = scene_of(REPLAY)
+    parts = Parts.of(Plan.of(scene), assembly.load_model(scene))
     named = []
     for _ in range(2):
         with ExitStack() as stack:
@@ -206,7 +208,7 @@ def test_a_driver_is_told_what_the_scene_says(
     monkeypatch: pytest.MonkeyPatch, driver: str, tactile: dict[str, Any], told: dict[str, Any]
 ) -> None:
     monkeypatch.setattr(f"graspd.drivers.{driver}", Constructed)
-    (constructed,) = assembly.build_drivers(scene_of(tactile))
+    (constructed,) = assembly.build_drivers(Plan.of(scene_of(tactile)))
     assert isinstance(constructed, Constructed)
     assert constructed.named | told == constructed.named
 
@@ -227,7 +229,7 @@ def test_what_a_driver_refuses_is_one_line_naming_the_section(
     sections: dict[str, dict[str, Any]], says: str
 ) -> None:
     with pytest.raises(SceneError, match=says) as error:
-        assembly.build_drivers(scene_of(**sections))
+        assembly.build_drivers(Plan.of(scene_of(**sections)))
     assert "\n" not in str(error.value)
 
 
@@ -256,4 +258,4 @@ def test_outcomes_that_no_recording_has_cannot_be_told(tmp_path: Path) -> None:
     bare.write_text(header.replace("slipped", "other") + f"\n{row}\n")
     wanted = scene_of({"driver": "replay", "recordings": [str(bare)], "outcomes": True})
     with pytest.raises(SceneError, match="outcomes needs the column `slipped`"):
-        assembly.build_drivers(wanted)
+        assembly.build_drivers(Plan.of(wanted))

@@ -12,6 +12,7 @@ import numpy as np
 from graspd.biotac import electrode_columns
 from graspd.daemon import scene as scenes
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.trust.lift_book import GraspId
@@ -48,7 +49,7 @@ def shown(path: Path) -> dict[str, Any]:
 def live_trust(path: Path) -> Trust:
     """That of a daemon which starts now."""
     wanted = scenes.load(path)
-    trust = assembly.build_pipeline(wanted, assembly.load_model(wanted)).trust
+    trust = assembly.build_pipeline(Plan.of(wanted), assembly.load_model(wanted)).trust
     assert trust is not None
     return trust
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from graspd.daemon import scene as scenes
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision
 from graspd.drivers.base import ElectrodeFault, JointReading, TactileReading
@@ -148,7 +149,7 @@ class Bench:
         self.random, self.clock = np.random.default_rng(seed), Clock()
         self.rows = [FINGERS.index(finger) for finger in fingers]
         model = model_of(scene.model.name or "")
-        self.pipeline: Pipeline = assembly.build_pipeline(scene, model, self.clock)
+        self.pipeline: Pipeline = assembly.build_pipeline(Plan.of(scene), model, self.clock)
         self.pipeline.boot_id = "b" * 32
         self.necessity = Necessity(
             poses()["rest"][self.rows],

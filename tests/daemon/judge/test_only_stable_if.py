@@ -221,14 +221,12 @@ class Hand:
 def limits(
     *,
     on_request: bool = False,
-    sweeps: int = 3,
     required: tuple[Finger, ...] = FINGERS,
     early: bool = False,
 ) -> HandLimits:
     """Those that `Necessity` knows."""
     return HandLimits(
         on_request=on_request,
-        sweeps=sweeps,
         required=required,
         contact=ContactLimits(counts=20.0),
         gate=GateLimits(
@@ -315,7 +313,6 @@ begins = st.sampled_from(
 gates = st.builds(
     limits,
     on_request=st.booleans(),
-    sweeps=st.sampled_from([1, 3]),
     required=st.sampled_from([FINGERS, ("ff", "th")]),
     early=st.booleans(),
 )

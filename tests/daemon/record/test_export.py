@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.publish.messages import OutcomeMessage, encode
 from graspd.daemon.record.export import collect
 from graspd.daemon.record.frames import read_grasps, read_recording
@@ -100,7 +101,7 @@ def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_a
     tmp_path: Path,
 ) -> None:
     wanted = scene.load(demo_scene(tmp_path, sections='[model]\nname = "cnn1"'))
-    pipeline = assembly.build_pipeline(wanted, assembly.load_model(wanted), lambda: 10**12)
+    pipeline = assembly.build_pipeline(Plan.of(wanted), assembly.load_model(wanted), lambda: 10**12)
     counts, sound = read_table(DEMO_TABLE).counts[0], np.zeros((3, 24), dtype=np.uint8)
     broken = sound.copy()
     broken[1, 3] = ElectrodeFault.MISSING

@@ -16,7 +16,8 @@ from msgspec.structs import replace
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.parts import build_recorder
+from graspd.daemon.assembly.parts import Parts, build_recorder
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Judgement
@@ -143,10 +144,12 @@ class Daemon:
         monkeypatch.setattr(
             "graspd.daemon.record.recorder.Recorder", partial(Recorder, clock=self._clock)
         )
-        self.pipeline = assembly.build_pipeline(wanted, model, self._clock)
+        plan = Plan.of(wanted)
+        self.pipeline = assembly.build_pipeline(plan, model, self._clock)
         self.pipeline.boot_id = BOOT
         assert wanted.record is not None
-        self.recorder = build_recorder(wanted, wanted.record, model, self.pipeline, BOOT, None)
+        parts = Parts(plan, model, self.pipeline, [])
+        self.recorder = build_recorder(parts, wanted.record, BOOT, None)
         self._outbox = Outbox("right", wanted.hand.fingers, "any", BOOT, [self.recorder])
 
     def _clock(self) -> int:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from graspd.daemon import scene
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.reasons import GateState
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.run.rehearsal import rehearse
@@ -149,7 +150,7 @@ def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None)
 
 def test_the_rehearsal_goes_through_a_whole_grasp() -> None:
     tactile = {"driver": "spi", "port": "/nowhere"}
-    pipeline = rehearse(scene.parse({"tactile": tactile}, Path("any.toml")))
+    pipeline = rehearse(Plan.of(scene.parse({"tactile": tactile}, Path("any.toml"))))
     assert pipeline.hand.grasp == 1
     assert pipeline.hand.state in (GateState.RELEASED, GateState.IDLE)
     assert pipeline.session is not None

@@ -22,7 +22,6 @@ from graspd.daemon.assembly.parts import Assembly
 from graspd.daemon.commands import check
 from graspd.daemon.doctor import surroundings
 from graspd.daemon.publish.keys import make
-from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.run.runner import enter_realtime, prepare
 from graspd.daemon.scene.scene import Scene
 from graspd.drivers.base import LinkError
@@ -163,9 +162,7 @@ def start(path: Path) -> None:
     parts = prepare(path)
     with ExitStack() as stack:
         around = Assembly(parts, stack)
-        sockets = Sockets(parts.scene)
-        stack.callback(sockets.close)
-        around.add_sockets(sockets)
+        around.open_sockets()
         for driver in parts.drivers:
             stack.callback(driver.close)
             with suppress(LinkError):

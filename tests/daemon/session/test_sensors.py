@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
@@ -86,12 +87,13 @@ def test_tare_and_grasp_are_forgotten_whether_or_not_a_session_is_kept(
         Pipeline, "sensors_exchanged", lambda pipeline, *_: forgotten.append(pipeline)
     )
     wanted = scene.load(path)
-    parts, driver = Parts.of(wanted, assembly.load_model(wanted)), sensors(ff="A")
+    parts, driver = Parts.of(Plan.of(wanted), assembly.load_model(wanted)), sensors(ff="A")
     parts.drivers[:] = [driver]
     with ExitStack() as stack:
         around = Assembly(parts, stack)
-        assert around.keep_session() is (keep == "true")
+        around.keep_session()
         (watch,) = around.companions
+        assert isinstance(watch, SessionKeeper) is (keep == "true")
         read_once(watch)
         driver.known = {"ff": "B"}
         read_once(watch)

@@ -1,0 +1,88 @@
+"""The plan of a run: a scene, and what the headers of its recordings decide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits
+from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene.drivers import ReplayTactile
+from graspd.daemon.scene.scene import GateMode
+from graspd.extras import require
+
+MCAP = ".mcap"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A scene, and what its recordings decide."""
+
+    scene: Scene
+    mode: GateMode
+    """Mode of the gate; without `gate.mode` the recordings decide."""
+    joints: bool
+    """True if joint angles come, from their own source or in a recording."""
+    without_outcomes: tuple[Path, ...] = ()
+    """Grasp tables and streams that do not say how the lifts ended."""
+
+    @classmethod
+    def of(cls, scene: Scene) -> Plan:
+        """Read the headers of the scene's recordings. Raises `SceneError` or `RecordingError`."""
+        options, mode, joints = scene.tactile, scene.gate.mode, scene.joints is not None
+        if not isinstance(options, ReplayTactile):
+            return cls(scene, mode or "settled", joints)
+        if is_mcap(options):
+            from graspd.daemon.record.mcap import header_of
+
+            recorded = [header_of(path).joints for path in options.recordings]
+            return cls(scene, mode or "settled", joints or any(recorded))
+        from graspd.drivers.recordings.csv_rows import columns_of
+
+        columns = {path: columns_of(path, scene.hand.fingers) for path in options.recordings}
+        if mode is None:
+            streams = {each.is_stream for each in columns.values()}
+            if len(streams) > 1:
+                raise SceneError("tactile.recordings: both grasp tables and streams; say gate.mode")
+            mode = "settled" if True in streams else "every"
+        joints = joints or any(each.joints for each in columns.values())
+        without = tuple(path for path, each in columns.items() if not each.has_labels)
+        return cls(scene, mode, joints, without)
+
+    @property
+    def hand(self) -> HandLimits | None:
+        """Limits of the gate; None in mode `every`."""
+        gate = self.scene.gate
+        if self.mode == "every":
+            return None
+        return HandLimits(
+            on_request=self.mode == "request",
+            required=gate.fingers,
+            gate=GateLimits(
+                false_alarms=gate.false_alarms,
+                early=gate.early,
+                request_ns=round(gate.request_ms * 1e6),
+            ),
+            joints=JointLimits() if self.joints else None,
+        )
+
+
+def is_mcap(options: ReplayTactile) -> bool:
+    """Return True for recordings of graspd.
+
+    Raises `SceneError` if some are CSV files, or if the package that reads MCAP is missing.
+    """
+    kinds = {path.suffix == MCAP for path in options.recordings}
+    if len(kinds) > 1:
+        raise SceneError("tactile.recordings: both CSV and MCAP files")
+    if True in kinds:
+        require_mcap("replaying MCAP")
+    return True in kinds
+
+
+def require_mcap(what: str) -> None:
+    """Raise `SceneError`, with advice, if `what` lacks the package of the extra `record`."""
+    try:
+        require("mcap", what, "record")
+    except ModuleNotFoundError as error:
+        raise SceneError(str(error)) from error
