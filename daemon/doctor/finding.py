@@ -110,8 +110,6 @@ class Trouble(NamedTuple):
     cause: Cause
     advice: str
     level: Level = Level.WARNING
-    counters: tuple[str, ...] = ()
-    """Names of a driver's counters that show it where they are not 0."""
 
     def finding(self, what: str) -> Finding:
         """Return a finding of this trouble; `what`: text on what was seen."""

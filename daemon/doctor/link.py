@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, fine
 from graspd.drivers.base import DeviceFault, Fact, LinkCause
@@ -28,133 +27,78 @@ JOINING_MAX = 108
 
 FLASH = "Flash the firmware of this graspd: deploy/bridge/BUILD.md."
 AGAIN = "Look longer (--listen 20). If it continues, check"
-CLOCK_ADVICE = f"The board's clock stands, was reset, or is wrong. {FLASH}"
-
 FLAPS_MIN = 3
 """Fewest losses of a link while the doctor listens that are an error."""
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
 """Causes that a link shows between its losses; they are not reported beside the losses."""
-BUS_ERRORS = Trouble(
-    Cause.BUS_ERRORS,
-    f"Frames are cut on the bus. {AGAIN} the bit rates, and the 120 ohm terminators at both ends.",
-    counters=("error_frames", "bus_off"),
-)
-NOT_OURS = (
-    Trouble(
-        Cause.VERSION,
-        "No known palm sends this length. Its firmware is another one, or the relay adds bytes.",
-        counters=("bad_lengths",),
+NOT_OURS: dict[Cause, tuple[str, ...]] = {
+    Cause.VERSION: ("bad_lengths",),
+    Cause.JOINTS: ("bad_messages",),
+    Cause.BITRATE: ("error_frames", "bus_off"),
+    Cause.NOT_A_BRIDGE: ("bad_cobs", "bad_crc", "too_long", "unknown_frames"),
+    Cause.PALM_MODE: ("service_packets", "empty_packets", "nonsense_packets"),
+    Cause.SETTINGS: (
+        *("wrong_length_frames", "unknown_commands", "malformed_frames", "unexpected_channels"),
+        *("foreign_frames", "frames"),
     ),
-    Trouble(
-        Cause.JOINTS,
-        "The messages are not joint angles: see deploy/wire/JOINTS.md.",
-        counters=("bad_messages",),
+}
+"""Counters of a link that receives data but gives no reading; the first that is not 0 counts."""
+NOT_OURS_ADVICE = {
+    Cause.VERSION: "No known palm sends this length. Other firmware, or a relay that adds bytes.",
+    Cause.JOINTS: "The messages are not joint angles: see deploy/wire/JOINTS.md.",
+    Cause.BITRATE: "Set the interface to the board's bit rate.",
+    Cause.NOT_A_BRIDGE: f"Check the baud rate. If it is no bridge yet: {FLASH}",
+    Cause.PALM_MODE: "The palm is in a service mode or starting. Let the hand's driver start it.",
+    Cause.SETTINGS: "Compare arbitration_id, sequence and data_length with the board's (candump "
+    "shows what it sends). Check that sensors are connected to it.",
+}
+COUNTERS: dict[Cause, tuple[str, ...]] = {
+    Cause.LINK_LOST: ("link_losses",),
+    Cause.RESTARTED: ("restarts",),
+    Cause.BUS_ERRORS: ("error_frames", "bus_off"),
+    Cause.DAMAGED: (
+        *("bad_cobs", "bad_crc", "too_long", "bad_frames", "unknown_frames", "malformed_frames"),
+        *("wrong_length_frames", "unknown_commands", "nonsense_packets", "bad_lengths"),
+        "not_counts",
     ),
-    Trouble(
-        Cause.BITRATE,
-        "Set the interface to the board's bit rate.",
-        counters=BUS_ERRORS.counters,
+    Cause.COMPUTER_BUSY: ("kernel_drops", "untimed_frames", "host_tx_dropped"),
+    Cause.CLOCK: ("clock_faults",),
+    Cause.REPEATED: (
+        *("duplicates", "duplicate_frames", "duplicate_packets", "conflicting_packets"),
+        "old_messages",
     ),
-    Trouble(
-        Cause.NOT_A_BRIDGE,
-        f"The bytes are damaged or foreign. Check the baud rate. If it is no bridge yet: {FLASH}",
-        counters=("bad_cobs", "bad_crc", "too_long", "unknown_frames"),
+    Cause.FOREIGN_SENDER: ("foreign_datagrams",),
+    Cause.SETTINGS: ("unexpected_channels",),
+    Cause.FRAMES_LOST: (
+        *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps", "interrupted_sweeps"),
+        *("interrupted_rounds", "controller_overflows"),
+        *("unsynchronised_frames", "unsynchronised_packets"),
     ),
-    Trouble(
-        Cause.PALM_MODE,
-        "The palm is in a service mode or starting. Let the hand's own driver start it.",
-        counters=("service_packets", "empty_packets", "nonsense_packets"),
+    Cause.OUT_OF_ORDER: (
+        *("reordered", "reordered_frames", "reordered_packets", "late_frames", "late_packets"),
     ),
-    Trouble(
-        Cause.SETTINGS,
-        "Compare arbitration_id, sequence and data_length with the board's (candump shows what it "
-        "sends). Check that sensors are connected to it.",
-        counters=(
-            *("wrong_length_frames", "unknown_commands", "malformed_frames"),
-            *("unexpected_channels", "foreign_frames", "frames"),
-        ),
-    ),
-)
-"""Troubles of a link that receives data but gives no reading; the first that counts is meant."""
-COUNTED = (
-    Trouble(
-        Cause.LINK_LOST,
-        f"It went away and came back. {AGAIN} plug, hub and supply.",
-        counters=("link_losses",),
-    ),
-    Trouble(
-        Cause.RESTARTED,
-        f"The board was reset. {AGAIN} its supply and reset line.",
-        counters=("restarts",),
-    ),
-    BUS_ERRORS,
-    Trouble(
-        Cause.DAMAGED,
-        f"Bytes are damaged or foreign. {AGAIN} cable and hub, and who else sends there.",
-        counters=(
-            *("bad_cobs", "bad_crc", "too_long", "bad_frames", "unknown_frames"),
-            *("malformed_frames", "wrong_length_frames", "unknown_commands"),
-            *("nonsense_packets", "bad_lengths", "not_counts"),
-        ),
-    ),
-    Trouble(
-        Cause.COMPUTER_BUSY,
-        "This computer read too late. top shows why; [realtime] puts graspd first.",
-        counters=("kernel_drops", "untimed_frames", "host_tx_dropped"),
-    ),
-    Trouble(Cause.CLOCK, CLOCK_ADVICE, counters=("clock_faults",)),
-    Trouble(
-        Cause.REPEATED,
-        "Data comes twice. Check for a second sender, and whether the board stands still.",
-        counters=(
-            *("duplicates", "duplicate_frames", "duplicate_packets", "conflicting_packets"),
-            "old_messages",
-        ),
-    ),
-    Trouble(
-        Cause.FOREIGN_SENDER,
-        "Two programs send to one port, and one is read. Name it with only_from.",
-        counters=("foreign_datagrams",),
-    ),
-    Trouble(
-        Cause.SETTINGS,
-        "The board samples electrodes that the scene's sequence does not have. Make them equal.",
-        counters=("unexpected_channels",),
-    ),
-    Trouble(
-        Cause.FRAMES_LOST,
-        f"Data is lost or late. {AGAIN} the load of bus, hub and this computer.",
-        counters=(
-            *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps"),
-            *("interrupted_sweeps", "interrupted_rounds", "controller_overflows"),
-            *("unsynchronised_frames", "unsynchronised_packets"),
-        ),
-    ),
-    Trouble(
-        Cause.OUT_OF_ORDER,
-        f"Frames overtake each other. {AGAIN} what lies between board and computer (relay, hub).",
-        counters=(
-            *("reordered", "reordered_frames", "reordered_packets"),
-            *("late_frames", "late_packets"),
-        ),
-    ),
-    Trouble(
-        Cause.PALM_MODE,
-        "The palm is in a service mode, or too late. Let the hand's own driver start it.",
-        counters=("service_packets", "empty_packets"),
-    ),
-    Trouble(
-        Cause.JOINTS,
-        "Unknown joints and wrong angles are left out: see deploy/wire/JOINTS.md.",
-        counters=("bad_messages", "unknown_names", "bad_angles"),
-    ),
-    Trouble(
-        Cause.RECORDING,
-        "The recording is damaged or ends in the middle. Record it again.",
-        counters=("cut_off", "malformed"),
-    ),
-)
-"""Troubles of a link that is up. Other counters show at the electrodes or are harmless."""
+    Cause.PALM_MODE: ("service_packets", "empty_packets"),
+    Cause.JOINTS: ("bad_messages", "unknown_names", "bad_angles"),
+    Cause.RECORDING: ("cut_off", "malformed"),
+}
+"""Counters of a link that is up. Others show at the electrodes or are harmless."""
+ADVICE = {
+    Cause.LINK_LOST: f"It went away and came back. {AGAIN} plug, hub and supply.",
+    Cause.RESTARTED: f"The board was reset. {AGAIN} its supply and reset line.",
+    Cause.BUS_ERRORS: f"Frames are cut on the bus. {AGAIN} the bit rates, and the 120 ohm "
+    "terminators at both ends.",
+    Cause.DAMAGED: f"Bytes are damaged or foreign. {AGAIN} cable, hub, and who else sends there.",
+    Cause.COMPUTER_BUSY: "This computer reads too late. See top; [realtime] puts graspd first.",
+    Cause.CLOCK: f"The board's clock stands, was reset, or is wrong. {FLASH}",
+    Cause.REPEATED: "Data comes twice. Check for a second sender, and whether the board hangs.",
+    Cause.FOREIGN_SENDER: "Two programs send to one port, and one is read. Name it with only_from.",
+    Cause.SETTINGS: "The board samples electrodes that the scene's sequence lacks. Align them.",
+    Cause.FRAMES_LOST: f"Data is lost or late. {AGAIN} the load of bus, hub and this computer.",
+    Cause.OUT_OF_ORDER: f"Frames overtake each other. {AGAIN} the relay or hub on the way.",
+    Cause.PALM_MODE: "The palm is in a service mode, or late. Let the hand's own driver start it.",
+    Cause.JOINTS: "Unknown joints and wrong angles are left out: see deploy/wire/JOINTS.md.",
+    Cause.RECORDING: "The recording is damaged or ends in the middle. Record it again.",
+}
 TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     LinkCause.UNKNOWN: Trouble(
         Cause.LINK_DOWN, "Check that it is powered, connected, and the one that the scene names."
@@ -204,8 +148,8 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
         Cause.SENSOR_WORDS,
         "Serial numbers are misread. Check supply, ground, MISO and its pull-up.",
     ),
-    LinkCause.CLOCK: Trouble(Cause.CLOCK, CLOCK_ADVICE),
-    DeviceFault.BUS_ERROR: BUS_ERRORS,
+    LinkCause.CLOCK: Trouble(Cause.CLOCK, ADVICE[Cause.CLOCK]),
+    DeviceFault.BUS_ERROR: Trouble(Cause.BUS_ERRORS, ADVICE[Cause.BUS_ERRORS]),
     DeviceFault.OLD_FIRMWARE: Trouble(Cause.FIRMWARE_OLD, FLASH),
     DeviceFault.NO_SENSOR: Trouble(
         Cause.SENSOR_ABSENT,
@@ -247,9 +191,9 @@ def device_findings(
             what += f"; it was up and was lost {losses} {'time' if losses == 1 else 'times'}"
             trouble = TROUBLES[LinkCause.DISCONNECTED]
         elif trouble.cause is Cause.SILENT:
-            for other in NOT_OURS:
-                if counted := _counted(other.counters, counters):
-                    what, trouble = f"{what}, but {counted}", other
+            for cause, names in NOT_OURS.items():
+                if counted := _counted(names, counters):
+                    what, trouble = f"{what}, but {counted}", Trouble(cause, NOT_OURS_ADVICE[cause])
                     break
         return [Finding(Level.ERROR, what, trouble.cause, trouble.advice)]
     found = [] if link is None else [fine(f"{driver}: link up")]
@@ -262,12 +206,10 @@ def device_findings(
 def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
     """Return a finding for each trouble that the counters of a link that is up show."""
     found = []
-    for trouble in COUNTED:
-        if counted := _counted(trouble.counters, counters):
-            finding = trouble.finding(f"{driver}: {counted}")
-            if _is_too_much(trouble, counters):
-                finding = replace(finding, level=Level.ERROR)
-            found.append(finding)
+    for cause, names in COUNTERS.items():
+        if counted := _counted(names, counters):
+            level = Level.ERROR if _is_too_much(cause, counters) else Level.WARNING
+            found.append(Finding(level, f"{driver}: {counted}", cause, ADVICE[cause]))
     return found
 
 
@@ -287,17 +229,17 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
     return fine(what)
 
 
-def _is_too_much(trouble: Trouble, counters: Mapping[str, int]) -> bool:
+def _is_too_much(cause: Cause, counters: Mapping[str, int]) -> bool:
     """Return True for `FLAPS_MIN` losses of a link, and for a share of bad frames in `TOO_MUCH`."""
-    if trouble.cause is Cause.LINK_LOST:
+    if cause is Cause.LINK_LOST:
         return counters["link_losses"] >= FLAPS_MIN
-    share = TOO_MUCH.get(trouble.cause)
+    share = TOO_MUCH.get(cause)
     if share is None:
         return False
     frames = next(filter(None, (counters.get(name, 0) for name in WHOLES)), 0)
-    of_frames = [name for name in trouble.counters if name not in NOT_FRAMES]
+    of_frames = [name for name in COUNTERS[cause] if name not in NOT_FRAMES]
     pairs = [(sum(counters.get(name, 0) for name in of_frames), frames)]
-    if trouble.cause is Cause.FRAMES_LOST:
+    if cause is Cause.FRAMES_LOST:
         pairs.append((counters.get("missed_readings", 0), counters.get("readings", 0)))
     return any(
         bad >= BAD_MIN and bad + 2.0 * math.sqrt(bad) >= share * (bad + sound)

@@ -33,8 +33,6 @@ from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.session.learning import last_kept
 from tests.kit.messages import decode_tactile, decode_verdict
 
-RATE_HZ: Final = 50.0
-"""256 grasps are remembered: an outcome that is told again must come within five seconds."""
 ANSWER_S: Final = 0.5
 """How long the client waits for an answer unless told otherwise."""
 LATE_S: Final = 0.1
@@ -83,7 +81,7 @@ class Bench:
         self._path = folder / "scene.toml"
         self._path.write_text(
             f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
-            f"rate_hz = {RATE_HZ}\n[risk]\nmax_slip_when_stable = 0.2\n"
+            "[risk]\nmax_slip_when_stable = 0.2\n"
             '[session]\nfolder = "right.session"\nkeep = true\nlearn = false\n'
             f'[publish]\nendpoint = "ipc://{folder}/graspd"\ntactile_hz = 10000\n'
             f'[ask]\nendpoint = "ipc://{folder}/ask"\n'

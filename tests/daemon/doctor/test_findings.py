@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Level
 from graspd.daemon.doctor.link import (
-    COUNTED,
+    COUNTERS,
     JOINING,
     NOT_FRAMES,
     NOT_OURS,
@@ -234,9 +234,9 @@ def test_a_recording_has_no_link() -> None:
 
 def test_counters_that_are_told_exist_and_have_a_cause_and_advice() -> None:
     kinds = (BridgeCounters, CanCounters, PalmCounters, JointCounters, ReplayCounters, McapCounters)
-    told = {name for trouble in COUNTED for name in trouble.counters}
+    told = {name for names in COUNTERS.values() for name in names}
     names = {name for kind in kinds for name in kind().as_dict()}
-    others = {name for trouble in NOT_OURS for name in trouble.counters}
+    others = {name for names in NOT_OURS.values() for name in names}
     assert told | others | NOT_FRAMES | JOINING | {*WHOLES} <= names
     for name in names:
         findings = counter_findings("x", {name: 1000})
