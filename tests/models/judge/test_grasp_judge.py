@@ -51,9 +51,7 @@ def test_a_margin_is_the_log_odds_of_slip(p_slip: float) -> None:
 
 
 @pytest.mark.parametrize(("p_slip", "sign"), [(0.0, -1), (1.0, 1)])
-def test_a_sure_answer_has_the_margin_of_one_in_a_million_millions(
-    p_slip: float, sign: int
-) -> None:
+def test_a_sure_answer_has_a_finite_margin(p_slip: float, sign: int) -> None:
     opinion = judge_of(FakeModel(p_slip)).weigh(Examined(COUNTS))
     assert opinion.p_slip == p_slip
     assert opinion.margin == pytest.approx(sign * 12 * math.log(10))
@@ -87,7 +85,7 @@ def test_probabilities_are_in_0_to_1_and_sum_to_one(
 @pytest.mark.parametrize("threshold", [0.3, 0.5, 0.8])
 @pytest.mark.parametrize("p_slip", [0.05, 0.4, 0.6, 0.95])
 @pytest.mark.parametrize("temperature", [1.0, 2.0, 5.0])
-def test_a_young_session_is_less_sure_and_on_the_same_side(
+def test_a_young_session_is_less_sure_on_the_same_side(
     threshold: float, p_slip: float, temperature: float
 ) -> None:
     judge = judge_of(FakeModel(p_slip), threshold)

@@ -39,7 +39,7 @@ def grasps(number: int, mean: float = MEAN, spread: float = SPREAD) -> NDArray[n
     ("number", "calibrated", "temperature"),
     [(0, False, 2.5), (1, False, 2.0), (2, False, 1.5), (3, True, 1.5), (4, True, 1.0)],
 )
-def test_a_session_is_calibrated_and_sharp_after_the_grasps_of_its_card(
+def test_a_session_is_calibrated_after_the_grasps_of_its_card(
     number: int, calibrated: bool, temperature: float
 ) -> None:
     session = new_session()
@@ -62,7 +62,7 @@ def test_what_cannot_have_been_grasps_is_never_calibrated_nor_sharp(spread: floa
     assert session.temperature == 2.5
 
 
-def test_a_count_is_mapped_by_its_distance_from_the_mean_in_spreads() -> None:
+def test_a_count_is_mapped_by_its_distance_in_spreads() -> None:
     session = new_session()
     session.counts_mean = np.full(SHAPE, 1500.0)
     session.scale = np.full(SHAPE, SPREAD / 50.0)
@@ -71,7 +71,7 @@ def test_a_count_is_mapped_by_its_distance_from_the_mean_in_spreads() -> None:
     assert (session.from_training(session.to_training(counts)) == counts).all()
 
 
-def test_the_statistics_are_those_of_the_grasps_and_of_one_grasp_of_the_training() -> None:
+def test_the_training_counts_as_one_grasp_of_a_session() -> None:
     session, seen = new_session(), grasps(200, mean=2300.0, spread=60.0)
     for counts in seen:
         session.observe(counts)

@@ -25,7 +25,7 @@ def covariance(learner: Learner) -> NDArray[np.float64]:
     return flat.reshape(math.isqrt(len(flat)), -1)
 
 
-def test_before_an_outcome_the_margin_speaks_moderated_by_what_the_prior_leaves_open() -> None:
+def test_before_an_outcome_the_prior_moderates_the_margin() -> None:
     learner = Learner(2)
     found = learner.judge(-3.0, np.array([1.0, -2.0]))[0]
     variance = 1.5**2 * 0.5**2 + 0.5**2 + 0.2**2 * (1.0 + 4.0) + 9.009
@@ -106,7 +106,7 @@ def test_moderated_log_odds_are_those_of_the_mean_probability() -> None:
         assert sigmoid(log_odds / 2.8) == pytest.approx(expected, abs=0.02)
 
 
-def test_it_learns_what_the_margin_does_not_know_and_follows_when_that_changes() -> None:
+def test_it_learns_what_the_margin_misses_and_follows_changes() -> None:
     learner = Learner(ONE_FINGER)
 
     def right(stream: list[Outcome]) -> float:
@@ -305,7 +305,7 @@ def spoilt(state: LearnerState) -> Iterator[tuple[str, LearnerState]]:
     yield "no covariance", replace(state, covariance=(0.0 * matrix).tobytes())
 
 
-def test_a_state_that_no_outcomes_lead_to_is_refused_and_changes_nothing() -> None:
+def test_a_state_that_no_outcomes_lead_to_is_refused() -> None:
     learner = Learner(4)
     learn(learner, lifts(7, 4))
     before = learner.state()

@@ -37,7 +37,7 @@ def test_the_prior_is_scikit_learns_kernel() -> None:
     np.testing.assert_allclose([Residual(told).shared(x) for x in told[:5]], apart, rtol=1e-12)
 
 
-def test_a_new_grasp_has_the_mean_and_variance_of_a_gaussian_process() -> None:
+def test_a_new_grasp_is_judged_as_by_a_gaussian_process() -> None:
     told, new = grasps(30)[:-1], grasps(30)[-1]
     values = np.sin(told).sum(axis=1)
     expected = process().fit(told, values)

@@ -46,7 +46,7 @@ def test_an_adversary_that_slips_when_told_stable_is_silenced(
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_in_the_long_run_the_share_is_the_one_that_was_set(alpha: float) -> None:
+def test_in_the_long_run_the_share_is_as_set(alpha: float) -> None:
     # An adversary that holds just long enough to be believed again.
     rule = risk(alpha)
     for _ in range(20_000):
@@ -106,7 +106,7 @@ def test_with_each_outcome_told_at_once_every_stretch_is_bounded(
         assert rule.bound == pytest.approx(alpha * rule.lifts + START)
 
 
-def test_every_stable_lift_that_was_out_when_the_rule_fell_silent_adds_one() -> None:
+def test_each_outstanding_stable_lift_adds_one_slip_at_most() -> None:
     rule = risk(0.05)
     assert all(rule.decide(-9.0) is Permission.ALLOWED for _ in range(20))  # none told yet
     for _ in range(20):
@@ -141,7 +141,7 @@ def test_the_threshold_rises_with_outcomes_and_falls_with_the_budget() -> None:
     assert probability() == pytest.approx(1.0 / (1.0 + 85.0 / 15.0 * 4.05 / 3.1))
 
 
-def test_stable_is_said_only_up_to_the_threshold_and_never_of_what_is_no_number() -> None:
+def test_stable_needs_a_number_up_to_the_threshold() -> None:
     rule = risk(0.05)
     assert rule.decide(rule.threshold) is Permission.ALLOWED
     assert rule.decide(math.nextafter(rule.threshold, 0.0)) is Permission.WITHHELD
@@ -153,7 +153,7 @@ def test_stable_is_said_only_up_to_the_threshold_and_never_of_what_is_no_number(
     assert generous.decide(0.1) is Permission.WITHHELD
 
 
-def test_too_many_announced_lifts_that_are_out_make_the_next_unproven() -> None:
+def test_too_many_outstanding_announced_lifts_make_the_next_unproven() -> None:
     rule = Risk(RiskLimits(0.05, outstanding_max=2))
     assert rule.decide(-9.0, awaited=1) is Permission.ALLOWED
     assert rule.decide(-9.0, awaited=2) is Permission.UNPROVEN
@@ -170,7 +170,7 @@ def test_without_a_risk_all_is_allowed_and_counted() -> None:
     assert (rule.lifts, rule.slips, rule.bound, rule.budget) == (3, 2, None, START)
 
 
-def test_in_the_warm_up_what_is_not_surely_stable_is_unproven_and_to_be_lifted() -> None:
+def test_the_warm_up_asks_for_lifts_of_unsure_grasps() -> None:
     rule = risk(0.05, warm_up=3)
     for left in (3, 2, 1):
         assert rule.warm_up_left == left
@@ -186,7 +186,7 @@ def test_in_the_warm_up_what_is_not_surely_stable_is_unproven_and_to_be_lifted()
     assert (rule.warm_up_left, rule.slips) == (3, 1)
 
 
-def test_so_many_of_the_others_are_to_be_lifted_under_supervision() -> None:
+def test_a_share_of_withheld_grasps_is_lifted_under_supervision() -> None:
     rule, none = risk(0.05, explore=0.05), risk(0.05)
     chosen = [rule.supervised(Permission.WITHHELD, "boot", grasp) for grasp in range(20_000)]
     # Three standard deviations of so many draws.
@@ -198,7 +198,7 @@ def test_so_many_of_the_others_are_to_be_lifted_under_supervision() -> None:
     assert not any(none.supervised(Permission.WITHHELD, "boot", n) for n in range(1000))
 
 
-def test_an_exchange_of_a_sensor_does_not_make_the_rule_more_generous() -> None:
+def test_an_exchange_of_sensors_makes_no_rule_more_generous() -> None:
     rule = risk(0.05)
     for _ in range(60):
         lift(rule, -9.0, lambda _: False)

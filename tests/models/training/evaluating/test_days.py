@@ -17,7 +17,7 @@ from tests.models.training.samples import sessions
 GRASPS = sessions(160)
 
 
-def test_a_job_of_days_says_what_is_refused_and_how_old_the_session_was() -> None:
+def test_a_job_of_days_has_refusals_and_session_ages() -> None:
     result = jobs.run(Job(SYSTEMS["svm-session"], "days", 0, 1, 2), GRASPS)
     assert set(result.margins) == set(result.refused) == {"running", "running-sorted"}
     for ages in result.ages.values():

@@ -61,7 +61,7 @@ def test_the_labels_of_the_test_grasps_are_not_looked_at(judged: JobResult) -> N
         assert np.array_equal(margins, other.margins[variant]), variant
 
 
-def test_a_session_system_is_judged_in_every_way_and_others_in_one(judged: JobResult) -> None:
+def test_only_a_session_system_is_judged_in_several_ways(judged: JobResult) -> None:
     assert set(judged.margins) == set(SESSION_VARIANTS)
     assert set(judged.ages) == {"running", "running-sorted"}
     assert list(jobs.run(Job(SVM, "session", 0, 1, 4), GRASPS).margins) == ["none"]
@@ -93,7 +93,7 @@ def test_no_damage_of_a_file_goes_unseen(judged: JobResult) -> None:
         assert all(np.array_equal(back.margins[n], judged.margins[n]) for n in judged.margins)
 
 
-def test_a_stored_result_is_found_and_a_broken_one_is_not(
+def test_a_stored_result_is_found_unless_it_is_broken(
     judged: JobResult, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert jobs.load(tmp_path, SESSION_JOB, "data") is None
@@ -123,7 +123,7 @@ def test_features_are_standardised_as_the_daemon_does() -> None:
     assert np.array_equal(standards.apply(features, 3.0), expected)
 
 
-def test_a_feature_that_does_not_vary_is_not_divided_by_zero() -> None:
+def test_a_constant_feature_is_not_divided_by_zero() -> None:
     standards = Standards.of(np.full((5, 2), 7.0))
     assert standards.apply(np.full((1, 2), 7.5), 3.0).tolist() == [[0.5, 0.5]]
 
@@ -141,7 +141,7 @@ def test_training_rows_are_standardised_by_their_own_table() -> None:
         training.each(np.array([1, 1, 1, 1]))
 
 
-def test_a_running_session_judges_each_grasp_by_what_came_before_it() -> None:
+def test_a_running_session_judges_by_earlier_grasps() -> None:
     random = np.random.default_rng(1)
     features = random.normal(50.0, 4.0, (60, 3))
     training = TrainingStandards.of(features[:20], np.zeros(20, dtype=np.int64))

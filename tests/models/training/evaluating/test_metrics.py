@@ -46,7 +46,7 @@ def test_spread_over_folds_and_error_over_seeds() -> None:
     assert over_seeds([[0.8], [1.0]]).std == pytest.approx(0.1)
 
 
-def test_a_figure_that_a_fold_lacks_is_left_out_without_a_warning() -> None:
+def test_a_figure_that_a_fold_lacks_is_left_out() -> None:
     assert over_seeds([[0.8, None, 0.6]]).mean == pytest.approx(0.7)
     assert math.isnan(over_seeds([[None, None]]).mean)
 

@@ -131,7 +131,7 @@ def rows(text: str, section: int) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_the_papers_figures_stand_beside_ours_and_nothing_is_made_up() -> None:
+def test_the_papers_figures_stand_beside_ours() -> None:
     ours = summary_of("cnn1", "cv", wrong=0.1)
     f1 = ours.main.spreads["f1"]
     text = results_table([ours], *MADE)

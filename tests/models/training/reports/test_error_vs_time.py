@@ -60,7 +60,7 @@ def found(folder: Path) -> dict[str, Any]:
     return content
 
 
-def test_every_model_of_the_zoo_is_in_the_report_with_error_and_time(
+def test_the_report_has_error_and_time_of_every_model(
     found: dict[str, Any],
 ) -> None:
     rows = {row["name"]: row for row in found["rows"]}
@@ -74,9 +74,7 @@ def test_every_model_of_the_zoo_is_in_the_report_with_error_and_time(
     assert {row["kind"] for row in found["rows"]} == {"model", "peer"}
 
 
-def test_each_point_is_named_in_the_panels_that_it_is_in(
-    folder: Path, found: dict[str, Any]
-) -> None:
+def test_each_point_is_named_in_its_panels(folder: Path, found: dict[str, Any]) -> None:
     drawn = (folder / "error-vs-time.svg").read_text()
     whole = [row for row in found["rows"] if len(row["fingers"]) == 3]
     for row in whole:
@@ -114,7 +112,7 @@ def test_no_name_covers_a_point_or_another_name() -> None:
     assert not any(box.overlaps(axes.get_window_extent()) for box in boxes)
 
 
-def test_the_front_is_what_none_is_both_faster_and_more_exact_than() -> None:
+def test_the_front_has_the_models_that_none_beats() -> None:
     # By hand: c is slower and worse than b; the peer is no model of graspd's.
     given = [("a", "model", 9.0, 8.0), ("b", "model", 20.0, 5.0), ("c", "model", 30.0, 6.0)]
     given += [("d", "model", 40.0, 4.0), ("e", "peer", 8.0, 1.0)]

@@ -34,7 +34,7 @@ def test_the_cases_of_a_model_become_two_tables() -> None:
     assert "| learner, 3e+03 outcomes, all of these in turns |" in said
 
 
-def test_a_broken_bound_and_a_case_that_ends_early_are_said() -> None:
+def test_broken_bounds_and_cases_that_end_early_are_reported() -> None:
     step = json.dumps({"step": "one", "expected": "1", "found": "1"})
     rows = [
         row_of(json.dumps(CASE), "test_a_case", "assert not problems"),

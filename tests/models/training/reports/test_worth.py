@@ -82,7 +82,7 @@ def test_the_figures_are_counted_over_all_streams_by_grasp() -> None:
     assert [point.grasps for point in curves[RISK]] == [5, 17, 37, 62, 87, 125, 175, 225, 275]
 
 
-def test_what_is_said_of_a_grasp_does_not_know_its_outcome() -> None:
+def test_a_verdict_does_not_know_the_outcome_of_its_grasp() -> None:
     whole = stream()
     turned = whole.slipped.copy()
     turned[100:] ^= True
@@ -93,7 +93,7 @@ def test_what_is_said_of_a_grasp_does_not_know_its_outcome() -> None:
         assert not np.array_equal(as_it_was.p_slip, otherwise.p_slip)
 
 
-def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
+def test_networks_saw_neither_objects_nor_poses_of_their_streams(
     bts3_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grasps = read_all(bts3_dir)
@@ -126,7 +126,7 @@ def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
     }
 
 
-def test_a_refused_grasp_is_neither_judged_nor_told_and_counts_as_not_kept() -> None:
+def test_a_refused_grasp_counts_as_not_kept() -> None:
     whole = stream()
     refused = np.arange(GRASPS) % 2 == 0
     life = live(replace(whole, refused=refused), RiskLimits(), every=True)
@@ -151,7 +151,7 @@ def test_probabilities_that_are_timid_or_too_sure_have_that_slope() -> None:
         assert slope(p_slip, slipped) == pytest.approx(factor, abs=0.03 * factor)
 
 
-def test_a_scale_is_fitted_on_the_other_objects_of_its_split() -> None:
+def test_a_scale_is_fitted_on_other_objects_of_its_split() -> None:
     """Outcomes of the judged objects change the others' scales and not their own."""
     several = [stream(seed) for seed in range(3)]
     other_split = replace(stream(3), group=(1, 0))
@@ -166,7 +166,7 @@ def test_a_scale_is_fitted_on_the_other_objects_of_its_split() -> None:
     assert former[1, 0] == later[1, 0] == SCALE
 
 
-def test_p_slip_is_honest_on_a_day_that_was_not_trained_on(bts3_dir: Path) -> None:
+def test_p_slip_is_honest_on_a_new_day(bts3_dir: Path) -> None:
     """Over all days and folds nine in ten sessions have a slope from 0.8 to 1.35."""
     grasps = read_all(bts3_dir)
     names = np.array([file.name for file in grasps.files])[grasps.table_of]
@@ -194,7 +194,7 @@ def pictures() -> tuple[str, str]:
     return draw(curves), draw(curves)
 
 
-def test_the_picture_has_every_method_and_is_drawn_the_same_again(
+def test_the_picture_shows_every_method_and_repeats(
     pictures: tuple[str, str],
 ) -> None:
     first, second = pictures
