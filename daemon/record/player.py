@@ -38,8 +38,6 @@ _Item = Reading | RecordedEvent
 class McapCounters(DriverCounters):
     """Counters of a replay."""
 
-    late: int = 0
-    """Readings handed over more than one period late."""
     malformed: int = 0
     """Malformed messages, and readings of other fingers."""
     cut_off: int = 0
@@ -93,13 +91,11 @@ class McapReplayDriver(RecordedDriver[_Item]):
         taken = self.take()
         if taken is None:
             return ()
-        at_ns, item, late_ns = taken
+        at_ns, item = taken
         if isinstance(item, RecordedEvent):
             if self.on_event is not None:
                 self.on_event(item)
             return ()
-        if self.speed is not None and self.period_ns is not None:
-            self.counters.late += late_ns > self.period_ns
         if isinstance(item, TactileReading):
             self._count(item)
         return [self.hand_over(item, at_ns)]

@@ -13,7 +13,7 @@ from typing import Final, Unpack
 
 from graspd.drivers.base import DriverError, Fact, LinkError, Opened, Reading
 from graspd.drivers.can.bus import STAMPED_INTERFACES, CanBus
-from graspd.drivers.can.frames import LOST, CanCounters, Stamped
+from graspd.drivers.can.frames import CanCounters, Stamped
 from graspd.drivers.can.stream import NAME, BoardOptions, CanStream
 from graspd.drivers.link import LinkState
 
@@ -26,8 +26,6 @@ REST_MAX_NS: Final = 15_000_000
 Waking for each frame costs more than the frame, so the loop rests until shortly before the reading
 should be complete.
 """
-RATE_WINDOW_NS: Final = 1_000_000_000
-"""Time over which frames of all kinds per second are counted, ns."""
 
 
 class CanBridgeDriver(Opened):
@@ -78,11 +76,7 @@ class CanBridgeDriver(Opened):
         return {}
 
     def describe(self) -> dict[str, Fact]:
-        facts = self.stream.describe()
-        if self.stream.link.state is LinkState.UP:
-            is_silent = self._clock() - self._window_start_ns > 2 * RATE_WINDOW_NS
-            facts["frames"] = Fact("0 /s" if is_silent else f"{self._frames_per_s:.0f} /s")
-        return facts
+        return self.stream.describe()
 
     def open(self) -> None:
         """Try once to take the bus. Raises `DriverError` if no try can ever succeed."""
@@ -90,10 +84,7 @@ class CanBridgeDriver(Opened):
         self.stream = self._make_stream()
         self._bus.counters = self.counters
         self._resting_until_ns = None
-        self._window_start_ns = now_ns = self._clock()
-        self._window_frames = 0
-        self._frames_per_s = 0.0
-        self.stream.link.start(now_ns)
+        self.stream.link.start(self._clock())
         self._try_to_open()
 
     def tap(self, sink: Callable[[list[Stamped]], None]) -> None:
@@ -125,10 +116,11 @@ class CanBridgeDriver(Opened):
             self._try_to_open()
         if self.stream.link.state is LinkState.WAITING:
             return ()
-        frames = self._bus.drain()
-        readings, trouble = self.stream.receive(frames)
-        self._count(frames)
-        self.stream.watch(self._clock(), more=self._bus.more)
+        readings, trouble = self.stream.receive(self._bus.drain())
+        now_ns = self._clock()
+        self._poll_due_ns = now_ns + (0 if self._bus.more else POLL_NS)
+        self._resting_until_ns = self._rest(now_ns)
+        self.stream.watch(now_ns, more=self._bus.more)
         trouble = self._bus.failure or trouble
         if trouble is not None:
             self._lose(trouble)
@@ -150,18 +142,6 @@ class CanBridgeDriver(Opened):
         self._resting_until_ns = None
         self._bus.close()
         self.stream.lost(error, self._clock())
-
-    def _count(self, stamped: Sequence[Stamped]) -> None:
-        frames = sum(frame.flags != LOST for frame, _, _ in stamped)
-        now_ns = self._clock()
-        self._poll_due_ns = now_ns + (0 if self._bus.more else POLL_NS)
-        self._resting_until_ns = self._rest(now_ns)
-        self.counters.frames += frames
-        self._window_frames += frames
-        elapsed_ns = now_ns - self._window_start_ns
-        if elapsed_ns >= RATE_WINDOW_NS:
-            self._frames_per_s = self._window_frames * 1e9 / elapsed_ns
-            self._window_start_ns, self._window_frames = now_ns, 0
 
     def _rest(self, now_ns: int) -> int | None:
         """Return the time, ns, until which frames may wait in the kernel; None: read now."""

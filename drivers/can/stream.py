@@ -85,6 +85,7 @@ class CanStream:
         """Return the readings that are complete, oldest first, and why the bus is lost."""
         readings: list[Reading] = []
         trouble = None
+        self.counters.frames += sum(frame.flags != LOST for frame, _, _ in frames)
         for frame, t_ns, until_ns in frames:
             if not frame.flags & _SPECIAL:
                 readings += self._decoder.push(frame, t_ns, until_ns)

@@ -117,7 +117,6 @@ class CanLog(LinkLogDriver[CanFrame]):
     def feed(self, t_ns: int, record: CanFrame) -> Sequence[Reading]:
         self.stream.watch(t_ns)
         readings, trouble = self.stream.receive([(record, t_ns, t_ns)])
-        self.stream.counters.frames += 1
         self.stream.watch(t_ns)
         if trouble is not None:
             self.stream.interrupt()

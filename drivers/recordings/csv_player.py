@@ -40,8 +40,6 @@ _log = logging.getLogger(__name__)
 class ReplayCounters(DriverCounters):
     """Counters of a replay."""
 
-    late: int = 0
-    """Readings handed over more than one period late; they are not skipped."""
     not_counts: int = 0
     """Electrode values handed over that are not 12-bit counts."""
     cut_off: int = 0
@@ -54,7 +52,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
 
     A row gives a `TactileReading` of `fingers`, after a `JointReading` if the file has joints. With
     a `speed`, `t_ns` is when the row was due, else when it is handed over. `recorded_ns` is the
-    file's own time. A late reading is counted, never skipped.
+    file's own time. No reading is skipped.
 
     `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
     no counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
@@ -103,13 +101,11 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         due = self.take()
         if due is None:
             return ()
-        at_ns, (row, recorded_period_ns), late_ns = due
-        speed = self.speed
+        at_ns, (row, recorded_period_ns) = due
         self._interrupted |= recorded_period_ns is None and at_ns > 0  # another stream begins
         if recorded_period_ns is not None:
-            self.period_ns = round(recorded_period_ns / (speed or 1.0))
-            self.counters.late += speed is not None and late_ns > self.period_ns
-        t_ns = self._clock() if speed is None else self.played_ns(at_ns)
+            self.period_ns = round(recorded_period_ns / (self.speed or 1.0))
+        t_ns = self._clock() if self.speed is None else self.played_ns(at_ns)
         return self._readings(row, t_ns, at_ns)
 
     def _items(self) -> Generator[tuple[int, tuple[Row, int | None]], None, None]:

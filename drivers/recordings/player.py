@@ -84,8 +84,8 @@ class RecordedDriver(Opened, Generic[Item]):
         began_ns, first_ns = self._began or (self._opened_ns, at_ns)
         return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
 
-    def take(self) -> tuple[int, Item, int] | None:
-        """Return time, content and lateness, ns, of a due item. Raises `RecordingError`."""
+    def take(self) -> tuple[int, Item] | None:
+        """Return time, ns, and content of a due item. Raises `RecordingError`."""
         if self._playing is None:
             raise RuntimeError("the replay is not open")
         now_ns, item = self._clock(), self._next
@@ -100,7 +100,7 @@ class RecordedDriver(Opened, Generic[Item]):
                 raise self._failure
             return None
         self._read_ahead(self._playing)
-        return *item, now_ns - due_ns
+        return item
 
     def hand_over(self, made: Reading, at_ns: int) -> Reading:
         """Return the reading `made`, complete at `at_ns`, moved to now."""
@@ -179,7 +179,7 @@ class LinkLogDriver(RecordedDriver[Item]):
     def read_ready(self) -> Sequence[Reading]:
         """Return the readings of the first due record that completes some."""
         while (due := self.take()) is not None:
-            t_ns, record, _ = due
+            t_ns, record = due
             if readings := self.feed(t_ns, record):
                 return [self.hand_over(reading, t_ns) for reading in readings]
         return ()

@@ -19,8 +19,6 @@ from tests.drivers.can.can_standin import (
     ScriptedBus,
     SocketBus,
     TwinLink,
-    bridge,
-    channel,
     contact,
     message,
     stand_in,
@@ -139,23 +137,6 @@ def test_one_call_takes_a_bounded_number_of_frames(monkeypatch: pytest.MonkeyPat
         driver.read_ready()
         assert driver.counters.frames == 2 * FRAMES_PER_DRAIN + 5
         assert driver.due_ns() == clock.now_ns + POLL_NS
-
-
-def test_frames_per_second_are_told_until_there_are_none() -> None:
-    clock = Clock()
-    where = channel()
-    with bridge(where, clock=clock) as driver:
-        with can.Bus(interface="virtual", channel=where, ignore_config=True) as bus:
-            for _ in range(11):
-                for sent in sweep_messages():
-                    bus.send(sent)
-                clock.now_ns += 100 * MS
-                driver.read_ready()
-            assert driver.describe()["frames"].text == "240 /s"  # 24 in each tenth
-        clock.now_ns += 1_900 * MS
-        assert driver.describe()["frames"].text == "240 /s"
-        clock.now_ns += 1
-        assert driver.describe()["frames"].text == "0 /s"
 
 
 def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(

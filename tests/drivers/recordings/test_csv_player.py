@@ -75,7 +75,6 @@ def test_a_table_plays_at_its_rate_times_speed(
     driver = ReplayDriver([path], rate_hz=rate_hz, speed=speed, clock=clock)
     assert times_ms(play(driver, clock)) == [k * period_ms for k in range(4)]
     assert driver.period_ns == period_ms * MS
-    assert driver.counters.late == 0
 
 
 def test_a_stream_plays_at_its_own_times_whatever_their_offset(tmp_path: Path) -> None:
@@ -98,7 +97,7 @@ def test_the_period_of_a_stream_is_the_shortest_step_so_far(tmp_path: Path) -> N
     assert periods_ms == [None, 0, 10, 5, 5]
 
 
-def test_a_lag_is_counted_and_nothing_is_skipped(tmp_path: Path) -> None:
+def test_a_lag_skips_nothing(tmp_path: Path) -> None:
     clock = Clock()
     with ReplayDriver([write(tmp_path, table(6))], clock=clock) as driver:
         driver.read_ready()
@@ -107,13 +106,7 @@ def test_a_lag_is_counted_and_nothing_is_skipped(tmp_path: Path) -> None:
         while readings := driver.read_ready():
             seqs.extend(reading.seq for reading in readings)
         assert seqs == [1, 2, 3]
-        # Due at 10, 20 and 30 ms, taken at 35 ms: late are those more than 10 ms behind.
-        assert driver.counters.late == 2
         assert driver.due_ns() == START_NS + 40 * MS
-        for now_ms, late in ((50 * MS, 2), (60 * MS + 1, 3)):
-            clock.now_ns = START_NS + now_ms
-            driver.read_ready()
-            assert driver.counters.late == late
 
 
 def test_several_files_play_in_a_row_on_one_time_axis(tmp_path: Path) -> None:

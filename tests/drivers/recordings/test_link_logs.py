@@ -244,7 +244,7 @@ def test_items_are_due_as_recorded_over_the_speed(speed: float, steps_ms: list[i
         clock.now_ns = due_ns - 1
         assert player.take() is None
         clock.now_ns = due_ns + 2
-        assert player.take() == (at_ns, f"at {at_ns // MS}", 2)
+        assert player.take() == (at_ns, f"at {at_ns // MS}")
         assert player.played_ns(at_ns) == due_ns
     assert player.exhausted
     assert player.due_ns() is None
@@ -255,7 +255,7 @@ def test_without_a_speed_all_is_due_at_once_and_keeps_its_recorded_times() -> No
     player = Player(None, clock)
     player.open()
     taken = [player.take() for _ in RECORDED_NS]
-    assert [at_ns for at_ns, _, _ in filter(None, taken)] == list(RECORDED_NS)
+    assert [at_ns for at_ns, _ in filter(None, taken)] == list(RECORDED_NS)
     assert [player.played_ns(at_ns) - clock.now_ns for at_ns in RECORDED_NS] == [
         *(0, 10 * MS, 30 * MS),
     ]
@@ -281,7 +281,7 @@ def test_an_error_waits_until_what_is_before_it_was_taken() -> None:
     with pytest.raises(RuntimeError, match="not open"):
         player.take()
     player.start(broken())
-    assert player.take() == (0, "first", 0)
+    assert player.take() == (0, "first")
     assert not player.exhausted
     with pytest.raises(RecordingError, match="no more"):
         player.take()
