@@ -16,6 +16,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from graspd.daemon.session.file import KeptSession, SessionFileError, load
 from graspd.daemon.session.folder import SessionFolder
@@ -113,9 +114,7 @@ PLANS = st.lists(
 
 @settings(max_examples=60)
 @given(PLANS)
-def test_whenever_it_is_killed_nothing_that_was_kept_is_lost(
-    tmp_path_factory: pytest.TempPathFactory, plan: Plan
-) -> None:
+def test_no_kill_loses_a_kept_session(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> None:
     path = tmp_path_factory.mktemp("session") / "right"
     written, kept = 0, 0
     for call, after in plan:
@@ -163,7 +162,7 @@ def damage(data: bytes, choose: random.Random) -> bytes:
     )[kind - 2]
 
 
-def test_a_thousand_damaged_files_never_become_a_state_that_was_not_written(tmp_path: Path) -> None:
+def test_a_thousand_damaged_files_become_no_other_state(tmp_path: Path) -> None:
     path = tmp_path / "1.session"
     data = learned(tmp_path)
     written, choose, refused = load(path), random.Random(16), 0
@@ -186,13 +185,14 @@ def sealed(plain: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "spoil", ["cut", "flip", "empty", "nested", "huge", "former", "no session"]
+    "spoil", ["cut", "flip", "empty", "nested", "huge", "former", "no session", "learned"]
 )
 def test_a_file_that_cannot_be_read_is_never_replaced(tmp_path: Path, spoil: str) -> None:
     path = tmp_path / "1.session"
     with SessionFolder(tmp_path) as folder:
         save(folder, 2)
     data = path.read_bytes()
+    of_other_learning = KeptSession(None, FINGERS, {}, replace(trust().state(), version=1))
     spoiled = {
         "cut": data[:-9],
         "flip": data[:50] + bytes([data[50] ^ 1]) + data[51:],
@@ -201,6 +201,7 @@ def test_a_file_that_cannot_be_read_is_never_replaced(tmp_path: Path, spoil: str
         "huge": sealed(bytes(16 << 20)),
         "former": sealed(msgspec.msgpack.encode({"version": 2})),
         "no session": sealed(msgspec.msgpack.encode({"version": 3, "grasps": 1})),
+        "learned": sealed(msgspec.msgpack.encode(of_other_learning)),
     }[spoil]
     path.write_bytes(spoiled)
     with SessionFolder(tmp_path) as folder:
@@ -247,7 +248,7 @@ def test_a_file_in_place_of_the_folder_stays(tmp_path: Path) -> None:
     assert path.read_bytes() == b"?"
 
 
-def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_path: Path) -> None:
+def test_a_full_book_of_open_lifts_fits_the_file(tmp_path: Path) -> None:
     part = trust(inputs=5 * 26)
     for grasp in range(LIFTS_MAX + 1):
         judge(part, grasp)

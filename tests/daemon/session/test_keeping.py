@@ -125,7 +125,7 @@ def taught(folder: SessionFolder) -> tuple[SessionCalibration, Trust, SessionKee
     return session, part, keeper
 
 
-def test_an_outcome_is_answered_when_it_is_on_the_disk(
+def test_an_outcome_is_answered_once_it_is_on_disk(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
@@ -143,7 +143,7 @@ def test_an_outcome_is_answered_when_it_is_on_the_disk(
     assert found == [(KEPT, part.state())]
 
 
-def test_outcomes_that_come_while_one_is_written_share_the_next_save(
+def test_outcomes_that_come_during_a_save_share_the_next(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
@@ -166,7 +166,7 @@ def test_outcomes_that_come_while_one_is_written_share_the_next_save(
     assert [outcomes for _, _, outcomes in found] == [1, 5, 5, 5, 5]
 
 
-def test_what_is_kept_already_is_answered_at_once(
+def test_a_kept_outcome_is_answered_at_once(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
@@ -181,7 +181,7 @@ def test_what_is_kept_already_is_answered_at_once(
     assert disk.written == 1
 
 
-def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
+def test_an_outcome_on_a_full_disk_is_kept_later(
     folder: SessionFolder, disk: Disk, caplog: pytest.LogCaptureFixture, keeper_of: KeeperOf
 ) -> None:
     part: Trust = trust()
@@ -207,7 +207,7 @@ def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
     assert kept_trust(folder) == part.state()
 
 
-def test_a_disk_that_hangs_holds_neither_the_loop_nor_too_many_answers(
+def test_a_disk_that_hangs_holds_up_no_loop(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
@@ -253,21 +253,6 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
         time.sleep(0.01)
 
 
-def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
-    folder: SessionFolder,
-) -> None:
-    session, part = calibration(), trust()
-    observe(session, 30)
-    folder.save([KeptSession(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None)])
-    keeper = session_keeper(None, sensors(), folder, part=part)
-    judge(part, 0)
-    keeper.keep(lambda _: None)
-    keeper.save()
-    kept = last_kept(folder.path)
-    assert kept is not None
-    assert (kept.fingers, kept.statistics, kept.serials) == (FINGERS, None, {})
-
-
 def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> None:
     session, part, keeper = taught(folder)
     keeper.save()
@@ -286,6 +271,26 @@ def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> N
     assert third.state() == other.state()
 
 
+def test_a_damaged_last_file_ends_the_session_and_no_ledger(
+    folder: SessionFolder, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It may have been of other sensors."""
+    _, part, keeper = taught(folder)
+    keeper.save()
+    damaged = folder.path / "9.session"
+    damaged.write_bytes(b"?")
+    again, back = calibration(), trust()
+    keeper = session_keeper(again, sensors(), folder, part=back)
+    assert f"{damaged}: not a session: its checksum is wrong; it stays" in caplog.text
+    assert (again.grasps, back.learner.outcomes, back.risk.proven) == (0, 0, 0)
+    assert (back.risk.lifts, back.risk.slips) == (part.risk.lifts, part.risk.slips)
+    assert part.risk.lifts > 0
+    observe(again, 1)
+    keeper.save()
+    assert [kept.grasps for kept in kept_in(folder.path)] == [1, 30]
+    assert damaged.read_bytes() == b"?"
+
+
 def test_a_start_with_another_model_destroys_no_ledger(folder: SessionFolder) -> None:
     parts = trust("a"), trust("b")
     for part in (*parts, *parts):
@@ -301,7 +306,7 @@ def test_a_start_with_another_model_destroys_no_ledger(folder: SessionFolder) ->
     assert [part.risk.proven for part in parts] == [6, 6]
 
 
-def test_what_cannot_be_kept_at_the_start_is_said_and_kept_later(
+def test_a_disk_that_fails_at_the_start_is_tried_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """As on a full or read-only disk, and in a folder that is gone."""
@@ -345,7 +350,7 @@ def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path) -> None:
     assert of_each == [mine.state(), theirs.state()]
 
 
-def test_announced_lifts_are_on_the_disk_when_that_is_answered(
+def test_announced_lifts_are_on_disk_before_the_answer(
     folder: SessionFolder, keeper_of: KeeperOf
 ) -> None:
     part, announced = trust(), list[int]()
@@ -364,7 +369,7 @@ def test_announced_lifts_are_on_the_disk_when_that_is_answered(
     assert announced == [1]
 
 
-def test_whoever_waits_is_answered_whatever_ends_the_writing(
+def test_an_unexpected_error_of_the_writer_is_answered(
     folder: SessionFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part, found = trust(), list[Reply]()
@@ -392,7 +397,7 @@ def test_session_and_what_was_learned_are_restored_together(folder: SessionFolde
     assert tell(other, 3) is OutcomeStatus.REPEATED
 
 
-def test_with_another_model_the_session_stays_and_learning_begins_anew(
+def test_another_model_continues_the_session_and_learns_again(
     folder: SessionFolder, caplog: pytest.LogCaptureFixture
 ) -> None:
     session, part = calibration(), trust("a")
@@ -408,7 +413,7 @@ def test_with_another_model_the_session_stays_and_learning_begins_anew(
     assert caplog.text.count(said) == 1
 
 
-def test_what_a_run_has_no_use_for_is_kept_as_it_is(folder: SessionFolder) -> None:
+def test_state_that_a_run_does_not_use_stays(folder: SessionFolder) -> None:
     session, part = calibration(), trust()
     observe(session, 30)
     judge(part, 1)
@@ -450,7 +455,7 @@ def test_an_exchanged_sensor_ends_what_was_learned(folder: SessionFolder) -> Non
     assert other.risk.lifts == lifts > 0  # slips that were counted stay counted
 
 
-def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
+def test_sensors_that_return_bring_learning_and_forget_no_slip(
     folder: SessionFolder,
 ) -> None:
     driver, part = sensors(ff="A"), trust()
@@ -473,7 +478,7 @@ def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
     assert part.risk.lifts > 0
 
 
-def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
+def test_an_open_grasp_is_kept_within_ten_seconds(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part, clock = trust(), Clock()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.session.file import KeptSession, SessionFileError
+from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import KEPT_MAX, SessionFolder
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import Durations
@@ -106,38 +106,6 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
         keeper.save()
     assert session.grasps == 0
     assert "a new session begins" in caplog.text
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"{", b"[]", b"\xff\xfe", b'{"version":1}', b'{"version":2}', b"null", b"x" * (2 << 20)],
-)
-def test_what_is_no_session_is_one_line_and_a_new_session(
-    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "7.session"
-    path.write_bytes(content)
-    session = calibration()
-    with SessionFolder(tmp_path) as folder:
-        (error,) = folder.load()
-        assert isinstance(error, SessionFileError)
-        assert str(error).startswith(f"{path}: ")
-        assert "\n" not in str(error)
-        session_keeper(session, sensors(), folder)
-    assert session.grasps == 0
-    assert "a new session begins" in caplog.text
-
-
-def test_a_session_of_other_fingers_begins_anew(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    other, session = calibration(), calibration()
-    observe(other, 9)
-    with SessionFolder(tmp_path / "right") as folder:
-        folder.save([KeptSession(other.state(), ("ff", "mf"), {})])
-        session_keeper(session, sensors(), folder)
-    assert "is of the fingers ff, mf, the hand has" in caplog.text
-    assert session.grasps == 0
 
 
 def session_pipeline(age_ns: int = 0, *, learns: bool = True) -> Pipeline:
