@@ -11,7 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from graspd.biotac import ELECTRODES, TABLE_FINGERS
-from graspd.daemon.process.signals import STOPPING
+from graspd.daemon.process.signals import stopping
 from graspd.daemon.process.text import complain, write_json
 from graspd.drivers.base import DriverError
 from graspd.drivers.biotac import SEQUENCES
@@ -152,7 +152,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until stopped or until the recording ends; prints the faults injected, as JSON."""
     stop = threading.Event()
-    former = {number: signal.signal(number, lambda *_: stop.set()) for number in STOPPING}
+    former = {number: signal.signal(number, lambda *_: stop.set()) for number in stopping()}
     try:
         injected = SERVE.get(args.kind, _serve_datagrams)(args, _faults(args), stop)
     except (DriverError, ValueError, OSError) as error:

@@ -9,10 +9,14 @@ import signal
 from types import FrameType
 from typing import Any, Self
 
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that stop the process; SIGHUP unless it is ignored, as `nohup` has it."""
 WAKEUPS_MAX = 4096
 """Most bytes of one read from the pipe; each signal is one byte."""
+
+
+def stopping() -> list[signal.Signals]:
+    """Return the signals that stop the process; not SIGHUP where `nohup` has it ignored."""
+    kept = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [signal.SIGINT, signal.SIGTERM, *([] if kept else [signal.SIGHUP])]
 
 
 class StopSignal:
@@ -40,9 +44,7 @@ class StopSignal:
     def __enter__(self) -> Self:
         """Take over the signals. Only the main thread can."""
         self._former_wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        for signum in STOPPING:
-            if signum is not signal.SIGHUP or signal.getsignal(signum) is not signal.SIG_IGN:
-                self._former[signum] = signal.signal(signum, self._handle)
+        self._former = {signum: signal.signal(signum, self._handle) for signum in stopping()}
         return self
 
     def __exit__(self, *_details: object) -> None:

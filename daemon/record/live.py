@@ -16,7 +16,6 @@ ADDRESS: Final = "127.0.0.1"
 """Address of the server; only loopback, because it does not check who connects."""
 BACKLOG: Final = 256
 """Most messages that wait for a viewer; a slow one loses the oldest."""
-IMAGES_HZ: Final = 10.0
 CHANNELS_MAX: Final = 128
 """Most topics, enough for about ten hands."""
 
@@ -58,7 +57,7 @@ class LiveServer:
         if hand not in self._viewers:
             if len(self._viewers) >= CHANNELS_MAX:
                 return
-            self._viewers[hand] = Viewer(IMAGES_HZ)
+            self._viewers[hand] = Viewer()
         for made, content in self._viewers[hand].of(kind, message, now_ns):
             self._log(made, hand, content, now_ns)
 

@@ -49,8 +49,6 @@ QUEUE_MAX: Final = 20_000
 """Most queued entries: 12 MB, a minute of readings. Later ones are dropped."""
 RETRY_NS: Final = 60_000_000_000
 """Time after a failure of the disk until the next try, ns."""
-IMAGES_HZ: Final = 10.0
-"""Rate of tactile images for viewers, 1/s."""
 ROUNDS_PER_FLUSH: Final = 10
 """Rounds of the thread in a flush interval; few, so that it rarely delays the loop."""
 FLUSH_AFTER: Final = 0.8
@@ -114,7 +112,7 @@ class Recorder(Companion):
         self._queue: deque[_Entry] = deque()
         self._names = {topic: f"{topic}.{hand}".encode() for topic in Topic}
         self._last_topic = b""
-        self._viewer = Viewer(IMAGES_HZ)
+        self._viewer = Viewer()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
         self._open: _Open | None = None

@@ -92,13 +92,17 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
     line: int = 0
 
 
+IMAGES_HZ: Final = 10.0
+"""Rate of tactile images, 1/s: fast enough to watch, a tenth of the readings."""
+
+
 class Viewer:
     """Makes Foxglove's log lines and images from the messages of one hand.
 
     Images are relative to the resting counts of each finger, which it learns.
     """
 
-    def __init__(self, images_hz: float) -> None:
+    def __init__(self, images_hz: float = IMAGES_HZ) -> None:
         """Draw at most `images_hz` images a second; 0 draws none."""
         self._period_ns = round(1e9 / images_hz) if images_hz else None
         self._due_ns = 0

@@ -252,3 +252,14 @@ def test_a_signal_is_waited_for_above_descriptor_1024() -> None:
         assert not stop.wait(0.0)
         signal.raise_signal(signal.SIGTERM)
         assert stop.wait(100.0)
+
+
+@pytest.mark.parametrize(("handler", "ends"), [(signal.SIG_DFL, True), (signal.SIG_IGN, False)])
+def test_a_hangup_stops_unless_it_is_ignored(handler: signal.Handlers, ends: bool) -> None:
+    former = signal.signal(signal.SIGHUP, handler)
+    try:
+        with StopSignal() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert (stop.received is signal.SIGHUP) is ends
+    finally:
+        signal.signal(signal.SIGHUP, former)
