@@ -51,7 +51,7 @@ class CanBridgeDriver(Opened):
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`fingers` and `board`: see `graspd.drivers.can.stream.SampleDecoder`.
+        """`fingers` and `board`: see `graspd.drivers.can.stream.CanStream`.
 
         `bitrate`: bit/s; not for socketcan, where `ip link` sets it.
         """

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 import msgspec
 
 from graspd.drivers.base import DriverCounters
-from graspd.drivers.biotac import channel_of, sample_command
+from graspd.drivers.biotac import sample_command
 
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
@@ -69,13 +68,6 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
 
 Stamped = tuple[CanFrame, int, int]
 """A frame or the marker `LOST`, and the two monotonic times, ns, between which it arrived."""
-
-
-class Reject(StrEnum):
-    """Reason why a frame is not a sample; the values are names of `CanCounters`."""
-
-    LENGTH = "wrong_length_frames"
-    COMMAND = "unknown_commands"
 
 
 @dataclass(slots=True)
@@ -164,16 +156,6 @@ def describe_error(frame: CanFrame) -> str:
 def encode_sample(channel: int, words: bytes) -> bytes:
     """Return the data of a frame. Raises `ValueError` for an unknown channel."""
     return bytes((sample_command(channel),)) + words
-
-
-def parse_sample(frame: CanFrame, sensors: int, length: int) -> tuple[int, bytes] | Reject:
-    """Return channel and response words of a frame of `length` bytes, padding included."""
-    if len(frame.data) != length:
-        return Reject.LENGTH
-    channel = channel_of(frame.data[0])
-    if channel is None:
-        return Reject.COMMAND
-    return channel, frame.data[1 : 1 + WORD_BYTES * sensors]
 
 
 def sample_length(sensors: int, length: int | None) -> int:

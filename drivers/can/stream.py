@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, TypedDict, Unpack
+from typing import Final, TypedDict
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from graspd.drivers.base import (
     TactileReading,
     sensor_rows,
 )
-from graspd.drivers.biotac import SEQUENCES, decode_words
+from graspd.drivers.biotac import SEQUENCES, channel_of, decode_words
 from graspd.drivers.can.frames import (
     ERROR,
     EXTENDED,
@@ -26,12 +26,10 @@ from graspd.drivers.can.frames import (
     STANDARD_ID_MAX,
     CanCounters,
     CanFrame,
-    Reject,
     Stamped,
     describe_error,
     is_bus_off,
     is_overflow,
-    parse_sample,
     sample_length,
 )
 from graspd.drivers.can.samples import SampleAssembler
@@ -41,6 +39,15 @@ NAME: Final = "can"
 _SPECIAL: Final = ERROR | REMOTE | LOST
 
 
+class BoardOptions(TypedDict, total=False):
+    """Options of `CanStream` that describe a board."""
+
+    sensors: Sequence[str] | None
+    arbitration_id: int | None
+    sequence: str
+    data_length: int | None
+
+
 class CanStream:
     """Decoder of one bus; `link` is up while the configured board sends.
 
@@ -48,8 +55,23 @@ class CanStream:
     the frames that arrive, and `lost` when the bus is gone. All times are monotonic ns.
     """
 
-    def __init__(self, bus: str, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
-        """`bus`: name of the bus in messages. `fingers` and `board`: see `SampleDecoder`."""
+    def __init__(
+        self,
+        bus: str,
+        fingers: Sequence[str],
+        *,
+        sensors: Sequence[str] | None = None,
+        arbitration_id: int | None = None,
+        sequence: str = "interleaved",
+        data_length: int | None = None,
+    ) -> None:
+        """`bus`: its name in messages. Raises `ValueError` for options that do not fit.
+
+        `fingers`: the rows of a reading. `sensors`: the fingers in the order of the board's words,
+        three at most; None: `fingers`. `arbitration_id`: above 0x7FF it has 29 bits. None: that of
+        the first sound sample, until the link is lost; use that for bring-up only. `sequence`: a
+        key of `SEQUENCES`. `data_length`: bytes of a frame that the board pads.
+        """
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None
@@ -57,16 +79,23 @@ class CanStream:
         self._where = bus
         self._accepted = 0
         self._silent_at_ns = 0
-        self._decoder = SampleDecoder(fingers, self.counters, **board)
+        rows = sensor_rows(fingers, sensors)
+        count = len(fingers if sensors is None else sensors)
+        self._length = sample_length(count, data_length)
+        self._words_end = sample_length(count, None)
+        self._configured_id = self.arbitration_id = arbitration_id
+        """Id of the frames that are decoded; None: not known yet."""
+        self._flags = 0 if (arbitration_id or 0) <= STANDARD_ID_MAX else EXTENDED
+        self._sweeps = SampleAssembler(count, SEQUENCES[sequence], self.counters, rows)
 
     @property
     def period_ns(self) -> int | None:
-        return self._decoder.sweeps.period_ns
+        return self._sweeps.period_ns
 
     @property
     def expected_ns(self) -> int | None:
         """Time when the next reading should be complete, ns; None: not known yet."""
-        return self._decoder.sweeps.expected_ns
+        return self._sweeps.expected_ns
 
     @property
     def silent_at_ns(self) -> int | None:
@@ -77,8 +106,8 @@ class CanStream:
         facts = {"bus": Fact(self._where), **self.link.describe()}
         if self.last_error is not None:
             facts["last error"] = Fact(self.last_error, DeviceFault.BUS_ERROR)
-        if self._decoder.arbitration_id is not None:
-            facts["arbitration id"] = Fact(f"{self._decoder.arbitration_id:#x}")
+        if self.arbitration_id is not None:
+            facts["arbitration id"] = Fact(f"{self.arbitration_id:#x}")
         return facts
 
     def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], LinkError | None]:
@@ -88,11 +117,11 @@ class CanStream:
         self.counters.frames += sum(frame.flags != LOST for frame, _, _ in frames)
         for frame, t_ns, until_ns in frames:
             if not frame.flags & _SPECIAL:
-                readings += self._decoder.push(frame, t_ns, until_ns)
+                readings += self.push(frame, t_ns, until_ns)
                 continue
             trouble = self._take_special(frame) or trouble
             if frame.flags & LOST or is_overflow(frame):
-                readings += self._decoder.sweeps.cut()
+                readings += self._sweeps.cut()
         return readings, trouble
 
     def watch(self, now_ns: int, *, more: bool = False) -> None:
@@ -118,8 +147,9 @@ class CanStream:
         self._down(error, now_ns)
 
     def interrupt(self) -> None:
-        """Drop the current sweep. Call when the next frames will be missing."""
-        self._decoder.interrupt()
+        """Drop the current sweep. Another board may come next."""
+        self._sweeps.interrupt()
+        self.arbitration_id = self._configured_id
 
     def _down(self, error: LinkError, now_ns: int) -> None:
         self.interrupt()
@@ -139,45 +169,6 @@ class CanStream:
         self.counters.bus_off += 1
         return LinkError(LinkCause.BUS_OFF, "bus-off")
 
-
-class BoardOptions(TypedDict, total=False):
-    """Options of `SampleDecoder` that describe a board."""
-
-    sensors: Sequence[str] | None
-    arbitration_id: int | None
-    sequence: str
-    data_length: int | None
-
-
-class SampleDecoder:
-    """Decoder of the frames of SynTouch's board."""
-
-    def __init__(
-        self,
-        fingers: Sequence[str],
-        counters: CanCounters,
-        *,
-        sensors: Sequence[str] | None = None,
-        arbitration_id: int | None = None,
-        sequence: str = "interleaved",
-        data_length: int | None = None,
-    ) -> None:
-        """`fingers`: the rows of a reading. Raises `ValueError` for options that do not fit.
-
-        `sensors`: the fingers in the order of the board's words, three at most; None: `fingers`.
-        `arbitration_id`: above 0x7FF it has 29 bits. None: that of the first sound sample, until
-        the link is lost; use that for bring-up only. `sequence`: a key of `SEQUENCES`.
-        `data_length`: bytes of a frame that the board pads.
-        """
-        rows = sensor_rows(fingers, sensors)
-        self._sensors = len(fingers if sensors is None else sensors)
-        self._length = sample_length(self._sensors, data_length)
-        self._configured_id = self.arbitration_id = arbitration_id
-        """Id of the frames that are decoded; None: not known yet."""
-        self._flags = 0 if (arbitration_id or 0) <= STANDARD_ID_MAX else EXTENDED
-        self._counters = counters
-        self.sweeps = SampleAssembler(self._sensors, SEQUENCES[sequence], counters, rows)
-
     def push(
         self, frame: CanFrame, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
@@ -185,30 +176,26 @@ class SampleDecoder:
 
         It arrived at `t_ns`, or between `t_ns` and `until_ns` if that is given.
         """
-        identifier = self.arbitration_id
+        identifier, counters = self.arbitration_id, self.counters
         if identifier is not None and (
             frame.arbitration_id != identifier or frame.flags & EXTENDED != self._flags
         ):
-            self._counters.foreign_frames += 1
+            counters.foreign_frames += 1
             return ()
-        sample = parse_sample(frame, self._sensors, self._length)
-        if isinstance(sample, Reject):
-            counter = "foreign_frames" if identifier is None else sample.value
-            setattr(self._counters, counter, getattr(self._counters, counter) + 1)
-            return ()
-        channel, words = sample
+        fits = len(frame.data) == self._length
+        channel = channel_of(frame.data[0]) if fits else None
+        words = frame.data[1 : self._words_end]
         if identifier is None:
-            if not _is_sound(words):
-                self._counters.foreign_frames += 1
+            if channel is None or not _is_sound(words):
+                counters.foreign_frames += 1
                 return ()
             self.arbitration_id, self._flags = frame.arbitration_id, frame.flags & EXTENDED
-        self._counters.accepted_frames += 1
-        return self.sweeps.push(channel, words, t_ns, until_ns)
-
-    def interrupt(self) -> None:
-        """Drop the current sweep. Another board may come next."""
-        self.sweeps.interrupt()
-        self.arbitration_id = self._configured_id
+        elif channel is None:
+            counters.wrong_length_frames += not fits
+            counters.unknown_commands += fits
+            return ()
+        counters.accepted_frames += 1
+        return self._sweeps.push(channel, words, t_ns, until_ns)
 
 
 def _is_sound(words: bytes) -> bool:

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from graspd.drivers.base import Reading
 from graspd.drivers.biotac import SEQUENCES
-from graspd.drivers.can.frames import CanCounters, CanFrame, encode_sample
-from graspd.drivers.can.stream import SampleDecoder
+from graspd.drivers.can.frames import CanFrame, encode_sample
+from graspd.drivers.can.stream import CanStream
 from graspd.drivers.joints import JointMessage, JointStream
 from graspd.drivers.link import LinkState
 from graspd.drivers.palm.stream import PalmStream
@@ -76,8 +76,8 @@ def palm(first: int) -> Feed:
 
 def samples(sequence: str) -> Callable[[int], Feed]:
     def begin(_first: int) -> Feed:
-        decoder = SampleDecoder(FINGERS, CanCounters(), arbitration_id=BASE_ID, sequence=sequence)
-        return lambda unit: decoder.push(sample(unit, SEQUENCES[sequence]), unit.at * SLOT_NS)
+        stream = CanStream("bus", FINGERS, arbitration_id=BASE_ID, sequence=sequence)
+        return lambda unit: stream.push(sample(unit, SEQUENCES[sequence]), unit.at * SLOT_NS)
 
     return begin
 

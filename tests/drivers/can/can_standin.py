@@ -15,7 +15,7 @@ import pytest
 from graspd.drivers.base import TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.frames import CanCounters, CanFrame, encode_sample
-from graspd.drivers.can.stream import SampleDecoder
+from graspd.drivers.can.stream import CanStream
 from graspd.drivers.kernel_stamps import SO_TIMESTAMPNS
 from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from graspd.drivers.twins.faults import LinkFaults
@@ -170,13 +170,12 @@ class TwinLink:
 
 def decoder(
     arbitration_id: int | None = SAMPLE_ID, data_length: int | None = None
-) -> tuple[SampleDecoder, CanCounters]:
-    counters = CanCounters()
-    made = SampleDecoder(
+) -> tuple[CanStream, CanCounters]:
+    made = CanStream(
+        "bus",
         ("ff", "mf", "th"),
-        counters,
         arbitration_id=arbitration_id,
         sequence="electrodes",
         data_length=data_length,
     )
-    return made, counters
+    return made, made.counters

@@ -16,15 +16,13 @@ from graspd.drivers.can.frames import (
     REMOTE,
     CanCounters,
     CanFrame,
-    Reject,
     describe_error,
     encode_sample,
     is_bus_off,
     is_overflow,
-    parse_sample,
     unpack_frame,
 )
-from graspd.drivers.can.stream import SampleDecoder
+from graspd.drivers.can.stream import CanStream
 from graspd.drivers.twins.can import SAMPLE_ID
 from tests.conftest import ROOT
 from tests.drivers.can.can_standin import decoder
@@ -42,12 +40,10 @@ def dbc() -> Database:
 
 
 def test_the_real_formats_sample_is_read_and_written() -> None:
-    sample = parse_sample(CanFrame(0x100, E1_SAMPLE), 3, 7)
-    assert not isinstance(sample, Reject)
-    channel, words = sample
-    assert channel == 17
-    assert words == word(2602) + word(2713) + word(2391)
-    assert encode_sample(17, words) == E1_SAMPLE
+    assert encode_sample(17, word(2602) + word(2713) + word(2391)) == E1_SAMPLE
+    made, counters = decoder()
+    made.push(CanFrame(0x100, E1_SAMPLE), 0)
+    assert counters.accepted_frames == 1
 
 
 def test_the_dbc_file_reads_the_real_formats_sample(dbc: Database) -> None:
@@ -192,10 +188,8 @@ def with_sensors(
     fingers: Sequence[str], spoilt: Mapping[int, bytes] | None = None
 ) -> tuple[list[TactileReading], CanCounters]:
     """What becomes of two sweeps of `ORDER`. `spoilt`: words of channels of the first sweep."""
-    counters = CanCounters()
-    made = SampleDecoder(
-        fingers, counters, sensors=ORDER, arbitration_id=SAMPLE_ID, sequence="electrodes"
-    )
+    made = CanStream("bus", fingers, sensors=ORDER, arbitration_id=SAMPLE_ID, sequence="electrodes")
+    counters = made.counters
     changed = [(at, (spoilt or {}).get(at, words), t_ns) for at, words, t_ns in samples(0)]
     readings: list[TactileReading] = []
     for channel, words, t_ns in (*changed, *samples(1)):
@@ -230,4 +224,4 @@ def test_a_damaged_word_is_flagged_at_its_finger_only(
 )
 def test_sensors_that_cannot_be_are_refused(sensors: Sequence[str], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        SampleDecoder(("ff", "mf", "th"), CanCounters(), sensors=sensors)
+        CanStream("bus", ("ff", "mf", "th"), sensors=sensors)
