@@ -22,7 +22,7 @@ from graspd.daemon.judge.decision import (
 from graspd.daemon.judge.health import Health
 from graspd.daemon.judge.reasons import OPEN, WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
-from graspd.daemon.trust.trust import RiskReport
+from graspd.daemon.trust.trust import RiskFigures
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.models.contract import ModelError
 from graspd.models.judge.grasp_judge import NO_OPINION, Examined, GraspJudge, Opinion, Refusal
@@ -52,7 +52,7 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
     """Answer of the network for the grasp, maybe of an earlier reading."""
     assessment: Assessment | None = None
     """Worth of `opinion` now; None: without learning and without a risk."""
-    risk: RiskReport | None = None
+    risk: RiskFigures | None = None
     """Outcomes of `stable` lifts before this verdict; None like `assessment`."""
     supervised: bool = False
     """True if its lift, watched, would teach what is not known: ask for it."""

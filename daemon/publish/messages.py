@@ -15,7 +15,6 @@ from msgspec.structs import replace
 from graspd.biotac import Finger
 from graspd.daemon.judge.reasons import Decision, FingerState, GateCause, GateState, Reason
 from graspd.daemon.trust.lift_book import OutcomeStatus
-from graspd.daemon.trust.trust import RiskReport
 
 WIRE_VERSION: Final = 1
 
@@ -50,6 +49,27 @@ class _Message(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """Wall-clock time, seconds since 1970, for plots and people only."""
     t_mono_ns: Count
     """Monotonic time, ns."""
+
+
+class RiskReport(msgspec.Struct, frozen=True):
+    """Outcomes of `stable` lifts so far, for a controller that decides to lift."""
+
+    target: Probability | None
+    """`[risk] max_slip_when_stable`; null: none is set."""
+    lifts: Count
+    """Lifts of `stable` verdicts whose outcome was told."""
+    slips: Count
+    """Slips among them."""
+    outstanding: Count
+    """`stable` verdicts whose outcome can still come; each may add one slip to the bound."""
+    bound: Annotated[float, msgspec.Meta(ge=0.0)] | None
+    """Upper bound of `slips` without `outstanding`; null: no risk is set."""
+    warm_up_left: Count
+    """Outcomes that are missing until the warm-up is over; 0 without a risk."""
+    announced: Count = 0
+    """`lift` questions that were answered `stable`, one a grasp."""
+    awaited: Count = 0
+    """Those of them whose outcome is out. From `[risk] outstanding_max` on nothing is `stable`."""
 
 
 class Verdict(_Message, frozen=True, kw_only=True):

@@ -9,8 +9,6 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
-import msgspec
-
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.process.text import Colour, coloured, printable
 from graspd.daemon.publish.companion import Companion, PublishedVerdict
@@ -205,7 +203,7 @@ class RunSummary:
             "gated": self._gated(),
             "repaired": self.repaired,
             "outcomes": 0 if trust is None else trust.learner.outcomes,
-            "risk": None if trust is None else msgspec.to_builtins(trust.report()),
+            "risk": None if trust is None else trust.report()._asdict(),
             "trained_on": list(self.trained_on),
             "latency_us": self.latency.spread_us(),
             "wall_s": wall_s,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Annotated, Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,7 +23,7 @@ from graspd.daemon.trust.lift_book import (
 )
 from graspd.models.trust.assessment import Assessment, assess
 from graspd.models.trust.learner import Learner, LearnerState
-from graspd.models.trust.risk import Count, Permission, Risk, RiskLimits, RiskState
+from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskState
 
 VERSION: Final = 2
 """Format of a state. In format 1 the learner had no residual."""
@@ -36,25 +36,17 @@ class FormatError(ValueError):
     """A state is of another format: another graspd kept it."""
 
 
-class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcomes of `stable` lifts so far, for a controller that decides to lift."""
+class RiskFigures(NamedTuple):
+    """Outcomes of `stable` lifts at one moment; `RiskReport` of the messages says what each is."""
 
-    target: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] | None
-    """`[risk] max_slip_when_stable`; null: none is set."""
-    lifts: Count
-    """Lifts of `stable` verdicts whose outcome was told."""
-    slips: Count
-    """Slips among them."""
-    outstanding: Count
-    """`stable` verdicts whose outcome can still come; each may add one slip to the bound."""
-    bound: Annotated[float, msgspec.Meta(ge=0.0)] | None
-    """Upper bound of `slips` without `outstanding`; null: no risk is set."""
-    warm_up_left: Count
-    """Outcomes that are missing until the warm-up is over; 0 without a risk."""
-    announced: Count = 0
-    """`lift` questions that were answered `stable`, one a grasp."""
-    awaited: Count = 0
-    """Those of them whose outcome is out. From `[risk] outstanding_max` on nothing is `stable`."""
+    target: float | None
+    lifts: int
+    slips: int
+    outstanding: int
+    bound: float | None
+    warm_up_left: int
+    announced: int
+    awaited: int
 
     @property
     def beyond_share(self) -> float:
@@ -132,9 +124,9 @@ class Trust:
                 self.learner.learn(np.frombuffer(lift.features, "<f8"), slipped=slipped)
         return status
 
-    def report(self) -> RiskReport:
+    def report(self) -> RiskFigures:
         """Return the outcomes of the lifts of `stable` verdicts until now."""
-        return RiskReport(
+        return RiskFigures(
             target=self.risk.limits.max_slip_when_stable,
             lifts=self.risk.lifts,
             slips=self.risk.slips,

@@ -11,9 +11,8 @@ import pytest
 from msgspec import structs
 
 from graspd.daemon.judge.reasons import ADVICE, Decision, GateState, Reason
-from graspd.daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
+from graspd.daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, RiskReport, encode
 from graspd.daemon.trust.lift_book import OutcomeStatus
-from graspd.daemon.trust.trust import RiskReport
 from graspd.daemon.watch.figures import SUPERVISED
 from graspd.daemon.watch.snapshot import Line, Snapshot, Tone
 from graspd.daemon.watch.view import History

@@ -11,9 +11,8 @@ from msgspec import structs
 from rich.console import Console
 
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.publish.messages import DECISION_CODE, LearnerHealth, encode
+from graspd.daemon.publish.messages import DECISION_CODE, LearnerHealth, RiskReport, encode
 from graspd.daemon.trust.lift_book import OutcomeStatus
-from graspd.daemon.trust.trust import RiskReport
 from graspd.daemon.watch.snapshot import Snapshot
 from graspd.daemon.watch.terminal import draw
 from graspd.daemon.watch.view import View
