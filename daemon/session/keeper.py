@@ -10,7 +10,6 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from msgspec.structs import replace
 
 from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.exchange import Exchanged
@@ -47,7 +46,6 @@ BUSY: Final = Reply(Told.BUSY, "too many wait for the disk, tell it again")
 HANGS: Final = Reply(Told.NOT_KEPT, "the disk does not answer")
 UNEXPECTED: Final = "it could not be written"
 SEEDED: Final = "the seeded session names no sensors: it is used once %d grasps fit it"
-
 
 Sessions = tuple[KeptSession, ...]
 """All that is saved: the session that runs, then the others."""
@@ -230,7 +228,8 @@ class SessionKeeper(SensorWatch):
 
     def _with_rest(self, rest: Rest, *, is_known: bool) -> KeptSession | None:
         is_known = is_known or (self._rest is None and not self._now().is_empty)
-        now = replace(self._now(), rest=tuple(rest.ravel().tolist()))
+        resting = tuple(rest.ravel().tolist())
+        now = KeptSession(None, self._fingers, numbers(self._serials), rest=resting)
         for each in self._others:
             is_seed = is_of_unknown_sensors(each)
             if self._fits(each) if is_seed else not is_known and is_of_sensors(each, now):
@@ -279,7 +278,7 @@ class SessionKeeper(SensorWatch):
         self._unused = trust
         self._serials, self._rest = numbers(former.serials), self._rest_of(former.rest)
         grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
-        log.warning("these sensors were there before: their session%s goes on", grasps)
+        log.warning("these sensors were there before: their session%s continues", grasps)
         return True
 
 
