@@ -71,7 +71,7 @@ class GraspModel:
         with self._turn:
             self._begin(session)
             for row, values in enumerate(judged):
-                p_slip = self._judge.weigh(self._examine(values)).p_slip
+                p_slip = self._judge.judge(self._examine(values)).p_slip
                 if p_slip is not None:
                     probabilities[row] = 1.0 - p_slip, p_slip
         return probabilities
@@ -94,7 +94,7 @@ class GraspModel:
         elif session is not None:
             for values in self._counts(session):
                 examined = self._examine(values)
-                self._judge.observe(examined, self._judge.weigh(examined))
+                self._judge.observe(examined, self._judge.judge(examined))
         if not calibration.calibrated:
             warnings.warn(
                 f"{self.name} does not know the sensors of this day: its probabilities mean little "

@@ -210,7 +210,7 @@ class Pipeline:
         examined = None
         if counts is not None:
             examined = self._judge.examine(counts, checked.broken)
-            self._opinion, self._assessment = self._judge.weigh(examined), None
+            self._opinion, self._assessment = self._judge.judge(examined), None
             if checked.broken is not None:
                 counts = None
         elif moment.state is not GateState.JUDGED:

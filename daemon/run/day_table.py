@@ -49,7 +49,7 @@ class DayTable(Companion):
         note = None if reading is None else reading.annotation
         if reading is None or note is None or note.slipped is None:
             return
-        p_slip = self._published.weigh(Examined(reading.counts)).p_slip
+        p_slip = self._published.judge(Examined(reading.counts)).p_slip
         if p_slip is None:
             said = Decision.UNKNOWN
         else:

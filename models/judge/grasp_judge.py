@@ -126,25 +126,14 @@ class GraspJudge:
         contract = model.contract
         return cls(model, contract.input, contract.fingers, contract.seen, slip_threshold)
 
-    def judge(self, counts: NDArray[np.uint16], broken: NDArray[np.bool_] | None = None) -> Opinion:
-        """Return the opinion on the counts of a held grasp, shape (fingers, 24).
-
-        `broken`: True for electrodes that are known to be broken, same shape; None: none.
-        """
-        return self.weigh(self.examine(counts, broken))
-
-    def observe(self, examined: Examined, opinion: Opinion) -> None:
-        """Have the session take in a grasp with the opinion on it, if it may learn from it."""
-        if self.session is None or examined.grasp is None:
-            return
-        p_slip = opinion.p_slip
-        slip = None if p_slip is None else p_slip >= self._slip_threshold
-        self.session.observe(examined.grasp, slip=slip)
-
     def examine(
         self, counts: NDArray[np.uint16], broken: NDArray[np.bool_] | None = None
     ) -> Examined:
-        """Return the counts to judge, or why they must not be; see `judge`."""
+        """Return the counts of a held grasp for `judge`: repaired, or refused.
+
+        `counts`: as read, shape (fingers, 24). `broken`: True for electrodes that are known to be
+        broken, same shape; None: none.
+        """
         session = self.session
         values = counts.astype(np.float64)
         if _is_flat(values, broken):
@@ -175,7 +164,7 @@ class GraspJudge:
             return Examined(judged, Refusal.NEVER_SEEN, (), grasp if learned else None)
         return Examined(judged, None, repaired, grasp)
 
-    def weigh(self, examined: Examined) -> Opinion:
+    def judge(self, examined: Examined) -> Opinion:
         """Return the network's opinion on examined counts, or why there is none."""
         network, repaired = self._network, examined.repaired
         if examined.refusal is not None:
@@ -197,6 +186,14 @@ class GraspJudge:
             log_odds = self._log_threshold + (margin - self._log_threshold) / temperature
             p_slip = 1.0 / (1.0 + math.exp(-log_odds))
         return Opinion(p_slip, None, repaired, margin)
+
+    def observe(self, examined: Examined, opinion: Opinion) -> None:
+        """Have the session take in a grasp with the opinion on it, if it may learn from it."""
+        if self.session is None or examined.grasp is None:
+            return
+        p_slip = opinion.p_slip
+        slip = None if p_slip is None else p_slip >= self._slip_threshold
+        self.session.observe(examined.grasp, slip=slip)
 
     def prepare(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
         """Write the network's input for counts (fingers, 24); return each finger's spread."""

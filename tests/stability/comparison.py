@@ -239,7 +239,7 @@ class Comparison:
         if judge.session is not None and self._state is not None:
             judge.session.restore(self._state)
         for reading in counts:
-            found = judge.weigh(Examined(reading))
+            found = judge.judge(Examined(reading))
             refused = () if found.refusal is None else (Reason(found.refusal),)
             decision, reasons = decide(found.p_slip, refused, HELD, 0, LIMITS)
             said.add(decision, found.p_slip, reasons, self.model)

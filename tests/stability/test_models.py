@@ -174,7 +174,7 @@ def test_inputs_and_probabilities_keep_their_bounds_over_the_12_bit_space(
 
     judge = GraspJudge.of(model)
     judge.session = None  # no softening
-    said = judge.weigh(Examined(counts))
+    said = judge.judge(Examined(counts))
     if said.p_slip is None:
         assert said.refusal
         assert min(exact_spread) < 1.0 + 1e-9

@@ -73,7 +73,7 @@ class Day:
     def judge(self, counts: NDArray[np.uint16]) -> tuple[float, bool]:
         """Return log-odds of slip and True if refused; then learn from the grasp."""
         examined = self.judge_of.examine(counts)
-        opinion = self.judge_of.weigh(examined)
+        opinion = self.judge_of.judge(examined)
         if opinion.refusal is not None:
             self.judge_of.prepare(counts)
             self.network.run()

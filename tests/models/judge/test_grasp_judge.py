@@ -45,14 +45,14 @@ def session(temperature: float) -> SessionCalibration:
 
 @pytest.mark.parametrize("p_slip", [0.01, 0.2, 0.5, 0.8, 0.99])
 def test_a_margin_is_the_log_odds_of_slip(p_slip: float) -> None:
-    opinion = judge_of(FakeModel(p_slip)).weigh(Examined(COUNTS))
+    opinion = judge_of(FakeModel(p_slip)).judge(Examined(COUNTS))
     assert (opinion.p_slip, opinion.refusal) == (p_slip, None)
     assert opinion.margin == pytest.approx(logit(p_slip))
 
 
 @pytest.mark.parametrize(("p_slip", "sign"), [(0.0, -1), (1.0, 1)])
 def test_a_sure_answer_has_a_finite_margin(p_slip: float, sign: int) -> None:
-    opinion = judge_of(FakeModel(p_slip)).weigh(Examined(COUNTS))
+    opinion = judge_of(FakeModel(p_slip)).judge(Examined(COUNTS))
     assert opinion.p_slip == p_slip
     assert opinion.margin == pytest.approx(sign * 12 * math.log(10))
 
@@ -77,7 +77,7 @@ def test_a_sure_answer_has_a_finite_margin(p_slip: float, sign: int) -> None:
 def test_probabilities_are_in_0_to_1_and_sum_to_one(
     p_stable: float, p_slip: float, sound: bool
 ) -> None:
-    opinion = judge_of(Answers(p_stable, p_slip)).weigh(Examined(COUNTS))
+    opinion = judge_of(Answers(p_stable, p_slip)).judge(Examined(COUNTS))
     assert opinion.p_slip == (p_slip if sound else None)
     assert opinion.refusal == (None if sound else Refusal.MODEL_FAILED)
 
@@ -90,7 +90,7 @@ def test_a_young_session_is_less_sure_on_the_same_side(
 ) -> None:
     judge = judge_of(FakeModel(p_slip), threshold)
     judge.session = session(temperature)
-    opinion = judge.weigh(Examined(COUNTS))
+    opinion = judge.judge(Examined(COUNTS))
     assert opinion.p_slip is not None
     expected = logit(threshold) + (logit(p_slip) - logit(threshold)) / temperature
     assert logit(opinion.p_slip) == pytest.approx(expected)
@@ -100,7 +100,7 @@ def test_a_young_session_is_less_sure_on_the_same_side(
 
 def test_a_refused_grasp_is_kept_from_the_network() -> None:
     model = FakeModel()
-    opinion = judge_of(model).weigh(Examined(COUNTS, Refusal.NEVER_SEEN, ("ff_1",), COUNTS))
+    opinion = judge_of(model).judge(Examined(COUNTS, Refusal.NEVER_SEEN, ("ff_1",), COUNTS))
     assert (opinion.p_slip, opinion.refusal, opinion.repaired) == (
         *(None, Refusal.NEVER_SEEN),
         ("ff_1",),
@@ -120,7 +120,7 @@ def test_a_finger_that_reads_about_the_same_everywhere_is_flat(
     counts[finger] = 2000 + swing * (-1) ** np.arange(24)
     counts[finger, :broken] = 0
     mask[finger, :broken] = True
-    assert (judge_of(FakeModel()).judge(counts, mask).refusal is Refusal.FLAT) == flat
+    assert (judge_of(FakeModel()).examine(counts, mask).refusal is Refusal.FLAT) == flat
 
 
 @pytest.mark.parametrize(("swing", "flat"), [(0, True), (2, False)])
@@ -128,7 +128,7 @@ def test_a_finger_without_an_image_is_not_judged(swing: int, flat: bool) -> None
     """Its electrodes differ by less than a count (standard deviation)."""
     counts, model = COUNTS.copy(), FakeModel(0.2)
     counts[1] = 2000 + swing * (-1) ** np.arange(24)
-    opinion = judge_of(model).weigh(Examined(counts))
+    opinion = judge_of(model).judge(Examined(counts))
     assert (opinion.p_slip, opinion.refusal) == ((None, Refusal.FLAT) if flat else (0.2, None))
     assert model.runs == (0 if flat else 1)
 
@@ -137,7 +137,7 @@ def test_a_session_model_is_asked_about_what_its_session_standardises() -> None:
     judge = GraspJudge.of(TactileModel(zoo.find("small-session")))
     judge.session = known = session(1.0)
     known.features_mean, known.features_spread = np.arange(78.0), np.linspace(1.0, 900.0, 78)
-    assert judge.weigh(Examined(COUNTS)).p_slip is not None
+    assert judge.judge(Examined(COUNTS)).p_slip is not None
     z = (COUNTS - COUNTS.mean(axis=1, keepdims=True)) / COUNTS.std(axis=1, keepdims=True)
     features = np.concatenate((z.ravel(), COUNTS.mean(axis=1), COUNTS.std(axis=1)))
     expected = (features - np.arange(78.0)) / np.linspace(1.0, 900.0, 78)
