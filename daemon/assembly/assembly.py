@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from graspd.biotac import Finger
 from graspd.daemon.assembly.plan import Plan, is_mcap
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Pipeline
@@ -178,52 +177,38 @@ def _section(name: str) -> Iterator[None]:
 
 
 def _tactile(plan: Plan) -> Driver:
-    scene = plan.scene
-    match scene.tactile:
-        case ReplayTactile() as options:
+    fingers, joints = plan.scene.hand.fingers, plan.scene.joints
+    options = plan.scene.tactile
+    arguments = options.model_dump(exclude={"driver"})
+    match options:
+        case ReplayTactile():
             return _replay(plan, options)
-        case SpiTactile() as options:
+        case SpiTactile():
             from graspd.drivers.spi.driver import SpiBridgeDriver
 
-            arguments = options.model_dump(exclude={"driver"})
-            return SpiBridgeDriver(fingers=scene.hand.fingers, **arguments)
-        case CanTactile() as options:
+            return SpiBridgeDriver(fingers=fingers, **arguments)
+        case CanTactile():
             from graspd.drivers.can.driver import CanBridgeDriver
 
-            arguments = options.model_dump(exclude={"driver"})
-            return CanBridgeDriver(fingers=scene.hand.fingers, **arguments)
-        case PalmTactile() as options:
-            return _palm(scene, options)
+            return CanBridgeDriver(fingers=fingers, **arguments)
+        case PalmTactile():
+            from graspd.drivers.palm.stream import PalmDriver
 
-
-def _palm(scene: Scene, options: PalmTactile) -> Driver:
-    from graspd.drivers.palm.stream import PalmDriver
-
-    joints = scene.joints
-    return PalmDriver(
-        fingers=scene.hand.fingers,
-        calibration=joints.calibration if isinstance(joints, PalmJoints) else None,
-        **options.model_dump(exclude={"driver"}),
-    )
+            calibration = joints.calibration if isinstance(joints, PalmJoints) else None
+            return PalmDriver(fingers=fingers, calibration=calibration, **arguments)
 
 
 def _replay(plan: Plan, options: ReplayTactile) -> Driver:
     fingers, speed = plan.scene.hand.fingers, 1.0 if options.pace == "realtime" else None
     if is_mcap(options):
-        return _replay_mcap(fingers, options, speed)
+        if options.loop or options.outcomes:
+            raise ValueError("MCAP files are replayed as they are: no loop or outcomes")
+        from graspd.daemon.record.player import McapReplayDriver
+
+        return McapReplayDriver(options.recordings, fingers, speed=speed)
     from graspd.drivers.recordings.csv_player import ReplayDriver
     from graspd.drivers.recordings.csv_rows import SLIPPED
 
     if options.outcomes and plan.without_outcomes:
         raise ValueError(f"outcomes needs the column `{SLIPPED}` in every recording")
     return ReplayDriver(options.recordings, fingers, speed=speed, loop=options.loop)
-
-
-def _replay_mcap(fingers: Sequence[Finger], options: ReplayTactile, speed: float | None) -> Driver:
-    if options.loop:
-        raise ValueError("MCAP files are replayed as they are: no loop")
-    if options.outcomes:
-        raise ValueError("MCAP files have no outcomes to tell: outcomes is for CSV files")
-    from graspd.daemon.record.player import McapReplayDriver
-
-    return McapReplayDriver(options.recordings, fingers, speed=speed)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 import uuid
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -27,10 +28,7 @@ from graspd.models.runtime import TactileModel
 if TYPE_CHECKING:
     from graspd.daemon.record.link_log import Tap
     from graspd.daemon.record.mcap import RecordingHeader
-    from graspd.daemon.record.player import McapReplayDriver
     from graspd.daemon.record.recorder import Recorder
-    from graspd.daemon.session.folder import SessionFolder
-    from graspd.drivers.recordings.player import LinkLogDriver
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,32 +41,28 @@ class Parts:
     drivers: list[Driver]
     """All drivers, the tactile one first."""
     boot_id: str | None = None
-    """Id of the daemon's start that made the recording; None: this start."""
+    """Id of the daemon's start whose recording is judged; None: this start."""
 
     @property
     def scene(self) -> Scene:
         return self.plan.scene
 
     @classmethod
-    def of(cls, plan: Plan, model: TactileModel) -> Parts:
-        """Make the parts. Raises `SceneError` or `ModelError`."""
-        assembly.refuse_absent_processors(plan.scene)
-        pipeline = assembly.build_pipeline(plan, model, learns=plan.scene.session.learn)
-        return cls(plan, model, pipeline, assembly.build_drivers(plan))
-
-    @classmethod
-    def played(
+    def of(
         cls,
         plan: Plan,
         model: TactileModel,
-        driver: McapReplayDriver | LinkLogDriver[Any],
-        boot_id: str | None = None,
+        player: Driver | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> Parts:
-        """Make the parts that judge each reading at the time when `driver` hands it over."""
-        pipeline = assembly.build_pipeline(
-            plan, model, lambda: driver.handed_over_ns, learns=plan.scene.session.learn
-        )
-        return cls(plan, model, pipeline, [driver], boot_id)
+        """Make the parts. Raises `SceneError` or `ModelError`.
+
+        `player`: takes the place of the scene's drivers. `clock`: the judge's now, ns.
+        """
+        assembly.refuse_absent_processors(plan.scene)
+        pipeline = assembly.build_pipeline(plan, model, clock, learns=plan.scene.session.learn)
+        drivers = assembly.build_drivers(plan) if player is None else [player]
+        return cls(plan, model, pipeline, drivers)
 
 
 class Assembly:
@@ -110,27 +104,20 @@ class Assembly:
 
         The last save is when the stack closes.
         """
-        pipeline, tactile = self._parts.pipeline, self._parts.drivers[0]
-        folder = self._session_folder()
-        if folder is None:
+        scene, pipeline, tactile = self._parts.scene, self._parts.pipeline, self._parts.drivers[0]
+        has_any = pipeline.session is not None or pipeline.trust is not None
+        if not (has_any and scene.keeps_session):
             self.companions.append(SensorWatch(pipeline, tactile))
             return
+        from graspd.daemon.session.folder import SessionFolder
         from graspd.daemon.session.keeper import SessionKeeper
 
+        folder = SessionFolder(scene.session_path)
         self._stack.callback(folder.close)
-        keeper = SessionKeeper(pipeline, self._parts.scene.hand.fingers, tactile, folder)
+        keeper = SessionKeeper(pipeline, scene.hand.fingers, tactile, folder)
         self._stack.callback(keeper.save)
         self.keep = keeper.keep
         self.companions.insert(0, keeper)  # its answers must come before the socket is read
-
-    def _session_folder(self) -> SessionFolder | None:
-        """Return the folder of sessions, not locked yet; None if no session is kept."""
-        scene, pipeline = self._parts.scene, self._parts.pipeline
-        if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
-            return None
-        from graspd.daemon.session.folder import SessionFolder
-
-        return SessionFolder(scene.session_path)
 
     def record(self) -> None:
         """Record if the scene asks for it. Call after `keep_session`. Raises `SceneError`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -20,15 +21,8 @@ from graspd.daemon.record.mcap import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late, Topic
 from graspd.daemon.scene import Scene, SceneError
+from graspd.daemon.scene import scene as kinds
 from graspd.daemon.scene.drivers import Section
-from graspd.daemon.scene.scene import (
-    GateSection,
-    Hand,
-    Learn,
-    Model,
-    RiskSection,
-    SessionSection,
-)
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.daemon.trust.trust import FormatError, decode
 from graspd.models.runtime import TactileModel
@@ -36,12 +30,12 @@ from graspd.models.runtime import TactileModel
 log = logging.getLogger("graspd")
 
 SECTIONS: Final[Mapping[str, type[Section]]] = {
-    "hand": Hand,
-    "model": Model,
-    "gate": GateSection,
-    "session": SessionSection,
-    "learn": Learn,
-    "risk": RiskSection,
+    "hand": kinds.Hand,
+    "model": kinds.Model,
+    "gate": kinds.GateSection,
+    "session": kinds.SessionSection,
+    "learn": kinds.Learn,
+    "risk": kinds.RiskSection,
 }
 """Sections of a scene that a recording has."""
 BEGINS_WITHIN: Final = (
@@ -95,7 +89,8 @@ class RecordedRun(Source):
         if header.file > 0:
             log.warning(BEGINS_WITHIN, self._paths[0])
         driver = McapReplayDriver(self._paths, replayed.hand.fingers, speed=speed)
-        parts = Parts.played(Plan.of(replayed), model, driver, header.boot_id)
+        parts = Parts.of(Plan.of(replayed), model, driver, lambda: driver.handed_over_ns)
+        parts = replace(parts, boot_id=header.boot_id)
         parts.pipeline.hand.count_from(header.grasps)
         driver.on_event = partial(self._repeat, parts.pipeline)
         return parts

@@ -87,8 +87,7 @@ class Tables(Source):
         """Make the parts for the model's fingers."""
         hand = Hand(fingers=model.contract.fingers)
         plan = Plan.of(replayed.model_copy(update={"hand": hand}))
-        pipeline = assembly.build_pipeline(plan, model, learns=replayed.session.learn)
-        return Parts(plan, model, pipeline, [self._driver(hand.fingers, speed=speed)])
+        return Parts.of(plan, model, self._driver(hand.fingers, speed=speed))
 
 
 class LinkLogs(Source):
@@ -116,7 +115,7 @@ class LinkLogs(Source):
             driver = self._driver(replayed, speed)
         except ValueError as error:
             raise SceneError(f"[tactile] {error}") from error
-        return Parts.played(Plan.of(replayed), model, driver)
+        return Parts.of(Plan.of(replayed), model, driver, lambda: driver.handed_over_ns)
 
     def _driver(self, replayed: Scene, speed: float | None) -> LinkLogDriver[Any]:
         tactile, fingers = replayed.tactile, replayed.hand.fingers
