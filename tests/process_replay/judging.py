@@ -16,7 +16,7 @@ from graspd.daemon.assembly.parts import header_now, header_of
 from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.signals import StopSignal
-from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
+from graspd.daemon.publish.companion import Companion, PublishedVerdict, Reply, Requests
 from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.record.mcap import RecordingHeader
 from graspd.daemon.record.recorder import Recorder
@@ -216,4 +216,9 @@ class _World(Companion):
         slipped = (grasp % 3 == 0) != turned
         object_name = "cup" if grasp % 2 else None
         report = Report(GraspId(boot_id, grasp), "slip" if slipped else "stable", object_name)
-        requests.outcome(report, lambda why: self.messages.append(("answer", f"{grasp}: {why}")))
+
+        def answer(reply: Reply) -> None:
+            why = f"{reply.told}: {reply.detail}" if reply.detail else None
+            self.messages.append(("answer", f"{grasp}: {why}"))
+
+        requests.outcome(report, answer)
