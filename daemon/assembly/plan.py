@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits
+from graspd.daemon.judge.decision import GateLimits, HandLimits
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.scene import GateMode
@@ -63,7 +63,7 @@ class Plan:
                 early=gate.early,
                 request_ns=round(gate.request_ms * 1e6),
             ),
-            joints=JointLimits() if self.joints else None,
+            joints=self.joints,
         )
 
 

@@ -20,6 +20,7 @@ from graspd.daemon.commands.models import f1_percent
 from graspd.daemon.doctor.computer import NETWORK
 from graspd.daemon.doctor.finding import Level
 from graspd.daemon.doctor.surroundings import socket_findings
+from graspd.daemon.judge.joint_motion import RAD_PER_S
 from graspd.daemon.judge.motion_limits import MotionLimits, SlowNoise, Tails
 from graspd.daemon.judge.stillness import centred
 from graspd.daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
@@ -224,7 +225,7 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
     if limits is None:
         return f"every reading, {age}"
     when = "when asked, " if limits.on_request else ""
-    joints = "" if limits.joints is None else f", joints below {limits.joints.rad_per_s:g} rad/s"
+    joints = f", joints below {RAD_PER_S:g} rad/s" if limits.joints else ""
     fingers = ", ".join(gate.fingers or wanted.hand.fingers)
     what = f"median of 3 fresh readings, {age}"
     return f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}"

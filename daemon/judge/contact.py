@@ -14,12 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import COUNT_MAX, ELECTRODES
-from graspd.daemon.judge.decision import ContactLimits
 
 WINDOW = 100
 """Untouched sweeps whose median is a baseline: one second at 100 Hz."""
 TARE_EVERY = 25
 """Untouched sweeps from one tare to the next."""
+TOUCH_COUNTS = 20.0
+"""Smallest fall below the baseline of a touch, counts.
+
+In 9.8 s of three untouched sensors no fall was over 10. On the same sensors each fall of three
+electrodes by 24 was seen as a touch.
+"""
+TOUCH_SIGMAS = 5.0
+"""Smallest fall of a touch, in standard deviations of the finger's median electrode."""
 FALLEN = 3
 """Rank of the fall that decides: the third deepest. A spike hits one electrode, rarely two."""
 SOUND_MIN = 12
@@ -72,7 +79,7 @@ Floats = NDArray[np.float64]
 class Touch:
     """Decides whether one finger touches, from its falls below the baseline."""
 
-    threshold: float
+    threshold: float = TOUCH_COUNTS
     """Smallest fall of a touch, counts."""
     touching: bool = False
     fall: float = 0.0
@@ -207,11 +214,10 @@ class Window:
 class Contact:
     """Tares all fingers while they rest, and finds which touch. Constant memory, no clock."""
 
-    def __init__(self, fingers: int, limits: ContactLimits) -> None:
+    def __init__(self, fingers: int) -> None:
         """`fingers`: their number. None has a baseline yet."""
         shape = (fingers, ELECTRODES)
-        self._limits = limits
-        self.touches = [Touch(limits.counts) for _ in range(fingers)]
+        self.touches = [Touch() for _ in range(fingers)]
         self.touching = np.zeros(fingers, dtype=np.bool_)
         """True for fingers that touch, shape (fingers,)."""
         self.tared = np.zeros(fingers, dtype=np.bool_)
@@ -305,8 +311,7 @@ class Contact:
             baseline = np.where(np.isfinite(former), limited, baseline)
         self.baseline[finger] = np.where(rest.known, baseline, np.inf)
         self._known[finger] = int(np.count_nonzero(rest.known))
-        limits = self._limits
-        touch.threshold = max(limits.counts, limits.sigmas * rest.sigma)
+        touch.threshold = max(TOUCH_COUNTS, TOUCH_SIGMAS * rest.sigma)
         self.tared[finger] = True
 
 

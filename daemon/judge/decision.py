@@ -14,8 +14,6 @@ from graspd.biotac import Finger
 from graspd.daemon.judge.reasons import Decision, Moment, Reason
 from graspd.models.trust.risk import Permission
 
-MEDIAN_SWEEPS: Final = 3
-"""Fresh sweeps whose median is judged: a value that is wrong in one of them does not count."""
 WITHHELD: Final = {
     Permission.ALLOWED: None,
     Permission.WITHHELD: Reason.LOW_CONFIDENCE,
@@ -27,27 +25,8 @@ WITHHELD: Final = {
 
 # Without slots, so that a default can be read from the class.
 @dataclass(frozen=True)
-class ContactLimits:
-    """Fall below the baseline from which a finger counts as touching.
-
-    The fall of a finger is that of its third deepest electrode. It must reach the larger of the two
-    limits.
-    """
-
-    counts: float = 20.0
-    """Smallest fall of a touch, counts.
-
-    In 9.8 s of three untouched sensors no fall was over 10. On the same sensors each fall of three
-    electrodes by 24 was seen as a touch.
-    """
-    sigmas: float = 5.0
-    """Smallest fall of a touch, in standard deviations of the noise of the finger's median
-    electrode."""
-
-
-@dataclass(frozen=True)
 class GateLimits:
-    """Limits by which the gate decides that a grasp has settled, changed or ended."""
+    """Limits of the gate that a scene may set."""
 
     false_alarms: float = 0.03
     """Share of sweeps, 0..0.5, in which a hand that holds still may be reported as moving.
@@ -57,62 +36,21 @@ class GateLimits:
     """
     early: bool = False
     """True: judge once fast motion is excluded, and again once slow slides are excluded."""
-    change_counts: float = 40.0
-    """Largest mean change of a finger's electrodes since the judgement, counts.
-
-    Above it the grasp is a different one, and must settle again.
-    """
-    gap_ns: int = 100_000_000
-    """Time without a usable reading after which the grasp must settle again, ns.
-
-    The default is the most: what a verdict rests on has no longer silence in it, whatever the scene
-    says.
-    """
-    release_ns: int = 100_000_000
-    """How long the gate stays in `released` before `idle`, ns."""
     request_ns: int = 1_000_000_000
     """Time after which an unanswered request to judge is dropped, ns."""
-
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for a `gap_ns` above the default."""
-        if self.gap_ns > GateLimits.gap_ns:
-            raise ValueError(f"gap_ns is {self.gap_ns}, must be at most {GateLimits.gap_ns}")
-
-
-@dataclass(frozen=True)
-class JointLimits:
-    """Speed of a joint that keeps still, and ages of its angles."""
-
-    rad_per_s: float = 0.1
-    """Largest speed of a joint that keeps still, rad/s.
-
-    One count of a Hall sensor is 0.0006 rad, so noise alone shows up to 0.02 rad/s.
-    """
-    window_ns: int = 80_000_000
-    """Least time between the two angles of which a speed is made, ns."""
-    late_ns: int = 150_000_000
-    """Age of the angles above which the grasp cannot settle, ns."""
-    lost_ns: int = 1_000_000_000
-    """Age of the angles above which their stream is lost, ns: judging goes on without it."""
-    frozen_ns: int = 1_000_000_000
-    """Time without any change of any angle after which the angles are old ones sent again, ns.
-
-    The noise of a Hall sensor is one count, so even a single joint changes many times in it.
-    """
 
 
 @dataclass(frozen=True)
 class HandLimits:
-    """Limits of a hand's grasp: which fingers touch, that they keep still, and what is judged."""
+    """Limits of a hand's grasp: which fingers must touch, and how still they must keep."""
 
     on_request: bool = False
     """True if a settled grasp is judged only when the controller asks."""
     required: tuple[Finger, ...] | None = None
     """Fingers that must touch. None: all."""
-    contact: ContactLimits = field(default_factory=ContactLimits)
     gate: GateLimits = field(default_factory=GateLimits)
-    joints: JointLimits | None = None
-    """Limits of the joints. None: the hand sends no joint angles."""
+    joints: bool = False
+    """True if the hand sends joint angles, which must keep still too."""
 
 
 # Without slots, so that a default can be read from the class.

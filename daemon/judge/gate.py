@@ -30,6 +30,14 @@ REFRESH_NS = 50_000_000
 however slow the readings are, and though one of them is lost."""
 STANDS_NS = 100_000_000
 """Age above which a verdict no longer stands, ns."""
+CHANGE_COUNTS = 40.0
+"""Largest mean change of a finger's electrodes since the judgement, counts. Above it the grasp is a
+different one, and must settle again."""
+GAP_NS = 100_000_000
+"""Time without a usable reading after which the grasp must settle again, ns. No verdict rests on
+readings with a longer silence between them."""
+RELEASE_NS = 100_000_000
+"""How long the gate stays in `released` before `idle`, ns."""
 JUST_SHORT_NS = LONG_NS - 1_000_000
 """Longest stillness, ns, of a hand of which something may slide slowly."""
 
@@ -146,7 +154,6 @@ class Gate:
         self._fingers = tuple(fingers)
         self.required = frozenset(fingers).intersection(required)
         """Fingers that must touch."""
-        self._limits = limits.gate
         self._settles_ns = SHORT_NS if limits.gate.early else LONG_NS
         self.motion = Motion(len(fingers), limits.gate.false_alarms, early=limits.gate.early)
         self.phase, self._still = Phase(), Stillness()
@@ -168,7 +175,7 @@ class Gate:
 
     def skip(self, t_ns: int) -> None:
         """Take in the time of a reading that cannot be used, ns."""
-        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._limits.gap_ns:
+        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= GAP_NS:
             self.restart(t_ns)
 
     def observe(
@@ -184,7 +191,7 @@ class Gate:
         `usable`: electrodes that can be used, shape (fingers, 24); None: all. `touches` is True if
         any finger touches.
         """
-        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._limits.gap_ns:
+        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= GAP_NS:
             self.restart(t_ns)
         self._last_ns = t_ns
         self.motion.add(t_ns, counts, usable, wanted=touches or not self.required)
@@ -295,7 +302,7 @@ class Gate:
 
     def _follow_contact(self, t_ns: int, touches: bool) -> None:
         phase = self.phase
-        if phase.state is GateState.RELEASED and t_ns - self._opened_ns >= self._limits.release_ns:
+        if phase.state is GateState.RELEASED and t_ns - self._opened_ns >= RELEASE_NS:
             self._go(ways.FORGOTTEN, t_ns)
         if touches and phase.state in ways.TOUCHED.states:
             phase.grasp += 1
@@ -322,7 +329,7 @@ class Gate:
             means = (distance @ ONES) / np.float64(ELECTRODES)
         else:
             means = (distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1)
-        if max(means.tolist()) > self._limits.change_counts:
+        if max(means.tolist()) > CHANGE_COUNTS:
             self._go(ways.CHANGED, t_ns)
             return ()
         if limits.early if still.early else limits.sure:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from graspd.biotac import ELECTRODES, Finger
 from graspd.daemon.judge.contact import Contact
-from graspd.daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
-from graspd.daemon.judge.gate import Gate
+from graspd.daemon.judge.decision import HandLimits
+from graspd.daemon.judge.gate import GAP_NS, Gate
 from graspd.daemon.judge.health import NO_COUNT, Checked
 from graspd.daemon.judge.reasons import OPEN, FingerState, GateState, Moment, Reason
 from graspd.drivers.base import JointReading
@@ -26,6 +26,8 @@ from graspd.drivers.base import JointReading
 if TYPE_CHECKING:
     from graspd.daemon.judge.joint_motion import JointMotion
 
+MEDIAN_SWEEPS = 3
+"""Fresh sweeps whose median is judged: a value that is wrong in one of them does not count."""
 OUTAGE_NS = 1_000_000_000
 """Time without a usable reading after which tare and noise are forgotten, ns.
 
@@ -141,14 +143,13 @@ class HandTracker:
     def __init__(self, fingers: Sequence[Finger], limits: HandLimits) -> None:
         """`fingers` are those of the readings, in their order."""
         self._fingers = tuple(fingers)
-        self._limits = limits
         self._fresh = FreshMedian((len(fingers), ELECTRODES))
-        self._contact = Contact(len(fingers), limits.contact)
+        self._contact = Contact(len(fingers))
         self._joints: JointMotion | None = None
-        if limits.joints is not None:
+        if limits.joints:
             from graspd.daemon.judge.joint_motion import JointMotion  # only where it is needed
 
-            self._joints = JointMotion(limits.joints)
+            self._joints = JointMotion()
         self.on_request = limits.on_request
         self.gate = Gate(fingers, limits)
         self._words = [FingerWord() for _ in fingers]
@@ -291,7 +292,7 @@ class HandTracker:
     def _follow_time(self, t_ns: int) -> None:
         """Forget what does not continue at the time of a usable reading."""
         last_ns = self._last_ns
-        if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gate.gap_ns:
+        if last_ns is not None and not 0 <= t_ns - last_ns <= GAP_NS:
             self._fresh.reset()
             if t_ns - last_ns > OUTAGE_NS:
                 self._contact.forget()

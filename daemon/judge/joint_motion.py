@@ -5,10 +5,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.decision import JointLimits
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import JointReading
 
+RAD_PER_S = 0.1
+"""Largest speed of a joint that keeps still, rad/s.
+
+One count of a Hall sensor is 0.0006 rad, so noise alone shows up to 0.02 rad/s.
+"""
+WINDOW_NS = 80_000_000
+"""Least time between the two angles of which a speed is made, ns."""
+LATE_NS = 150_000_000
+"""Age of the angles above which the grasp cannot settle, ns."""
+LOST_NS = 1_000_000_000
+"""Age of the angles above which their stream is lost, ns: judging continues without it."""
+FROZEN_NS = 1_000_000_000
+"""Time without any change of any angle after which the angles are old ones sent again, ns.
+
+The noise of a Hall sensor is one count, so even a single joint changes many times in it.
+"""
 ANGLES = 16
 """Number of angles remembered of a window; of faster readings, some are left out."""
 LOST_MAX = 64
@@ -20,9 +35,8 @@ SOURCES_MAX = 8
 class JointMotion:
     """Follows the joints of one hand. Constant memory, no clock."""
 
-    def __init__(self, limits: JointLimits) -> None:
-        """Start without angles; `lost_ns` counts from the first sweep on."""
-        self._limits = limits
+    def __init__(self) -> None:
+        """Start without angles; `LOST_NS` counts from the first sweep on."""
         self.past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]] = {}
         """Times, ns, and angles, rad, shape (names,), of each set, oldest first.
 
@@ -54,10 +68,10 @@ class JointMotion:
         past = self.past.setdefault(names, [])
         latest_ns = self.latest_ns.get(names, t_ns)
         before = past[-1][1] if past else None
-        if not 0 <= t_ns - latest_ns <= self._limits.late_ns:
+        if not 0 <= t_ns - latest_ns <= LATE_NS:
             past.clear()  # time went back, or it is not known what the joints did meanwhile
         self.latest_ns[names] = t_ns
-        if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
+        if not past or t_ns - past[-1][0] >= WINDOW_NS // ANGLES:
             angles = reading.position_rad[valid]
             past.append((t_ns, angles))
             del past[: -(ANGLES + 2)]  # and one at each end of the window
@@ -73,7 +87,7 @@ class JointMotion:
             if self._waits_since_ns is None or self._waits_since_ns > t_ns:
                 self._waits_since_ns = t_ns
             return None if self.is_lost(t_ns) else Reason.JOINTS_LATE
-        if any(t_ns - at_ns > self._limits.late_ns for at_ns in self.latest_ns.values()):
+        if any(t_ns - at_ns > LATE_NS for at_ns in self.latest_ns.values()):
             return Reason.JOINTS_LATE
         if not all(map(self._is_still, self.past.values())):
             return Reason.MOVING
@@ -85,23 +99,23 @@ class JointMotion:
 
     @property
     def is_frozen(self) -> bool:
-        """True if angles have come for over `frozen_ns` without any change."""
+        """True if angles have come for over `FROZEN_NS` without any change."""
         if self._changed_ns is None or not self.latest_ns:
             return False
-        return max(self.latest_ns.values()) - self._changed_ns > self._limits.frozen_ns
+        return max(self.latest_ns.values()) - self._changed_ns > FROZEN_NS
 
     def is_lost(self, t_ns: int) -> bool:
-        """Return True if no joint angle has come for over `lost_ns` at `t_ns`."""
+        """Return True if no joint angle has come for over `LOST_NS` at `t_ns`."""
         return (
             not self.past
             and self._waits_since_ns is not None
-            and t_ns - self._waits_since_ns > self._limits.lost_ns
+            and t_ns - self._waits_since_ns > LOST_NS
         )
 
     def _drop_lost(self, t_ns: int) -> None:
         """Forget joints that no longer come, and those of a time that has gone back."""
         for names, latest_ns in list(self.latest_ns.items()):
-            if -self._limits.late_ns <= t_ns - latest_ns <= self._limits.lost_ns:
+            if -LATE_NS <= t_ns - latest_ns <= LOST_NS:
                 continue
             del self.past[names], self.latest_ns[names]
             self._waits_since_ns = min(latest_ns, t_ns)
@@ -110,11 +124,11 @@ class JointMotion:
 
     def _is_still(self, past: list[tuple[int, NDArray[np.float64]]]) -> bool:
         now_ns, now = past[-1]
-        while len(past) > 2 and now_ns - past[1][0] >= self._limits.window_ns:
+        while len(past) > 2 and now_ns - past[1][0] >= WINDOW_NS:
             del past[0]
-        if now_ns - past[0][0] < self._limits.window_ns:
+        if now_ns - past[0][0] < WINDOW_NS:
             return False
         # Against every moment of the window: two alone would miss what swings.
         moved = np.abs(np.array([then for _, then in past]) - now).max(axis=1)
-        ages_ns = [max(now_ns - at_ns, self._limits.window_ns) for at_ns, _ in past]
-        return bool((moved <= self._limits.rad_per_s * np.array(ages_ns) / 1e9).all())
+        ages_ns = [max(now_ns - at_ns, WINDOW_NS) for at_ns, _ in past]
+        return bool((moved <= RAD_PER_S * np.array(ages_ns) / 1e9).all())

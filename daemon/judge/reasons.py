@@ -147,7 +147,7 @@ class GateState(StrEnum):
     JUDGED = "judged"
     """The verdict stands, and is refreshed while readings confirm that the grasp is the same."""
     RELEASED = "released"
-    """Nothing touches since less than `GateLimits.release_ns`; a new touch may follow."""
+    """Nothing touches since less than `RELEASE_NS` of the gate; a new touch may follow."""
 
 
 OPEN = frozenset({GateState.IDLE, GateState.RELEASED})

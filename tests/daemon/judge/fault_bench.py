@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
+from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.drivers.base import JointReading, TactileReading
@@ -24,8 +24,6 @@ from tests.daemon.fakes import FINGERS, MS, Clock
 
 START_NS = 10**12
 MAX_AGE_NS = 100 * MS
-GATE = GateLimits()
-JOINTS = JointLimits()
 UNDER_FAULT = 30
 """Periods of the readings."""
 KEPT = 20
@@ -95,7 +93,7 @@ class Grasp:
         self._period_ns = round(1e9 / rate_hz)
         self._steps = self._sound_steps(rate_hz, durations)
         clock = Clock(START_NS)
-        settling = HandLimits(on_request=on_request, gate=GATE, joints=JOINTS)
+        settling = HandLimits(on_request=on_request, joints=True)
         pipeline = Pipeline(network(), FINGERS, Limits(MAX_AGE_NS), clock, hand=settling)
         # A daemon tells of silence after ten periods, and not before the age limit.
         hand = _Hand(pipeline, clock, max(MAX_AGE_NS, 10 * self._period_ns))

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.contact import Contact
-from graspd.daemon.judge.decision import ContactLimits
 from graspd.daemon.judge.hand import FreshMedian
 
 FF, MF, TH = 0, 1, 2
@@ -33,7 +32,7 @@ class Hand:
     """Feeds a hand's sweeps, 10 ms apart, to fresh values and contact."""
 
     def __init__(self) -> None:
-        self.contact = Contact(3, ContactLimits())
+        self.contact = Contact(3)
         self.fresh = FreshMedian((3, 24))
         self.t_ns = 10**12
 

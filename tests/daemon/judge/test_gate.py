@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspd.daemon.judge import phase
-from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits
+from graspd.daemon.judge.decision import GateLimits, HandLimits
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.reasons import GateChange, GateState, Reason
@@ -160,7 +160,7 @@ SETTLES = (0.41, 0.45)
 """0.2 s of closing, and 240 ms in which the hand keeps still; the last sweep or two of closing are
 no more than noise."""
 REQUEST = replace(LIMITS, on_request=True)
-JOINTS = replace(LIMITS, joints=JointLimits())
+JOINTS = replace(LIMITS, joints=True)
 SUBSET = replace(LIMITS, required=("ff", "th"))
 
 

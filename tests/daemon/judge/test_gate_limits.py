@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from graspd.biotac import Finger
-from graspd.daemon.judge.decision import GateLimits, HandLimits, JointLimits
+from graspd.daemon.judge.decision import GateLimits, HandLimits
 from graspd.daemon.judge.gate import Gate
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
@@ -358,7 +358,7 @@ def test_sensors_that_were_away_for_more_than_a_second_may_be_others(
 
 
 def test_joints_are_lost_when_readings_go_on_without_them() -> None:
-    silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=JointLimits()))
+    silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=True))
     assert "joints" not in HandTracker(FINGERS, silent.limits).health(), "nothing came yet"
     assert play(silent).hand.health()["joints"] is Reason.JOINTS_LATE
     assert "joints" not in play(replace(silent, joint=lambda t_s: 0.7)).hand.health()

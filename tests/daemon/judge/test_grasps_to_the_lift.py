@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.decision import HandLimits, JointLimits, Limits
+from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.drivers.base import JointReading
@@ -76,7 +76,7 @@ def found(bts3_dir: Path, untouched: NDArray[np.uint16], request: pytest.Fixture
 
     rows = [judge(None).judge(sound(point.counts)) for point in points]
     grasps = [Seen(*each) for each in zip(stream.timetables(), rows, strict=True)]
-    study, pipeline = Study(grasps), judge(HandLimits(joints=JointLimits()))
+    study, pipeline = Study(grasps), judge(HandLimits(joints=True))
     for moment in stream:
         clock.now_ns = round(moment.t_s * 1e9)
         joints = JointReading(clock(), 0, moment.joint_names, moment.position_rad)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from graspd.daemon.judge.decision import HandLimits, JointLimits, Limits
+from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.joint_motion import JointMotion
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Reason
@@ -19,7 +19,6 @@ from tests.daemon.judge.fault_bench import network
 MS = 1_000_000
 START_NS = 10**12
 NAMES = ("FFJ1", "FFJ2", "FFJ3")
-LIMITS = JointLimits()
 
 
 NOISE_RAD = 1e-9
@@ -31,11 +30,9 @@ def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] 
     motion.observe(JointReading(t_ns, 0, names, measured), t_ns)
 
 
-def turning(
-    rate_hz: float, rad_per_s: float, seconds: float = 1.0, limits: JointLimits = LIMITS
-) -> tuple[JointMotion, int]:
+def turning(rate_hz: float, rad_per_s: float, seconds: float = 1.0) -> tuple[JointMotion, int]:
     """One joint of three turns at a constant speed; also the time of the last angles."""
-    motion, t_ns = JointMotion(limits), START_NS
+    motion, t_ns = JointMotion(), START_NS
     for place in range(round(seconds * rate_hz) + 1):
         t_ns = START_NS + round(place / rate_hz * 1e9)
         send(motion, t_ns, 0.3, 1.2 + rad_per_s * (t_ns - START_NS) / 1e9, -0.1)
@@ -83,7 +80,7 @@ def test_a_step_counts_as_motion_for_a_window_and_no_longer(
 @pytest.mark.parametrize("joint", range(3))
 def test_a_joint_without_an_angle_hides_no_other(joint: int) -> None:
     for speed, reason in ((0.0, None), (0.3, Reason.MOVING)):
-        motion = JointMotion(LIMITS)
+        motion = JointMotion()
         for ms in range(0, 501, 10):
             angles = np.full(3, 1.0 + speed * ms / 1000)
             angles[joint] = np.nan
@@ -97,7 +94,7 @@ def test_angles_that_are_all_missing_are_as_good_as_none() -> None:
         send(motion, now_ns + ms * MS, np.nan, np.nan, np.nan)
         expected = None if ms <= 150 else Reason.JOINTS_LATE
         assert motion.objection(now_ns + ms * MS) is expected
-    unheard = JointMotion(LIMITS)
+    unheard = JointMotion()
     send(unheard, START_NS, np.nan, np.nan, np.nan)
 
 
@@ -119,7 +116,7 @@ def test_joints_are_late_and_then_lost(age_ms: int, reason: Reason | None, lost:
 
 
 def test_joints_that_never_come_are_waited_for_once_from_the_first_sweep_on() -> None:
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     assert not motion.is_lost(START_NS)
     assert motion.objection(START_NS) is Reason.JOINTS_LATE
     assert motion.objection(START_NS + 1000 * MS) is Reason.JOINTS_LATE
@@ -142,14 +139,14 @@ def test_angles_of_one_and_the_same_time_are_no_speed() -> None:
     for _ in range(1000):
         send(motion, now_ns, 0.3, 1.2, -0.1)
     assert motion.objection(now_ns) is None
-    alone = JointMotion(LIMITS)
+    alone = JointMotion()
     for angle in range(100):
         send(alone, START_NS, float(angle), 0.0, 0.0)
         assert alone.objection(START_NS) is Reason.MOVING
 
 
 def test_each_sender_must_be_still() -> None:
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     for ms in range(0, 501, 10):
         t_ns = START_NS + ms * MS
         send(motion, t_ns, 0.3, 1.2, -0.1)
@@ -193,7 +190,7 @@ def test_angles_from_the_future_are_not_trusted() -> None:
 def test_joints_that_swing_in_step_with_the_window_are_moving(
     swing_hz: float, rate_hz: float
 ) -> None:
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     for place in range(round(rate_hz)):
         t_s = place / rate_hz
         send(
@@ -217,7 +214,7 @@ def test_a_joint_that_loses_its_angle_is_late_and_then_lost() -> None:
 
 @pytest.mark.parametrize(("gap_ms", "reason"), [(150, None), (151, Reason.MOVING)])
 def test_angles_after_a_gap_begin_a_new_window(gap_ms: int, reason: Reason | None) -> None:
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     for t_ns in (START_NS, START_NS + gap_ms * MS):
         send(motion, t_ns, 0.3, 1.2, -0.1)
     assert motion.objection(t_ns) is reason
@@ -226,7 +223,7 @@ def test_angles_after_a_gap_begin_a_new_window(gap_ms: int, reason: Reason | Non
 @pytest.mark.parametrize(("every_ms", "kept"), [(5, 18), (4, 18), (2.5, 18), (10, 18)])
 def test_eighteen_angles_a_sixteenth_of_a_window_apart_are_kept(every_ms: float, kept: int) -> None:
     """Sixteen in a window of 80 ms, and one at each end."""
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     for place in range(200):
         send(motion, START_NS + round(place * every_ms * MS), 0.3, 1.2, -0.1)
     (past,) = motion.past.values()
@@ -250,7 +247,7 @@ def test_a_window_is_compared_with_its_first_angle_and_nothing_older() -> None:
 
 
 def test_eight_senders_are_told_apart_and_a_ninth_begins_anew() -> None:
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     for sender in range(8):
         send(motion, START_NS, 1.0, names=(f"J{sender}",))
     assert len(motion.past) == len(motion.latest_ns) == 8
@@ -261,7 +258,7 @@ def test_eight_senders_are_told_apart_and_a_ninth_begins_anew() -> None:
 
 
 def test_no_more_than_64_lost_joints_are_remembered_and_each_once() -> None:
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     for place in range(70):
         t_ns = START_NS + place * 2000 * MS
         send(motion, t_ns, 1.0, names=(f"J{place // 2}",))  # each comes twice
@@ -276,7 +273,7 @@ def test_no_more_than_64_lost_joints_are_remembered_and_each_once() -> None:
 
 def held(rates_hz: Mapping[tuple[str, ...], float], seconds: float) -> JointMotion:
     """Senders whose angles stay the same to the bit, by the names of their joints."""
-    motion = JointMotion(LIMITS)
+    motion = JointMotion()
     times = sorted(
         (START_NS + round(place / rate_hz * 1e9), names)
         for names, rate_hz in rates_hz.items()
@@ -339,7 +336,7 @@ def test_after_time_went_back_angles_have_a_second_to_change() -> None:
 
 
 def test_the_health_says_that_joints_are_frozen_until_one_changes() -> None:
-    hand = HandLimits(joints=JointLimits())
+    hand = HandLimits(joints=True)
     pipeline = Pipeline(network(), FINGERS, Limits(), lambda: START_NS, hand=hand)
     for ms in range(0, 1501, 10):
         angles = np.array([0.8, 0.4 + (ms == 1500)])

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspd.biotac import Finger
-from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits
+from graspd.daemon.judge.decision import GateLimits, HandLimits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision
 from graspd.drivers.base import JointReading, TactileReading
@@ -28,12 +28,7 @@ from tests.daemon.fakes import FINGERS, MS, Clock, FakeModel, pipeline
 from tests.daemon.judge.necessity import (
     AGE_MAX_MS,
     EARLY_MS,
-    GAP_MS,
-    JOINT_RAD_PER_S,
-    JOINTS_LATE_MS,
-    JOINTS_LOST_MS,
     STILL_MS,
-    WINDOW_MS,
     Necessity,
 )
 
@@ -226,19 +221,7 @@ def limits(
 ) -> HandLimits:
     """Those that `Necessity` knows."""
     return HandLimits(
-        on_request=on_request,
-        required=required,
-        contact=ContactLimits(counts=20.0),
-        gate=GateLimits(
-            early=early,
-            gap_ns=GAP_MS * MS,
-        ),
-        joints=JointLimits(
-            rad_per_s=JOINT_RAD_PER_S,
-            window_ns=WINDOW_MS * MS,
-            late_ns=JOINTS_LATE_MS * MS,
-            lost_ns=JOINTS_LOST_MS * MS,
-        ),
+        on_request=on_request, required=required, gate=GateLimits(early=early), joints=True
     )
 
 

@@ -13,7 +13,6 @@ import pytest
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.contact import Contact, Rest, Touch, Window
-from graspd.daemon.judge.decision import ContactLimits
 
 THRESHOLD = 20.0
 S = 1_000_000_000
@@ -75,7 +74,7 @@ def test_the_depth_of_a_hold_fades_by_five_counts_a_second_down_to_the_fall() ->
 
 
 def test_the_depth_of_a_hold_fades_by_the_time_between_sweeps() -> None:
-    contact, rest = Contact(1, ContactLimits()), np.full((1, 24), 3000, dtype=np.uint16)
+    contact, rest = Contact(1), np.full((1, 24), 3000, dtype=np.uint16)
     for place in range(100):
         contact.observe(place * 10 * MS, rest, rest, None)
     for t_ns, fall in ((1 * S, 200), (2 * S, 100)):
@@ -174,7 +173,7 @@ def rest_of(sweeps: Sweeps, usable: int = 24) -> Rest | None:
 
 
 def test_a_window_is_looked_at_after_a_hundred_sweeps_and_every_25_more() -> None:
-    contact = Contact(1, ContactLimits())
+    contact = Contact(1)
     rest = np.full((1, 24), 3000, dtype=np.uint16)
     looks = []
     for place in range(1, 320):
@@ -187,7 +186,7 @@ def test_a_window_is_looked_at_after_a_hundred_sweeps_and_every_25_more() -> Non
 
 
 def test_a_finger_that_touches_with_all_others_at_times_is_not_alone() -> None:
-    contact = Contact(2, ContactLimits())
+    contact = Contact(2)
     rest = np.full((2, 24), 3000, dtype=np.uint16)
     for place in range(100):
         contact.observe(place * 10 * MS, rest, rest, None)
@@ -262,18 +261,11 @@ def test_an_electrode_that_wavers_three_times_as_much_as_a_finger_may_has_no_res
 
 
 @pytest.mark.parametrize(
-    ("limits", "step", "threshold"),
-    [
-        (ContactLimits(), 2, 20.0),  # 5 sigmas are 14.8
-        (ContactLimits(), 4, 5 * 4 * 1.4826),
-        (ContactLimits(counts=5.0), 0, 7.5),  # 5 times the least sigma
-        (ContactLimits(counts=5.0, sigmas=3.0), 4, 3 * 4 * 1.4826),
-    ],
+    ("step", "threshold"),
+    [(2, 20.0), (4, 5 * 4 * 1.4826)],  # 5 sigmas are 14.8, and 29.7
 )
-def test_a_touch_takes_five_sigmas_or_twenty_counts(
-    limits: ContactLimits, step: int, threshold: float
-) -> None:
-    contact = Contact(1, limits)
+def test_a_touch_takes_five_sigmas_or_twenty_counts(step: int, threshold: float) -> None:
+    contact = Contact(1)
     for place, counts in enumerate(wavering(step)):
         assert not contact.tared.any()
         contact.observe(place * 10 * MS, counts[None], counts[None], ALL)
@@ -289,7 +281,7 @@ def test_a_touch_takes_five_sigmas_or_twenty_counts(
 def test_a_baseline_rises_five_and_sinks_one_and_a_half_counts_a_second(
     step: float, followed: float
 ) -> None:
-    contact = Contact(1, ContactLimits())
+    contact = Contact(1)
     for place in range(100):
         counts = np.full((1, 24), 3000, dtype=np.uint16)
         contact.observe(place * 10 * MS, counts, counts, ALL)
@@ -301,7 +293,7 @@ def test_a_baseline_rises_five_and_sinks_one_and_a_half_counts_a_second(
 
 
 def test_the_third_deepest_electrode_makes_the_touch() -> None:
-    contact = Contact(1, ContactLimits())
+    contact = Contact(1)
     rest = np.full((1, 24), 3000, dtype=np.uint16)
     for place in range(100):
         contact.observe(place * 10 * MS, rest, rest, ALL)

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from graspd.daemon.judge.decision import ContactLimits, GateLimits, HandLimits
+from graspd.daemon.judge.decision import HandLimits
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.run.loop import DRAINS_MAX, LoopTiming
@@ -228,7 +228,7 @@ def test_a_sensor_that_freezes_among_what_is_left_out_is_never_stable() -> None:
     assert Decision.STABLE in {verdict.verdict for verdict, _ in bench.judged}
 
 
-LIMITS = HandLimits(contact=ContactLimits(), gate=GateLimits())
+LIMITS = HandLimits()
 
 
 def grasps(seed: int) -> list[TactileReading]:
