@@ -163,7 +163,7 @@ class LinkCause(Enum):
     SERIALS = auto()
     """The device gives different serial numbers each time it is asked."""
     CLOCK = auto()
-    """The device's clock stands, falls back, or is too fast or slow."""
+    """The device's clock stands, falls back or jumps."""
 
 
 _CAUSES: dict[int | None, LinkCause] = {

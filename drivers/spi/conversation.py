@@ -227,15 +227,9 @@ class Conversation:
             self.lost(LinkCause.SERIALS, "the bridge names other sensors", arrival_ns)
         else:
             self._take(hello)
-            try:
-                self._sweeps.clock.round_trip(hello.tick, sent_ns, arrival_ns)
-            except ClockError as error:
-                self._on_wrong_clock(error, arrival_ns)
-
-    def _on_wrong_clock(self, error: ClockError, now_ns: int) -> None:
-        """Lose the link: the next greeting begins with another clock."""
-        self.counters.clock_faults += 1
-        self.lost(LinkCause.CLOCK, f"the bridge's clock {error}", now_ns)
+            clock = self._sweeps.clock
+            clock.round_trip(hello.tick, sent_ns, arrival_ns)
+            self.counters.clock_faults += clock.is_doubted
 
     def _is_confirmed(self, serials: tuple[str, ...]) -> bool:
         """Return True if two HELLOs in a row had these serial numbers."""
@@ -290,7 +284,9 @@ class Conversation:
         try:
             reading = self._sweeps.reading(sweep, arrival_ns)
         except ClockError as error:
-            self._on_wrong_clock(error, arrival_ns)
+            # The next greeting begins with another clock.
+            self.counters.clock_faults += 1
+            self.lost(LinkCause.CLOCK, f"the bridge's clock {error}", arrival_ns)
             return None
         if reading is None:
             return None

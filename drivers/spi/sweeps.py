@@ -31,6 +31,11 @@ DRIFT_MAX = 500e-6
 
 Crystals keep 100 ppm, and the host's own clock may be adjusted by 500 ppm.
 """
+DOUBT_NS = 20_000_000
+"""Assumed error of a time, ns, while PINGs contradict each other: of 247 ms at a rate 8 % off.
+
+A computer whose time is being set may be off by that much for some seconds.
+"""
 AGE_MAX_NS = 10_000_000_000
 """Greatest age of a mapped time, ns; buffers on the way hold a few seconds at most."""
 
@@ -65,7 +70,7 @@ class BridgeCounters(FrameCounters):
     host_tx_dropped: int = 0
     """Frames to the bridge that were dropped because the port's buffer was full."""
     clock_faults: int = 0
-    """Times that the link was lost because the bridge's clock was wrong."""
+    """Times that the link was lost for the bridge's clock, and PINGs that doubt its rate."""
     bridge_overruns: int = 0
     bridge_tx_dropped: int = 0
     bridge_rx_errors: int = 0
@@ -144,7 +149,7 @@ class SweepDecoder:
 
 
 class ClockError(ValueError):
-    """The clock of a bridge stands, falls back, or is too fast or slow."""
+    """The clock of a bridge stands, falls back or jumps."""
 
 
 class _Bound(NamedTuple):
@@ -162,6 +167,9 @@ class DeviceClock:
     narrower one replaces it. A reading has the earliest time that its tick can have had: it may
     look too old, never too new (deploy/MEASURED.md). Its time is not before that of the reading
     before, and at most `AGE_MAX_NS` before its arrival.
+
+    A PING that contradicts the bounds replaces both. Until the next one that agrees, times are
+    `DOUBT_NS` earlier.
     """
 
     def __init__(self, tick_hz: int, tick: int, sent_ns: int, received_ns: int) -> None:
@@ -171,27 +179,34 @@ class DeviceClock:
         self._ns_per_tick = 1e9 / tick_hz
         self._earliest, self._latest = _Bound(tick, sent_ns), _Bound(tick, received_ns)
         self._last_tick, self._last_ns = tick, sent_ns
+        self._doubt_ns = 0
 
     def round_trip(self, tick: int, sent_ns: int, received_ns: int) -> None:
-        """Add an answered PING: host time before it was sent, and after its answer came.
-
-        Raises `ClockError` if it contradicts the ones before.
-        """
+        """Add an answered PING: host time before it was sent, and after its answer came."""
         self.round_trip_ns = min(self.round_trip_ns, received_ns - sent_ns)
-        if self._earliest_ns(tick) > received_ns or self._latest_ns(tick) < sent_ns:
-            raise ClockError("is too fast or too slow")
-        if self._earliest_ns(tick) + self._ns_per_tick <= sent_ns:
+        earliest_ns, latest_ns = self._earliest_ns(tick), self._latest_ns(tick)
+        contradicts = earliest_ns > received_ns or latest_ns < sent_ns
+        self._doubt_ns = DOUBT_NS if contradicts else 0
+        if contradicts or earliest_ns + self._ns_per_tick <= sent_ns:
             self._earliest = _Bound(tick, sent_ns)
-        if self._latest_ns(tick) - self._ns_per_tick >= received_ns:
+        if contradicts or latest_ns - self._ns_per_tick >= received_ns:
             self._latest = _Bound(tick, received_ns)
+
+    @property
+    def is_doubted(self) -> bool:
+        """True if the rate of the clock is wrong now, by more than `DRIFT_MAX`."""
+        return self._doubt_ns > 0
 
     def host_ns(self, tick: int, arrival_ns: int) -> int:
         """Return the host time, ns, of a reading's `tick`. Raises `ClockError`."""
         if tick <= self._last_tick:
             raise ClockError("stands or falls back")
-        earliest_ns = self._earliest_ns(tick)
+        earliest_ns = self._earliest_ns(tick) - self._doubt_ns
         if earliest_ns > arrival_ns:
-            raise ClockError("is ahead of its readings")
+            if earliest_ns > arrival_ns + DOUBT_NS:
+                raise ClockError("jumps ahead")
+            self._doubt_ns = DOUBT_NS
+            earliest_ns = arrival_ns - DOUBT_NS
         self._last_tick = tick
         self._last_ns = max(earliest_ns, self._last_ns, arrival_ns - AGE_MAX_NS)
         return self._last_ns
