@@ -172,20 +172,13 @@ def port_holders(protocol: str, port: int) -> list[Process]:
 def _with_open(files: Collection[object]) -> set[int]:
     """Return processes with one of these files (device, inode) or sockets (inode) open."""
     pids = set()
-    for process in PROC.glob("[0-9]*"):
-        with suppress(OSError):  # it has ended
-            for descriptor in list((process / "fd").iterdir()):
-                if _is_one_of(files, descriptor):
-                    pids.add(int(process.name))
+    for descriptor in PROC.glob("[0-9]*/fd/*"):
+        with suppress(OSError):
+            opened = descriptor.stat()
+            is_socket = stat.S_ISSOCK(opened.st_mode)
+            if (opened.st_ino if is_socket else _identity(opened)) in files:
+                pids.add(int(descriptor.parts[-3]))
     return pids
-
-
-def _is_one_of(files: Collection[object], descriptor: Path) -> bool:
-    try:
-        opened = descriptor.stat()
-    except OSError:  # it was closed
-        return False
-    return (opened.st_ino if stat.S_ISSOCK(opened.st_mode) else _identity(opened)) in files
 
 
 def _identity(file: os.stat_result) -> tuple[int, int]:

@@ -67,6 +67,8 @@ class Feed:
         """When no message waited last; those that `take` gives may be as old."""
         self.looked_ns = self._opened_ns
         """When the last message was looked for; it came before."""
+        self.stood_still = 0, 0
+        """When this process last stopped looking for longer than `PAUSE_NS`, and went on, ns."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._events = EVENTS if keys is None else EVENTS_WITH_KEYS
         self._follow = 0
@@ -111,6 +113,8 @@ class Feed:
     def _reconnect_if_needed(self) -> None:
         now_ns = self._clock()
         paused = now_ns - self._taken_ns > PAUSE_NS
+        if paused:
+            self.stood_still = self._taken_ns, now_ns
         self._taken_ns = now_ns
         if paused or (self.link.is_turned_away and now_ns - self._opened_ns > RETRY_NS):
             self._opened_ns = self.empty_ns = now_ns

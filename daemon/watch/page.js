@@ -307,6 +307,8 @@ class Hand {
   }
 
   drawTables() {
+    const {counts} = this.seen;
+    this.say("counts", Object.entries(counts).map(([name, count]) => `${count} ${name}`).join(", "));
     children(this.part("grasps"), this.seen.grasps,
       () => element("tr", element("td", element("button")), element("td", element("i"), element("span")), element("td"), element("td")),
       (node, grasp) => {

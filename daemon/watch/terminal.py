@@ -1,4 +1,4 @@
-"""The terminal view: tables, drawn until `q`, Ctrl-C or SIGTERM."""
+"""The terminal view: tables, drawn until `q`, Ctrl-C or SIGTERM; Ctrl-Z stops it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import termios
 import time
 import tty
 from collections.abc import Iterator, Sequence
+from types import FrameType
+from typing import Self
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
@@ -51,7 +53,7 @@ NAME_MAX = 40
 NAMES_MAX = 1000
 """Most characters shown of several received names: a hand's 120 electrodes have 840."""
 LABEL_COLUMNS = 12
-"""Width of the longest label, `last message`, columns."""
+"""Width of the longest label, `grasps seen` or `last message`, columns."""
 SIGNALS_MAX = 64
 
 Row = tuple[str, str]
@@ -67,13 +69,49 @@ def can_draw() -> bool:
 def show(hands: Sequence[HandFeed]) -> None:
     """Draw on the terminal until `q`, Ctrl-C or SIGTERM."""
     console = Console(highlight=False)
-    signal.signal(signal.SIGTSTP, signal.SIG_IGN)  # the last verdict would stay on the screen
-    with StopSignal() as stop:
+    with StopSignal() as stop, Suspension() as suspension:
         keyboard = Keyboard(stop)
-        with keyboard.unbuffered(), Live(console=console, screen=True, auto_refresh=False) as live:
-            for seen in snapshots(hands, keyboard.wait):
-                chosen = keyboard.tabs % len(hands)
-                live.update(draw(seen, console.width, chosen, keyboard.spaces), refresh=True)
+        while True:
+            with (
+                keyboard.unbuffered(),
+                Live(console=console, screen=True, auto_refresh=False) as live,
+            ):
+                for seen in snapshots(hands, lambda: keyboard.wait() or suspension.asked):
+                    chosen = keyboard.tabs % len(hands)
+                    picture = draw(seen, console.width, chosen, keyboard.spaces)
+                    live.update(picture, refresh=True)
+            if stop.received is not None or not suspension.asked:
+                return
+            now = time.strftime("%H:%M:%S")
+            console.print(f"graspd watch stopped at {now}: unknown until it goes on (fg)")
+            suspension.stop()
+
+
+class Suspension:
+    """Ctrl-Z: the last verdict must not stay on the screen while nothing is drawn."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> Self:
+        """Take over SIGTSTP, unless it is ignored."""
+        self._former = signal.getsignal(signal.SIGTSTP)
+        if self._former is not signal.SIG_IGN:
+            signal.signal(signal.SIGTSTP, self._ask)
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        signal.signal(signal.SIGTSTP, self._former)
+
+    def stop(self) -> None:
+        """Stop the process; return when it is continued."""
+        self.asked = False
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTSTP)
+        signal.signal(signal.SIGTSTP, self._ask)
+
+    def _ask(self, _number: int, _frame: FrameType | None) -> None:
+        self.asked = True
 
 
 class Keyboard:
@@ -252,6 +290,7 @@ def _figures(seen: Snapshot) -> Iterator[Row]:
         then = time.strftime("%H:%M:%S", time.localtime(seen.last_t))
         ago_s = seen.t - seen.last_t
         yield "last message", f"{then}, {ago_s:.0f} s ago; figures of then"
+    yield "grasps seen", ", ".join(f"{count} {what}" for what, count in seen.counts.items())
     yield "last grasps", "; ".join(map(_past, seen.grasps)) or "-"
     yield "learning", _flow(seen.learning)
     for line in seen.session:

@@ -59,8 +59,8 @@ A daemon without readings sends the next `unknown` only after `silence_ms`.
 """
 PROMPT_NS = 50_000_000
 """Longest wait of a message for this viewer, ns, with which it tells how the clocks differ."""
-PAUSE_NS = 1_000_000_000
-"""Pause of the verdicts, ns, after which the clocks are compared again."""
+CATCHING_UP_NS = 1_000_000_000
+"""Time to reconnect after the viewer itself stood still, ns."""
 NO_SHARE = -1
 """Value in place of a probability for a second that has none."""
 TONE_CODE = {
@@ -119,6 +119,8 @@ class View:
         `wall`: returns seconds since 1970.
         """
         self.link = Link.CONNECTING
+        self.stood_still = 0, 0
+        """When the viewer itself last stopped and went on, ns."""
         self._endpoint = endpoint
         self._hand = hand
         self._look, self._doctor = look, doctor
@@ -186,7 +188,7 @@ class View:
     def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
         """Return when a verdict came, by its own time: it may have waited for this viewer."""
         sent_ns = verdict.t_mono_ns + round(verdict.age_ms * 1e6)
-        if earliest_ns - self._verdict_ns > PAUSE_NS:
+        if self._verdict_ns < self.stood_still[1]:
             self._clocks_ns = None  # the computer may have slept, with one of the clocks
         if latest_ns - earliest_ns <= PROMPT_NS:
             way_ns = latest_ns - sent_ns
@@ -204,7 +206,8 @@ class View:
         judged = verdict if tone in {Tone.STABLE, Tone.LEANS, Tone.SLIP} else None
         p_slip = None if judged is None else judged.p_slip
         word = "unknown" if judged is None else judged.verdict.value
-        self._history.add(now_ns, tone, p_slip)
+        if not (silent and self._is_catching_up(now_ns)):
+            self._history.add(now_ns, tone, p_slip)
         if not silent:
             self._rate_marks.append((now_ns, self._received))
         wall_t = self._wall()
@@ -225,6 +228,7 @@ class View:
             contact=None if verdict is None or verdict.contact is None else list(verdict.contact),
             still=stillness(None if verdict is None else verdict.still_ms),
             grasps=self._grasps.last(now_ns, None if silent else self._held()),
+            counts=self._grasps.counts(),
             fingers=[] if verdict is None else self._fingers.images(verdict, now_ns),
             joints={} if silent else self._fingers.joints,
             health=health,
@@ -247,8 +251,7 @@ class View:
         if now_ns - self._verdict_ns > verdict.silence_ms * 1e6 * (
             1 if verdict.valid else LATE_UNKNOWNS
         ):
-            silence = f"no message for {_duration(now_ns - self._verdict_ns)}"
-            return Tone.SILENT, [Line("silent", silence), *self._where_to_look()]
+            return Tone.SILENT, [self._silence(now_ns), *self._where_to_look()]
         if verdict.verdict is Decision.UNKNOWN:
             why = [Line(reason.value, ADVICE[reason]) for reason in to_act_on(verdict.reasons)]
             if Reason.STALE in verdict.reasons:
@@ -276,6 +279,20 @@ class View:
         boot_id, grasp, likely_ns = self._likely
         is_same = (boot_id, grasp) == (verdict.boot_id, verdict.grasp)
         return is_same and now_ns - likely_ns <= HELD_NS
+
+    def _silence(self, now_ns: int) -> Line:
+        stopped_ns, went_on_ns = self.stood_still
+        stood_ns = went_on_ns - max(stopped_ns, self._verdict_ns)
+        if stood_ns <= 0:
+            return Line("silent", f"no message for {_duration(now_ns - self._verdict_ns)}")
+        held_up = f"this viewer itself stood still for {_duration(stood_ns)}"
+        if self._is_catching_up(now_ns):
+            return Line("held up", f"{held_up} and connects again")
+        return Line("silent", f"no message since; {held_up}")
+
+    def _is_catching_up(self, now_ns: int) -> bool:
+        _, went_on_ns = self.stood_still
+        return self._verdict_ns < went_on_ns and now_ns - went_on_ns < CATCHING_UP_NS
 
     def _where_to_look(self) -> list[Line]:
         lines = [Line("link", self.link)]
@@ -347,7 +364,7 @@ def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterato
         for feed, view in hands:
             for topic, payload in feed.take():
                 view.take(topic, payload, feed.empty_ns, feed.looked_ns)
-            view.link = feed.link
+            view.link, view.stood_still = feed.link, feed.stood_still
         if time.monotonic() >= due_s:
             due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)
             yield [view.snapshot(boottime_ns()) for _, view in hands]

@@ -76,6 +76,19 @@ def test_a_viewer_held_up_goes_by_the_times_in_messages() -> None:
         assert view.snapshot(801 * MS).tone is tone
 
 
+def test_a_viewer_that_stood_still_says_so_itself() -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE)))
+    view.snapshot(0)
+    view.stood_still = 20 * MS, 5020 * MS
+    seen = view.snapshot(5100 * MS)
+    stood = "this viewer itself stood still for 5000 ms"
+    assert seen.why[0] == Line("held up", f"{stood} and connects again")
+    assert (seen.headline, seen.history) == ("unknown", ["s"])
+    seen = view.snapshot(6100 * MS)
+    assert seen.why[0] == Line("silent", f"no message since; {stood}")
+    assert seen.history == ["s", "", "", "", "", "", "."]
+
+
 def test_a_silent_daemon_has_the_commands_to_look_with() -> None:
     look = "systemctl status graspd@right; journalctl -u graspd@right"
     view = View(ENDPOINT, look=look)
