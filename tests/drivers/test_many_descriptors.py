@@ -58,13 +58,13 @@ def slcan(folder: Path) -> Iterator[Bench]:
     path, ends = folder / "adapter", list[int]()
 
     def unplug() -> None:
+        path.unlink(missing_ok=True)  # the kernel gives the terminal's name to others at once
         while ends:
             os.close(ends.pop())
 
     def plug() -> None:
         ends.extend(pty.openpty())
         tty.setraw(ends[1])
-        path.unlink(missing_ok=True)
         path.symlink_to(os.ttyname(ends[1]))
 
     def send() -> None:
