@@ -186,7 +186,7 @@ def _what_is_in(
         parts["ask"] = f"on {wanted.ask_endpoint}, answered within {wanted.gate.request_ms:g} ms"
     if wanted.joints is not None:
         parts["joints"] = _section(wanted.joints)
-    elif limits is not None and limits.joints is not None:
+    elif limits is not None and limits.joints:
         parts["joints"] = "those of the recordings"
     if isinstance(contract.input, SessionInput):
         parts["session"] = _session(wanted, contract.input)
@@ -316,7 +316,7 @@ def _what_is_left_out(
     drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]
     others = [driver for driver in drivers if driver != wanted.tactile.driver]
     left_out = {"drivers": f"{', '.join(others)}: not imported"}
-    if wanted.joints is None and (limits is None or limits.joints is None):
+    if wanted.joints is None and (limits is None or not limits.joints):
         left_out["joints"] = "no joint code"
     if limits is None:
         left_out["gate"] = "no tare, no contact, no gate: each reading is a grasp"
