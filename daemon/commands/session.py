@@ -264,8 +264,9 @@ def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: st
                 trust.lifts.take_back(lifts[name])
             else:
                 trust.outcome(lifts[name], slipped=told == "slipped")
-        settled = replace(mine, trust=trust.state())
-        folder.save([settled, *(kept for kept in before if kept is not mine)])
+        if lifts:
+            settled = replace(mine, trust=trust.state())
+            folder.save([settled, *(kept for kept in before if kept is not mine)])
     write_lines(f"{printable(str(path))}: {len(names or lifts)} lifts {told}")
 
 

@@ -99,16 +99,23 @@ class SessionFolder:
         Raises `SessionFileError`, after which the sessions on the disk are whole.
         """
         self.lock()
-        running, *others = sessions = sessions[:KEPT_MAX]
+        running, *others = sessions[:KEPT_MAX]
         try:
+            stay: set[int] = set()
             for each in reversed(others):
-                if each not in self._kept.values():
+                same = (n for n, kept in self._kept.items() if kept == each and n not in stay)
+                number = next(same, None)
+                if number is None:
+                    number = self._free()
+                    self._write(number, each)
                     self._running = None  # its file must have a higher number
-                    self._write(self._free(), each)
+                elif number == self._running:
+                    self._running = None
+                stay.add(number)
             if self._running is None:
                 self._running = self._free()
             self._write(self._running, running)
-            gone = [number for number, each in self._kept.items() if each not in sessions]
+            gone = [number for number in self._kept if number not in {*stay, self._running}]
             for number in gone + self._damaged[DAMAGED_MAX:]:
                 _path(self.path, number).unlink(missing_ok=True)
                 self._kept.pop(number, None)

@@ -194,6 +194,9 @@ def test_a_person_settles_announced_lifts(tmp_path: Path) -> None:
     assert found.learner.state() == trust.learner.state()
     assert found.risk.state() == trust.risk.state()
     assert (found.lifts.announced, found.lifts.awaited) == (3, 0)
+    files = {each.name: each.read_bytes() for each in kept.iterdir()}
+    assert "0 lifts held" in graspd("session", "settle", path, "--as", "held").stdout
+    assert {each.name: each.read_bytes() for each in kept.iterdir()} == files
 
 
 def test_what_is_damaged_is_said(tmp_path: Path) -> None:

@@ -132,6 +132,23 @@ def test_no_kill_loses_a_kept_session(tmp_path_factory: pytest.TempPathFactory, 
     assert kept <= max(kept_grasps(path), default=0) <= written
 
 
+def test_what_is_saved_again_unchanged_leaves_no_copy(tmp_path: Path) -> None:
+    first, *others = (KeptSession(state(each), FINGERS, {"ff": str(each)}) for each in (3, 2, 1))
+    for _ in range(4):
+        with SessionFolder(tmp_path) as folder:
+            folder.load()
+            folder.save([first, *others])
+        assert kept_grasps(tmp_path) == [3, 2, 1]
+
+
+def test_an_exchange_right_after_a_save_loses_no_session(tmp_path: Path) -> None:
+    leaving, new = (KeptSession(state(each), FINGERS, {}) for each in (1, 2))
+    with SessionFolder(tmp_path) as folder:
+        folder.save([leaving])
+        folder.save([new, leaving])
+    assert kept_grasps(tmp_path) == [2, 1]
+
+
 def learned(path: Path) -> bytes:
     """A file as it is after a day, with grasps whose outcome is still out."""
     session, part = calibration(), trust()
