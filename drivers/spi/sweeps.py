@@ -8,6 +8,7 @@ batches of a USB adapter and stalls of the host do no harm.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -38,6 +39,12 @@ A computer whose time is being set may be off by that much for some seconds.
 """
 AGE_MAX_NS = 10_000_000_000
 """Greatest age of a mapped time, ns; buffers on the way hold a few seconds at most."""
+PINGS = 8
+"""Number of the last PINGs that bound a time from below: about two seconds.
+
+An older one would hide the age of readings on a slow line, once the rate is wrong by more than
+`DRIFT_MAX`.
+"""
 
 
 @dataclass(slots=True)
@@ -163,13 +170,13 @@ class DeviceClock:
     """Map the ticks of one bridge, from one reset to the next, to monotonic host time.
 
     The clock showed the tick of an answered PING not before the PING was sent, and not after its
-    answer came. Both bounds move on with the ticks and widen by `DRIFT_MAX`; a PING that gives a
-    narrower one replaces it. A reading has the earliest time that its tick can have had: it may
-    look too old, never too new (deploy/MEASURED.md). Its time is not before that of the reading
-    before, and at most `AGE_MAX_NS` before its arrival.
+    answer came. Both bounds move on with the ticks and widen by `DRIFT_MAX`. A reading has the
+    earliest time that its tick can have had by the last `PINGS`: it may look too old, never too
+    new while the rate is right to `DRIFT_MAX` (deploy/MEASURED.md). Its time is not before that
+    of the reading before, and at most `AGE_MAX_NS` before its arrival.
 
-    A PING that contradicts the bounds replaces both. Until the next one that agrees, times are
-    `DOUBT_NS` earlier.
+    A PING that contradicts the bounds replaces them. Until the next one that agrees, times are
+    `DOUBT_NS` earlier, and the first may be before that of the reading before.
     """
 
     def __init__(self, tick_hz: int, tick: int, sent_ns: int, received_ns: int) -> None:
@@ -178,17 +185,22 @@ class DeviceClock:
         """Shortest round trip of a PING, ns."""
         self._ns_per_tick = 1e9 / tick_hz
         self._earliest, self._latest = _Bound(tick, sent_ns), _Bound(tick, received_ns)
+        self._sent = deque([self._earliest], PINGS)
         self._last_tick, self._last_ns = tick, sent_ns
         self._doubt_ns = 0
 
     def round_trip(self, tick: int, sent_ns: int, received_ns: int) -> None:
         """Add an answered PING: host time before it was sent, and after its answer came."""
         self.round_trip_ns = min(self.round_trip_ns, received_ns - sent_ns)
-        earliest_ns, latest_ns = self._earliest_ns(tick), self._latest_ns(tick)
+        earliest_ns = self._earliest_ns(self._earliest, tick)
+        latest_ns = self._latest_ns(tick)
         contradicts = earliest_ns > received_ns or latest_ns < sent_ns
         self._doubt_ns = DOUBT_NS if contradicts else 0
-        if contradicts or earliest_ns + self._ns_per_tick <= sent_ns:
-            self._earliest = _Bound(tick, sent_ns)
+        if contradicts:
+            self._sent.clear()
+            self._last_ns = 0  # by a bound that was wrong
+        self._sent.append(_Bound(tick, sent_ns))
+        self._earliest = max(self._sent, key=lambda bound: self._earliest_ns(bound, tick))
         if contradicts or latest_ns - self._ns_per_tick >= received_ns:
             self._latest = _Bound(tick, received_ns)
 
@@ -201,20 +213,21 @@ class DeviceClock:
         """Return the host time, ns, of a reading's `tick`. Raises `ClockError`."""
         if tick <= self._last_tick:
             raise ClockError("stands or falls back")
-        earliest_ns = self._earliest_ns(tick) - self._doubt_ns
+        earliest_ns = self._earliest_ns(self._earliest, tick) - self._doubt_ns
         if earliest_ns > arrival_ns:
             if earliest_ns > arrival_ns + DOUBT_NS:
                 raise ClockError("jumps ahead")
             self._doubt_ns = DOUBT_NS
+            self._last_ns = 0
             earliest_ns = arrival_ns - DOUBT_NS
         self._last_tick = tick
         self._last_ns = max(earliest_ns, self._last_ns, arrival_ns - AGE_MAX_NS)
         return self._last_ns
 
-    def _earliest_ns(self, tick: int) -> int:
-        passed_ns = (tick - self._earliest.tick) * self._ns_per_tick
+    def _earliest_ns(self, bound: _Bound, tick: int) -> int:
+        passed_ns = (tick - bound.tick) * self._ns_per_tick
         slack_ns = abs(passed_ns) * DRIFT_MAX + self._ns_per_tick  # ticks are whole
-        return self._earliest.t_ns + math.floor(passed_ns - slack_ns)
+        return bound.t_ns + math.floor(passed_ns - slack_ns)
 
     def _latest_ns(self, tick: int) -> int:
         passed_ns = (tick - self._latest.tick) * self._ns_per_tick

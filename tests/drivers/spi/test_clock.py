@@ -30,6 +30,8 @@ class Way:
     """Mean of an exponential delay, both ways."""
     batch_ms: float = 16.0
     """Arrivals wait for the next multiple of this; 0 for none."""
+    lag_ms: float = 0.0
+    """Delay of every message, both ways, as of a line that is full."""
     drifts_ppm: tuple[float, ...] = (0.0,)
     """How much the device's clock is fast, second by second, again and again."""
     stall_probability: float = 0.0
@@ -62,7 +64,7 @@ def events(way: Way, duration_s: int) -> Iterator[Event]:
     def delay_ns() -> int:
         delay_ms = rng.expovariate(1.0 / way.jitter_ms) if way.jitter_ms else 0.0
         stall_ms = rng.uniform(0.0, 1000.0) if rng.random() < way.stall_probability else 0.0
-        return round((delay_ms + stall_ms) * MS)
+        return round((delay_ms + stall_ms + way.lag_ms) * MS)
 
     def arrival_ns(made_ns: int) -> int:
         ready_ns = made_ns + delay_ns()
@@ -184,6 +186,23 @@ def test_a_rate_far_off_makes_no_reading_newer_by_20_ms(wrong_ppm: float, seed: 
     """As while a computer's time is set; what round trips hide is shorter than they are."""
     too_old = [ns for ns, _ in too_old_ns(Way(drifts_ppm=(wrong_ppm,), seed=seed), 5)]
     assert min(too_old) >= -DOUBT_NS
+
+
+@pytest.mark.parametrize(("wrong_ppm", "lag_ms"), [(600, 120), (3_000, 150), (10_000, 400)])
+def test_a_wrong_rate_hides_no_age_on_a_slow_line(wrong_ppm: float, lag_ms: float) -> None:
+    way = Way(batch_ms=0.0, drifts_ppm=(wrong_ppm,), lag_ms=lag_ms)
+    too_old = [ns for ns, _ in too_old_ns(way, 300)]
+    assert len(too_old) > 29_000
+    assert min(too_old) >= 0
+
+
+def test_a_time_by_a_wrong_bound_is_not_kept() -> None:
+    """The clock gained 90 ms where readings come 150 ms late; a PING shows it."""
+    clock, now_ns = exact(3)
+    tick = 3 * TICK_HZ + 90_000
+    assert clock.host_ns(tick, now_ns + 150 * MS) > now_ns + 80 * MS
+    clock.round_trip(tick + 10_000, now_ns + 10 * MS, now_ns + 10 * MS)
+    assert clock.host_ns(tick + 20_000, now_ns + 170 * MS) <= now_ns + 20 * MS
 
 
 def test_no_reading_is_older_than_ten_seconds() -> None:
