@@ -10,6 +10,7 @@ from functools import partial
 from typing import Final
 
 import numpy as np
+from msgspec.structs import replace
 
 from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.exchange import Exchanged
@@ -224,17 +225,39 @@ class SessionKeeper(SensorWatch):
 
     def _with_serials(self, serials: Mapping[str, str]) -> KeptSession | None:
         now = numbers(serials).items()
-        return next((each for each in self._others if now and now <= each.serials.items()), None)
+        return self._former(lambda each: bool(now) and now <= each.serials.items())
 
     def _with_rest(self, rest: Rest, *, is_known: bool) -> KeptSession | None:
         is_known = is_known or (self._rest is None and not self._now().is_empty)
         resting = tuple(rest.ravel().tolist())
         now = KeptSession(None, self._fingers, numbers(self._serials), rest=resting)
-        for each in self._others:
-            is_seed = is_of_unknown_sensors(each)
-            if self._fits(each) if is_seed else not is_known and is_of_sensors(each, now):
-                return each
-        return None
+
+        def is_there(each: KeptSession) -> bool:
+            if is_of_unknown_sensors(each):
+                return self._fits(each)
+            return not is_known and is_of_sensors(each, now)
+
+        return self._former(is_there)
+
+    def _former(self, is_there: Callable[[KeptSession], bool]) -> KeptSession | None:
+        """Return the last session of present sensors, with what this model learned with them."""
+        needs_none = self._session is None
+        usable = (
+            each
+            for each in self._others
+            if each.fingers == self._fingers and (each.statistics is None) is needs_none
+        )
+        used = next(filter(is_there, usable), None)
+        if used is None:
+            return None
+        learned = (
+            each.trust
+            for each in (used, *self._others)
+            if each.trust is not None
+            and is_of_sensors(each, used)
+            and (self._trust is None or self._trust.fits(each.trust))
+        )
+        return replace(used, trust=next(learned, None))
 
     def _fits(self, seeded: KeptSession) -> bool:
         """Return True if the grasps of this session, still a young one, fit a seeded one."""
@@ -265,8 +288,6 @@ class SessionKeeper(SensorWatch):
     def _take_up(self, former: KeptSession, *, tared: bool) -> bool:
         """Continue a session of the new sensors; return False if it cannot be used."""
         trust = former.trust
-        if trust is not None and self._trust is not None and not self._trust.fits(trust):
-            trust = None
         learned = None if trust is None else trust.learner
         proves = tared and not is_of_unknown_sensors(former)
         proven = trust.risk.proven if proves and trust is not None else 0
@@ -277,8 +298,9 @@ class SessionKeeper(SensorWatch):
             return False
         self._unused = trust
         self._serials, self._rest = numbers(former.serials), self._rest_of(former.rest)
-        grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
-        log.warning("these sensors were there before: their session%s continues", grasps)
+        if self._session is not None or trust is not None:
+            grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
+            log.warning("these sensors were there before: their session%s continues", grasps)
         return True
 
 

@@ -478,6 +478,24 @@ def test_sensors_that_return_bring_learning_and_forget_no_slip(
     assert part.risk.lifts > 0
 
 
+def test_sensors_that_return_after_another_model_bring_learning(folder: SessionFolder) -> None:
+    """Five outcomes with each set of sensors."""
+    learned: list[int] = []
+    for model, sensor_sets in (("a", "X"), ("b", "XY"), ("a", "YX"), ("a", "X")):
+        session, part, driver = calibration(), trust(model), sensors()
+        keeper = session_keeper(session, driver, folder, part=part)
+        for sensor in sensor_sets:
+            driver.known = {"ff": sensor}
+            read_once(keeper)
+            learned.append(part.learner.outcomes)
+            for grasp in range(5 * len(learned), 5 * len(learned) + 5):
+                observe(session, 1, seed=grasp)
+                judge(part, grasp)
+                tell(part, grasp)
+        keeper.save()
+    assert learned == [0, 0, 0, 0, 5, 10]
+
+
 def test_an_open_grasp_is_kept_within_ten_seconds(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
