@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, Self
 
@@ -16,7 +17,10 @@ from graspd.daemon.session.file import KeptSession, SessionFileError, load, writ
 log = logging.getLogger("graspd")
 
 KEPT_MAX: Final = 5
-"""Most sessions that are kept; the one that was used longest ago goes."""
+"""Most sessions that are kept, beside an empty one that runs.
+
+An empty one goes first, then the one that was used longest ago.
+"""
 DAMAGED_MAX: Final = 16
 """Most files that cannot be read and stay; the oldest goes."""
 LOCK: Final = "lock"
@@ -99,7 +103,8 @@ class SessionFolder:
         Raises `SessionFileError`, after which the sessions on the disk are whole.
         """
         self.lock()
-        running, *others = sessions[:KEPT_MAX]
+        running, *others = sessions
+        others = sorted(others, key=attrgetter("is_empty"))[: KEPT_MAX - (not running.is_empty)]
         try:
             stay: set[int] = set()
             for each in reversed(others):

@@ -149,6 +149,18 @@ def test_an_exchange_right_after_a_save_loses_no_session(tmp_path: Path) -> None
     assert kept_grasps(tmp_path) == [2, 1]
 
 
+def test_starts_without_a_grasp_evict_no_session(tmp_path: Path) -> None:
+    taught = [KeptSession(state(each), FINGERS, {}) for each in (5, 4, 3, 2, 1)]
+    with SessionFolder(tmp_path) as folder:
+        folder.save(taught)
+        for serial in "AB":
+            others = [each for each in folder.load() if isinstance(each, KeptSession)]
+            folder.save([KeptSession(None, FINGERS, {"ff": serial}), *others])
+            assert kept_grasps(tmp_path) == [0, 5, 4, 3, 2, 1]
+        folder.save([KeptSession(state(6), FINGERS, {}), *taught])
+    assert kept_grasps(tmp_path) == [6, 5, 4, 3, 2]
+
+
 def learned(path: Path) -> bytes:
     """A file as it is after a day, with grasps whose outcome is still out."""
     session, part = calibration(), trust()
