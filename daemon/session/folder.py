@@ -89,12 +89,9 @@ class SessionFolder:
     def load(self) -> list[KeptSession | SessionFileError]:
         """Return what `look` finds, the last used first. Raises `SessionFileError`."""
         found = look(self.path)
-        self._kept, self._damaged, self._running = {}, [], None
-        if self._lock is not None:  # else another graspd may write these
-            self._kept = {
-                number: kept for number, kept in found.items() if isinstance(kept, KeptSession)
-            }
-            self._damaged = [number for number in found if number not in self._kept]
+        self._kept = {n: kept for n, kept in found.items() if isinstance(kept, KeptSession)}
+        self._damaged = [number for number in found if number not in self._kept]
+        self._running = None
         return list(found.values())
 
     def save(self, sessions: Sequence[KeptSession]) -> None:
@@ -102,7 +99,8 @@ class SessionFolder:
 
         Raises `SessionFileError`, after which the sessions on the disk are whole.
         """
-        self.lock()
+        if self._lock is None:
+            self._lock_late()
         running, *others = sessions
         others = sorted(others, key=attrgetter("is_empty"))[: KEPT_MAX - (not running.is_empty)]
         try:
@@ -137,6 +135,19 @@ class SessionFolder:
         except OSError as error:
             raise SessionFileError(f"{self.path}: cannot remove: {error.strerror}") from error
         return bool(numbers)
+
+    def _lock_late(self) -> None:
+        """Lock what was loaded without. Raises `SessionFileError` if that has changed since."""
+        loaded = self._kept, self._damaged
+        self.lock()
+        try:
+            self.load()
+            if (self._kept, self._damaged) != loaded:
+                raise SessionFileError(f"{self.path}: changed since the start, start graspd again")
+        except SessionFileError:
+            self._kept, self._damaged = loaded
+            self.close()
+            raise
 
     def _write(self, number: int, kept: KeptSession) -> None:
         write(_path(self.path, number), kept)

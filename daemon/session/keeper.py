@@ -77,12 +77,13 @@ class SessionKeeper(SensorWatch):
         """State of learning that was kept, where this run does not learn."""
         self._others: tuple[KeptSession, ...] = ()
         """Sessions of other fingers, models or sensors, the last used first."""
-        self._warned = False
+        self._warned = ""
+        """Why the last save failed, as it was logged; empty: it did not."""
         try:
             folder.lock()
         except SessionFileError as error:
             log.warning("%s; outcomes are `not kept` until it can be", error)
-            self._warned = True
+            self._warned = str(error)
         self._restore()
         self._saved: Sessions = (self._now(), *self._others)
         self._save_due_ns = clock() + SAVE_PERIOD_NS
@@ -122,15 +123,15 @@ class SessionKeeper(SensorWatch):
         if result is None:
             return
         if not isinstance(result, Exception):
-            self._saved, self._warned = result, False
+            self._saved, self._warned = result, ""
             self._answer(self._in_writing, KEPT)
             return
         why = str(result) if isinstance(result, SessionFileError) else UNEXPECTED
-        if not self._warned:
+        if why != self._warned:
             unexpected = None if isinstance(result, SessionFileError) else result
             warning = "%s; the next start begins without what is new"
             log.warning(warning, why, exc_info=unexpected)
-        self._warned = True
+        self._warned = why
         self._answer(self._in_writing, Reply(Told.NOT_KEPT, why))
 
     def _start_save(self) -> None:

@@ -329,9 +329,11 @@ def test_a_disk_that_fails_at_the_start_is_tried_again(
     folder.close()
 
 
-def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize("writes", [False, True])
+def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path, writes: bool) -> None:
     path, mine, theirs, found = tmp_path / "right", trust(), trust(), list[Reply]()
     with SessionFolder(path) as other:
+        other.save([KeptSession(None, FINGERS, {}, theirs.state())])
         folder = SessionFolder(path)
         keeper = session_keeper(None, sensors(), folder, part=mine)
         judge(mine, 1)
@@ -339,15 +341,17 @@ def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path) -> None:
         keeper.keep(found.append)
         go_round(keeper)
         judge(theirs, 2)
-        other.save([KeptSession(None, FINGERS, {}, theirs.state())])
-    keeper.keep(found.append)
-    go_round(keeper)
+        if writes:
+            other.save([KeptSession(None, FINGERS, {}, theirs.state())])
+    for _ in range(2):
+        keeper.keep(found.append)
+        go_round(keeper)
     keeper.save()
     folder.close()
     in_use = f"{path}: in use by another graspd, stop that one first"
-    assert found == [Reply(Told.NOT_KEPT, in_use), KEPT]
-    of_each = [kept.trust for kept in kept_in(path) if kept.trust is not None]
-    assert of_each == [mine.state(), theirs.state()]
+    changed = Reply(Told.NOT_KEPT, f"{path}: changed since the start, start graspd again")
+    assert found == [Reply(Told.NOT_KEPT, in_use), *[changed if writes else KEPT] * 2]
+    assert kept_trust(folder) == (theirs if writes else mine).state()
 
 
 def test_announced_lifts_are_on_disk_before_the_answer(
