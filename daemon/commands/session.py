@@ -26,7 +26,7 @@ from graspd.daemon.scene.scene import GateMode
 from graspd.daemon.session.file import KeptSession, SessionFileError, restore_kept
 from graspd.daemon.session.folder import ENDING, SessionFolder, look
 from graspd.daemon.session.keeper import is_of_unknown_sensors
-from graspd.daemon.trust.lift_book import GraspId, LiftBook
+from graspd.daemon.trust.lift_book import GraspId, Lift, LiftBook
 from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
 from graspd.models.contract import ModelError, SessionInput
@@ -241,33 +241,51 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
 
 
 def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: str | None) -> None:
-    """Tell how open lifts ended, as their controller would have; show which are open."""
+    """Tell how open lifts ended, as their controller would have; show which are open.
+
+    A lift that was announced before an exchange of sensors is open in the files of both.
+    """
     path, trust = wanted.session_path, assembly.build_pipeline(Plan.of(wanted), model).trust
     with SessionFolder(path) as folder:
-        before = [kept for kept in folder.load() if isinstance(kept, KeptSession)]
-        mine = next((kept for kept in before if kept.model == model.sha256), None)
-        if trust is None or mine is None or mine.trust is None:
+        mine = {
+            number: kept
+            for number, kept in look(path).items()
+            if isinstance(kept, KeptSession) and kept.model == model.sha256
+        }
+        if trust is None or not mine:
             raise SessionFileError(f"{path}: no lifts are kept")
-        try:
-            trust.restore(mine.trust)
-        except ValueError as error:
-            raise SessionFileError(f"{path}: what was learned {error}") from error
-        grasps = [lift.id for lift in trust.lifts.state().records if lift.is_awaited]
-        lifts = {f"{grasp.boot_id[:8]}-{grasp.grasp}": grasp for grasp in grasps}
-        if unknown := set(names) - lifts.keys():
+        known: dict[str, Lift] = {}
+        for kept in mine.values():
+            known = _restored_lifts(trust, kept, path) | known  # the file used last knows best
+        lifts = [name for name, lift in known.items() if lift.is_awaited]
+        if unknown := set(names).difference(lifts):
             raise SessionFileError(f"{', '.join(unknown)}: not open")
         if told is None:
             write_lines(f"{printable(str(path))}: {len(lifts)} lifts without outcome", *lifts)
             return
-        for name in names or lifts:
-            if told == "not-lifted":
-                trust.lifts.take_back(lifts[name])
-            else:
-                trust.outcome(lifts[name], slipped=told == "slipped")
-        if lifts:
-            settled = replace(mine, trust=trust.state())
-            folder.save([settled, *(kept for kept in before if kept is not mine)])
+        for number, kept in mine.items():
+            here = _restored_lifts(trust, kept, path)
+            ended = [name for name in names or lifts if name in here and here[name].is_awaited]
+            for name in ended:
+                if told == "not-lifted":
+                    trust.lifts.take_back(here[name].id)
+                else:
+                    trust.outcome(here[name].id, slipped=told == "slipped")
+            if ended:
+                folder.replace(number, replace(kept, trust=trust.state()))
     write_lines(f"{printable(str(path))}: {len(names or lifts)} lifts {told}")
+
+
+def _restored_lifts(trust: Trust, kept: KeptSession, path: Path) -> dict[str, Lift]:
+    """Restore what was learned; return its lifts by name. Raises `SessionFileError`."""
+    if kept.trust is None:
+        return {}
+    try:
+        trust.restore(kept.trust)
+    except ValueError as error:
+        raise SessionFileError(f"{path}: what was learned {error}") from error
+    lifts = trust.lifts.state().records
+    return {f"{lift.id.boot_id[:8]}-{lift.id.grasp}": lift for lift in lifts}
 
 
 def _taught(trust: Trust, *, proves: bool) -> TrustState:

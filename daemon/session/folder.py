@@ -126,6 +126,14 @@ class SessionFolder:
         except OSError as error:
             raise _not_kept(self.path, error) from error
 
+    def replace(self, number: int, kept: KeptSession) -> None:
+        """Replace a single file, which stays as old as it is. Raises `SessionFileError`."""
+        self.lock()
+        try:
+            self._write(number, kept)
+        except OSError as error:
+            raise _not_kept(self.path, error) from error
+
     def remove(self) -> bool:
         """Delete all that was kept; return False if that is nothing. Raises `SessionFileError`."""
         numbers = _numbers(self.path)

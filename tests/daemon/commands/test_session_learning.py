@@ -22,7 +22,7 @@ from graspd.drivers.recordings.csv_rows import SLIPPED, read_rows
 from graspd.drivers.twins.grasps.grasp_script import EndPoint
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
 from tests.daemon.record.test_export import Writer
-from tests.daemon.session.learning import SHORT, last_kept
+from tests.daemon.session.learning import SHORT, kept_in, last_kept
 from tests.kit.inside import graspd
 from tests.kit.scenes import session_scene, unlabelled_demo
 
@@ -197,6 +197,30 @@ def test_a_person_settles_announced_lifts(tmp_path: Path) -> None:
     files = {each.name: each.read_bytes() for each in kept.iterdir()}
     assert "0 lifts held" in graspd("session", "settle", path, "--as", "held").stdout
     assert {each.name: each.read_bytes() for each in kept.iterdir()} == files
+
+
+def test_settling_leaves_the_last_session_the_last(tmp_path: Path) -> None:
+    """Of two lifts one is open in the files of two sets of sensors; another model ran last."""
+    path = session_scene(tmp_path, "mlp", "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n")
+    kept, trust = tmp_path / "right", live_trust(path)
+    told, grasp = (GraspId("0123456789abcdef" * 2, number) for number in (1, 2))
+    for each in (told, grasp):
+        trust.note(each, trust.judge(each, 0.01, -5.0, np.zeros(0)), stable=True)
+        trust.lifts.announce()
+    former = KeptSession(None, FINGERS, {"ff": "B"}, trust.state())
+    trust.outcome(told, slipped=True)  # after the exchange
+    mine = KeptSession(None, FINGERS, {"ff": "A"}, trust.state())
+    with SessionFolder(kept) as folder:
+        folder.save([KeptSession(None, FINGERS, {"ff": "C"}), mine, former])
+    settled = graspd("session", "settle", path, "--as", "held")
+    assert settled.stdout.endswith(": 1 lifts held\n"), settled.stderr
+    trust.outcome(grasp, slipped=False)
+    found = [(each.serials["ff"], each.trust) for each in kept_in(kept)]
+    assert [sensor for sensor, _ in found] == ["C", "A", "B"]
+    assert found[1][1] is not None
+    assert found[1][1].risk == trust.risk.state()
+    assert found[2][1] != former.trust
+    assert "0 lifts without" in graspd("session", "settle", path).stdout
 
 
 def test_what_is_damaged_is_said(tmp_path: Path) -> None:
