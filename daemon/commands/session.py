@@ -23,9 +23,9 @@ from graspd.daemon.process.text import complain, printable, write_json, write_li
 from graspd.daemon.run.replaying import trained_on
 from graspd.daemon.scene import drivers as scene_drivers
 from graspd.daemon.scene.scene import GateMode
-from graspd.daemon.session.file import KeptSession, SessionFileError, restore_kept
+from graspd.daemon.session.file import KeptSession, SessionFileError
 from graspd.daemon.session.folder import ENDING, SessionFolder, look
-from graspd.daemon.session.keeper import is_of_unknown_sensors
+from graspd.daemon.session.keeper import continue_kept, newest_of_each
 from graspd.daemon.trust.lift_book import GraspId, Lift, LiftBook
 from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
@@ -101,13 +101,12 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
     """Show what is kept; return 2 if a file cannot be read."""
     path, found = wanted.session_path, look(wanted.session_path)
     sessions = {n: kept for n, kept in found.items() if isinstance(kept, KeptSession)}
-    fingers = tuple(wanted.hand.fingers)
-    mine = {n: kept for n, kept in sessions.items() if kept.fingers == fingers}
-    sessions = mine | sessions  # those of the hand first
     for problem in found.values():
         if isinstance(problem, SessionFileError):
             complain(str(problem))
-    calibrated = _is_calibrated(wanted, model, next(iter(sessions.values()), None))
+    sessions, calibrated = _continued(wanted, model, sessions)
+    if isinstance(next(iter(found.values()), None), SessionFileError):
+        calibrated = False  # it may have been of other sensors
     if as_json:
         documents = [_document(number, kept) for number, kept in sessions.items()]
         document = {
@@ -127,18 +126,22 @@ def _document(number: int, kept: KeptSession) -> dict[str, Any]:
     return {"file": f"{number}{ENDING}", **content, "trust": _learned(kept.trust)}
 
 
-def _is_calibrated(wanted: scene.Scene, model: TactileModel, kept: KeptSession | None) -> bool:
-    """Return True if a daemon that starts now is calibrated."""
+def _continued(
+    wanted: scene.Scene, model: TactileModel, sessions: dict[int, KeptSession]
+) -> tuple[dict[int, KeptSession], bool]:
+    """Return the sessions, first what a start continues, and whether it is calibrated then."""
     pipeline = assembly.build_pipeline(Plan.of(wanted), model)
-    session = pipeline.session
-    if session is None:
-        return False
-    try:
-        if kept is not None and not (is_of_unknown_sensors(kept) and pipeline.read_rest):
-            restore_kept(kept, wanted.hand.fingers, session)
-    except SessionFileError as error:
-        complain(f"{error}; a new session begins")
-    return session.calibrated
+    fingers, kept = tuple(wanted.hand.fingers), list(sessions.values())
+    used, learned, problems = continue_kept(pipeline, fingers, newest_of_each(kept))
+    for problem in problems:
+        complain(problem)
+    calibrated = pipeline.session is not None and pipeline.session.calibrated
+    if used is None:
+        mine = {n: each for n, each in sessions.items() if each.fingers == fingers}
+        return mine | sessions, calibrated
+    number = next(n for n, each in sessions.items() if each is used)
+    first = replace(used, trust=None if learned is None else learned.trust)
+    return {number: first} | {n: each for n, each in sessions.items() if n != number}, calibrated
 
 
 def _lines(

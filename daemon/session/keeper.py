@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -32,7 +32,7 @@ from graspd.daemon.session.sensors import (
     moved_fingers,
     numbers,
 )
-from graspd.daemon.trust.trust import TrustState
+from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.base import Driver
 
 log = logging.getLogger("graspd")
@@ -84,7 +84,7 @@ class SessionKeeper(SensorWatch):
         except SessionFileError as error:
             log.warning("%s; outcomes are `not kept` until it can be", error)
             self._warned = str(error)
-        self._restore()
+        self._restore(pipeline)
         self._saved: Sessions = (self._now(), *self._others)
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._waiting: deque[Answer] = deque()
@@ -164,18 +164,19 @@ class SessionKeeper(SensorWatch):
         rest = None if self._rest is None else tuple(self._rest.ravel().tolist())
         return KeptSession(statistics, self._fingers, numbers(self._serials), trust, rest)
 
-    def _restore(self) -> None:
+    def _restore(self, pipeline: Pipeline) -> None:
         try:
             found = self._folder.load()
         except SessionFileError as error:
             found = [error]
-        for at, problem in enumerate(found):
-            if isinstance(problem, SessionFileError):
+        for at, damaged in enumerate(found):
+            if isinstance(damaged, SessionFileError):
                 then = "" if at else ", and a new session begins"
-                log.warning("%s; it stays as it is%s", problem, then)
+                log.warning("%s; it stays as it is%s", damaged, then)
         kept = newest_of_each([each for each in found if isinstance(each, KeptSession)])
-        used = next((each for each in kept if self._continues(each)), None)
-        learned = None if used is None else self._restore_trust(used, kept)
+        used, learned, problems = continue_kept(pipeline, self._fingers, kept)
+        for problem in problems:
+            log.warning("%s", problem)
         continued = used if used is not None and used.trust is None else learned
         self._others = tuple(each for each in kept if each not in (continued, learned))
         if used is None:
@@ -185,44 +186,12 @@ class SessionKeeper(SensorWatch):
         self._serials, self._rest = numbers(used.serials), self._rest_of(used.rest)
         grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
         log.info("session%s restored from %s", grasps, self._folder.path)
+        if learned is not None and self._trust is None:
+            self._unused = learned.trust
+        elif learned is not None and self._trust is not None:
+            log.info("%d outcomes restored", self._trust.learner.outcomes)
         if isinstance(found[0], SessionFileError):  # it may have been of other sensors
             self._begin(None)
-
-    def _continues(self, kept: KeptSession) -> bool:
-        """Continue a session; return False if it is of other fingers or may be of other sensors."""
-        try:
-            of_fingers(kept, self._fingers)
-            if self._session is None:
-                return kept.statistics is None
-            if self._read_rest is not None and is_of_unknown_sensors(kept):
-                log.warning(SEEDED, FIT_GRASPS)
-                return False
-            restore_kept(kept, self._fingers, self._session)
-        except SessionFileError as error:
-            log.warning("%s; it stays kept", error)
-            return False
-        return True
-
-    def _restore_trust(self, used: KeptSession, kept: Sequence[KeptSession]) -> KeptSession | None:
-        """Restore what this model learned last with the sensors of `used`; return where it was."""
-        problem: ValueError | None = None
-        for each in (used, *kept):
-            if each.trust is None or not is_of_sensors(each, used):
-                continue
-            if self._trust is None:
-                self._unused = each.trust
-                return each
-            try:
-                self._trust.restore(each.trust)
-            except ValueError as error:
-                problem = problem or error
-                continue
-            log.info("%d outcomes restored", each.trust.learner.outcomes)
-            return each
-        if problem is not None:
-            lost = "learning and the count of the risk begin again"
-            log.warning("%s: what was learned %s; %s", self._folder.path, problem, lost)
-        return None
 
     def _with_serials(self, serials: Mapping[str, str]) -> KeptSession | None:
         now = numbers(serials).items()
@@ -303,6 +272,65 @@ class SessionKeeper(SensorWatch):
             grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
             log.warning("these sensors were there before: their session%s continues", grasps)
         return True
+
+
+class Continued(NamedTuple):
+    """Kept sessions that a start continues; None: it has none."""
+
+    used: KeptSession | None
+    """The session of these fingers."""
+    learned: KeptSession | None
+    """The one with the learning of this model with the same sensors."""
+    problems: list[str]
+    """Why others are not continued."""
+
+
+def continue_kept(
+    pipeline: Pipeline, fingers: Sequence[str], kept: Sequence[KeptSession]
+) -> Continued:
+    """Restore the session that a start continues, of those that are kept, the last used first."""
+    problems: list[str] = []
+    used = next((each for each in kept if _continues(pipeline, fingers, each, problems)), None)
+    learned = None if used is None else _restore_trust(pipeline.trust, used, kept, problems)
+    return Continued(used, learned, problems)
+
+
+def _continues(
+    pipeline: Pipeline, fingers: Sequence[str], kept: KeptSession, problems: list[str]
+) -> bool:
+    """Continue a session; return False if it is of other fingers or may be of other sensors."""
+    try:
+        of_fingers(kept, fingers)
+        if pipeline.session is None:
+            return kept.statistics is None
+        if pipeline.read_rest is not None and is_of_unknown_sensors(kept):
+            problems.append(SEEDED % FIT_GRASPS)
+            return False
+        restore_kept(kept, fingers, pipeline.session)
+    except SessionFileError as error:
+        problems.append(f"{error}; it stays kept")
+        return False
+    return True
+
+
+def _restore_trust(
+    trust: Trust | None, used: KeptSession, kept: Sequence[KeptSession], problems: list[str]
+) -> KeptSession | None:
+    """Restore what this model learned last with the sensors of `used`; return where it was."""
+    why: list[str] = []
+    for each in (used, *kept):
+        if each.trust is None or not is_of_sensors(each, used):
+            continue
+        try:
+            if trust is not None:
+                trust.restore(each.trust)
+        except ValueError as error:
+            why.append(str(error))
+            continue
+        return each
+    lost = "learning and the count of the risk begin again"
+    problems += [f"what was learned {problem}; {lost}" for problem in why[:1]]
+    return None
 
 
 def is_of_unknown_sensors(kept: KeptSession) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from graspd.biotac import electrode_columns
 from graspd.daemon import scene as scenes
@@ -221,6 +222,25 @@ def test_settling_leaves_the_last_session_the_last(tmp_path: Path) -> None:
     assert found[1][1].risk == trust.risk.state()
     assert found[2][1] != former.trust
     assert "0 lifts without" in graspd("session", "settle", path).stdout
+
+
+def test_a_session_is_shown_as_a_start_continues_it(tmp_path: Path) -> None:
+    """A model that needs no statistics ran last with the same sensors."""
+    path = session_scene(tmp_path)
+    learned = seed(path, DEMO_TABLE)
+    seeded = last_kept(tmp_path / "right")
+    assert seeded is not None
+    assert learned is not None
+    other = live_trust(session_scene(tmp_path / "other", "mlp")).state()
+    with SessionFolder(tmp_path / "right") as folder:
+        folder.load()
+        mine = replace(seeded, serials={"ff": "A"})
+        folder.save([KeptSession(None, FINGERS, {"ff": "A"}, other), mine])
+    document = shown(path)
+    assert document["calibrated"] is True
+    assert document["session"]["file"] == "2.session"
+    assert document["session"]["trust"]["outcomes"] == learned.learner.outcomes > 0
+    assert [each["file"] for each in document["others"]] == ["3.session"]
 
 
 def test_what_is_damaged_is_said(tmp_path: Path) -> None:
