@@ -66,6 +66,8 @@ class SessionFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             self.close()
+            if not isinstance(error, BlockingIOError):
+                raise _not_kept(self.path, error) from error
             raise SessionFileError(
                 f"{self.path}: in use by another graspd, stop that one first"
             ) from error
