@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from operator import attrgetter
@@ -27,6 +28,8 @@ LOCK: Final = "lock"
 """Name of the file that is locked."""
 ENDING: Final = ".session"
 """End of the names of the others; before it is a number."""
+NUMBER: Final = re.compile(r"[1-9][0-9]{0,8}")
+"""The numbers; files with other names are not of graspd."""
 
 Found = dict[int, KeptSession | SessionFileError]
 """Content of each file, or why it cannot be read, by its number, the last used first."""
@@ -187,7 +190,7 @@ def _numbers(folder: Path) -> list[int]:
     except OSError as error:
         raise SessionFileError(f"{folder}: cannot read the session: {error.strerror}") from error
     names = [name.removesuffix(ENDING) for name in files]
-    return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
+    return sorted((int(name) for name in names if NUMBER.fullmatch(name)), reverse=True)
 
 
 def _path(folder: Path, number: int) -> Path:

@@ -290,6 +290,16 @@ def test_a_disk_without_locks_is_not_in_use(
         SessionFolder(tmp_path).lock()
 
 
+def test_files_with_other_names_are_let_alone(tmp_path: Path) -> None:
+    names = {f"{stem}.session" for stem in ("0", "007", "٣", "9" * 10)}
+    for name in names:
+        (tmp_path / name).write_bytes(b"?")
+    with SessionFolder(tmp_path) as folder:
+        assert folder.load() == []
+        save(folder, 1)
+    assert {path.name for path in tmp_path.iterdir()} == {*names, "lock", "1.session"}
+
+
 def test_a_full_book_of_open_lifts_fits_the_file(tmp_path: Path) -> None:
     part = trust(inputs=5 * 26)
     for grasp in range(LIFTS_MAX + 1):
