@@ -25,6 +25,7 @@ GONE = {
     ("ReplayTactile", "speed"): "`graspd replay --speed` has it: remove the line",
     ("ReplayTactile", "rate_hz"): "`graspd replay --rate` has it: remove the line",
     ("ReplayTactile", "strict"): "`graspd replay --strict` has it: remove the line",
+    ("SessionSection", "file"): "[session] folder is a folder: name a new one or remove the line",
     ("GateSection", "sweeps"): FIXED,
     ("GateSection", "contact_counts"): FIXED,
     ("GateSection", "contact_sigmas"): FIXED,

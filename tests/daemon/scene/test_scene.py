@@ -26,6 +26,7 @@ CAN = "[tactile]\ndriver = 'can'\n"
 BEFORE = {
     "ReplayTactile": GOOD,
     "CanTactile": CAN,
+    "SessionSection": f"{CAN}[session]\n",
     "GateSection": f"{CAN}[gate]\n",
     "Publish": f"{CAN}[publish]\n",
     "Ask": f"{CAN}[ask]\n",
