@@ -24,7 +24,7 @@ from graspd.daemon.run.replaying import trained_on
 from graspd.daemon.scene import drivers as scene_drivers
 from graspd.daemon.scene.scene import GateMode
 from graspd.daemon.session.file import KeptSession, SessionFileError
-from graspd.daemon.session.folder import ENDING, SessionFolder, look
+from graspd.daemon.session.folder import ENDING, Found, SessionFolder, look
 from graspd.daemon.session.keeper import continue_kept, newest_of_each
 from graspd.daemon.trust.lift_book import GraspId, Lift, LiftBook
 from graspd.daemon.trust.trust import Trust, TrustState
@@ -100,11 +100,7 @@ def _has_folder(wanted: scene.Scene) -> bool:
 def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
     """Show what is kept; return 2 if a file cannot be read."""
     path, found = wanted.session_path, look(wanted.session_path)
-    sessions = {n: kept for n, kept in found.items() if isinstance(kept, KeptSession)}
-    for problem in found.values():
-        if isinstance(problem, SessionFileError):
-            complain(str(problem))
-    sessions, calibrated = _continued(wanted, model, sessions)
+    sessions, calibrated = _continued(wanted, model, _readable(found))
     if isinstance(next(iter(found.values()), None), SessionFileError):
         calibrated = False  # it may have been of other sensors
     if as_json:
@@ -124,6 +120,14 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
 def _document(number: int, kept: KeptSession) -> dict[str, Any]:
     content = msgspec.to_builtins(kept)
     return {"file": f"{number}{ENDING}", **content, "trust": _learned(kept.trust)}
+
+
+def _readable(found: Found) -> dict[int, KeptSession]:
+    """Return the sessions; complain about each file that cannot be read."""
+    for problem in found.values():
+        if isinstance(problem, SessionFileError):
+            complain(str(problem))
+    return {number: kept for number, kept in found.items() if isinstance(kept, KeptSession)}
 
 
 def _continued(
@@ -203,7 +207,8 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
     pipeline = assembly.build_pipeline(plan, model)
     session, trust = pipeline.session, pipeline.trust
     with SessionFolder(wanted.session_path) as folder:
-        before = [kept for kept in folder.load() if isinstance(kept, KeptSession)]
+        folder.load()
+        before = list(_readable(look(folder.path)).values())
         judgements = _judge(plan, pipeline)
         readings = len(judgements)
         outcomes = 0 if trust is None else trust.learner.outcomes
@@ -250,11 +255,8 @@ def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: st
     """
     path, trust = wanted.session_path, assembly.build_pipeline(Plan.of(wanted), model).trust
     with SessionFolder(path) as folder:
-        mine = {
-            number: kept
-            for number, kept in look(path).items()
-            if isinstance(kept, KeptSession) and kept.model == model.sha256
-        }
+        found = _readable(look(path))
+        mine = {number: kept for number, kept in found.items() if kept.model == model.sha256}
         if trust is None or not mine:
             raise SessionFileError(f"{path}: no lifts are kept")
         known: dict[str, Lift] = {}

@@ -247,7 +247,8 @@ def test_what_is_damaged_is_said(tmp_path: Path) -> None:
     path, kept = session_scene(tmp_path, model="mlp"), tmp_path / "right" / "1.session"
     kept.parent.mkdir()
     kept.write_bytes(b"?")
-    result = graspd("session", "show", path)
-    assert f"{kept}: not a session" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-    assert result.returncode == 2
+    for arguments in (("show", path), ("seed", path, DEMO_TABLE), ("settle", path)):
+        result = graspd("session", *arguments)
+        assert f"{kept}: not a session" in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+        assert result.returncode == (2 if arguments[0] == "show" else 0)
