@@ -32,6 +32,8 @@ RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage
 """An event of `EVENTS`, an outcome, an exchange of sensors, or what belongs to the next reading:
 that it was late, or that it changed the gate."""
 _Item = Reading | RecordedEvent
+HELD_MAX = 64
+"""Most messages that may stand between a reading and what is about it."""
 
 
 @dataclass(slots=True)
@@ -144,19 +146,18 @@ class McapReplayDriver(RecordedDriver[_Item]):
 
 def _in_order(messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
     """Yield the messages to play, those about a reading before it, at its time."""
-    reading: RecordedMessage | None = None
+    held: list[RecordedMessage] = []
     for message in messages:
         if message.kind in (Topic.LATE, Topic.GATE):
-            yield message if reading is None else message._replace(at_ns=reading.at_ns)
-            continue
-        if message.kind not in PLAYED:
-            continue
-        if reading is not None:
-            yield reading
-            reading = None
-        if message.kind == Topic.TACTILE:
-            reading = message
-        else:
+            yield message._replace(at_ns=held[0].at_ns) if held else message
+        elif message.kind == Topic.TACTILE:
+            yield from held
+            held = [message]
+        elif message.kind in PLAYED and held:
+            held.append(message)
+        elif message.kind in PLAYED:
             yield message
-    if reading is not None:
-        yield reading
+        if len(held) == HELD_MAX:
+            yield from held
+            held.clear()
+    yield from held

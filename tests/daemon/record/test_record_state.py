@@ -165,6 +165,8 @@ class Daemon:
         self._outbox.tactile(reading, None)
         self.pipeline.clock = lambda: reading.t_ns + next(ages) * 1_000_000
         judgement = self.pipeline.judge(reading)
+        if Reason.STALE in judgement.reasons:  # a lift that waited is taken back first
+            self.recorder.on_event(LoopEvent.TAKEN_BACK)
         self.recorder.on_verdict(
             PublishedVerdict(judgement, NO_VERDICT, b"", reading, True, *NO_LIFT)
         )
