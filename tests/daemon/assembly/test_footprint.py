@@ -180,7 +180,8 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     others = {"graspd.drivers.joints", *BUSES["spi"], *BUSES["can"]}
     assert below(others, found["modules"]) == []
     assert found["threads"] == 1 + ZMQ_THREADS
-    assert found["descriptors"] == STANDARD + SIGNALS + SOCKET + ASK_SOCKET + FILE
+    # Whether the connection of a subscriber has gone by now is a matter of time.
+    assert STANDARD + SIGNALS + SOCKET + ASK_SOCKET + FILE - found["descriptors"] in {0, 1}
     assert found["judged"]
 
 

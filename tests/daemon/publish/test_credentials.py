@@ -67,16 +67,18 @@ made = socket.socket(socket.AF_UNIX)
 os.setgroups([]); os.setgid(uid); os.setuid(uid)
 made.connect(path); made.settimeout(30); made.sendall(hello[:64])
 assert made.recv(64, socket.MSG_WAITALL); made.sendall(hello[64:])
+assert made.recv(100); made.sendall(bytes.fromhex(sys.argv[4]))  # READY comes before a question
 while made.recv(100): pass
 """
+QUESTION = b"\x00\x04lift"
 
 
 def hello(*properties: tuple[bytes, bytes]) -> bytes:
-    """A DEALER's handshake (RFC 23) with these properties, and a question."""
+    """A DEALER's part of a handshake (RFC 23) with these properties."""
     fields = b"\x05READY"
     for name, value in ((b"Socket-Type", b"DEALER"), (b"Identity", NAME), *properties):
         fields += bytes([len(name)]) + name + struct.pack(">I", len(value)) + value
-    return b"\x04" + bytes([len(fields)]) + fields + b"\x00\x04lift"
+    return b"\x04" + bytes([len(fields)]) + fields
 
 
 @pytest.mark.parametrize("forged", [b"Peer-Address", b"User-Id"])
@@ -86,17 +88,19 @@ def test_a_peer_cannot_name_its_own_user(door: tuple[Door, str], forged: bytes) 
         rogue.sendall(GREETING)
         assert len(rogue.recv(64, socket.MSG_WAITALL)) == 64
         rogue.sendall(hello((forged, b"localhost:4242:4242:1")))
+        assert rogue.recv(100)
+        rogue.sendall(QUESTION)
         assert first_of(door[0].receive) == [NAME, b"user %d" % os.getuid(), b"lift"]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 def test_another_user_with_the_same_routing_id_is_told_apart(door: tuple[Door, str]) -> None:
     command = [sys.executable, "-I", "-c", CONNECTS_AS, door[1]]
-    said = (GREETING + hello()).hex()
+    said = (GREETING + hello()).hex(), QUESTION.hex()
     # A DEALER of libzmq would connect again, and take its routing id back.
-    with subprocess.Popen([*command, "0", said]) as owner:
+    with subprocess.Popen([*command, "0", *said]) as owner:
         assert first_of(door[0].receive) == [NAME, b"user 0", b"lift"]
-        with subprocess.Popen([*command, "65534", said]) as rogue:
+        with subprocess.Popen([*command, "65534", *said]) as rogue:
             assert first_of(door[0].receive) == [NAME, b"user 65534", b"lift"]
             rogue.kill()
         owner.kill()
