@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -221,11 +221,9 @@ class SessionKeeper(SensorWatch):
         if used is None:
             return None
         learned = (
-            each.trust
-            for each in (used, *self._others)
-            if each.trust is not None
-            and is_of_sensors(each, used)
-            and (self._trust is None or self._trust.fits(each.trust))
+            trust
+            for _, trust in _taught_with(used, self._others)
+            if self._trust is None or self._trust.fits(trust)
         )
         return replace(used, trust=next(learned, None))
 
@@ -318,12 +316,10 @@ def _restore_trust(
 ) -> KeptSession | None:
     """Restore what this model learned last with the sensors of `used`; return where it was."""
     why: list[str] = []
-    for each in (used, *kept):
-        if each.trust is None or not is_of_sensors(each, used):
-            continue
+    for each, learned in _taught_with(used, kept):
         try:
             if trust is not None:
-                trust.restore(each.trust)
+                trust.restore(learned)
         except ValueError as error:
             why.append(str(error))
             continue
@@ -331,6 +327,15 @@ def _restore_trust(
     lost = "learning and the count of the risk begin again"
     problems += [f"what was learned {problem}; {lost}" for problem in why[:1]]
     return None
+
+
+def _taught_with(
+    used: KeptSession, kept: Sequence[KeptSession]
+) -> Iterator[tuple[KeptSession, TrustState]]:
+    """Yield the sessions with the sensors of `used` that hold learning, it first, and that."""
+    for each in (used, *kept):
+        if each.trust is not None and is_of_sensors(each, used):
+            yield each, each.trust
 
 
 def is_of_unknown_sensors(kept: KeptSession) -> bool:

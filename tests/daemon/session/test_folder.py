@@ -48,7 +48,7 @@ class Killed(BaseException):
 
 @contextmanager
 def killed(call: int, *, after: bool) -> Iterator[None]:
-    """Kill what runs inside before or after so many calls."""
+    """Kill what runs inside, before or after its `call`-th call of a step."""
     left = itertools.count(-call)
 
     def deadly(real: Callable[..., object]) -> Callable[..., object]:
