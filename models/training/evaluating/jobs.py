@@ -216,7 +216,8 @@ def run_jobs(
     Each result is stored in `folder` before it is yielded, so an interrupted run can continue.
     `processes`: number of jobs at a time. `dask`: address of the scheduler of a Dask cluster, which
     then runs the jobs. Its workers need graspd with the extras `train` and `cluster`, but no folder
-    and no data. A job whose worker is lost runs again.
+    and no data. A job whose worker is lost runs again, or ends the run with `ClusterError`: what is
+    stored by then is not run again.
 
     Raises what `run` raises, `ClusterError`, and `OSError` if the folder cannot be used.
     """
@@ -279,8 +280,10 @@ def _on_cluster(address: str, grasps: Grasps) -> Iterator[joblib.Parallel]:
             yield _parallel("dask", client=client, scatter=[grasps], pure=False)
         except KilledWorker as error:
             raise ClusterError(f"a job lost several workers: {one_line(error)}") from error
-        except (TimeoutError, CancelledError) as error:
+        except TimeoutError as error:
             raise ClusterError(f"the cluster does not answer: {one_line(error)}") from error
+        except CancelledError as error:
+            raise ClusterError(f"the cluster lost a job: {one_line(error)}") from error
 
 
 async def _knock(address: str) -> None:

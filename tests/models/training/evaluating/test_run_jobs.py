@@ -79,16 +79,19 @@ def test_a_cluster_may_lose_a_worker_and_then_its_scheduler(tmp_path: Path) -> N
     wanted, more = some_jobs(8, trees=40), some_jobs(8, trees=30)
     found: dict[Job, JobResult] = {}
     with cluster(tmp_path) as (address, scheduler, workers):
-        for job, result in run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address):
-            if not found:
-                workers[0].kill()
-            found[job] = result
+        results = run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address)
+        next(results)
+        workers[0].kill()
+        # Dask runs a lost job again, or cancels it: then the next run has what is stored.
+        with contextlib.suppress(ClusterError):
+            found.update(results)
         assert workers[0].wait(START_S) == -signal.SIGKILL
+        found.update(run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address))
         assert workers[1].poll() is workers[2].poll() is None
         results = run_jobs(more, GRASPS, tmp_path / "more", dask=address)
         next(results)
         scheduler.kill()
-        with pytest.raises(ClusterError, match="the cluster does not answer"):
+        with pytest.raises(ClusterError, match=r"the cluster (does not answer|lost a job)"):
             list(results)
     assert_same(found, {job: jobs.run(job, GRASPS) for job in wanted})
     assert_same(dict(run_jobs(wanted, GRASPS, tmp_path / "ours")), found)
