@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graspd.biotac import COUNT_MAX, ELECTRODES, Finger, electrode_columns
+from graspd.biotac import Finger
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.plan import MCAP, require_mcap
@@ -24,24 +24,31 @@ from graspd.daemon.judge.health import at_rail
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
 from graspd.models import trial, zoo
-from graspd.models.contract import ModelError, SessionInput
+from graspd.models.contract import CLASSES, ModelError, SessionInput
+from graspd.models.counts import check_fingers, counts_of
 from graspd.models.judge.grasp_judge import Examined, GraspJudge
+from graspd.models.runtime import read
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from graspd.daemon.publish.messages import Verdict
 
 
 class GraspModel:
-    """A trained model that judges grasps; it refuses those that the daemon would refuse."""
+    """A trained model that judges grasps; it refuses those that the daemon would refuse.
 
-    classes = ("stable", "slip")
-    """Columns of `predict_proba`."""
+    It is pickled as its path and digest, for processes of one's own on the same computer.
+    """
 
-    def __init__(self, path: Path) -> None:
-        """Load an ONNX file. Raises `ModelError`."""
-        model = trial.load(path)
+    classes_ = np.array(CLASSES)
+    """Columns of `predict_proba`: `stable`, `slip`."""
+
+    def __init__(self, path: Path, sha256: str | None = None) -> None:
+        """Load an ONNX file. Raises `ModelError`, also if its digest is not `sha256`."""
+        file = read(path)
+        if sha256 not in (None, file.sha256):
+            raise ModelError(f"{path}: was changed since this model was pickled: load it again")
+        model = trial.load(path, file)
+        self._file = path.absolute(), file.sha256
         self._takes = model.contract.input
         self.name: str = model.contract.name
         self.fingers: tuple[Finger, ...] = model.contract.fingers
@@ -50,23 +57,39 @@ class GraspModel:
         self._turn = threading.Lock()
         """Held while it judges: it has one session, and the network one input."""
 
+    def __repr__(self) -> str:
+        return f"<GraspModel {self.name} of {', '.join(self.fingers)}>"
+
+    def __reduce__(self) -> tuple[type[GraspModel], tuple[Path, str]]:
+        return type(self), self._file
+
+    def predict(
+        self, counts: ArrayLike, *, session: str | os.PathLike[str] | ArrayLike | None = None
+    ) -> NDArray[np.str_]:
+        """Return `stable`, `slip` or `unknown` for each grasp, shape (n,), by `predict_proba`."""
+        p_slip = self._probabilities(counts, session)[:, 1]
+        stable = p_slip < Limits.slip_threshold
+        return np.where(np.isnan(p_slip), "unknown", np.where(stable, *CLASSES))
+
     def predict_proba(
-        self,
-        counts: ArrayLike | pd.DataFrame,
-        *,
-        session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None = None,
+        self, counts: ArrayLike, *, session: str | os.PathLike[str] | ArrayLike | None = None
     ) -> NDArray[np.float64]:
-        """Return the probabilities of `classes`, shape (n, 2), for each of n held grasps.
+        """Return the probabilities of `classes_`, shape (n, 2), for each of n held grasps.
 
         `counts`: shape (n, fingers, 24), or a table with columns such as `ff_biotac_1`. NaN, or a
-        masked value, is an electrode that is known to be broken, as is one at 0 or 4095. A row is
-        NaN if the daemon would refuse to judge it. Threads may share a model.
+        masked or missing value, is an electrode that is known to be broken, as is one at 0 or 4095.
+        A row is NaN if the daemon would refuse to judge it. Threads may share a model.
 
         `session`, for models that need one: grasps of the same sensors on the same day, like
         `counts` and without outcomes, or the file of a session that a daemon has kept.
         Raises `ValueError`, `ModelError` or `SessionFileError` for what does not fit.
         """
-        judged = self._counts(counts)
+        return self._probabilities(counts, session)
+
+    def _probabilities(
+        self, counts: ArrayLike, session: str | os.PathLike[str] | ArrayLike | None
+    ) -> NDArray[np.float64]:
+        judged = counts_of(counts, self.fingers)
         probabilities = np.full((len(judged), 2), np.nan)
         with self._turn:
             self._begin(session)
@@ -81,7 +104,7 @@ class GraspModel:
         broken = at_rail(counts)  # as is a NaN, which is 0 there
         return self._judge.examine(counts, broken if broken.any() else None)
 
-    def _begin(self, session: str | os.PathLike[str] | ArrayLike | pd.DataFrame | None) -> None:
+    def _begin(self, session: str | os.PathLike[str] | ArrayLike | None) -> None:
         """Begin a session of today's sensors."""
         calibration = self._judge.session
         if calibration is None or not isinstance(self._takes, SessionInput):
@@ -92,7 +115,7 @@ class GraspModel:
         if isinstance(session, str | os.PathLike):
             session_file.restore(Path(session), self.fingers, calibration)
         elif session is not None:
-            for values in self._counts(session):
+            for values in counts_of(session, self.fingers):
                 examined = self._examine(values)
                 self._judge.observe(examined, self._judge.judge(examined))
         if not calibration.calibrated:
@@ -101,33 +124,21 @@ class GraspModel:
                 "on any day but those of its training. Give session= "
                 f"{self._takes.calibrated_from:g} grasps or more of the same sensors; outcomes are "
                 "not needed.",
-                stacklevel=3,
+                stacklevel=4,
             )
-
-    def _counts(self, given: ArrayLike | pd.DataFrame) -> NDArray[np.float64]:
-        """Return counts of shape (n, fingers, 24). Raises `ValueError`."""
-        values = _of_table(given, self.fingers) if hasattr(given, "columns") else given
-        given = np.asarray(values).dtype
-        if given.kind in "cmM":
-            raise ValueError(f"counts are of type {given}, not numbers")
-        counts: NDArray[np.float64] = np.ma.array(values, dtype=np.float64).filled(np.nan)
-        fingers = len(self.fingers)
-        if counts.ndim != 3 or counts.shape[1:] != (fingers, ELECTRODES):
-            raise ValueError(
-                f"counts have shape {counts.shape}, {self.name} takes (n, {fingers}, {ELECTRODES})"
-            )
-        sound = counts[~np.isnan(counts)]
-        if ((sound < 0) | (sound > COUNT_MAX) | (sound != np.trunc(sound))).any():
-            raise ValueError(f"counts must be whole numbers in 0..{COUNT_MAX}, or NaN")
-        return counts
 
 
 def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> GraspModel:
     """Return a model by its name (`graspd models` lists them) or by the path of an ONNX file.
 
-    `fingers`: those of the hand, for the form of the model that judges fewer. Raises `ModelError`.
+    `fingers`: those of the hand, for the form of the model that judges fewer. Raises `ModelError`,
+    and `ValueError` for a name that is not a finger's.
     """
-    return GraspModel(_path(model, fingers))
+    check_fingers(fingers)
+    found = GraspModel(_path(model, fingers))
+    if fingers and not set(found.fingers).issubset(fingers):
+        raise ModelError(f"{found} does not judge a hand of {', '.join(fingers)}")
+    return found
 
 
 def judge(
@@ -178,17 +189,3 @@ def _path(model: str | os.PathLike[str], fingers: Sequence[Finger] = ()) -> Path
     if isinstance(model, str) and not model.endswith(".onnx"):
         return zoo.find(zoo.for_hand(model, fingers) if fingers else model)
     return Path(model)
-
-
-def _of_table(table: Any, fingers: Sequence[str]) -> NDArray[np.float64]:  # noqa: ANN401
-    """Return the counts of a table of pandas, or of anything that has its columns."""
-    names = [name for finger in fingers for name in electrode_columns(finger)]
-    missing = [name for name in names if name not in table.columns]
-    if missing:
-        raise ValueError(f"the table has no column {missing[0]}")
-    columns = list(table.columns)
-    twice = [name for name in names if columns.count(name) > 1]
-    if twice:
-        raise ValueError(f"the table has the column {twice[0]} more than once")
-    values = np.asarray(table[names].to_numpy(dtype=np.float64, na_value=np.nan))
-    return values.reshape(-1, len(fingers), ELECTRODES)

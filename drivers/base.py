@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, IntFlag, auto
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import msgspec
 import numpy as np
@@ -278,6 +278,10 @@ class Driver(Protocol):
 
 class DriverError(Exception):
     """Base of all driver failures."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the text and the fields: a pool of processes raises it in the parent."""
+        return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
 class LinkError(DriverError):

@@ -56,8 +56,9 @@ def test_without_a_daemon_it_is_no_in_time(tmp_path: Path) -> None:
     asyncio.run(asks())
 
 
+@pytest.mark.parametrize("same_computer", [True, False])
 def test_it_waits_without_looking_again_and_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, same_computer: bool
 ) -> None:
     looks: list[float] = []
     poll = Poller.poll
@@ -67,7 +68,8 @@ def test_it_waits_without_looking_again_and_again(
         return poll(poller, timeout)
 
     async def waits() -> None:
-        async with made(tmp_path) as graspd:
+        out = f"ipc://{tmp_path}/out"
+        async with AsyncClient(out, same_computer=same_computer) as graspd:
             await graspd.verdict(0.3)
             await graspd.wait_for_grasp(0.3)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -19,7 +20,9 @@ from numpy.typing import NDArray
 
 import graspd
 from graspd.daemon.session.file import SessionFileError
+from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING
+from graspd.models import zoo
 from graspd.models.contract import ModelError
 from tests.conftest import ROOT
 from tests.kit import inside
@@ -123,14 +126,6 @@ def test_what_the_daemon_would_refuse_has_no_probability(counts: NDArray[np.floa
     assert np.isfinite(got[2]).all()
 
 
-@pytest.mark.parametrize("value", [-1.0, 4096.0, 2000.5, np.inf])
-def test_what_is_no_count_is_refused(counts: NDArray[np.float64], value: float) -> None:
-    wrong = counts[:2].copy()
-    wrong[1, 2, 3] = value
-    with pytest.raises(ValueError, match=r"whole numbers in 0\.\.4095"):
-        graspd.load("mlp").predict_proba(wrong)
-
-
 @pytest.mark.parametrize("name", ["small-session", "cnn1"])
 def test_threads_share_a_model(name: str, counts: NDArray[np.float64]) -> None:
     model = graspd.load(name)
@@ -162,35 +157,156 @@ def test_a_dead_hand_has_no_probability(
     assert np.isnan(model.predict_proba(given, session=session)[0]).all()
 
 
-def test_a_masked_count_is_as_a_nan(counts: NDArray[np.float64]) -> None:
+def with_none(values: NDArray[np.float64]) -> list[Any]:
+    return np.where(np.isnan(values), None, values.astype(object)).tolist()  # type: ignore[call-overload,no-any-return]
+
+
+def masked(values: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    return np.ma.array(np.nan_to_num(values).astype(np.uint16), mask=np.isnan(values))
+
+
+def columns(values: NDArray[np.float64]) -> dict[str, list[int | None]]:
+    """Columns by name, in another order than the model's fingers."""
+    names = [f"{finger}_biotac_{place}" for finger in ("ff", "mf", "th") for place in range(1, 25)]
+    rows = values.reshape(len(values), 72).T
+    whole = [[None if np.isnan(each) else int(each) for each in row] for row in rows]
+    return dict(reversed(list(zip(names, whole, strict=True))))
+
+
+def structured(values: NDArray[np.float64]) -> NDArray[np.void]:
+    held = columns(values)
+    rows = [
+        tuple(np.nan if each is None else each for each in row)
+        for row in zip(*held.values(), strict=True)
+    ]
+    return np.array(rows, dtype=[(name, np.float64) for name in held])
+
+
+def pandas(values: NDArray[np.float64], kind: str) -> Any:  # noqa: ANN401
+    pd = pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    return pd.DataFrame(columns(values)).astype(kind)
+
+
+def arrow(values: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    pa = pytest.importorskip("pyarrow", reason="needs the extra `pandas`")
+    return pa.table(columns(values))
+
+
+def polars(values: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    pl = pytest.importorskip("polars", reason="no extra brings polars, of 180 MB")
+    return pl.DataFrame(columns(values))
+
+
+GIVEN: dict[str, Callable[[NDArray[np.float64]], Any]] = {
+    "lists": with_none,
+    "a masked array": masked,
+    "a list of masked arrays": lambda values: list(masked(values)),
+    "columns by name": columns,
+    "a structured array": structured,
+    "pandas": lambda values: pandas(values, "float64"),
+    "pandas of its own integers": lambda values: pandas(values, "Int64"),
+    "pandas of objects": lambda values: pandas(values, "object"),
+    "Arrow": arrow,
+    "a batch of Arrow": lambda values: arrow(values).to_batches()[0],
+    "polars": polars,
+}
+
+
+@pytest.mark.parametrize("given", GIVEN.values(), ids=GIVEN)
+def test_whatever_holds_counts_is_judged_alike(
+    counts: NDArray[np.float64], given: Callable[[NDArray[np.float64]], Any]
+) -> None:
+    values = counts[:20].copy()
+    values[:5, 0, :], values[5:10, 1, 7] = np.nan, np.nan
     model = graspd.load("mlp")
-    given = np.ma.array(counts.astype(np.uint16), mask=np.zeros(counts.shape, np.bool_))
-    given[:5, 0, :], given[5:10, 1, 7] = np.ma.masked, np.ma.masked
-    plain = counts.copy()
-    plain[:5, 0, :], plain[5:10, 1, 7] = np.nan, np.nan
-    expected = model.predict_proba(plain)
+    expected = model.predict_proba(values)
     assert np.isnan(expected[:5]).all()
-    for each in (given, list(given)):
-        np.testing.assert_array_equal(model.predict_proba(each), expected)
+    assert np.isfinite(expected[5:, 0]).sum() > 10
+    np.testing.assert_array_equal(model.predict_proba(given(values)), expected)
 
 
-def test_a_column_twice_is_refused(counts: NDArray[np.float64]) -> None:
-    pd = pytest.importorskip("pandas", reason="needs the extra pandas")
-    table = graspd.read_grasps(DEMO_DAY)
-    twice = pd.concat([table, table[["mf_biotac_3"]]], axis=1)
-    with pytest.raises(ValueError, match="the column mf_biotac_3 more than once"):
-        graspd.load("mlp").predict_proba(twice)
+REFUSED: dict[str, tuple[Callable[[NDArray[np.float64]], Any], str]] = {
+    "below 0": (lambda values: values - 4000, r"whole numbers in 0..4095.*grasp 0 .*ff_1 has -"),
+    "above 12 bits": (lambda values: values + 4096, "whole numbers in 0..4095.*ff_1 has [4-8]"),
+    "a half": (lambda values: values + 0.5, r"whole numbers in 0..4095.*ff_1 has \d+\.5"),
+    "infinite": (lambda values: values * np.inf, "whole numbers in 0..4095.*ff_1 has inf"),
+    "complex": (lambda values: values.astype(complex), r"\+0j\) and the like are not numbers"),
+    "a time": (lambda values: values.astype("datetime64[s]"), "are not numbers"),
+    "text": (lambda values: values.astype(int).astype(str), r"'\d+' and the like are not numbers"),
+    "a path": (lambda values: str(DEMO_DAY), "synthetic_day.csv' and the like are not numbers"),
+    "True": (lambda values: values > 2000, "are not numbers"),
+    "one grasp": (lambda values: values[0], r"shape \(3, 24\); it takes \(n, 3, 24\): ff, mf, th"),
+    "flattened": (lambda values: values.reshape(-1, 72), r"shape \(\d+, 72\); it takes"),
+    "uneven lists": (lambda values: [[1, 2], [3]], "lists of different lengths"),
+    "no column": (lambda values: {"a": [], "b": []}, "no column ff_biotac_1.* begin with a, b"),
+    "text in a column": (
+        lambda values: columns(values) | {"th_biotac_2": ["x"] * len(values)},
+        "the column th_biotac_2: 'x' and the like are not numbers",
+    ),
+    "a column twice": (
+        lambda values: (table := arrow(values)).append_column("mf_biotac_3", table["mf_biotac_3"]),
+        "the column mf_biotac_3 more than once",
+    ),
+    "not collected": (lambda values: polars(values).lazy(), "LazyFrame has no values yet"),
+}
 
 
-@pytest.mark.parametrize("kind", ["complex128", "datetime64[s]"])
-def test_values_of_other_kinds_are_refused(counts: NDArray[np.float64], kind: str) -> None:
-    with pytest.raises(ValueError, match="not numbers"):
-        graspd.load("mlp").predict_proba(counts.astype(kind))
+@pytest.mark.parametrize(("given", "words"), REFUSED.values(), ids=REFUSED)
+def test_an_error_names_what_was_given(
+    counts: NDArray[np.float64], given: Callable[[NDArray[np.float64]], Any], words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        graspd.load("mlp").predict_proba(given(counts))
 
 
-def test_counts_of_another_shape_are_refused(counts: NDArray[np.float64]) -> None:
-    with pytest.raises(ValueError, match=r"takes \(n, 3, 24\)"):
-        graspd.load("mlp").predict_proba(counts[0])
+def test_it_predicts_what_scikit_learn_would(counts: NDArray[np.float64]) -> None:
+    model = graspd.load("mlp")
+    counts = np.concatenate([counts, np.full((1, 3, 24), np.nan)])
+    best = model.classes_[model.predict_proba(counts).argmax(axis=1)]
+    said = model.predict(counts)
+    assert list(model.classes_) == ["stable", "slip"]
+    assert said[-1] == "unknown"
+    np.testing.assert_array_equal(said[said != "unknown"], best[said != "unknown"])
+    assert repr(model) == "<GraspModel mlp of ff, mf, th>"
+
+
+def test_a_pickled_model_judges_alike(counts: NDArray[np.float64]) -> None:
+    model = graspd.load("small-session")
+    again: graspd.GraspModel = pickle.loads(pickle.dumps(model))
+    expected = model.predict_proba(counts[40:], session=counts[:40])
+    got = again.predict_proba(counts[40:], session=counts[:40])
+    np.testing.assert_array_equal(got, expected)
+
+
+def test_a_pool_of_processes_can_raise_a_recording_error(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError) as raised:
+        graspd.read_recording(tmp_path / "none.csv")
+    again = pickle.loads(pickle.dumps(raised.value))
+    assert (str(again), vars(again)) == (str(raised.value), vars(raised.value))
+
+
+def test_a_changed_file_is_refused_at_unpickling(tmp_path: Path) -> None:
+    path = tmp_path / "own.onnx"
+    path.write_bytes(zoo.find("mlp").read_bytes())
+    kept = pickle.dumps(graspd.load(path))
+    assert pickle.loads(kept).fingers == ("ff", "mf", "th")
+    path.write_bytes(zoo.find("svm").read_bytes())
+    with pytest.raises(ModelError, match="was changed since"):
+        pickle.loads(kept)
+
+
+@pytest.mark.parametrize(
+    ("fingers", "words"),
+    [
+        (["ff", "index"], "no finger is called 'index'"),
+        ("ff", "no finger is called 'f'"),
+        (["ff", "ff"], "a finger is there twice"),
+        (["ff", "rf"], "small-session of ff, mf, th> does not judge a hand of ff, rf"),
+    ],
+)
+def test_fingers_that_do_not_fit_are_refused(fingers: Any, words: str) -> None:  # noqa: ANN401
+    with pytest.raises((ValueError, ModelError), match=words):
+        graspd.load("small-session", fingers=fingers)
 
 
 def test_a_session_that_does_not_fit_is_refused(

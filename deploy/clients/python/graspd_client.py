@@ -328,19 +328,17 @@ class _Hand:
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)
 
-    @property
-    def _unusable(self) -> str:
-        """Why the sockets cannot be used, `closed` or `other-process`; empty if they can.
-
-        After a fork, ZeroMQ's thread is the parent's alone.
-        """
+    def _check_process(self) -> None:
+        """Raise `RuntimeError` after a fork: ZeroMQ's thread is the parent's alone."""
         if os.getpid() != self._pid:
-            return "other-process"
-        return "closed" if self._closed else ""
+            raise RuntimeError(
+                f"this client is of process {self._pid}: make another one in this process, "
+                f"{os.getpid()}, after the fork"
+            )
 
     def _verdict(self, due_ns: int) -> Waits[Verdict]:
-        if self._unusable:
-            return Verdict(Decision.UNKNOWN, (self._unusable,))
+        if self._closed:
+            return Verdict(Decision.UNKNOWN, ("closed",))
         while not self._drain() and (yield from self._wait(due_ns)):
             pass
         if self._behind:
@@ -354,7 +352,7 @@ class _Hand:
             raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms!r}")
         began_ns = time.monotonic_ns()
         due_ns = _due_ns("deadline_s", deadline_s)
-        asking = self._link.asking if self._asks and not self._unusable else None
+        asking = self._link.asking if self._asks and not self._closed else None
         question = _Question(self._newest, asking, supervised is True, still_ms)
         allowed = False
         try:
@@ -365,7 +363,7 @@ class _Hand:
                     decided = decided.unknown("late")
             allowed = question.permits(decided)
         finally:
-            if not self._unusable:
+            if not self._closed:
                 self._link.asking.hang_up(lifts=allowed)
         decided = question.at_the_end(decided)
         waited_s = (time.monotonic_ns() - began_ns) / 1e9
@@ -383,7 +381,7 @@ class _Hand:
             if is_judged and not said.early and _key(said) != self._returned:
                 self._returned = _key(said)
                 return said
-            if self._unusable or time.monotonic_ns() >= due_ns:
+            if self._closed or time.monotonic_ns() >= due_ns:
                 return None
 
     def _wait_for_slide(self, timeout_s: float) -> Waits[SlideAnswer]:
@@ -407,7 +405,7 @@ class _Hand:
             if touched and touched.issubset(touching):
                 sure_ns = now_ns - round((newest.age_ms or 0.0) * 1e6)
             is_old = now_ns - sure_ns > self._max_age_ns
-            ends = bool(sliding or lost or is_old or self._unusable)
+            ends = bool(sliding or lost or is_old or self._closed)
             if ends or not (yield from self._wait(due_ns, sure_ns + self._max_age_ns + 1)):
                 waited_s = (now_ns - began_ns) / 1e9
                 return SlideAnswer(newest, waited_s, sliding, held=bool(touched) and not ends)
@@ -419,8 +417,8 @@ class _Hand:
         if not self._asks:
             raise ValueError("an outcome needs an ask_endpoint")
         due_ns = _due_ns("wait_s", wait_s)
-        if self._unusable:
-            return OutcomeAnswer(self._unusable)
+        if self._closed:
+            return OutcomeAnswer("closed")
         self._link.telling.hang_up()
         self._link.telling.ask(telling)
         self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
@@ -433,7 +431,7 @@ class _Hand:
 
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on."""
-        if not self._unusable:
+        if not self._closed and os.getpid() == self._pid:
             self._closed = True
             self._link.close()
             self._allow(("", 0))
@@ -526,7 +524,7 @@ class _Hand:
     def _wait(self, due_ns: int, look_ns: int | None = None) -> Waits[bool]:
         """Wait for a message, or until another look is due; False when it is time to end."""
         now_ns = time.monotonic_ns()
-        if now_ns >= due_ns or self._unusable:
+        if now_ns >= due_ns or self._closed:
             return False
         if self._newest.needs_arrival:
             look_ns = now_ns + SLICE_MS * 1_000_000
@@ -611,6 +609,7 @@ class Client(_Hand):
 
     def _finish(self, steps: Waits[_T]) -> _T:
         while True:
+            self._check_process()
             try:
                 timeout_ms = next(steps)
             except StopIteration as end:
@@ -666,6 +665,7 @@ class AsyncClient(_Hand):
     async def _finish(self, steps: Waits[_T]) -> _T:
         from zmq.asyncio import Poller  # only here: it loads asyncio
 
+        self._check_process()
         if self._is_busy:
             raise RuntimeError("another call is under way: one call at a time, or two clients")
         self._is_busy = True
@@ -730,8 +730,9 @@ class Newest:
 
     @property
     def needs_arrival(self) -> bool:
-        """Whether the age of a message rests on the time when it came."""
-        return not self._same_computer and self._bound is None
+        """Whether the age of the next message rests on the time when it comes."""
+        knows_clock = self._same_computer or self._bound is not None
+        return not knows_clock and self._best is not None
 
     def forget(self, why: str) -> None:
         """Forget the message and the clocks' difference, but not what repeats are."""

@@ -1,0 +1,122 @@
+"""Counts of grasps as a program has them, tables, arrays or lists, as one array.
+
+The names of a table's columns, and the values by name, are all that is asked of its library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS, Finger, electrode_columns, electrode_name
+
+
+def counts_of(given: ArrayLike, fingers: Sequence[Finger] = ()) -> NDArray[np.float64]:
+    """Return the counts of n grasps, shape (n, fingers, 24), NaN for a broken electrode.
+
+    `given`: a table of pandas, polars or Arrow, or columns by name, such as `ff_biotac_1`; or an
+    array or nested lists of that shape. A missing or masked value is a broken electrode.
+    `fingers`: those of the counts, in order; empty: those of the table, or any number of an array.
+    Raises `ValueError` for anything else, and for values that are not counts.
+    """
+    names = column_names(given)
+    if names:
+        fingers = fingers or fingers_of(names)
+        counts = _of_table(given, names, fingers)
+    else:
+        counts = _numbers(given, "counts")
+    number = len(fingers) or (counts.shape[1] if counts.ndim == 3 else 0)
+    if counts.ndim != 3 or counts.shape[1:] != (number, ELECTRODES) or not 0 < number <= 5:
+        takes = f"{len(fingers)}, {ELECTRODES}): {', '.join(fingers)}"
+        raise ValueError(
+            f"counts have shape {counts.shape}; it takes (n, "
+            + (takes if fingers else f"fingers, {ELECTRODES})")
+        )
+    _check_range(counts, fingers)
+    return counts
+
+
+def column_names(given: object) -> list[str]:
+    """Return the names of a table's columns; empty if it is not a table. Raises `ValueError`."""
+    if isinstance(given, Mapping):
+        return list(given)
+    if not hasattr(given, "__array__"):
+        if hasattr(type(given), "columns"):
+            raise ValueError(f"a {type(given).__name__} has no values yet: collect it first")
+        return []
+    names = getattr(getattr(given, "dtype", None), "names", None)  # of a structured array
+    for attribute in ("columns", "column_names"):
+        names = getattr(given, attribute, names)
+    return [] if names is None else list(names)
+
+
+def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
+    """Return the fingers that have columns of these names, in the order of the hand."""
+    return tuple(finger for finger in FINGERS if electrode_columns(finger)[0] in names)
+
+
+def check_fingers(fingers: Sequence[str]) -> None:
+    """Raise `ValueError` for a name that is not a finger's, or that is there twice."""
+    unknown = [finger for finger in fingers if finger not in FINGERS]
+    if unknown:
+        raise ValueError(f"no finger is called {unknown[0]!r}: they are {', '.join(FINGERS)}")
+    if len(set(fingers)) != len(fingers):
+        raise ValueError(f"a finger is there twice: {', '.join(fingers)}")
+
+
+def _of_table(table: Any, names: Sequence[str], fingers: Sequence[str]) -> NDArray[np.float64]:  # noqa: ANN401
+    needed = [name for finger in fingers for name in electrode_columns(finger)]
+    missing = [name for name in needed if name not in names]
+    if missing or not needed:
+        begin = ", ".join(map(str, names[:3]))
+        first = missing[0] if missing else "ff_biotac_1"
+        raise ValueError(f"the table has no column {first}; its columns begin with {begin}")
+    twice = [name for name in needed if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"the table has the column {twice[0]} more than once")
+    columns = [_numbers(_without_na(table[name]), f"the column {name}") for name in needed]
+    return np.stack(columns, axis=-1).reshape(-1, len(fingers), ELECTRODES)
+
+
+def _without_na(column: Any) -> Any:  # noqa: ANN401
+    """Return a column with None for what pandas calls NA, which is not a number."""
+    values = np.asarray(column)
+    if values.dtype.kind == "O" and hasattr(column, "isna"):
+        values = values.copy()
+        values[np.asarray(column.isna())] = None
+    return column if isinstance(column, np.ma.MaskedArray) else values
+
+
+def _numbers(given: Any, what: str) -> NDArray[np.float64]:  # noqa: ANN401
+    """Return numbers, NaN for what is missing or masked. Raises `ValueError`."""
+    try:
+        values: Any = np.ma.array(given)
+    except ValueError as error:
+        raise ValueError(f"{what}: lists of different lengths") from error
+    if values.dtype.kind not in "iuf":
+        odd = [each for each in values.compressed().tolist() if not _is_number(each)]
+        if odd:
+            raise ValueError(f"{what}: {odd[0]!r} and the like are not numbers")
+    counts: NDArray[np.float64] = values.astype(np.float64).filled(np.nan)
+    return counts
+
+
+def _is_number(value: object) -> bool:
+    """Return True for a number, and for None, which is a missing one."""
+    return value is None or (isinstance(value, Real) and not isinstance(value, bool))
+
+
+def _check_range(counts: NDArray[np.float64], fingers: Sequence[Finger]) -> None:
+    inside = (counts >= 0) & (counts <= COUNT_MAX) & (counts == np.trunc(counts))
+    wrong = np.argwhere(~(inside | np.isnan(counts)))
+    if len(wrong):
+        grasp, finger, place = wrong[0].tolist()
+        name = electrode_name(fingers[finger] if fingers else f"finger {finger}, electrode", place)
+        raise ValueError(
+            f"counts must be whole numbers in 0..{COUNT_MAX}, or NaN; of grasp {grasp} (from 0) "
+            f"{name} has {counts[grasp, finger, place]:g}"
+        )
