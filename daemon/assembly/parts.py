@@ -19,6 +19,7 @@ from graspd.daemon.publish.companion import Answer, Companion, at_once
 from graspd.daemon.publish.outbox import Outbox, Output
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.scene import Scene
+from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.scene import Record
 from graspd.daemon.session.sensors import SensorWatch
 from graspd.daemon.trust.trust import encode as encode_trust
@@ -144,9 +145,10 @@ class Assembly:
 def build_recorder(parts: Parts, options: Record, boot_id: str, tap: Tap | None) -> Recorder:
     """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
     require_mcap("[record]")
-    from graspd.daemon.record.recorder import Recorder
+    from graspd.daemon.record.recorder import Recorder, ReplayRecorder
 
-    recorder = Recorder(
+    plays = isinstance(parts.scene.tactile, ReplayTactile)
+    recorder = (ReplayRecorder if plays else Recorder)(
         options,
         parts.scene.hand.name,
         boot_id,

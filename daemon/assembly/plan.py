@@ -33,7 +33,7 @@ class Plan:
         if not isinstance(options, ReplayTactile):
             return cls(scene, mode or "settled", joints)
         if is_mcap(options):
-            from graspd.daemon.record.mcap import header_of
+            from graspd.daemon.record.mcap_reader import header_of
 
             recorded = [header_of(path).joints for path in options.recordings]
             return cls(scene, mode or "settled", joints or any(recorded))

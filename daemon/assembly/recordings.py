@@ -17,7 +17,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import GateCause
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.publish.messages import GateMessage, OutcomeMessage
-from graspd.daemon.record.mcap import header_of
+from graspd.daemon.record.mcap_reader import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late, Topic
 from graspd.daemon.scene import Scene, SceneError
@@ -42,6 +42,10 @@ BEGINS_WITHIN: Final = (
     "%s: begins in the middle of a run: verdicts may differ until the hand has been open for a "
     "second and grasps again"
 )
+LOST_HEADER = (
+    "%s: another tool has dropped the record `graspd` (`mcap filter` needs --include-metadata): "
+    "judged with the defaults, without session and learning, so verdicts may differ"
+)
 
 
 class RecordedRun(Source):
@@ -59,6 +63,9 @@ class RecordedRun(Source):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
         recorded = self.header.scene
+        if not recorded:
+            log.warning(LOST_HEADER, paths[0])
+            recorded = {"hand": {"fingers": self.header.fingers}}
         sections: dict[str, dict[str, Any]] = {}
         for name in filter(recorded.__contains__, SECTIONS):
             keys, known = recorded[name], SECTIONS[name].model_fields
@@ -84,7 +91,7 @@ class RecordedRun(Source):
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
         header = self.header
-        if model.sha256 != header.model_sha256:
+        if header.model_sha256 != model.sha256[: len(header.model_sha256)]:
             log.warning("%s: was judged by %s, not by this model", self._paths[0], header.model)
         if header.file > 0:
             log.warning(BEGINS_WITHIN, self._paths[0])

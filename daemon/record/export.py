@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graspd.biotac import ELECTRODES, electrode_columns
 from graspd.daemon.publish.messages import decode_outcome
-from graspd.daemon.record.mcap import McapReader, RecordedMessage
+from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
 from graspd.daemon.record.topics import Judged, Topic, decode_judged
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import RecordingError

@@ -62,7 +62,7 @@ def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
     driver: ReplayDriver | McapReplayDriver
     if path.suffix == MCAP:
         require("mcap", "read_recording of MCAP", "record")
-        from graspd.daemon.record.mcap import header_of
+        from graspd.daemon.record.mcap_reader import header_of
         from graspd.daemon.record.player import McapReplayDriver
 
         fingers = header_of(path).fingers

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from graspd.daemon.judge.exchange import Exchanged
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish.messages import GateMessage, OutcomeMessage, decode_outcome
-from graspd.daemon.record.mcap import McapReader, RecordedMessage, header_of
+from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage, header_of
 from graspd.daemon.record.topics import (
     EVENTS,
     PLAYED,
@@ -32,6 +33,10 @@ RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage
 """An event of `EVENTS`, an outcome, an exchange of sensors, or what belongs to the next reading:
 that it was late, or that it changed the gate."""
 _Item = Reading | RecordedEvent
+LATE = b'{"judged":false}'
+"""Mark of a reading that may have been late."""
+STALE = f'"{Reason.STALE}"'.encode()
+"""Part of the verdict on a late reading."""
 HELD_MAX = 64
 """Most messages that may stand between a reading and what is about it."""
 
@@ -144,15 +149,27 @@ class McapReplayDriver(RecordedDriver[_Item]):
         return Topic(message.kind) if message.kind in EVENTS else None
 
 
-def _in_order(messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
-    """Yield the messages to play, those about a reading before it, at its time."""
+def _in_order(recording: McapReader) -> Iterator[RecordedMessage]:
+    """Yield the messages to play, those about a reading before it, at its time.
+
+    The mark of a late reading may be lost where entries are; its verdict says it too. Without a
+    verdict the last reading before a loss counts as late.
+    """
     held: list[RecordedMessage] = []
-    for message in messages:
+    was_in_time = False
+    for message in recording:
         if message.kind in (Topic.LATE, Topic.GATE):
             yield message._replace(at_ns=held[0].at_ns) if held else message
+        elif message.kind == Topic.VERDICT:
+            was_in_time = STALE not in message.payload
         elif message.kind == Topic.TACTILE:
             yield from held
-            held = [message]
+            held, was_in_time = [message], False
+        elif message.kind == Topic.DROPPED:
+            _log.warning("%s: the disk was slow: verdicts may differ after a loss", recording.path)
+            yield from held if was_in_time else _called_late(held)
+            yield message._replace(kind=Topic.SKIPPED)
+            held.clear()
         elif message.kind in PLAYED and held:
             held.append(message)
         elif message.kind in PLAYED:
@@ -160,4 +177,11 @@ def _in_order(messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
         if len(held) == HELD_MAX:
             yield from held
             held.clear()
+    yield from held if was_in_time or not recording.cut_off else _called_late(held)
+
+
+def _called_late(held: Sequence[RecordedMessage]) -> Iterator[RecordedMessage]:
+    """Yield a reading and what follows it, with a mark that it was late and not judged."""
+    if held:
+        yield held[0]._replace(kind=Topic.LATE, payload=LATE)
     yield from held

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -115,6 +115,8 @@ class Recorder(Companion):
         self._viewer = Viewer()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
+        self._room = QUEUE_MAX
+        """Most entries of the queue; 0 after a drop, until that is noted in the recording."""
         self._open: _Open | None = None
         self._number = 0
         self._flush_due_ns = clock() + FLUSH_NS
@@ -166,11 +168,19 @@ class Recorder(Companion):
         self._put(self._names[Topic.EXCHANGED], lambda: known or Exchanged())
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
-        if len(self._queue) >= QUEUE_MAX:
-            self._dropped += 1
-        else:
+        if len(self._queue) < self._room or self._goes_on():
             self._queue.append((self._clock() if at_ns is None else at_ns, topic, content))
             self._last_topic = topic
+
+    def _goes_on(self) -> bool:
+        """Return False, and drop an entry, while the queue is full; note it once there is room."""
+        if len(self._queue) >= QUEUE_MAX:
+            self._dropped += 1
+            self._room = 0
+            return False
+        self._room = QUEUE_MAX
+        self._put(self._names[Topic.DROPPED], EVENT)
+        return True
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
@@ -264,10 +274,7 @@ class Recorder(Companion):
 
     def _write_message(self, current: _Open, topic: bytes, content: object, at_ns: int) -> None:
         """Write a message, and the log lines and images made from it."""
-        if callable(content):
-            message = msgspec.to_builtins(content())
-        else:
-            message = msgspec.json.decode(cast(bytes, content))
+        message = _message(content)
         file = cast(McapWriter, current.files[0])
         file.write(topic, msgspec.json.encode(flat(message)), at_ns)
         kind = topic.partition(b".")[0].decode()
@@ -313,6 +320,47 @@ class Recorder(Companion):
         say = log.warning if is_first else log.debug
         where = self._options.folder
         say("record: %s: %s; nothing is recorded", where, error.strerror or error)
+
+
+class ReplayRecorder(Recorder):
+    """Record a run that plays recordings, at any pace, by the times of its readings.
+
+    All messages are recorded as if each reading had come at its time, and the rest at once.
+    """
+
+    _base_ns: int | None = None
+    """Monotonic time of the zero of the readings' times, ns. None before the first reading."""
+    _now_ns = 0
+    """Time of the last reading, ns."""
+    _ahead_ns = 0
+    """Its time of playing less `_now_ns`."""
+
+    def on_reading(self, reading: Reading) -> None:
+        if self._base_ns is None:
+            self._base_ns = reading.t_ns - reading.made_ns
+        self._now_ns = self._base_ns + reading.made_ns
+        self._ahead_ns = reading.t_ns - self._now_ns
+        super().on_reading(reading)
+
+    def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
+        if self._base_ns is not None:
+            content, at_ns = partial(_moved, content, self._ahead_ns), self._now_ns
+        super()._put(topic, content, at_ns)
+
+
+def _moved(content: object, ahead_ns: int) -> dict[str, object]:
+    """Return the message with a monotonic time that is earlier by `ahead_ns`."""
+    message = _message(content)
+    if "t_mono_ns" in message:
+        message["t_mono_ns"] = max(message["t_mono_ns"] - ahead_ns, 0)
+    return message
+
+
+def _message(content: object) -> dict[str, Any]:
+    """Return the message that an entry has or makes."""
+    if callable(content):
+        return cast(dict[str, Any], msgspec.to_builtins(content()))
+    return cast(dict[str, Any], msgspec.json.decode(cast(bytes, content)))
 
 
 def make_room(options: Record, hand: str) -> int:

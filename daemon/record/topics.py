@@ -112,6 +112,8 @@ class Topic(StrEnum):
     EXCHANGED = "exchanged"
     LATE = "late"
     """The last reading was late."""
+    DROPPED = "dropped"
+    """Entries before the next one were not recorded: the disk was slow."""
     SKIPPED = "skipped"
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
@@ -130,6 +132,7 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
     "asked": Event,
     "exchanged": Exchanged,
     "late": Late,
+    "dropped": Event,
     "skipped": Event,
     "announced": Event,
     "taken-back": Event,
@@ -139,7 +142,7 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
 """Type of the messages by the first part of their topic."""
 EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED, Topic.TAKEN_BACK)
 PLAYED: Final = (*EVENTS, Topic.TACTILE, Topic.JOINTS, Topic.OUTCOME, Topic.EXCHANGED)
-"""Topics that a replay repeats, in the order of the file."""
+"""Topics that a replay repeats, in their order."""
 EVENT: Final = b"{}"
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode

@@ -12,7 +12,8 @@ from typing import Any, cast
 import zmq
 
 from graspd.daemon.publish.messages import Status, Verdict
-from graspd.daemon.record.mcap import McapReader, RecordingHeader
+from graspd.daemon.record.mcap import RecordingHeader
+from graspd.daemon.record.mcap_reader import McapReader
 from graspd.daemon.record.recorder import MakeHeader, Recorder
 from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.lift_book import NAME_BYTES

@@ -10,7 +10,7 @@ import can
 import numpy as np
 import pytest
 
-from graspd.daemon.record.mcap import header_of
+from graspd.daemon.record.mcap_reader import header_of
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.recordings.can_log import CanLog
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING

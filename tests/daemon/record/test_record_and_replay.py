@@ -22,6 +22,7 @@ from graspd import judge, read_recording
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.models.training.data.datasets import read_table
 from tests.bench.live import Subscriber
 from tests.daemon.processes import TIMEOUT_S, graspd, graspd_with, start, wait_for
@@ -109,6 +110,25 @@ def test_a_replay_gives_the_same_verdicts_bit_for_bit(lab: Lab) -> None:
     now = again(path)
     assert sum(verdict["judged"] for verdict in before) >= GRASPS
     assert [compared(v) for v in now] == [compared(v) for v in before]
+
+
+@pytest.mark.parametrize("pace", ["fast", "realtime"])
+def test_a_run_of_recorded_data_replays_the_same(tmp_path: Path, pace: str) -> None:
+    path = scene(tmp_path, '[model]\nname = "cnn1"\n')
+    played = path.read_text().replace("loop = true", f'outcomes = true\npace = "{pace}"')
+    path.write_text(played.replace(str(DEMO_RECORDING), str(three_seconds(tmp_path))))
+    assert graspd("run", path).returncode == 0
+    (recorded,) = files(tmp_path)
+    said = [compared(verdict) for verdict in of_kind(recorded, "verdict")]
+    assert [compared(verdict) for verdict in again(recorded)] == said
+    assert sum(verdict["judged"] for verdict in said) == 1
+
+
+def three_seconds(folder: Path) -> Path:
+    """A stream of one grasp."""
+    lines = DEMO_RECORDING.read_text().splitlines(keepends=True)
+    (folder / "short.csv").write_text("".join(lines[:300]))
+    return folder / "short.csv"
 
 
 def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:

@@ -25,7 +25,8 @@ from graspd.daemon.judge.reasons import Decision, GateCause, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent, PublishedVerdict
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.outbox import Outbox
-from graspd.daemon.record.mcap import RecordingHeader, header_of
+from graspd.daemon.record.mcap import RecordingHeader
+from graspd.daemon.record.mcap_reader import header_of
 from graspd.daemon.record.recorder import Recorder
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver

@@ -16,7 +16,8 @@ import pytest
 
 from graspd.daemon import scene
 from graspd.daemon.record import recorder as recorder_module
-from graspd.daemon.record.mcap import McapReader, McapWriter
+from graspd.daemon.record.mcap import McapWriter
+from graspd.daemon.record.mcap_reader import McapReader
 from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, make_room
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.scene import Record
@@ -168,8 +169,14 @@ def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
         writing.send(TOPIC, payload(number))
     assert writing.counters["record"]["dropped"] == 500
     disk.answers.set()
+    wait_until(lambda: writing.counters["record"]["recorded"] == QUEUE_MAX)
+    writing.send(TOPIC, payload(QUEUE_MAX + 500))
     writing.close()
-    assert numbers(tmp_path) == list(range(QUEUE_MAX))
+    (path,) = (tmp_path / "record").iterdir()
+    with open_recording(path) as stream:
+        *before, loss, last = McapReader(path, stream)
+    assert len(before) == QUEUE_MAX
+    assert (loss.kind, last.kind) == ("dropped", before[-1].kind)
 
 
 def test_the_end_does_not_wait_for_a_disk_that_never_answers(

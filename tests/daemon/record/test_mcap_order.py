@@ -1,0 +1,177 @@
+"""Recordings that other tools have packed again, and recordings with losses, replay in order."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from msgspec.structs import replace
+
+from graspd.daemon.record import mcap_reader
+from graspd.daemon.record.mcap import METADATA, McapWriter
+from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
+from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
+from graspd.daemon.record.topics import Late
+from graspd.drivers.base import RecordingError
+from tests.daemon.record.recorded import BOOT
+from tests.daemon.record.test_mcap import OFFSET_NS, START_NS, WHOLE, header, read
+
+
+def packed_again(
+    data: bytes, order: Callable[[list[RecordedMessage]], list[RecordedMessage]], **options: int
+) -> bytes:
+    """The recording as another tool writes it: messages in this order, the metadata at the end."""
+    stream = io.BytesIO()
+    writer = Writer(stream, **{"chunk_size": 4000, **options})  # type: ignore[arg-type]
+    writer.start(profile="", library="another tool")
+    schema = writer.register_schema("any", "jsonschema", b"{}")
+    messages = order(read(data))
+    channels = {
+        kind: writer.register_channel(f"{kind}.right", "json", schema)
+        for kind in dict.fromkeys(message.kind for message in messages)
+    }
+    for message in messages:
+        log_ns = message.at_ns + OFFSET_NS
+        writer.add_message(channels[message.kind], log_ns, message.payload, log_ns)
+    writer.add_metadata(METADATA, header("ff", "th", joints=True).texts())
+    writer.finish()
+    return stream.getvalue()
+
+
+def by_topic(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+    return sorted(messages, key=lambda message: message.kind)
+
+
+def in_fifths(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+    """Every fifth message, then every fifth after the first, and the like."""
+    return [message for first in range(5) for message in messages[first::5]]
+
+
+def backwards(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+    return messages[::-1]
+
+
+@pytest.mark.parametrize("order", [list, by_topic, backwards])
+@pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"chunk_size": 1}])
+def test_any_order_of_a_file_gives_the_order_of_time(
+    order: Callable[[list[RecordedMessage]], list[RecordedMessage]], options: dict[str, int]
+) -> None:
+    assert read(packed_again(WHOLE, order, **options)) == read(WHOLE)
+
+
+@given(st.randoms(use_true_random=False), st.integers(1, 20_000))
+@settings(max_examples=50, deadline=None)
+def test_no_order_and_no_cut_gives_readings_out_of_time(random: Random, chunk: int) -> None:
+    def shuffled(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+        return random.sample(messages, len(messages))
+
+    data = packed_again(WHOLE, shuffled, chunk_size=chunk)
+    assert read(data) == read(WHOLE)
+    with contextlib.suppress(RecordingError):
+        found = [message.at_ns for message in read(data[: random.randrange(len(data))])]
+        assert found == sorted(found)
+
+
+def test_times_too_far_apart_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_reader, "OPEN_MAX_BYTES", 10_000)
+    with pytest.raises(RecordingError, match="`mcap sort` puts it in order"):
+        read(packed_again(WHOLE, in_fifths))
+    assert read(packed_again(WHOLE, list)) == read(WHOLE)
+
+
+def test_a_file_without_its_metadata_tells_its_fingers() -> None:
+    reader = McapReader(Path("a.mcap"), io.BytesIO(without_metadata(WHOLE)))
+    assert reader.header.fingers == ("ff", "th")
+    assert (reader.header.boot_id, reader.header.joints) == (BOOT, True)
+    # Readings were 2 ms old when they were recorded: that is not known any more.
+    assert [m.at_ns for m in reader] == [m.at_ns - 2_000_000 for m in read(WHOLE)]
+
+
+def without_metadata(data: bytes) -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start(profile="", library="another tool")
+    for message in read(data):
+        channel = writer.register_channel(f"{message.kind}.right", "json", 0)
+        log_ns = message.at_ns + OFFSET_NS
+        writer.add_message(channel, log_ns, message.payload, log_ns)
+    writer.finish()
+    return stream.getvalue()
+
+
+def test_two_recordings_in_one_file_are_refused() -> None:
+    stream = io.BytesIO(packed_again(WHOLE, list))
+    writer = Writer(stream)
+    writer.start(profile="", library="another tool")
+    for number in range(2):
+        texts = replace(header("ff", "th", joints=True), file=number).texts()
+        writer.add_metadata(METADATA, texts)
+    writer.finish()
+    with pytest.raises(RecordingError, match="several recordings"):
+        read(stream.getvalue())
+
+
+def lines(*kinds: str) -> list[tuple[str, bytes]]:
+    """Topics and contents; `stale` and `stable` are verdicts."""
+    verdicts = {
+        "stale": b'{"reasons": ["stale"]}',
+        "stable": b'{"reasons": []}',
+    }
+    reading = json.dumps(
+        {
+            **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": START_NS},
+            **{"fingers": ["ff"], "counts": [1] * 24, "faults": [0] * 24},
+        }
+    ).encode()
+    return [
+        ("verdict", verdicts[kind])
+        if kind in verdicts
+        else (kind, reading if kind == "tactile" else b"{}")
+        for kind in kinds
+    ]
+
+
+@pytest.mark.parametrize(
+    ("recorded", "is_cut", "called_late"),
+    [
+        (("tactile", "stable", "tactile"), False, [False, False]),
+        (("tactile", "stable", "tactile"), True, [False, True]),
+        (("tactile", "stable"), True, [False]),
+        (("tactile", "stale"), True, [True]),
+        (("tactile", "dropped", "tactile", "stable"), False, [True, False]),
+        (("tactile", "stable", "dropped", "tactile", "stable"), False, [False, False]),
+        (("tactile", "stale", "dropped", "tactile", "stable"), False, [True, False]),
+    ],
+)
+def test_a_reading_before_a_loss_is_late_unless_its_verdict_denies_it(
+    tmp_path: Path, recorded: tuple[str, ...], is_cut: bool, called_late: list[bool]
+) -> None:
+    path = tmp_path / "a.mcap"
+    file = McapWriter(path, header("ff", joints=False))
+    for topic, content in lines(*recorded):
+        file.write(f"{topic}.right".encode(), content, START_NS)
+    file.close()
+    if is_cut:
+        path.write_bytes(path.read_bytes()[:-1])
+    found: list[bool] = []
+    late = False
+
+    def note(event: RecordedEvent) -> None:
+        nonlocal late
+        late = late or isinstance(event, Late)
+
+    with McapReplayDriver([path], ("ff",)) as driver:
+        driver.on_event = note
+        while not driver.exhausted:
+            for _ in driver.read_ready():
+                found.append(late)
+                late = False
+    assert found == called_late
