@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import suppress
 
 import serial
 
 from graspd.drivers.link import is_ready
 
 SCHEME = "polled://"
+
+_OF_NETWORK = frozenset({"rfc2217", "socket"})
+"""Schemes of pyserial's URLs of a network, whose form is checked without a device."""
 
 serial.protocol_handler_packages.append(__package__)
 
@@ -45,3 +49,18 @@ class PolledSerial(serial.Serial):
 def serial_class_for_url(url: str) -> tuple[str, type[PolledSerial]]:
     """Return the path in a URL, and the class that opens it."""
     return url.removeprefix(SCHEME), PolledSerial
+
+
+def refuse_url(port: str) -> None:
+    """Raise `ValueError` for a URL that pyserial can never open. Opens nothing."""
+    scheme, is_url, _ = port.partition("://")
+    if not is_url:
+        return
+    with suppress(serial.SerialException):  # a device that is not there yet
+        handler = serial.serial_for_url(port, do_not_open=True)
+        if scheme.lower() not in _OF_NETWORK:
+            return
+        try:
+            handler.from_url(port)  # type: ignore[attr-defined]
+        except (serial.SerialException, TypeError) as error:
+            raise ValueError(f"not of the form {scheme}://HOST:PORT") from error

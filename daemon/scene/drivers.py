@@ -5,7 +5,7 @@ import ipaddress
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from graspd.biotac import Finger
 
@@ -28,11 +28,18 @@ def _ip_address(address: str) -> str:
     return address
 
 
+def _scalar(value: object) -> object:
+    if not isinstance(value, str | bool | int | float):
+        raise ValueError("must be a string, a number or a boolean")
+    return value
+
+
 def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
     base: Path = (info.context or {}).get("base", Path())
     return base / path
 
 
+Option = Annotated[str | bool | int | float, BeforeValidator(_scalar)]
 Fingers = Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
 UdpSource = Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
@@ -103,6 +110,8 @@ class CanTactile(Section):
     """Length of a frame if the board pads it."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
     """Rate of the bus; not with socketcan."""
+    options: dict[str, Option] = {}
+    """More arguments of the interface, as `{ host = "10.0.0.7", port = 29536 }` of socketcand."""
 
 
 class PalmTactile(Section):

@@ -14,12 +14,12 @@ import os
 import socket
 import stat
 from collections.abc import Callable
-from importlib.util import find_spec
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Final
 
 import can
 
-from graspd.drivers.base import DriverError, LinkCause, LinkError
+from graspd.drivers.base import LinkCause, LinkError
 from graspd.drivers.can.frames import (
     CAN_FRAME,
     ERROR,
@@ -31,9 +31,9 @@ from graspd.drivers.can.frames import (
     Stamped,
     unpack_frame,
 )
+from graspd.drivers.can.interfaces import OWN_OPTIONS, Options, open_bus, refuse_unusable
 from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
 from graspd.drivers.link import is_ready
-from graspd.extras import installer
 
 FRAMES_PER_DRAIN: Final = 512
 """Most frames of one call: about 100 ms of a full bus. The loop must get its turn."""
@@ -41,73 +41,10 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """Receive buffer asked of the kernel, bytes; the usual 208 KiB hold 60 ms at 4400 frames/s."""
 DATAGRAM_BYTES_MAX: Final = 4096
 """Longest datagram of `udp_multicast` that is read, bytes, as in python-can."""
+QUIET_NS: Final = 2_000_000_000
+"""Longest time without a frame of socketcand, ns: python-can does not notice a lost server."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
-
-_OPTIONS: Final[dict[str, dict[str, Any]]] = {
-    # The defaults wait: 2 s after opening, 1 ms in every read.
-    "slcan": {"sleep_after_open": 0.0, "timeout": 0.0},
-    # The default queue has no bound; this one holds about 4 s of a full bus.
-    "virtual": {"rx_queue_size": 16384},
-}
-
-_EXTRAS: Final[dict[str, tuple[str, str]]] = {
-    **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "serial")),
-    "udp_multicast": ("msgpack", "multicast"),
-    "gs_usb": ("gs_usb", "gs-usb"),
-    "canalystii": ("canalystii", "canalystii"),
-    "cantact": ("cantact", "cantact"),
-    "neovi": ("ics", "neovi"),
-}
-"""Module that an interface needs, and the extra of python-can that brings it."""
-_WINDOWS: Final = ("etas", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector")
-_UNUSABLE: Final = {
-    "socketcand": "needs host and port, which a scene cannot give",
-    **dict.fromkeys(_WINDOWS, "is for Windows alone"),
-}
-
-
-def refuse_unusable(interface: str) -> None:
-    """Raise `ValueError` for an interface that can never be opened on this computer."""
-    if interface not in can.VALID_INTERFACES:
-        common = "socketcan, slcan, udp_multicast, virtual"
-        why = f"python-can has no interface {interface!r}; it has {common} and others"
-    elif interface in _UNUSABLE:
-        why = f"python-can's interface {interface!r} {_UNUSABLE[interface]}"
-    elif interface in _EXTRAS and find_spec(_EXTRAS[interface][0]) is None:
-        why = _what_is_missing(interface)
-    else:
-        return
-    raise ValueError(f"interface: {why}")
-
-
-def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noqa: ANN401
-    """Open a bus of python-can. Raises `LinkError`; `DriverError` if no retry can succeed."""
-    where = f"cannot open {interface} {channel}"
-    if interface == "socketcan":
-        try:
-            socket.if_nametoindex(channel)
-        except OSError as error:
-            raise LinkError(LinkCause.NO_INTERFACE, f"{where}: {error}") from error
-    try:
-        if interface == "slcan" and "://" not in channel:
-            from graspd.drivers.protocol_polled import SCHEME  # needs pyserial
-
-            channel = SCHEME + channel
-        return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
-    except (NotImplementedError, ImportError) as error:
-        raise DriverError(_what_is_missing(interface, error)) from error
-    except Exception as error:
-        raise LinkError.from_errno(error, f"{where}: {error}") from error
-
-
-def _what_is_missing(interface: str, error: Exception | None = None) -> str:
-    if interface not in _EXTRAS:
-        return f"python-can's interface {interface!r} does not work here: {error}"
-    return (
-        f"python-can's interface {interface!r} needs more packages: run {installer()} "
-        f"'python-can[{_EXTRAS[interface][1]}]'"
-    )
 
 
 class CanBus:
@@ -120,12 +57,13 @@ class CanBus:
         bitrate: int | None,
         clock: Callable[[], int],
         wall_clock: Callable[[], int],
+        options: Options = MappingProxyType({}),
     ) -> None:
-        """`bitrate`: bit/s; None: that of the interface.
+        """`bitrate`: bit/s; None: that of the interface. `options`: more arguments of it.
 
-        Raises `ValueError` for a rate of socketcan, and for an interface that cannot be used.
+        Raises `ValueError` for a rate of socketcan, and for what can never be opened.
         """
-        refuse_unusable(interface)
+        refuse_unusable(interface, channel, options)
         if interface == "socketcan" and bitrate is not None:
             raise ValueError(
                 "bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`"
@@ -139,7 +77,7 @@ class CanBus:
         self.counters = CanCounters()
         self._interface = interface
         self._channel = channel
-        self._options = dict(_OPTIONS.get(interface, {}))
+        self._options = {**OWN_OPTIONS.get(interface, {}), **options}
         if bitrate is not None:
             self._options["bitrate"] = bitrate
         self._stamped = interface in STAMPED_INTERFACES
@@ -153,7 +91,7 @@ class CanBus:
     def open(self) -> None:
         self.close()
         self.failure = None
-        self._idle_ns = self._clock()
+        self._idle_ns = self._received_ns = self._clock()
         self._bus = bus = open_bus(self._interface, self._channel, **self._options)
         self.descriptor = _fileno(bus)
         if self.descriptor is not None:
@@ -240,6 +178,7 @@ class CanBus:
                 # slcan returns no frame for an adapter's answer, although frames wait behind it.
                 if self.descriptor is None or not is_ready(self.descriptor):
                     self._idle_ns = before_ns
+                    self._notice_quiet(before_ns, bool(frames))
                     return
                 continue
             frame = _frame_of(message)
@@ -250,6 +189,14 @@ class CanBus:
                 frames.append((frame, t_ns, t_ns))
             else:
                 frames.append((frame, since_ns, self._clock()))
+
+    def _notice_quiet(self, now_ns: int, received: bool) -> None:
+        """Have a connection that may be lost opened again."""
+        if received:
+            self._received_ns = now_ns
+        elif self._interface == "socketcand" and now_ns - self._received_ns > QUIET_NS:
+            text = f"no frame from the server for {QUIET_NS / 1e9:g} s"
+            self.failure = LinkError(LinkCause.TIMEOUT, text)
 
 
 def _fileno(bus: can.BusABC) -> int | None:

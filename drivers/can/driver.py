@@ -9,11 +9,13 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Sequence
+from types import MappingProxyType
 from typing import Final, Unpack
 
 from graspd.drivers.base import DriverError, Fact, LinkError, Opened, Reading
 from graspd.drivers.can.bus import STAMPED_INTERFACES, CanBus
 from graspd.drivers.can.frames import CanCounters, Stamped
+from graspd.drivers.can.interfaces import Options
 from graspd.drivers.can.stream import NAME, BoardOptions, CanStream
 from graspd.drivers.link import LinkState
 
@@ -47,18 +49,20 @@ class CanBridgeDriver(Opened):
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
         bitrate: int | None = None,
+        options: Options = MappingProxyType({}),
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
         """`fingers` and `board`: see `graspd.drivers.can.stream.CanStream`.
 
-        `bitrate`: bit/s; not for socketcan, where `ip link` sets it.
+        `bitrate`: bit/s; not for socketcan, where `ip link` sets it. `options`: more arguments of
+        python-can's interface.
         """
         self._stamped = interface in STAMPED_INTERFACES
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)
         self.stream = self._make_stream()
-        self._bus = CanBus(interface, channel, bitrate, clock, wall_clock)
+        self._bus = CanBus(interface, channel, bitrate, clock, wall_clock, options)
         self._clock = clock
         self._resting_until_ns: int | None = None
 

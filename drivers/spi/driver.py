@@ -19,7 +19,7 @@ import serial
 
 from graspd.drivers.base import DriverError, Fact, LinkCause, LinkError, Opened, Reading
 from graspd.drivers.link import LinkState, is_ready
-from graspd.drivers.protocol_polled import SCHEME, PolledSerial
+from graspd.drivers.protocol_polled import SCHEME, PolledSerial, refuse_url
 from graspd.drivers.spi.conversation import NAME, NONCES, Conversation
 from graspd.drivers.spi.messages import Stop, encode
 from graspd.drivers.spi.sweeps import BridgeCounters
@@ -68,6 +68,10 @@ class SpiBridgeDriver(Opened):
     ) -> None:
         self._fingers, self._sensors = fingers, sensors
         self._clock = clock
+        try:
+            refuse_url(port)
+        except ValueError as error:
+            raise ValueError(f"port {port}: {error}") from error
         self._line = SerialLine(port, baud)
         self._poll_due_ns = 0
         self.conversation = self._begin()

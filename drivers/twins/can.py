@@ -12,8 +12,8 @@ import can
 
 from graspd.drivers.base import Opened
 from graspd.drivers.biotac import E1, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
-from graspd.drivers.can.bus import open_bus, refuse_unusable
 from graspd.drivers.can.frames import STANDARD_ID_MAX, encode_sample
+from graspd.drivers.can.interfaces import open_bus, refuse_unusable
 from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 
@@ -55,7 +55,7 @@ class CanTwin(Opened):
         """
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
-        refuse_unusable(interface)
+        refuse_unusable(interface, channel, {})
         faults.refuse("CAN", "one_byte_at_a_time", "wrong_version", "stuck_clock")
         self._fingers = len(fingers)
         self._channels = SEQUENCES[sequence]

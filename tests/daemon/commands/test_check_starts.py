@@ -12,7 +12,8 @@ from tests.kit.scenes import demo_scene, written
 
 ABSENT = os.sysconf("SC_NPROCESSORS_CONF")
 """A processor that this computer lacks."""
-CAN = '[tactile]\ndriver = "can"\ninterface = "{}"\n[publish]\nendpoint = "ipc://{}/v"\n'
+CAN = '[tactile]\ndriver = "can"\n{}\n[publish]\nendpoint = "ipc://{}/v"\n'
+SOCKETCAND = 'interface = "socketcand"\noptions = { host = "127.0.0.1", '
 
 
 @pytest.mark.parametrize(
@@ -37,14 +38,30 @@ def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -
     assert graspd("run", scene).returncode != 0
 
 
-@pytest.mark.parametrize("interface", ["socketcan_native", "usb2can", "socketcand"])
-def test_check_finds_a_can_interface_that_cannot_be_used(interface: str, tmp_path: Path) -> None:
-    scene = written(tmp_path, CAN.format(interface, tmp_path))
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ('interface = "socketcan_native"', "interface: python-can has no interface"),
+        ('interface = "usb2can"', "interface: python-can's interface 'usb2can' is for Windows"),
+        ('interface = "pcan"', "interface: python-can's interface 'pcan' needs the library"),
+        ('interface = "socketcand"', "options: python-can's interface 'socketcand' needs options"),
+        (SOCKETCAND + 'port = "29536" }', "options.port: Expected `int`, got `str`"),
+        (SOCKETCAND + "port = 1, tune = true }", "options.tune: python-can's interface 'socketca"),
+        (SOCKETCAND + "port = 1, bitrate = 1 }", "options.bitrate: is a key of its own"),
+        ('interface = "slcan"\noptions = { timeout = 1.0 }', "options.timeout: must be 0.0"),
+        ('interface = "slcan"\nchannel = "foo://x"', "channel foo://x: invalid URL"),
+        ('interface = "udp_multicast"', "channel can0: 'can0' does not appear to be an IP"),
+        ('channel = "a-name-of-16-byte"', "channel a-name-of-16-byte: longer than 15 bytes"),
+    ],
+)
+def test_check_finds_a_can_bus_that_can_never_open(keys: str, says: str, tmp_path: Path) -> None:
+    scene = written(tmp_path, CAN.format(keys, tmp_path))
     for command in ("check", "run"):
         refused = graspd(command, scene)
         assert refused.returncode == 2
-        assert "[tactile] interface: " in refused.stderr
-        assert "pip install" not in refused.stderr
+        (line,) = refused.stderr.splitlines()
+        assert line.startswith(f"graspd: [tactile] {says}")
+        assert "pip install" not in line
 
 
 def test_check_finds_a_palm_source_of_another_kind(tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ PLACES: dict[str, tuple[list[Any], list[Any]]] = {
         ["socketcan", "slcan", "virtual", "udp_multicast"],
         ["gs_usb", "socketcand", "usb2can", "none"],
     ),
+    "options": ([{}, {"host": "127.0.0.1", "port": 9}], [{"nonsense": True}]),
     "channel": (["can0", "239.74.163.9", "/dev/absent"], []),
     "port": (["/dev/absent", "loop://"], []),
     "source": (["udp://127.0.0.1:0", "udp://127.0.0.1:P"], ["absent.bin", "tcp://127.0.0.1:P"]),

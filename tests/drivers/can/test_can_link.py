@@ -77,7 +77,7 @@ def test_whatever_python_can_raises_is_a_link_fault_that_is_recovered_from(
     buses: list[object] = [first, second]
     stand_in(monkeypatch, lambda: buses.pop(0))
     clock = Clock()
-    driver = CanBridgeDriver("pcan", "x", arbitration_id=SAMPLE_ID, clock=clock)
+    driver = CanBridgeDriver("robotell", "x", arbitration_id=SAMPLE_ID, clock=clock)
     with driver:
         (reading,) = tactile(driver.read_ready())
         assert (reading.counts == truth(0)).all()
@@ -114,7 +114,7 @@ def test_whatever_opening_raises_is_tried_again(
 
     stand_in(monkeypatch, open_bus)
     clock = Clock()
-    with CanBridgeDriver("pcan", "x", arbitration_id=SAMPLE_ID, clock=clock) as driver:
+    with CanBridgeDriver("robotell", "x", arbitration_id=SAMPLE_ID, clock=clock) as driver:
         readings: list[Reading] = []
         while not readings:
             due_ns = driver.due_ns()
@@ -129,7 +129,7 @@ def test_one_call_takes_a_bounded_number_of_frames(monkeypatch: pytest.MonkeyPat
     clock = Clock()
     bus = ScriptedBus([message(b"\0", 0x7FF)] * (2 * FRAMES_PER_DRAIN + 5))
     stand_in(monkeypatch, lambda: bus)
-    with CanBridgeDriver("pcan", "x", clock=clock) as driver:
+    with CanBridgeDriver("robotell", "x", clock=clock) as driver:
         for expected in (FRAMES_PER_DRAIN, 2 * FRAMES_PER_DRAIN):
             driver.read_ready()
             assert driver.counters.frames == expected
@@ -233,7 +233,7 @@ def test_a_frame_without_a_stamp_came_since_the_bus_was_last_empty(
 ) -> None:
     scripted, clock = ScriptedBus(), Clock(1_000)
     stand_in(monkeypatch, lambda: scripted)
-    bus = CanBus("pcan", "x", None, clock, Clock(0))
+    bus = CanBus("robotell", "x", None, clock, Clock(0))
     bus.open()
     doubts = []
     for now_ns, frames in ((2_000, 1), (3_000, 0), (5_000, 2)):

@@ -320,7 +320,7 @@ def unstamped(monkeypatch: pytest.MonkeyPatch, clock: Clock) -> tuple[ScriptedBu
     bus = ScriptedBus()
     stand_in(monkeypatch, lambda: bus)
     return bus, CanBridgeDriver(
-        "pcan", "x", arbitration_id=SAMPLE_ID, sequence="electrodes", clock=clock
+        "robotell", "x", arbitration_id=SAMPLE_ID, sequence="electrodes", clock=clock
     )
 
 
@@ -339,7 +339,7 @@ def test_old_frames_make_no_fresh_reading(monkeypatch: pytest.MonkeyPatch) -> No
     clock = Clock()
     bus = ScriptedBus()
     stand_in(monkeypatch, lambda: bus)
-    driver = CanBridgeDriver("pcan", "x", clock=clock, sequence="electrodes")
+    driver = CanBridgeDriver("robotell", "x", clock=clock, sequence="electrodes")
     twin = CanTwin("virtual", "x", iter(contact(3)), sequence="electrodes")
     with driver:
         driver.read_ready()

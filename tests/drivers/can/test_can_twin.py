@@ -92,7 +92,10 @@ def test_a_package_that_is_missing_is_named(
     [
         ("socketcan_native", "python-can has no interface 'socketcan_native'"),
         ("usb2can", "'usb2can' is for Windows alone"),
-        ("socketcand", "'socketcand' needs host and port, which a scene cannot give"),
+        ("iscan", "'iscan' is for Windows alone"),
+        ("socketcand", r"'socketcand' needs options = \{ host = ..., port = ... \}$"),
+        ("kvaser", r"needs the library libcanlib.so: see https://.*/interfaces/kvaser.html$"),
+        ("remote", r"pip install 'python-can\[remote\]'$"),
         ("gs_usb", r"'gs_usb' needs more packages: run .* -m pip install 'python-can\[gs-usb\]'$"),
         ("cantact", r"pip install 'python-can\[cantact\]'$"),
         ("slcan", r"pip install 'python-can\[serial\]'$"),
@@ -104,7 +107,7 @@ def test_an_interface_that_cannot_be_used_is_refused(
     interface: str,
     says: str,
 ) -> None:
-    monkeypatch.setattr("graspd.drivers.can.bus.find_spec", lambda _name: None)
+    monkeypatch.setattr("graspd.drivers.can.interfaces.find_spec", lambda _name: None)
     arguments = (iter(()),) if make is CanTwin else ()
     with pytest.raises(ValueError, match=says):
         make(interface, "can0", *arguments)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from graspd.drivers.base import DriverError, TactileReading
+from graspd.drivers.base import TactileReading
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.driver import SerialLine, SpiBridgeDriver
 from graspd.drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
@@ -37,11 +37,12 @@ def rig() -> Iterator[Rig]:
         driver.close()
 
 
-def test_a_port_that_can_never_be_is_said_at_once() -> None:
-    driver = SpiBridgeDriver("nonsense://1", FINGERS)
-    with pytest.raises(DriverError, match="nonsense"):
-        driver.open()
-    driver.close()
+@pytest.mark.parametrize("port", ["nonsense://1", "socket://here", "rfc2217://here:70000"])
+def test_a_port_that_can_never_be_is_refused(port: str) -> None:
+    with pytest.raises(ValueError, match=f"^port {port}: "):
+        SpiBridgeDriver(port, FINGERS)
+    for possible in ("/dev/absent", "loop://", "socket://here:5", "hwgrep://absent"):
+        SpiBridgeDriver(possible, FINGERS)
 
 
 def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:

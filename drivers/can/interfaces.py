@@ -1,0 +1,213 @@
+"""Interfaces of python-can: which can work on this computer, with which channel and options.
+
+The extras are those of python-can's own metadata. The name of a module may be another's package, so
+advice names nothing else but the page of the interface.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import inspect
+import ipaddress
+import logging
+import socket
+from collections.abc import Mapping
+from ctypes.util import find_library
+from importlib.util import find_spec
+from typing import Any, Final, get_type_hints
+
+import can
+import msgspec
+from can.interfaces import BACKENDS
+
+from graspd.drivers.base import DriverError, LinkCause, LinkError
+from graspd.extras import installer
+
+Options = Mapping[str, str | int | float | bool]
+"""Arguments of an interface of python-can beside channel and bit rate, by name."""
+
+NAME_BYTES_MAX: Final = 15
+"""Longest name of a network interface (IFNAMSIZ - 1 of linux/if.h)."""
+CONNECT_S: Final = 0.25
+"""Longest wait for each step of the connection to socketcand, s; a robot's network needs 1 ms."""
+OWN_OPTIONS: Final[dict[str, dict[str, str | int | float | bool]]] = {
+    # The defaults wait: 2 s after opening, 1 ms in every read.
+    "slcan": {"sleep_after_open": 0.0, "timeout": 0.0},
+    # Without it the server may hold frames back for 40 ms, until they are acknowledged.
+    "socketcand": {"tcp_tune": True},
+    # The default queue has no bound; this one holds about 4 s of a full bus.
+    "virtual": {"rx_queue_size": 16384},
+}
+
+_EXTRAS: Final[dict[str, tuple[str, str]]] = {
+    **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "serial")),
+    "udp_multicast": ("msgpack", "multicast"),
+    "gs_usb": ("gs_usb", "gs-usb"),
+    "canalystii": ("canalystii", "canalystii"),
+    "cantact": ("cantact", "cantact"),
+    "neovi": ("ics", "neovi"),
+}
+"""Module that an interface needs, and the extra of python-can that brings it."""
+_PLUGINS: Final = frozenset({"candle", "canine", "cvector", "remote", "sontheim", "zlgcan"})
+"""Extras of python-can that bring an interface of the same name."""
+_LIBRARIES: Final = {"kvaser": "canlib", "neousys": "wdt_dio", "pcan": "pcanbasic"}
+"""Libraries of vendors; no package of Python brings them."""
+_WINDOWS: Final = frozenset(
+    {"etas", "iscan", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector"}
+)
+_OWN_KEYS: Final = frozenset({"interface", "channel", "bitrate"})
+_TYPES: Final[dict[str, dict[str, type]]] = {
+    "socketcand": {"host": str, "port": int, "tcp_tune": bool},
+}
+"""Types of options that python-can does not declare."""
+_WRONG_ARGUMENT: Final = (TypeError, ValueError, OverflowError)
+_ARGUED: Final = frozenset({"gs_usb", "slcan", "socketcan", "socketcand", "udp_multicast"})
+"""Interfaces that raise `_WRONG_ARGUMENT` for arguments alone; others do for absent devices too."""
+
+# What python-can logs it also raises, and socketcand logs each piece of a stream.
+logging.getLogger("can").setLevel(logging.CRITICAL)
+
+
+def refuse_unusable(interface: str, channel: str, options: Options) -> None:
+    """Raise `ValueError` for what can never be opened on this computer. Opens nothing."""
+    if interface not in can.VALID_INTERFACES:
+        raise ValueError(f"interface: {_what_there_is(interface)}")
+    if interface in _WINDOWS:
+        raise ValueError(f"interface: {_named(interface)} is for Windows alone")
+    if interface in _EXTRAS and find_spec(_EXTRAS[interface][0]) is None:
+        raise ValueError(f"interface: {_what_is_missing(interface)}")
+    if interface in _LIBRARIES and not _has_library(_LIBRARIES[interface]):
+        missing = f"the library lib{_LIBRARIES[interface]}.so"
+        raise ValueError(f"interface: {_named(interface)} needs {missing}: {_page(interface)}")
+    _refuse_channel(interface, channel)
+    _refuse_options(interface, options)
+
+
+def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noqa: ANN401
+    """Open a bus of python-can. Raises `LinkError`; `DriverError` if no retry can succeed."""
+    where = f"cannot open {interface} {channel}"
+    if interface == "socketcan":
+        try:
+            socket.if_nametoindex(channel)
+        except OSError as error:
+            raise LinkError(LinkCause.NO_INTERFACE, f"{where}: {error}") from error
+    try:
+        if interface == "socketcand":
+            return _open_socketcand(channel, **options)
+        if interface == "slcan" and "://" not in channel:
+            from graspd.drivers.protocol_polled import SCHEME  # needs pyserial
+
+            channel = SCHEME + channel
+        return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
+    except (NotImplementedError, ImportError) as error:
+        raise DriverError(_what_is_missing(interface, error)) from error
+    except Exception as error:
+        if isinstance(error, _WRONG_ARGUMENT) and interface in _ARGUED:
+            raise DriverError(f"{where}: {error}") from error
+        raise LinkError.from_errno(error, f"{where}: {error}") from error
+
+
+def _open_socketcand(channel: str, host: str, port: int, **options: Any) -> can.BusABC:  # noqa: ANN401
+    """Connect within `CONNECT_S`: python-can waits for ever, or spins for ten seconds."""
+    before_s = socket.getdefaulttimeout()
+    socket.create_connection((host, port), CONNECT_S).close()
+    socket.setdefaulttimeout(CONNECT_S)
+    try:
+        return can.Bus(
+            channel=channel,
+            interface="socketcand",
+            ignore_config=True,
+            host=host,
+            port=port,
+            **options,
+        )
+    finally:
+        socket.setdefaulttimeout(before_s)
+
+
+def _refuse_channel(interface: str, channel: str) -> None:
+    """Raise `ValueError` for a channel that the interface can never have."""
+    try:
+        if interface == "socketcan" and len(channel.encode()) > NAME_BYTES_MAX:
+            raise ValueError(f"longer than {NAME_BYTES_MAX} bytes, so no network interface has it")
+        if interface == "udp_multicast" and not ipaddress.ip_address(channel).is_multicast:
+            raise ValueError("not a multicast address, as 239.74.163.2")
+        if interface == "slcan":
+            from graspd.drivers.protocol_polled import refuse_url
+
+            refuse_url(channel)
+    except ValueError as error:
+        raise ValueError(f"channel {channel}: {error}") from error
+
+
+def _refuse_options(interface: str, options: Options) -> None:
+    """Raise `ValueError` for options that the interface needs, lacks or has of another type."""
+    constructor = _constructor(interface)
+    parameters = inspect.signature(constructor).parameters
+    needed = [name for name, each in parameters.items() if _is_needed(each)]
+    for name in needed:
+        if name not in options:
+            example = ", ".join(f"{each} = ..." for each in needed)
+            raise ValueError(f"options: {_named(interface)} needs options = {{ {example} }}")
+    types = get_type_hints(constructor) | _TYPES.get(interface, {}) if options else {}
+    for name, value in options.items():
+        if name in _OWN_KEYS:
+            raise ValueError(f"options.{name}: is a key of its own, tactile.{name}")
+        own = OWN_OPTIONS.get(interface, {}).get(name, value)
+        if own != value:
+            raise ValueError(f"options.{name}: must be {own}, or left out")
+        # Some interfaces take arguments out of a dictionary: then their code has the names.
+        if name not in parameters and name not in constructor.__code__.co_consts:
+            raise ValueError(f"options.{name}: {_named(interface)} has no such option")
+        try:
+            msgspec.convert(value, types.get(name, Any))
+        except (msgspec.ValidationError, TypeError) as error:
+            raise ValueError(f"options.{name}: {error}") from error
+
+
+def _constructor(interface: str) -> Any:  # noqa: ANN401
+    """Return the function that takes an interface's arguments. Raises `ValueError`."""
+    module, name = BACKENDS[interface]
+    try:
+        return inspect.unwrap(getattr(importlib.import_module(module), name).__init__)
+    except Exception as error:
+        raise ValueError(f"interface: {_what_is_missing(interface, error)}") from error
+
+
+def _is_needed(parameter: inspect.Parameter) -> bool:
+    if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+        return False
+    return parameter.default is parameter.empty and parameter.name not in {"self", *_OWN_KEYS}
+
+
+def _has_library(name: str) -> bool:
+    try:
+        return find_library(name) is not None or bool(ctypes.CDLL(f"lib{name}.so"))
+    except OSError:
+        return False
+
+
+def _what_there_is(interface: str) -> str:
+    if interface in _PLUGINS:
+        return f"{_named(interface)} needs a package: {_install(interface)}"
+    common = "socketcan, slcan, udp_multicast, socketcand, virtual"
+    return f"python-can has no interface {interface!r}; it has {common} and others"
+
+
+def _what_is_missing(interface: str, error: Exception | None = None) -> str:
+    if interface in _EXTRAS:
+        return f"{_named(interface)} needs more packages: {_install(_EXTRAS[interface][1])}"
+    return f"{_named(interface)} does not work here: {error}: {_page(interface)}"
+
+
+def _named(interface: str) -> str:
+    return f"python-can's interface {interface!r}"
+
+
+def _install(extra: str) -> str:
+    return f"run {installer()} 'python-can[{extra}]'"
+
+
+def _page(interface: str) -> str:
+    return f"see https://python-can.readthedocs.io/en/stable/interfaces/{interface}.html"
