@@ -17,12 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from graspd.biotac import Finger
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
-from graspd.daemon.assembly.plan import MCAP, require_mcap
+from graspd.daemon.assembly.plan import require_mcap
 from graspd.daemon.assembly.sources import Source, Tables
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
+from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
 from graspd.models import trial, zoo
 from graspd.models.contract import CLASSES, ModelError, SessionInput
 from graspd.models.counts import check_fingers, counts_of
@@ -154,10 +155,10 @@ def judge(
     """
     if isinstance(recordings, str | os.PathLike):
         recordings = [recordings]
-    paths = [Path(path) for path in recordings]
-    parts = _parts(paths, {} if model is None else {"path": _path(model).absolute()})
-    pipeline, driver = parts.pipeline, parts.drivers[0]
     with ExitStack() as stack:
+        paths = stack.enter_context(files_of([Path(path) for path in recordings]))
+        parts = _parts(paths, {} if model is None else {"path": _path(model).absolute()})
+        pipeline, driver = parts.pipeline, parts.drivers[0]
         around = Assembly(parts, stack)
         outbox = around.build_outbox()
         around.open_drivers()
@@ -174,7 +175,7 @@ def judge(
 
 def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
     source: Source = Tables(paths, {})
-    if MCAP in {path.suffix for path in paths}:
+    if kind_of_all(paths) is Kind.MCAP:
         require_mcap("judging MCAP")
         from graspd.daemon.assembly.recordings import RecordedRun
 

@@ -11,8 +11,6 @@ from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.scene import GateMode
 from graspd.extras import require
 
-MCAP = ".mcap"
-
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -68,16 +66,20 @@ class Plan:
 
 
 def is_mcap(options: ReplayTactile) -> bool:
-    """Return True for recordings of graspd.
+    """Return True for recordings of graspd, False for tables and streams.
 
-    Raises `SceneError` if some are CSV files, or if the package that reads MCAP is missing.
+    Raises `RecordingError` for files of two kinds, `SceneError` for those of another kind, or if
+    the package that reads MCAP is missing.
     """
-    kinds = {path.suffix == MCAP for path in options.recordings}
-    if len(kinds) > 1:
-        raise SceneError("tactile.recordings: both CSV and MCAP files")
-    if True in kinds:
+    from graspd.drivers.recordings.kinds import Kind, kind_of_all
+
+    kind = kind_of_all(options.recordings)
+    if kind is Kind.MCAP:
         require_mcap("replaying MCAP")
-    return True in kinds
+    elif kind is not Kind.TEXT:
+        first = options.recordings[0]
+        raise SceneError(f"tactile.recordings: {first} is {kind.value}: `graspd replay` plays it")
+    return kind is Kind.MCAP
 
 
 def require_mcap(what: str) -> None:

@@ -17,13 +17,14 @@ from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import CanTactile, SpiTactile
 from graspd.daemon.scene.scene import Hand
 from graspd.drivers.recordings.csv_player import ReplayDriver
+from graspd.drivers.recordings.kinds import CAN_LOGS, Kind, kind_of_all
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from graspd.drivers.recordings.player import LinkLogDriver
 
-LINK_LOGS = {".log": "can", ".serial": "spi"}
-"""File name endings of link logs, candump text and serial bytes, and the driver of such a link."""
+LINK_LOGS = {Kind.SERIAL: "spi", **dict.fromkeys(CAN_LOGS, "can")}
+"""Kinds of link logs, and the driver of such a link."""
 LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session")
 """Sections of a scene that change verdicts; a link log has no joints."""
 
@@ -94,12 +95,9 @@ class LinkLogs(Source):
     """Link logs of one kind, in order of time."""
 
     def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
-        """`path`: of the scene; None: defaults. Raises `SceneError` for two kinds of files."""
-        endings = {each.suffix for each in paths}
-        if len(endings) > 1:
-            raise SceneError(f"files of {' and '.join(sorted(endings))} are not one recording")
+        """`path`: of the scene; None: defaults. Raises `RecordingError` for two kinds of files."""
         self._paths = tuple(paths)
-        driver = LINK_LOGS[paths[0].suffix]
+        driver = LINK_LOGS[kind_of_all(paths)]
         if path is None:
             port = {"port": "link log"} if driver == "spi" else {}
             super().__init__({"tactile": {"driver": driver, **port}}, Path("command line"))

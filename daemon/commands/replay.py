@@ -12,7 +12,7 @@ from typing import Any
 from graspd.biotac import TABLE_FINGERS
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
-from graspd.daemon.assembly.plan import MCAP, require_mcap
+from graspd.daemon.assembly.plan import require_mcap
 from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
 from graspd.daemon.commands.arguments import UsageError, within
 from graspd.daemon.judge.pipeline import Pipeline
@@ -31,6 +31,7 @@ from graspd.daemon.session import file as session_file
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_DAY
 from graspd.drivers.recordings.csv_rows import SLIPPED
+from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError
@@ -53,12 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         type=Path,
         metavar="RECORDING",
-        help="grasp tables or streams (CSV); what `graspd run` has recorded (.mcap); what came "
-        "over a link (candump text .log, serial bytes .serial); without any, the demo: a synthetic "
-        "day, with --outcomes and --max-slip-when-stable 0.05",
+        help="grasp tables or streams (CSV, Parquet); what `graspd run` has recorded (MCAP); what "
+        "came over a link (a CAN log, serial bytes); each packed by gzip or not, known by its "
+        "content; - is standard input; without any, the demo: a synthetic day, with --outcomes "
+        "and --max-slip-when-stable 0.05",
     )
     parser.add_argument(
-        "--scene", type=Path, help="of .log and .serial: the scene that says how to decode them"
+        "--scene", type=Path, help="of a link log: the scene that says how to decode it"
     )
     parser.add_argument(
         "--model",
@@ -156,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
     if args.max_slip_when_stable and args.recordings and not args.outcomes:
         raise UsageError("--max-slip-when-stable rests on outcomes: it needs --outcomes")
     try:
-        with StopSignal() as stop:
+        with StopSignal() as stop, files_of(args.recordings) as args.recordings:
             return _replay(args, stop)
     except RecordingError as error:
         if error.path.exists() or error.path.stem not in {table.name for table in TABLES}:
@@ -232,8 +234,8 @@ def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
 
 def _source(args: argparse.Namespace) -> Source:
     """Return what plays the recordings. Imports only what this kind of them needs."""
-    endings = {path.suffix for path in args.recordings}
-    if endings.isdisjoint({MCAP, *LINK_LOGS}):
+    kind = kind_of_all(args.recordings)
+    if kind is Kind.TEXT:
         return _tables(args)
     if args.outcomes or args.min_confidence is not None or _risk(args):
         raise UsageError(
@@ -242,8 +244,10 @@ def _source(args: argparse.Namespace) -> Source:
         )
     if args.loop or args.strict:
         raise UsageError("what graspd has recorded is played as it is: no --loop or --strict")
-    if MCAP not in endings:
+    if kind in LINK_LOGS:
         return LinkLogs(args.recordings, args.scene)
+    if kind is not Kind.MCAP:
+        raise RecordingError(args.recordings[0], f"is {kind.value}, which is not read yet")
     require_mcap("replaying MCAP")
     from graspd.daemon.assembly.recordings import RecordedRun
 

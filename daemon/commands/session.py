@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.plan import MCAP, Plan, is_mcap
+from graspd.daemon.assembly.plan import Plan, is_mcap
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
@@ -29,6 +29,7 @@ from graspd.daemon.session.keeper import continue_kept, newest_of_each
 from graspd.daemon.trust.lift_book import GraspId, Lift, LiftBook
 from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
+from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
 from graspd.models.session_statistics import SessionState
@@ -87,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
             result = "forgotten" if folder.remove() else "no session was kept"
         write_lines(f"{printable(str(wanted.session_path))}: {result}")
     else:
-        _seed(wanted, model, args.recordings)
+        with files_of(args.recordings) as recordings:
+            _seed(wanted, model, recordings)
     return 0
 
 
@@ -202,7 +204,7 @@ def _learned(state: TrustState | None) -> dict[str, Any] | None:
 
 def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
     """Judge the recordings as the daemon does, tell their outcomes, and keep the session."""
-    mode: GateMode | None = "every" if any(path.suffix == MCAP for path in recordings) else None
+    mode: GateMode | None = "every" if kind_of_all(recordings) is Kind.MCAP else None
     plan = Plan.of(_on_recordings(wanted, recordings, mode))
     pipeline = assembly.build_pipeline(plan, model)
     session, trust = pipeline.session, pipeline.trust

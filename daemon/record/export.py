@@ -17,7 +17,8 @@ from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
 from graspd.daemon.record.topics import Judged, Topic, decode_judged
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, open_recording
+from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED
+from graspd.drivers.recordings.kinds import open_recording
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,13 +15,12 @@ from graspd.biotac import electrode_columns
 from graspd.drivers.base import JointReading, RecordingError, TactileReading
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, Row, columns_of, read_rows
+from graspd.drivers.recordings.kinds import Kind, kind_of
 from graspd.extras import require
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
     from graspd.daemon.record.player import McapReplayDriver
-
-MCAP, PARQUET = ".mcap", ".parquet"
 
 
 def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
@@ -31,9 +30,10 @@ def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
     Raises `RecordingError`.
     """
     path = Path(path)
-    if path.suffix == PARQUET:
+    kind = kind_of(path)
+    if kind is Kind.PARQUET:
         return pd.read_parquet(path)
-    if path.suffix == MCAP:
+    if kind is Kind.MCAP:
         require("mcap", "read_grasps of MCAP", "record")
         from graspd.daemon.record.export import collect
 
@@ -60,7 +60,7 @@ def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
     """
     path = Path(path)
     driver: ReplayDriver | McapReplayDriver
-    if path.suffix == MCAP:
+    if kind_of(path) is Kind.MCAP:
         require("mcap", "read_recording of MCAP", "record")
         from graspd.daemon.record.mcap_reader import header_of
         from graspd.daemon.record.player import McapReplayDriver

@@ -30,7 +30,7 @@ from graspd.biotac import Finger
 from graspd.daemon.record.mcap import METADATA, RecordingHeader
 from graspd.daemon.record.topics import Topic
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.kinds import open_recording
 
 RECORD_MAX_BYTES: Final = 64 << 20
 """Largest record, bytes; a longer one is damaged."""

@@ -24,7 +24,7 @@ from graspd.daemon.record.topics import (
     tactile_reading,
 )
 from graspd.drivers.base import DriverCounters, Reading, RecordingError, TactileReading
-from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.player import RecordedDriver
 
 _log = logging.getLogger(__name__)

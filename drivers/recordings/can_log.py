@@ -27,7 +27,7 @@ from graspd.drivers.can.frames import (
     Stamped,
 )
 from graspd.drivers.can.stream import BoardOptions, CanStream
-from graspd.drivers.recordings.csv_rows import open_recording, read_lines
+from graspd.drivers.recordings.kinds import open_recording, read_lines
 from graspd.drivers.recordings.player import LinkLogDriver
 
 NS_PER_US: Final = 1000

@@ -8,27 +8,24 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import re
-import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS, electrode_columns
 from graspd.drivers.base import Annotation, ElectrodeFault, RecordingError, joint_name
+from graspd.drivers.recordings.kinds import LINE_BYTES_MAX, open_recording, read_lines
 
 TIME = "t"
 """Column of seconds, with any zero. Files with it are streams, files without it grasp tables."""
 OBJECT = "object"
 SLIPPED = "slipped"
-LINE_BYTES_MAX = 65_536
-"""Longest line, bytes; a full row has 1,200. A disk image may have no line end at all."""
 TIME_MAX_S = 1e11
 """Largest time, s (the year 5138). Unix time in ms, us or ns lies above it."""
 SHOWN_LENGTH_MAX = 40
@@ -249,26 +246,6 @@ def read_rows(path: Path, fingers: Sequence[str], *, strict: bool = False) -> It
         yield from Recording(path, read_lines(path, file), fingers, strict=strict)
 
 
-def open_recording(path: Path) -> BinaryIO:
-    """Open a file. Raises `RecordingError` if it is not regular or cannot be read."""
-    try:
-        mode = os.stat(path).st_mode
-        if stat.S_ISREG(mode):
-            return path.open("rb")
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        raise RecordingError(path, _reason(error)) from error
-    raise RecordingError(path, "is a directory" if stat.S_ISDIR(mode) else "is not a regular file")
-
-
-def read_lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of `stream` with their ends, at most `LINE_BYTES_MAX` + 1 bytes each."""
-    try:
-        while line := stream.readline(LINE_BYTES_MAX + 1):
-            yield line
-    except OSError as error:
-        raise RecordingError(path, _reason(error)) from error
-
-
 def count_of(cell: str) -> int | None:
     """Return the 12-bit count in a cell; None if it holds no count."""
     count = _COUNT_OF_TEXT.get(cell)
@@ -291,8 +268,3 @@ def number_of(cell: str) -> float | None:
 
 def _shown(cell: str) -> str:
     return repr(cell if len(cell) <= SHOWN_LENGTH_MAX else cell[:SHOWN_LENGTH_MAX] + "...")
-
-
-def _reason(error: OSError | ValueError) -> str:
-    system = error.strerror if isinstance(error, OSError) else None
-    return (system or str(error)).lower()

@@ -11,10 +11,8 @@ from typing import Generic, Protocol, TypeVar
 import msgspec
 
 from graspd.drivers.base import DriverCounters, Fact, Opened, Reading, RecordingError
-from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.kinds import open_recording
 
-CANDUMP, SERIAL = ".log", ".serial"
-"""File name endings of the two kinds of link log that graspd writes."""
 Item = TypeVar("Item")
 
 

@@ -14,7 +14,7 @@ from typing import Final
 
 from graspd.drivers.base import Reading
 from graspd.drivers.link import LinkState
-from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.player import LinkLogDriver
 from graspd.drivers.spi.conversation import Conversation
 from graspd.drivers.spi.driver import LineEvent

@@ -349,9 +349,11 @@ def test_the_example_of_the_page_runs(
     ],
 )
 def test_a_missing_extra_is_an_error_that_says_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch, function: str, package: str, extra: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, function: str, package: str, extra: str
 ) -> None:
+    path = tmp_path / "run"
+    path.write_bytes(b"\x89MCAP0\r\n")
     monkeypatch.setitem(sys.modules, package, None)
     advice = re.escape(f"run {sys.executable} -m pip install '.[{extra}]'")
     with pytest.raises(ModuleNotFoundError, match=rf"{function}.* '{package}': {advice}"):
-        getattr(graspd, function)("run.mcap")
+        getattr(graspd, function)(path)

@@ -18,7 +18,7 @@ from graspd.daemon.record.recorder import MakeHeader, Recorder
 from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.lift_book import NAME_BYTES
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.kinds import open_recording
 from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_verdict
 

@@ -21,7 +21,7 @@ from graspd.daemon.record.mcap_reader import McapReader
 from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, make_room
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.scene import Record
-from graspd.drivers.recordings.csv_rows import open_recording
+from graspd.drivers.recordings.kinds import open_recording
 from tests.daemon.record.recorded import BOOT, NO_STATUS, files, messages, recorder
 from tests.kit.waiting import wait_until
 

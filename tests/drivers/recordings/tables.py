@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.csv_rows import Recording, Row, read_lines
+from graspd.drivers.recordings.csv_rows import Recording, Row
+from graspd.drivers.recordings.kinds import read_lines
 
 FINGERS = ("ff", "mf", "th")
 ELECTRODES = [f"{finger}_biotac_{number}" for finger in FINGERS for number in range(1, 25)]

@@ -17,9 +17,8 @@ from graspd.drivers.recordings.csv_rows import (
     Recording,
     count_of,
     number_of,
-    open_recording,
-    read_lines,
 )
+from graspd.drivers.recordings.kinds import open_recording, read_lines
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,

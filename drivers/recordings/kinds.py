@@ -1,0 +1,265 @@
+"""Kinds of recordings, by content: the first bytes decide, never the name.
+
+A packed file (gzip) is unpacked as it is read. Standard input and pipes, which can be read only
+once, are first copied to a file.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import re
+import stat
+import sys
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import BinaryIO, Final
+
+from graspd.drivers.base import RecordingError
+
+STANDARD_INPUT: Final = Path("-")
+"""Name of standard input on a command line."""
+COPIED_BYTES_MAX: Final = 4 * 2**30
+"""Most bytes that are copied from a pipe, and most that a packed file unpacks to."""
+LINE_BYTES_MAX: Final = 65_536
+"""Longest line, bytes; a full row has 1,200. A disk image may have no line end at all."""
+HEAD_BYTES: Final = 65_536
+"""Bytes of a file that decide what it is."""
+PAGE: Final = "deploy/RECORDING.md"
+
+
+class Kind(Enum):
+    """Kinds of recordings; the value is a text for people."""
+
+    TEXT = "a text table"
+    PARQUET = "a Parquet table"
+    MCAP = "a recording of graspd (MCAP)"
+    ROS1_BAG = "a ROS 1 bag"
+    ROS2_BAG = "a ROS 2 bag"
+    CANDUMP = "a CAN log of candump"
+    ASC = "a CAN log of Vector (ASC)"
+    BLF = "a CAN log of Vector (BLF)"
+    TRC = "a CAN log of PEAK (TRC)"
+    SERIAL = "a serial link log of graspd"
+
+
+TABLES: Final = frozenset((Kind.TEXT, Kind.PARQUET))
+CAN_LOGS: Final = frozenset((Kind.CANDUMP, Kind.ASC, Kind.BLF, Kind.TRC))
+BAGS: Final = frozenset((Kind.ROS1_BAG, Kind.ROS2_BAG))
+
+_GZIP: Final = b"\x1f\x8b\x08"
+_MCAP: Final = b"\x89MCAP0\r\n"
+_MCAP_ROS2: Final = _MCAP + b"\x01", b"\x04\x00\x00\x00ros2"
+"""Begin of a file and of its profile, after the length of the header record."""
+_MAGIC: Final = {
+    b"PAR1": Kind.PARQUET,
+    _MCAP: Kind.MCAP,
+    b"#ROSBAG V2.0": Kind.ROS1_BAG,
+    b"LOGG": Kind.BLF,
+    b";$FILEVERSION": Kind.TRC,
+}
+_BYTE_ORDER_MARKS: Final = (b"\xef\xbb\xbf", b"\xff\xfe", b"\xfe\xff")
+_CANDUMP_LINE: Final = re.compile(
+    rb"^[ \t]*(?:\([^)\r\n]{1,40}\))?[ \t]*[!-~]{1,64}[ \t]+"
+    rb"(?:[0-9A-F]{3}|[0-9A-F]{8})(?:#[0-9A-FR#_. \t]*|[ \t]+\[ ?[0-9]{1,2}\][ \t].*)"
+    rb"(?:[ \t]+[RT])?[ \t]*\r?$",
+    re.IGNORECASE | re.MULTILINE,
+)
+"""A frame as candump writes it into a file, `can0 100#0D3A`, or shows it, `can0 100 [2] 0D 3A`."""
+_ASC_LINE: Final = re.compile(rb"^base (?:hex|dec)\s+timestamps ", re.IGNORECASE | re.MULTILINE)
+_SQLITE: Final = b"SQLite format 3\0"
+_SERIAL_EVENTS: Final = frozenset((1, 2, 3))
+"""Types of the records of `graspd.drivers.recordings.serial_log`."""
+_OTHERS: Final = {
+    b"#ROSBAG V1": "an old ROS 1 bag: `rosbag fix` makes version 2.0 of it",
+    b"\x89PNG": "a PNG image",
+    b"\xff\xd8\xff": "a JPEG image",
+    b"%PDF": "a PDF document",
+    b"PK\x03\x04": "a zip archive or an Excel workbook: save the sheet as CSV",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook: save the sheet as CSV",
+    b"\x89HDF": "HDF5: write the table as CSV or Parquet",
+    b"MATLAB": "a MATLAB file: write the table as CSV",
+    b"\x93NUMPY": "a NumPy array: write CSV with a header, or give the array to graspd.load()",
+    b"\x80\x02": "a Python pickle: write the table as CSV or Parquet",
+    b"\x80\x03": "a Python pickle: write the table as CSV or Parquet",
+    b"\x80\x04": "a Python pickle: write the table as CSV or Parquet",
+    b"\x80\x05": "a Python pickle: write the table as CSV or Parquet",
+    b"ARROW1": "Arrow or Feather: write the table as Parquet",
+    b"\x28\xb5\x2f\xfd": "packed with zstd: unpack it first",
+    b"BZh": "packed with bzip2: unpack it first",
+    b"\xfd7zXZ": "packed with xz: unpack it first",
+    b"7z\xbc\xaf": "a 7z archive: unpack it first",
+    b"\x7fELF": "a program",
+    b"\xd4\xc3\xb2\xa1": "a network capture (pcap)",
+    b"\x0a\x0d\x0d\x0a": "a network capture (pcapng)",
+    _SQLITE: "an SQLite database without the tables of a ROS 2 bag",
+    _GZIP: "packed twice: unpack it first",
+}
+"""Other files, by their first bytes."""
+
+
+def kind_of(path: Path) -> Kind:
+    """Return what a file or folder holds. Raises `RecordingError` for what graspd does not read."""
+    if (path / "metadata.yaml").is_file():
+        return Kind.ROS2_BAG
+    with open_recording(path) as file:
+        try:
+            head = file.read(HEAD_BYTES)
+        except OSError as error:
+            raise RecordingError(path, reason(error)) from error
+    if not head:
+        raise RecordingError(path, "the file is empty")
+    kind = _kind_of(head)
+    if kind is None:
+        looks = next((text for magic, text in _OTHERS.items() if head.startswith(magic)), None)
+        problem = "is of a kind that is not known" if looks is None else f"looks like {looks}"
+        raise RecordingError(path, f"{problem}; {PAGE} lists what graspd reads")
+    return kind
+
+
+def kind_of_all(paths: Sequence[Path]) -> Kind:
+    """Return what all these files hold; `Kind.TEXT` for tables of either form.
+
+    Raises `RecordingError` if they are not of one kind.
+    """
+    kinds = [kind_of(path) for path in paths]
+    kinds = [Kind.TEXT if kind in TABLES else kind for kind in kinds]
+    for path, kind in zip(paths, kinds, strict=True):
+        if kind is not kinds[0]:
+            problem = f"is {kind.value}, {paths[0]} is {kinds[0].value}: they are not one recording"
+            raise RecordingError(path, problem)
+    return kinds[0]
+
+
+def _kind_of(head: bytes) -> Kind | None:
+    if head.startswith(_MCAP_ROS2[0]) and head[17:].startswith(_MCAP_ROS2[1]):
+        return Kind.ROS2_BAG
+    if head.startswith(_SQLITE) and b"messages" in head and b"topics" in head:
+        return Kind.ROS2_BAG
+    for magic, kind in _MAGIC.items():
+        if head.startswith(magic):
+            return kind
+    if head.startswith(_BYTE_ORDER_MARKS):
+        return Kind.TEXT
+    if any(head.startswith(magic) for magic in _OTHERS):
+        return None
+    if b"\0" in head:
+        from graspd.drivers.spi.messages import FrameParser
+
+        events = (event for event, _ in FrameParser().feed(head))
+        return Kind.SERIAL if not _SERIAL_EVENTS.isdisjoint(events) else None
+    if _ASC_LINE.search(head):
+        return Kind.ASC
+    return Kind.CANDUMP if _CANDUMP_LINE.search(head) else Kind.TEXT
+
+
+def open_recording(path: Path) -> BinaryIO:
+    """Open a file, packed or not; it can be read again from its start.
+
+    Raises `RecordingError` if it is not regular or cannot be read.
+    """
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISREG(mode):
+            file = path.open("rb")
+            packed = file.read(len(_GZIP)) == _GZIP
+            file.seek(0)
+            return io.BufferedReader(_Unpacked(file)) if packed else file
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise RecordingError(path, reason(error)) from error
+    raise RecordingError(path, "is a directory" if stat.S_ISDIR(mode) else "is not a regular file")
+
+
+class _Unpacked(io.RawIOBase):
+    """The content of a gzip file. A damaged file, or one that grows too much, is an `OSError`."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._packed = gzip.GzipFile(fileobj=file)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        try:
+            data = self._packed.read(len(buffer))
+        except (EOFError, zlib.error) as error:
+            raise OSError(None, "the packed file is damaged or cut off") from error
+        if self._packed.tell() > COPIED_BYTES_MAX:
+            raise OSError(None, f"it unpacks to more than {COPIED_BYTES_MAX} bytes")
+        buffer[: len(data)] = data
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._packed.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._packed.tell()
+
+    def close(self) -> None:
+        self._packed.close()
+        self._file.close()
+        super().close()
+
+
+@contextmanager
+def files_of(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """Yield `paths` with a copy in place of what can be read only once: `-` and pipes.
+
+    Raises `RecordingError` for more than `COPIED_BYTES_MAX`.
+    """
+    with TemporaryDirectory(prefix="graspd-") as folder:
+        yield [_file_of(path, Path(folder, str(number))) for number, path in enumerate(paths)]
+
+
+def _file_of(path: Path, folder: Path) -> Path:
+    try:
+        is_pipe = path == STANDARD_INPUT or stat.S_ISFIFO(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return path  # whatever opens it says why not
+    if not is_pipe:
+        return path
+    folder.mkdir()
+    name = "standard input" if path == STANDARD_INPUT else path.name
+    try:
+        with (folder / name).open("xb") as copy:
+            if path == STANDARD_INPUT:
+                _copy(path, sys.stdin.buffer, copy)
+            else:
+                with path.open("rb") as pipe:
+                    _copy(path, pipe, copy)
+    except OSError as error:
+        raise RecordingError(path, reason(error)) from error
+    return folder / name
+
+
+def _copy(path: Path, source: BinaryIO, target: BinaryIO) -> None:
+    left = COPIED_BYTES_MAX
+    while chunk := source.read(HEAD_BYTES):
+        left -= len(chunk)
+        if left < 0:
+            raise RecordingError(path, f"brings more than {COPIED_BYTES_MAX} bytes")
+        target.write(chunk)
+
+
+def read_lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
+    """Yield the lines of `stream` with their ends, at most `LINE_BYTES_MAX` + 1 bytes each."""
+    try:
+        while line := stream.readline(LINE_BYTES_MAX + 1):
+            yield line
+    except OSError as error:
+        raise RecordingError(path, reason(error)) from error
+
+
+def reason(error: OSError | ValueError) -> str:
+    """Return why a file cannot be read, for people."""
+    system = error.strerror if isinstance(error, OSError) else None
+    return (system or str(error)).lower()

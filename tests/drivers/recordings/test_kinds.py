@@ -1,0 +1,220 @@
+"""What a file is, by its content; what is packed or piped is read as the file would be."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import pickle
+import sqlite3
+import struct
+import sys
+import threading
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings import kinds
+from graspd.drivers.recordings.kinds import (
+    Kind,
+    files_of,
+    kind_of,
+    kind_of_all,
+    open_recording,
+    read_lines,
+)
+from graspd.drivers.recordings.serial_log import encode_records
+from graspd.drivers.spi.driver import LineEvent
+from tests.drivers.recordings.tables import table, write
+
+HEADER = struct.Struct("<BQI")
+
+
+def mcap(profile: bytes) -> bytes:
+    """Magic and header record of an MCAP file (its specification, "Header")."""
+    library = struct.pack("<I", 1) + b"x"
+    length = 4 + len(profile) + len(library)
+    return b"\x89MCAP0\r\n" + HEADER.pack(1, length, len(profile)) + profile + library
+
+
+def bag2(tables: str) -> Callable[[Path], None]:
+    def make(path: Path) -> None:
+        database = sqlite3.connect(path)
+        database.executescript(tables)
+        database.close()
+
+    return make
+
+
+def parquet(path: Path) -> None:
+    frame = pytest.importorskip("pandas").DataFrame({"ff_biotac_1": [1]})
+    frame.to_parquet(path)
+
+
+TOPICS = "create table topics (id integer); create table messages (id integer);"
+FILES: dict[str, tuple[bytes | Callable[[Path], None], Kind]] = {
+    "table": (table(2), Kind.TEXT),
+    "with a byte order mark": (b"\xef\xbb\xbf" + table(2), Kind.TEXT),
+    "UTF-16": (table(2).decode().encode("utf-16"), Kind.TEXT),
+    "Latin-1": (table(2).replace(b"thing", b"K\xe4se"), Kind.TEXT),
+    "comments": (b"# lab A\n#ROS\n" + table(2), Kind.TEXT),
+    "Parquet": (parquet, Kind.PARQUET),
+    "MCAP of graspd": (mcap(b""), Kind.MCAP),
+    "MCAP of ROS 2": (mcap(b"ros2"), Kind.ROS2_BAG),
+    "ROS 1 bag": (b"#ROSBAG V2.0\n\x45\0\0\0", Kind.ROS1_BAG),
+    "SQLite bag": (bag2(TOPICS), Kind.ROS2_BAG),
+    "candump -L": (b"(1436509052.249713) can0 5A1#A2BF98\n", Kind.CANDUMP),
+    "candump -L in ns": (b"(1436509052.249713123) vcan0 0000005A#R\n", Kind.CANDUMP),
+    "candump, CRLF": (b"(1436509052.2497) can0 5A1#A2\r\n", Kind.CANDUMP),
+    "candump -ta": (b" (1436509052.249713)  can0  5A1   [7]  A2 BF 98\n", Kind.CANDUMP),
+    "candump -tA": (b" (2023-11-14 22:13:20.000000)  can0  5A1   [1]  A2\n", Kind.CANDUMP),
+    "candump alone": (b"  can0  5A1   [2]  A2 BF\n", Kind.CANDUMP),
+    "candump after noise": (b"\n? ##\n(1.5) can0 5A1#\n", Kind.CANDUMP),
+    "ASC": (b"date Thu Nov 26 2026\nbase hex  timestamps absolute\n", Kind.ASC),
+    "BLF": (b"LOGG\x90\0\0\0", Kind.BLF),
+    "TRC": (b";$FILEVERSION=2.1\n", Kind.TRC),
+    "serial": (b"noise\0" + encode_records(LineEvent.RECEIVED, 5, b"\1\2"), Kind.SERIAL),
+}
+
+
+def made(path: Path, content: bytes | Callable[[Path], None]) -> Path:
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        content(path)
+    return path
+
+
+@pytest.mark.parametrize(("content", "kind"), FILES.values(), ids=FILES)
+@pytest.mark.parametrize("packed", [False, True], ids=["plain", "gzip"])
+def test_a_file_is_what_it_holds_whatever_its_name(
+    tmp_path: Path, content: bytes | Callable[[Path], None], kind: Kind, packed: bool
+) -> None:
+    path = made(tmp_path / "RUN.XYZ", content)
+    if packed:
+        path.write_bytes(gzip.compress(path.read_bytes()))
+    assert kind_of(path) is kind
+
+
+def test_a_folder_with_metadata_is_a_bag(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").touch()
+    assert kind_of(tmp_path) is Kind.ROS2_BAG
+
+
+def workbook(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("xl/workbook.xml", "")
+
+
+def array(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+OTHERS: dict[str, tuple[bytes | Callable[[Path], None], str]] = {
+    "PNG": (b"\x89PNG\r\n\x1a\n\0", "looks like a PNG image"),
+    "xlsx": (workbook, "a zip archive or an Excel workbook: save the sheet as CSV"),
+    "npy": (array, "a NumPy array"),
+    "pickle": (pickle.dumps([1, 2]), "a Python pickle"),
+    "HDF5": (b"\x89HDF\r\n\x1a\n", "HDF5: write the table as CSV or Parquet"),
+    "other SQLite": (bag2("create table x (y integer);"), "an SQLite database without"),
+    "old bag": (b"#ROSBAG V1.2\n", "an old ROS 1 bag"),
+    "packed twice": (gzip.compress(gzip.compress(b"1")), "packed twice: unpack it first"),
+    "binary": (bytes(range(256)), "is of a kind that is not known"),
+}
+
+
+@pytest.mark.parametrize(("content", "said"), OTHERS.values(), ids=OTHERS)
+def test_any_other_file_is_named_with_the_page(
+    tmp_path: Path, content: bytes | Callable[[Path], None], said: str
+) -> None:
+    path = made(tmp_path / "grasps.csv", content)
+    with pytest.raises(RecordingError) as caught:
+        kind_of(path)
+    assert said in str(caught.value)
+    assert str(caught.value).endswith("; deploy/RECORDING.md lists what graspd reads")
+
+
+def test_an_empty_file_is_called_empty(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"grasps\.csv: the file is empty"):
+        kind_of(write(tmp_path, b""))
+
+
+def test_files_of_two_kinds_are_not_one_recording(tmp_path: Path) -> None:
+    paths = [write(tmp_path, table(1), "a"), write(tmp_path, mcap(b""), "b")]
+    assert kind_of_all(paths[:1] * 2) is Kind.TEXT
+    with pytest.raises(RecordingError, match=r"b: is a recording of graspd .* not one recording"):
+        kind_of_all(paths)
+
+
+def lines(path: Path) -> bytes:
+    with open_recording(path) as file:
+        return b"".join(read_lines(path, file))
+
+
+def test_a_packed_file_reads_as_unpacked_and_rewinds(tmp_path: Path) -> None:
+    path = write(tmp_path, gzip.compress(table(50)))
+    assert lines(path) == table(50)
+    with open_recording(path) as file:
+        first = file.read(1000)
+        file.seek(0)
+        assert file.read(1000) == first == table(50)[:1000]
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-20], lambda data: data[:99] + b"?" * 99])
+def test_a_damaged_packed_file_is_an_error(
+    tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    path = write(tmp_path, damage(gzip.compress(table(50))))
+    with pytest.raises(RecordingError, match=r"grasps\.csv: "):
+        lines(path)
+
+
+def test_a_packed_file_that_grows_too_much_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kinds, "COPIED_BYTES_MAX", 100_000)
+    path = write(tmp_path, gzip.compress(b"1,2\n" * 50_000))
+    with pytest.raises(RecordingError, match="it unpacks to more than 100000 bytes"):
+        lines(path)
+
+
+def test_standard_input_is_read_as_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.TextIOWrapper(io.BytesIO(gzip.compress(table(3))))
+    monkeypatch.setattr(sys, "stdin", stream)
+    plain = write(tmp_path, table(3))
+    with files_of([Path("-"), plain]) as (copy, same):
+        assert lines(copy) == table(3)
+        assert lines(copy) == table(3), "again"
+        assert copy.name == "standard input"
+        assert same == plain
+    assert not copy.exists()
+
+
+def test_a_pipe_is_read_once_and_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipe = tmp_path / "pipe"
+
+    def played(content: bytes) -> Path:
+        pipe.unlink(missing_ok=True)
+        os.mkfifo(pipe)
+        threading.Thread(target=pipe.write_bytes, args=(content,)).start()
+        return pipe
+
+    with files_of([played(table(2))]) as (copy,):
+        assert lines(copy) == lines(copy) == table(2)
+    monkeypatch.setattr(kinds, "COPIED_BYTES_MAX", 100)
+    with (
+        pytest.raises(RecordingError, match="brings more than 100 bytes"),
+        files_of([played(table(2))]),
+    ):
+        pass
+
+
+def test_a_path_that_is_not_there_is_left_for_its_reader(tmp_path: Path) -> None:
+    absent = tmp_path / "absent"
+    with files_of([absent]) as paths:
+        assert paths == [absent]
