@@ -36,20 +36,21 @@ class Worker(Generic[R]):
         self._results: SimpleQueue[R | Exception]
         self._ended: int
         """Event descriptor, one count per result; the thread closes it."""
-        self.busy = False
+        self.filenos: list[int] = []
+        """The descriptor that is readable after the job; empty without a job."""
+
+    @property
+    def busy(self) -> bool:
         """True from `submit` until the result is taken."""
+        return bool(self.filenos)
 
     def submit(self, job: Callable[[], R]) -> bool:
         """Start a job; return False if the worker is busy or no thread can be started."""
         if self.busy or (self._thread is None and not self._start_thread()):
             return False
-        self.busy = True
+        self.filenos.append(self._ended)
         self._jobs.put(job)
         return True
-
-    def filenos(self) -> list[int]:
-        """Return the descriptor that is readable after the job; none without a job."""
-        return [self._ended] if self.busy else []
 
     def take(self, wait_s: float = 0.0) -> R | Exception | None:
         """Return the job's result or exception; None without one or if it still runs."""
@@ -60,7 +61,7 @@ class Worker(Generic[R]):
         if not poll.poll(wait_s * 1e3):
             return None
         os.eventfd_read(self._ended)
-        self.busy = False
+        self.filenos.clear()
         return self._results.get()
 
     def close(self, wait_s: float) -> bool:
@@ -70,7 +71,7 @@ class Worker(Generic[R]):
             return True
         self._jobs.put(None)
         thread.join(wait_s if self.busy else None)
-        self.busy = False
+        self.filenos.clear()
         return not thread.is_alive()
 
     def _start_thread(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from enum import Enum, StrEnum
 from typing import Any, Concatenate, Final, NamedTuple, ParamSpec, Protocol, TypeVar
 
@@ -97,16 +97,15 @@ class Companion:
     The loop calls them in its own thread. They must not block. An exception ends the loop.
     """
 
-    def before_wait(self, requests: Requests) -> None:
-        """Act before the loop waits, such as on `requests`, the messages of peers."""
+    filenos: Sequence[int] = ()
+    """Descriptors that end the loop's wait when they become readable, now."""
 
-    def due_ns(self) -> int | None:
-        """Latest end of the loop's wait, monotonic ns; None: no limit."""
+    def before_wait(self, requests: Requests) -> int | None:
+        """Act before the loop waits, such as on the messages of peers, through `requests`.
+
+        Return the latest end of the wait, monotonic ns; None: no limit.
+        """
         return None
-
-    def filenos(self) -> list[int]:
-        """Return the descriptors that end the loop's wait when they become readable."""
-        return []
 
     def on_reading(self, reading: Reading) -> None:
         """A reading has come. It is judged, or skipped, after this call."""

@@ -136,6 +136,7 @@ class Outbox:
         `boot_id`: id of this start in all messages; None: a new one.
         """
         self._latency = LatencyHistogram()
+        self._deadlines = Deadlines()
         self._decisions: Counter[Decision] = Counter()
         self._reasons: Counter[Reason] = Counter()
         self._repaired: Counter[str] = Counter()
@@ -156,12 +157,18 @@ class Outbox:
         }
 
     def verdict(
-        self, judgement: Judgement, received_ns: int, silence_ns: int
+        self,
+        judgement: Judgement,
+        received_ns: int,
+        silence_ns: int,
+        reading: TactileReading | None = None,
+        period_ns: int | None = None,
     ) -> tuple[Verdict, bytes]:
         """Send one verdict, after the changes of the gate; return it, plain and encoded.
 
         `received_ns`: when the driver handed the reading over. `silence_ns`: time without a message
-        after which subscribers take the grasp for unknown.
+        after which subscribers take the grasp for unknown. `reading`, None after silence, is
+        counted as late or in time by its sensor's `period_ns`; None: that is not known.
         """
         moment, worth = judgement.moment, judgement.assessment
         valid = judgement.decision is not Decision.UNKNOWN
@@ -169,6 +176,7 @@ class Outbox:
             self._gate_change(judgement.t_ns, moment, change)
         now_ns = self._clock()
         latency_us = max(now_ns - received_ns, 0) / 1e3
+        age_ms = max(now_ns - judgement.t_ns, 0) / 1e6
         message = Verdict(
             **self._head("verdict"),
             t_mono_ns=judgement.t_ns,
@@ -178,7 +186,7 @@ class Outbox:
             p_slip=judgement.p_slip,
             valid=valid,
             reasons=list(judgement.reasons),
-            age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
+            age_ms=age_ms,
             latency_us=latency_us,
             repaired=list(judgement.opinion.repaired),
             session_calibrated=judgement.session_calibrated,
@@ -198,14 +206,16 @@ class Outbox:
             motion_limits=moment.motion_limits,
             fingers=moment.fingers,
         )
-        payload = encode(message)
-        self._send("verdict", payload)
         self._latency.add(latency_us)
+        if reading is not None:
+            self._deadlines.add(reading, age_ms, period_ns)
         self._decisions[judgement.decision] += 1
         if judgement.reasons:
             self._reasons.update(judgement.reasons)
         if judgement.opinion.repaired:
             self._repaired.update(judgement.opinion.repaired)
+        payload = encode(message)
+        self._send("verdict", payload)
         return message, payload
 
     def outcome(self, report: Report) -> None:
@@ -269,7 +279,6 @@ class Outbox:
         readings_hz: float,
         drivers: dict[str, dict[str, int]],
         pipeline: Pipeline,
-        deadlines: Deadlines,
         beside: dict[str, Reason],
         *,
         skipped_readings: int,
@@ -281,6 +290,7 @@ class Outbox:
         are not well.
         """
         session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
+        deadlines = self._deadlines
         health = pipeline.health() | beside
         if state is State.SILENT:
             health["link"] = Reason.STALE

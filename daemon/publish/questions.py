@@ -82,6 +82,17 @@ class Questions:
         """Questions without an answer; the oldest first."""
         self._last: PublishedVerdict | None = None
 
+    def serve(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> int | None:
+        """Take messages that arrived by `now_ns`, and give answers that are due by then.
+
+        Return the latest time of the next answer, monotonic ns; None: no question waits.
+        """
+        if messages:
+            self.take(messages, now_ns, requests)
+        if self.waiting:
+            self._expire(now_ns, requests)
+        return next((question.due_ns for question in self.waiting.values()), None)
+
     def take(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> None:
         """Take messages of peers that arrived by `now_ns`; pass them on to `requests`.
 
@@ -168,12 +179,7 @@ class Questions:
     def _answer(self, envelope: Frames, payload: bytes) -> None:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
-    @property
-    def due_ns(self) -> int | None:
-        """Latest time of the next answer, monotonic ns; None: no question waits."""
-        return next((question.due_ns for question in self.waiting.values()), None)
-
-    def expire(self, now_ns: int, requests: Requests) -> None:
+    def _expire(self, now_ns: int, requests: Requests) -> None:
         """Answer `unknown` to questions that are due, though no reading has come."""
         due = [peer for peer, question in self.waiting.items() if question.due_ns <= now_ns]
         if due and self._last is None:

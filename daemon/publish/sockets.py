@@ -56,12 +56,11 @@ class Sockets(Companion):
         self.questions: Questions | None = None
         self._listeners: list[Listener] = []
         """Endpoint of the messages, then that of the questions, if peers may ask."""
-        self._filenos: list[int] = []
         try:
             self._listen(wanted)
             self._door = Door(self._listeners, high_water_mark or HIGH_WATER_MARK, keys)
             if self.questions is not None:
-                self._filenos = [self._door.fileno()]
+                self.filenos = [self._door.fileno()]
         except BaseException:
             self.close()
             raise
@@ -106,21 +105,14 @@ class Sockets(Companion):
     def _answer(self, frames: Sequence[bytes]) -> bool:
         return self._door is not None and self._door.answer(frames)
 
-    def filenos(self) -> list[int]:
-        return self._filenos
-
-    def due_ns(self) -> int | None:
-        return None if self.questions is None else self.questions.due_ns
-
-    def before_wait(self, requests: Requests) -> None:
+    def before_wait(self, requests: Requests) -> int | None:
+        """Take and answer questions; return when the next answer is due, monotonic ns."""
         if self._door is None:
-            return
+            return None
         self._door.check()
-        if self.questions is not None:
-            messages = self._door.receive()
-            if messages:
-                self.questions.take(messages, self._clock(), requests)
-            self.questions.expire(self._clock(), requests)
+        if self.questions is None:
+            return None
+        return self.questions.serve(self._door.receive(), self._clock(), requests)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         """Answer the questions with an answer; with another verdict only those that are due."""

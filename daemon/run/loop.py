@@ -25,8 +25,8 @@ from graspd.daemon.publish.companion import (
     at_once,
     hooks,
 )
-from graspd.daemon.publish.messages import State, Verdict
-from graspd.daemon.publish.outbox import Deadlines, Outbox
+from graspd.daemon.publish.messages import State
+from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.run.overload import LoadShedder, mark_repeats
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus, Report
 from graspd.drivers.base import Driver, JointReading, Reading, TactileReading
@@ -99,6 +99,7 @@ class Loop:
         self._drivers = drivers
         self._tactile = drivers[0]
         self._pipeline = pipeline
+        self._on_request = pipeline.on_request
         self._outbox = outbox
         self._stop = stop
         self._clock = timing.clock
@@ -110,9 +111,6 @@ class Loop:
         pipeline.lifts.on_announced = self._announced
         self._companions = companions
         self._before_wait = hooks(companions, Companion.before_wait)
-        drivers_due_ns = (driver.due_ns for driver in drivers)
-        self._due_ns = (*drivers_due_ns, *hooks(companions, Companion.due_ns))
-        self._filenos = hooks(companions, Companion.filenos)
         self._on_reading = hooks(companions, Companion.on_reading)
         self._on_event = hooks(companions, Companion.on_event)
         self._on_verdict = hooks(companions, Companion.on_verdict)
@@ -120,7 +118,6 @@ class Loop:
         self._on_status = hooks(companions, Companion.on_status)
         self._after_round = hooks(companions, Companion.after_round)
 
-        self._deadlines = Deadlines()
         self._joints: JointReading | None = None
         self._watched: list[int] = []
         """Descriptors of drivers and companions in the selector."""
@@ -128,7 +125,7 @@ class Loop:
         now_ns = self._clock()
         self._shedder = LoadShedder(now_ns, live=self._tactile.live, sleep=timing.rest)
         self._last_t_ns = now_ns
-        self._silence_due_ns = now_ns + self._silence_ns
+        self._silence_due_ns = now_ns + self._longest_silence_ns(self._tactile.period_ns)
         self._status_at_ns = now_ns
         self._readings_since_status = 0
 
@@ -153,9 +150,6 @@ class Loop:
         self._send_status()
 
     def _go_round(self, selector: selectors.BaseSelector) -> None:
-        # Now, without asking the descriptors: sending a message resets them.
-        for before_wait in self._before_wait:
-            before_wait(self)
         self._wait(selector)
         if not self._take_readings() and not self._tactile.exhausted:
             now_ns = self._clock()
@@ -167,8 +161,22 @@ class Loop:
             after_round()
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
-        self._register(selector)
-        due_ns = self._next_due_ns()
+        """Have the companions act; wait for input, or until something is due."""
+        # Without asking their descriptors: sending a message resets them.
+        ends_ns = [before_wait(self) for before_wait in self._before_wait]
+        watched = list[int]()
+        for companion in self._companions:
+            watched += companion.filenos
+        for driver in self._drivers:
+            if (descriptor := driver.fileno()) is not None:
+                watched.append(descriptor)
+            ends_ns.append(driver.due_ns())
+        due_ns = min(self._silence_due_ns, self._status_at_ns + STATUS_PERIOD_NS)
+        for end_ns in ends_ns:
+            if end_ns is not None and end_ns < due_ns:
+                due_ns = end_ns
+        if watched != self._watched:
+            self._watch(watched, selector)
         now_ns = began_ns = self._clock()
         worked_ns = time.thread_time_ns()
         if began_ns < due_ns:
@@ -182,25 +190,12 @@ class Loop:
         else:  # work was waiting already
             self._shedder.yield_processor(now_ns)
 
-    def _register(self, selector: selectors.BaseSelector) -> None:
-        watched = [fd for driver in self._drivers if (fd := driver.fileno()) is not None]
-        for filenos in self._filenos:
-            watched += filenos()
-        if watched == self._watched:
-            return
+    def _watch(self, watched: list[int], selector: selectors.BaseSelector) -> None:
         for former in set(self._watched).difference(watched):
             selector.unregister(former)
         for descriptor in set(watched).difference(self._watched):
             selector.register(descriptor, selectors.EVENT_READ)
         self._watched = watched
-
-    def _next_due_ns(self) -> int:
-        due_ns = min(self._silence_due_ns, self._status_at_ns + STATUS_PERIOD_NS)
-        for timer in self._due_ns:
-            timer_ns = timer()
-            if timer_ns is not None and timer_ns < due_ns:
-                due_ns = timer_ns
-        return due_ns
 
     def _take_readings(self) -> bool:
         """Judge and publish the waiting readings; return False if none is tactile."""
@@ -266,15 +261,13 @@ class Loop:
 
     def _judge(self, reading: TactileReading, received_ns: int) -> bool:
         """Judge and publish a reading; return False if the computer slept since it arrived."""
-        self._outbox.tactile(reading, self._joints)
         judgement = self._pipeline.judge(reading)
         if self._sleep.has_slept():
             return False
         self._state = State.RUNNING
         self._last_t_ns = reading.t_ns
         self._readings_since_status += 1
-        verdict = self._publish(judgement, reading, received_ns)
-        self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
+        self._publish(judgement, reading, received_ns)
         return True
 
     def _report_silence(self, now_ns: int, *, is_answer: bool = False) -> None:
@@ -289,27 +282,30 @@ class Loop:
         received_ns: int,
         *,
         is_answer: bool = False,
-    ) -> Verdict:
-        """Publish a verdict. `is_answer`: True if it answers waiting questions."""
-        silence_ns = self._silence_ns
+    ) -> None:
+        """Publish a verdict and its reading. `is_answer`: True if it answers waiting questions."""
+        period_ns = self._tactile.period_ns
+        silence_ns = self._longest_silence_ns(period_ns)
         self._silence_due_ns = received_ns + silence_ns
-        verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
-        is_answer = is_answer or verdict.judged or not self._pipeline.on_request
+        if reading is not None:
+            self._outbox.tactile(reading, self._joints)
+        verdict, payload = self._outbox.verdict(
+            judgement, received_ns, silence_ns, reading, period_ns
+        )
+        is_answer = is_answer or verdict.judged or not self._on_request
         grasp = GraspId(self._pipeline.boot_id, verdict.grasp)
         about = grasp, self._pipeline.lifts, self._keep
         published = PublishedVerdict(judgement, verdict, payload, reading, is_answer, *about)
         for on_verdict in self._on_verdict:
             on_verdict(published)
-        return verdict
 
     def _announced(self, announced: bool) -> None:
         for on_event in self._on_event:
             on_event(LoopEvent.ANNOUNCED if announced else LoopEvent.TAKEN_BACK)
 
-    @property
-    def _silence_ns(self) -> int:
+    def _longest_silence_ns(self, period_ns: int | None) -> int:
         """Return the time without a reading, ns, after which silence is reported."""
-        return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
+        return max(self._max_age_ns, SILENCE_PERIODS * (period_ns or 0))
 
     def _send_status(self) -> None:
         now_ns = self._clock()
@@ -324,7 +320,6 @@ class Loop:
             self._readings_since_status / elapsed_s,
             counters,
             self._pipeline,
-            self._deadlines,
             health,
             skipped_readings=self._shedder.skipped_readings,
             overloaded=self._shedder.overloaded,

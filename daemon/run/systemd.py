@@ -8,7 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 
-from graspd.daemon.publish.companion import Companion
+from graspd.daemon.publish.companion import Companion, Requests
 from graspd.daemon.publish.messages import Status
 
 log = logging.getLogger("graspd")
@@ -58,7 +58,7 @@ class Systemd(Companion):
         """Show the status in `systemctl status`."""
         self._send(f"STATUS={in_a_line(status)}")
 
-    def due_ns(self) -> int | None:
+    def before_wait(self, requests: Requests) -> int | None:
         """Return the time of the next feeding, monotonic ns; None without a watchdog."""
         return None if self._watchdog_us is None else self._due_ns
 

@@ -91,9 +91,7 @@ class SessionKeeper(SensorWatch):
         self._in_writing = 0
         """Number of the first answers, which wait for the current save."""
         self._worker: Worker[Sessions] = Worker("session")
-
-    def filenos(self) -> list[int]:
-        return self._worker.filenos()
+        self.filenos = self._worker.filenos
 
     def before_wait(self, requests: Requests) -> None:
         """Answer saved outcomes; start the next save if it is due."""

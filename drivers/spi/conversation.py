@@ -66,6 +66,8 @@ class Conversation:
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """Last HELLO of an accepted bridge; None before the first."""
+        self.period_ns: int | None = None
+        """Time between two sweeps by `hello`, ns."""
         self.serials: dict[str, str] = {}
         """Serial numbers in `hello` by finger; silent sensors are left out."""
         self.status: BridgeStatus | None = None
@@ -82,10 +84,6 @@ class Conversation:
         self._sweeps: SweepDecoder | None = None
         self._pings: dict[int, int] = {}
         """Time, ns, when each unanswered PING was sent, by nonce."""
-
-    @property
-    def period_ns(self) -> int | None:
-        return None if self.hello is None else self.hello.period_ns
 
     @property
     def due_ns(self) -> int:
@@ -270,7 +268,7 @@ class Conversation:
             self._sweeps = SweepDecoder(hello, self._sensors, self.counters, clock)
 
     def _take(self, hello: Hello) -> None:
-        self.hello = hello
+        self.hello, self.period_ns = hello, hello.period_ns
         serials = {
             finger: hello.serials[sensor]
             for finger, sensor in zip(self._fingers, self._sensors, strict=True)

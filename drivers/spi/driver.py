@@ -139,8 +139,11 @@ class SpiBridgeDriver(Opened):
         except LinkError as error:
             self._lose(error)
             return ()
-        readings = self.conversation.receive(chunk, self._clock())
-        self._send()
+        conversation = self.conversation
+        readings = conversation.receive(chunk, self._clock())
+        frames = conversation.say(self._clock())
+        if frames or conversation.link.state is LinkState.WAITING:
+            self._send(frames)
         return readings
 
     def _connect(self) -> None:
@@ -151,12 +154,12 @@ class SpiBridgeDriver(Opened):
             return
         self._poll_due_ns = now_ns = self._clock()
         self.conversation.opened(now_ns)
-        self._send()
+        self._send(self.conversation.say(now_ns))
 
-    def _send(self) -> None:
-        """Write the frames that are due; close the port if the link is lost."""
+    def _send(self, frames: Sequence[bytes]) -> None:
+        """Write frames of the conversation; close the port if the link is lost."""
         try:
-            for frame in self.conversation.say(self._clock()):
+            for frame in frames:
                 self.conversation.sent(frame, self._clock())
                 if not self._line.write(frame):
                     self.counters.host_tx_dropped += 1

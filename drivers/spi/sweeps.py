@@ -94,6 +94,7 @@ class SweepDecoder:
         self.hello = hello
         self.clock = clock
         self.longest_ticks = 0
+        self._shape = hello.slots, hello.sensors
         self._sensors = tuple(sensors)
         self._counters = counters
         self._bridge_seq: int | None = None
@@ -113,7 +114,7 @@ class SweepDecoder:
 
         Raises `ClockError`.
         """
-        if sweep.words.shape != (self.hello.slots, self.hello.sensors):
+        if sweep.words.shape != self._shape:
             self._counters.bad_frames += 1
             return None
         if not self._is_next(sweep):

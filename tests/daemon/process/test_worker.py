@@ -30,14 +30,14 @@ def named_slow() -> list[threading.Thread]:
 def test_a_job_makes_the_descriptor_readable_and_gives_its_result_once(
     worker: Worker[object],
 ) -> None:
-    assert worker.filenos() == []
+    assert worker.filenos == []
     assert worker.submit(lambda: 7)
-    readable, _, _ = select.select(worker.filenos(), [], [], PATIENCE_S)
-    assert readable == worker.filenos() != []
+    readable, _, _ = select.select(worker.filenos, [], [], PATIENCE_S)
+    assert readable == worker.filenos != []
     assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
     assert worker.take() == 7
     assert worker.take() is None
-    assert worker.filenos() == []
+    assert worker.filenos == []
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(5), KeyError()])
@@ -59,7 +59,7 @@ def test_a_job_is_refused_until_the_result_before_it_is_taken(worker: Worker[obj
     assert worker.take() is None
     assert not worker.submit(lambda: 2)
     go.set()
-    readable, _, _ = select.select(worker.filenos(), [], [], PATIENCE_S)
+    readable, _, _ = select.select(worker.filenos, [], [], PATIENCE_S)
     assert readable
     assert not worker.submit(lambda: 2)
     assert worker.take() is True
@@ -73,7 +73,7 @@ def test_close_leaves_a_job_that_hangs_and_its_thread_ends_with_it() -> None:
     go = threading.Event()
     assert worker.submit(go.wait)
     assert not worker.close(0.05)
-    assert worker.filenos() == []
+    assert worker.filenos == []
     assert worker.take() is None
     go.set()
     for thread in named_slow():
@@ -119,7 +119,7 @@ def test_where_the_system_refuses_a_thread_a_job_is_refused(
         patched.setattr(threading.Thread, "start", refuse)
         assert not worker.submit(lambda: 1)
     assert "no thread for slow: can't start new thread" in caplog.text
-    assert worker.filenos() == []
+    assert worker.filenos == []
     assert worker.submit(lambda: 1)
     assert worker.take(PATIENCE_S) == 1
 

@@ -229,25 +229,24 @@ def test_five_questions_without_a_lift_leave_none_announced(bench: Bench) -> Non
 def test_a_question_ends_in_time_without_a_reading(bench: Bench) -> None:
     bench.verdict("slip")
     bench.say(b"judge")
-    bench.questions.expire(S - 1, bench.book)
-    assert (bench.sent, bench.questions.due_ns) == ([], S)
-    bench.questions.expire(S, bench.book)
+    assert (bench.questions.serve([], S - 1, bench.book), bench.sent) == (S, [])
+    assert bench.questions.serve([], S, bench.book) is None
     assert [(answer["verdict"], answer["reasons"]) for answer in bench.answers] == [
         ("unknown", ["stale"])
     ]
-    assert (bench.questions.due_ns, bench.book.silences) == (None, 0)
+    assert bench.book.silences == 0
 
 
 def test_before_the_first_reading_silence_is_the_answer(bench: Bench) -> None:
     bench.say(b"judge")
-    bench.questions.expire(S, bench.book)
+    bench.questions.serve([], S, bench.book)
     assert bench.book.silences == 1
 
 
 def test_a_lift_that_waits_too_long_for_the_disk_ends_unknown(bench: Bench) -> None:
     bench.say(b"lift")
     bench.verdict(keep=bench.book.disk.append)
-    bench.questions.expire(S, bench.book)
+    bench.questions.serve([], S, bench.book)
     assert [answer["reasons"] for answer in bench.answers] == [["not-kept"]]
     assert bench.announced == (0, 0)
     bench.book.disk[0](KEPT)

@@ -91,7 +91,7 @@ def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers:
         sockets.before_wait(requests)
         peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask").send(b"judge")
         while not requests.times:  # it may be ready for less
-            assert select.select(sockets.filenos(), [], [], PATIENCE_S)[0]
+            assert select.select(sockets.filenos, [], [], PATIENCE_S)[0]
             sockets.before_wait(requests)
 
 

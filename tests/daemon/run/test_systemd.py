@@ -15,6 +15,7 @@ from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.messages import State
 from graspd.daemon.run.systemd import Systemd, in_a_line
 from tests.daemon.fakes import MS, Clock
+from tests.daemon.session.learning import NOBODY
 from tests.kit.messages import GOLDEN_STATUS
 
 
@@ -64,7 +65,7 @@ def test_the_watchdog_is_fed_four_times_within_its_timeout(ears: socket.socket) 
 def test_without_a_watchdog_nothing_is_fed_and_nothing_is_due(ears: socket.socket) -> None:
     manager = Systemd.of({"NOTIFY_SOCKET": ears.getsockname()})
     assert manager is not None
-    assert manager.due_ns() is None
+    assert manager.before_wait(NOBODY) is None
     manager.after_round()
     manager.stopping()
     assert heard(ears) == ["STOPPING=1", "STATUS=stopping"]
@@ -87,7 +88,7 @@ def test_only_a_sound_watchdog_of_this_process_counts(
 ) -> None:
     manager = Systemd.of({"NOTIFY_SOCKET": "/nowhere", **environment})
     assert manager is not None
-    assert (manager.due_ns() is not None) is watched
+    assert (manager.before_wait(NOBODY) is not None) is watched
     manager.close()
 
 

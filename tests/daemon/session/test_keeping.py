@@ -98,8 +98,8 @@ def keeper_of(folder: SessionFolder) -> Iterator[Callable[..., SessionKeeper]]:
 def go_round(keeper: SessionKeeper) -> None:
     """As the loop does, until nothing is being written any more."""
     keeper.before_wait(NOBODY)
-    while keeper.filenos():
-        ready, _, _ = select.select(keeper.filenos(), [], [], 10.0)
+    while keeper.filenos:
+        ready, _, _ = select.select(keeper.filenos, [], [], 10.0)
         assert ready
         keeper.before_wait(NOBODY)
 
@@ -507,7 +507,7 @@ def test_an_open_grasp_is_kept_within_ten_seconds(
     keeper = keeper_of(part, clock)
     judge(part, 1)
     read_once(keeper)
-    assert not keeper.filenos()
+    assert not keeper.filenos
     for _ in range(3):
         clock.now_ns += SAVE_PERIOD_NS
         read_once(keeper)
