@@ -22,12 +22,12 @@ from graspd.daemon.judge.decision import (
 from graspd.daemon.judge.health import Health
 from graspd.daemon.judge.reasons import OPEN, WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
-from graspd.daemon.trust.trust import RiskFigures
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.models.contract import ModelError
 from graspd.models.judge.grasp_judge import NO_OPINION, Examined, GraspJudge, Opinion, Refusal
 from graspd.models.runtime import TactileModel
 from graspd.models.trust.assessment import Assessment
+from graspd.models.trust.risk import RiskOutcomes
 
 if TYPE_CHECKING:
     from graspd.daemon.judge.every_reading import EveryReading
@@ -52,7 +52,7 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
     """Answer of the network for the grasp, maybe of an earlier reading."""
     assessment: Assessment | None = None
     """Worth of `opinion` now; None: without learning and without a risk."""
-    risk: RiskFigures | None = None
+    risk: RiskOutcomes | None = None
     """Outcomes of `stable` lifts before this verdict; None like `assessment`."""
     supervised: bool = False
     """True if its lift, watched, would teach what is not known: ask for it."""
@@ -216,9 +216,9 @@ class Pipeline:
         elif moment.state is not GateState.JUDGED:
             self._forget_opinion()
         lift = GraspId(self.boot_id, moment.grasp)
-        worth = None if self.trust is None else self._assess(self.trust, lift, moment)
+        worth, risk = self._assess(lift, self._opinion if moment.judges else NO_OPINION)
         judgement = self._conclude(
-            reading.t_ns, made_ns, checked.reasons, lift, moment, self._opinion, worth, counts
+            reading.t_ns, made_ns, checked.reasons, lift, moment, self._opinion, worth, risk, counts
         )
         self._late = None
         if examined is not None and moment.steady and Reason.STALE not in judgement.reasons:
@@ -232,8 +232,10 @@ class Pipeline:
         """Return the judgement when no reading came for too long since that of `last_t_ns`."""
         moment = self.hand.silent()
         lift = GraspId(self.boot_id, moment.grasp)
-        worth = None if self.trust is None else self.trust.review(lift, None)
-        return self._conclude(last_t_ns, 0, (Reason.STALE,), lift, moment, NO_OPINION, worth)
+        worth, risk = None, None
+        if self.trust is not None:
+            worth, risk = self.trust.assess(lift, NO_OPINION, self._judge.features, None)
+        return self._conclude(last_t_ns, 0, (Reason.STALE,), lift, moment, NO_OPINION, worth, risk)
 
     def health(self) -> dict[str, Reason]:
         """Return what is not well: electrodes such as `ff_7`, fingers, joints, model, session."""
@@ -266,19 +268,24 @@ class Pipeline:
     def _forget_opinion(self) -> None:
         self._opinion, self._assessment = NO_OPINION, None
 
-    def _assess(self, trust: Trust, grasp: GraspId, moment: Moment) -> Assessment:
-        """Return what the opinion is worth by the outcomes that are known now."""
-        opinion = self._opinion
-        if not moment.judges or opinion.p_slip is None:
-            return trust.review(grasp, self._assessment)
+    def _assess(
+        self, grasp: GraspId, opinion: Opinion
+    ) -> tuple[Assessment | None, RiskOutcomes | None]:
+        """Return what the grasp is worth by the outcomes that are known now, and these.
+
+        `opinion`: the answer to this reading.
+        """
+        if self.trust is None:
+            return None, None
+        features = self._judge.features
         try:
-            self._assessment = trust.judge(
-                grasp, opinion.p_slip, opinion.margin, self._judge.features
-            )
+            worth, risk = self.trust.assess(grasp, opinion, features, self._assessment)
         except ValueError:
             self._opinion = Opinion(None, Refusal.MODEL_FAILED, opinion.repaired)
-            return trust.review(grasp, None)
-        return self._assessment
+            return self.trust.assess(grasp, NO_OPINION, features, None)
+        if opinion.p_slip is not None:
+            self._assessment = worth
+        return worth, risk
 
     def _note(self, grasp: GraspId, worth: Assessment | None, *, stable: bool) -> None:
         if self.trust is None or worth is None:
@@ -295,6 +302,7 @@ class Pipeline:
         moment: Moment,
         opinion: Opinion,
         worth: Assessment | None,
+        risk: RiskOutcomes | None,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
         """Return the judgement of a reading that is `unusable` for these reasons, or for none.
@@ -335,7 +343,7 @@ class Pipeline:
             moment=moment,
             opinion=opinion,
             assessment=worth,
-            risk=None if self.trust is None else self.trust.report(),
+            risk=risk,
             supervised=supervised and WATCHED_LIFT.issuperset(reasons),
             session_calibrated=calibrated,
             judged_counts=counts,

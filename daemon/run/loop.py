@@ -125,7 +125,7 @@ class Loop:
         now_ns = self._clock()
         self._shedder = LoadShedder(now_ns, live=self._tactile.live, sleep=timing.rest)
         self._last_t_ns = now_ns
-        self._silence_due_ns = now_ns + self._longest_silence_ns(self._tactile.period_ns)
+        self._silence_due_ns = now_ns + self._silence_ns
         self._status_at_ns = now_ns
         self._readings_since_status = 0
 
@@ -284,8 +284,7 @@ class Loop:
         is_answer: bool = False,
     ) -> None:
         """Publish a verdict and its reading. `is_answer`: True if it answers waiting questions."""
-        period_ns = self._tactile.period_ns
-        silence_ns = self._longest_silence_ns(period_ns)
+        silence_ns, period_ns = self._silence_ns, self._tactile.period_ns
         self._silence_due_ns = received_ns + silence_ns
         if reading is not None:
             self._outbox.tactile(reading, self._joints)
@@ -299,13 +298,14 @@ class Loop:
         for on_verdict in self._on_verdict:
             on_verdict(published)
 
+    @property
+    def _silence_ns(self) -> int:
+        """Return the time without a reading, ns, after which silence is reported."""
+        return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
+
     def _announced(self, announced: bool) -> None:
         for on_event in self._on_event:
             on_event(LoopEvent.ANNOUNCED if announced else LoopEvent.TAKEN_BACK)
-
-    def _longest_silence_ns(self, period_ns: int | None) -> int:
-        """Return the time without a reading, ns, after which silence is reported."""
-        return max(self._max_age_ns, SILENCE_PERIODS * (period_ns or 0))
 
     def _send_status(self) -> None:
         now_ns = self._clock()

@@ -1,14 +1,13 @@
 """The worth of a verdict: the model's opinion, corrected by outcomes, under the set risk.
 
-At each reading: `judge` a grasp that the network judged, or `review` one that it judged before;
-decide; `note` what was said. Tell each `outcome`.
+At each reading: `assess` the grasp; decide; `note` what was said. Tell each `outcome`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -21,9 +20,10 @@ from graspd.daemon.trust.lift_book import (
     LiftBookState,
     OutcomeStatus,
 )
+from graspd.models.judge.grasp_judge import Opinion
 from graspd.models.trust.assessment import Assessment, assess
 from graspd.models.trust.learner import Learner, LearnerState
-from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskState
+from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskOutcomes, RiskState
 
 VERSION: Final = 2
 """Format of a state. In format 1 the learner had no residual."""
@@ -34,26 +34,6 @@ DIGEST_BYTES: Final = 32
 
 class FormatError(ValueError):
     """A state is of another format: another graspd kept it."""
-
-
-class RiskFigures(NamedTuple):
-    """Outcomes of `stable` lifts at one moment; `RiskReport` of the messages says what each is."""
-
-    target: float | None
-    lifts: int
-    slips: int
-    outstanding: int
-    bound: float | None
-    warm_up_left: int
-    announced: int
-    awaited: int
-
-    @property
-    def beyond_share(self) -> float:
-        """Slips that the bound allows beyond the target's share of the lifts; 0 without a bound."""
-        if self.target is None or self.bound is None:
-            return 0.0
-        return self.bound - self.target * self.lifts
 
 
 class _Versioned(msgspec.Struct, frozen=True):
@@ -87,6 +67,25 @@ class Trust:
         """The learner by which grasps are judged; without learning, one that is never taught."""
         self.risk = Risk(limits or RiskLimits())
         self.lifts = LiftBook()
+
+    def assess(
+        self,
+        grasp: GraspId,
+        opinion: Opinion,
+        inputs: NDArray[np.floating],
+        former: Assessment | None,
+    ) -> tuple[Assessment, RiskOutcomes]:
+        """Return what a grasp is worth, and the outcomes that are known until now.
+
+        `opinion`, `inputs`: the network's answer to this reading, and what it was given; without an
+        answer the `former` assessment is reviewed. Raises `ValueError` as `judge`.
+        """
+        if opinion.p_slip is None:
+            worth = self.review(grasp, former)
+        else:
+            worth = self.judge(grasp, opinion.p_slip, opinion.margin, inputs)
+        book = self.lifts
+        return worth, self.risk.figures(book.outstanding, book.announced, book.awaited)
 
     def judge(
         self, grasp: GraspId, p_slip: float, margin: float, inputs: NDArray[np.floating]
@@ -124,18 +123,10 @@ class Trust:
                 self.learner.learn(np.frombuffer(lift.features, "<f8"), slipped=slipped)
         return status
 
-    def report(self) -> RiskFigures:
+    def report(self) -> RiskOutcomes:
         """Return the outcomes of the lifts of `stable` verdicts until now."""
-        return RiskFigures(
-            target=self.risk.limits.max_slip_when_stable,
-            lifts=self.risk.lifts,
-            slips=self.risk.slips,
-            outstanding=self.lifts.outstanding,
-            bound=self.risk.bound,
-            warm_up_left=self.risk.warm_up_left,
-            announced=self.lifts.announced,
-            awaited=self.lifts.awaited,
-        )
+        book = self.lifts
+        return self.risk.figures(book.outstanding, book.announced, book.awaited)
 
     def sensors_exchanged(self, learned: LearnerState | None = None, proven: int = 0) -> None:
         """Learn from the start, or from `learned`. Raises `ValueError` for another model's.

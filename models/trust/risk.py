@@ -6,7 +6,7 @@ import hashlib
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import msgspec
 
@@ -66,6 +66,26 @@ class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slips: Count
     proven: Count
     budget: float
+
+
+class RiskOutcomes(NamedTuple):
+    """Outcomes of `stable` lifts at one moment; `RiskReport` of the messages says what each is."""
+
+    target: float | None
+    lifts: int
+    slips: int
+    outstanding: int
+    bound: float | None
+    warm_up_left: int
+    announced: int
+    awaited: int
+
+    @property
+    def beyond_share(self) -> float:
+        """Slips that the bound allows beyond the target's share of the lifts; 0 without a bound."""
+        if self.target is None or self.bound is None:
+            return 0.0
+        return self.bound - self.target * self.lifts
 
 
 class Risk:
@@ -132,6 +152,19 @@ class Risk:
         share = min(alpha * (SHARE_YOUNG + (SHARE_PROVEN - SHARE_YOUNG) * known), 0.5)
         odds = share / (1.0 - share) * left / (BUDGET_START - (1.0 - alpha))
         return min(math.log(odds), 0.0)
+
+    def figures(self, outstanding: int, announced: int, awaited: int) -> RiskOutcomes:
+        """Return the outcomes until now, with the lifts that have none by the book."""
+        return RiskOutcomes(
+            target=self.limits.max_slip_when_stable,
+            lifts=self.lifts,
+            slips=self.slips,
+            outstanding=outstanding,
+            bound=self.bound,
+            warm_up_left=self.warm_up_left,
+            announced=announced,
+            awaited=awaited,
+        )
 
     def decide(self, log_odds: float, awaited: int = 0) -> Permission:
         """Return whether a grasp with these log-odds of slip may be called `stable`.
