@@ -209,8 +209,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
     pipeline = assembly.build_pipeline(plan, model)
     session, trust = pipeline.session, pipeline.trust
     with SessionFolder(wanted.session_path) as folder:
-        folder.load()
-        before = list(_readable(look(folder.path)).values())
+        before = list(_readable(folder.load()).values())
         judgements = _judge(plan, pipeline)
         readings = len(judgements)
         outcomes = 0 if trust is None else trust.learner.outcomes

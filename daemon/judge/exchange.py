@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import msgspec
 
 from graspd.models.session_statistics import SessionState
@@ -16,5 +18,10 @@ class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
     learned: LearnerState | None = None
     proven: Count = 0
     """Outcomes that count for their warm-up."""
+    budget: float | None = None
+    """Slips that were affordable with them, under the risk that is set; None: not known."""
     tared: bool = False
     """True if the tare that is known is theirs."""
+
+
+NOTHING_KNOWN: Final = Exchanged()

@@ -19,6 +19,7 @@ from graspd.daemon.judge.decision import (
     Limits,
     decide,
 )
+from graspd.daemon.judge.exchange import NOTHING_KNOWN, Exchanged
 from graspd.daemon.judge.health import Health
 from graspd.daemon.judge.reasons import OPEN, WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
@@ -31,7 +32,6 @@ from graspd.models.trust.risk import RiskOutcomes
 
 if TYPE_CHECKING:
     from graspd.daemon.judge.every_reading import EveryReading
-    from graspd.daemon.judge.exchange import Exchanged
     from graspd.daemon.judge.hand import HandTracker
     from graspd.daemon.trust.trust import Trust
     from graspd.models.session_statistics import SessionState
@@ -129,7 +129,7 @@ class Pipeline:
         """The grasp that the session took in last, or is about to."""
         self._late: bool | None = None
         """Argument of `expect_late` for the next reading. None: its age says if it is late."""
-        self.on_exchange: Callable[[Exchanged | None], None] | None = None
+        self.on_exchange: Callable[[Exchanged], None] | None = None
         """Called when the sensors were exchanged, with what was known of the new ones."""
 
     @property
@@ -145,10 +145,11 @@ class Pipeline:
         state = session.state()
         if self._to_learn is None:
             return state
-        self._judge.observe(*self._to_learn)
-        then = session.state()
-        session.restore(state)
-        return then
+        try:
+            self._judge.observe(*self._to_learn)
+            return session.state()
+        finally:
+            session.restore(state)
 
     def ask(self) -> None:
         """Judge the current grasp once it has settled: the controller waits for the verdict."""
@@ -158,7 +159,7 @@ class Pipeline:
         """In a replay: the next reading was late when it was live; `judged`: the network ran."""
         self._late = judged
 
-    def sensors_exchanged(self, known: Exchanged | None = None) -> None:
+    def sensors_exchanged(self, known: Exchanged = NOTHING_KNOWN) -> None:
         """Forget session, grasp and maybe the tare: the sensors are others.
 
         Go on from what is `known` of them. Raises `ValueError` if that is of another model.
@@ -168,12 +169,11 @@ class Pipeline:
         self.needs_session = True
         if self.session is not None:
             self.session.reset()
-            if known is not None and known.session is not None:
+            if known.session is not None:
                 self.session.restore(known.session)
         if self.trust is not None:
-            learned, proven = (None, 0) if known is None else (known.learned, known.proven)
-            self.trust.sensors_exchanged(learned, proven)
-        if known is not None and known.tared:
+            self.trust.sensors_exchanged(known.learned, known.proven, known.budget)
+        if known.tared:
             self.hand.restart()
         else:
             self.hand.forget()

@@ -164,8 +164,8 @@ class Recorder(Companion):
             self._wants_turn = False
             self._queue.append((self._clock(), NEXT_FILES, self._take_header()))
 
-    def exchanged(self, known: Exchanged | None) -> None:
-        self._put(self._names[Topic.EXCHANGED], lambda: known or Exchanged())
+    def exchanged(self, known: Exchanged) -> None:
+        self._put(self._names[Topic.EXCHANGED], lambda: known)
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
         if len(self._queue) < self._room or self._goes_on():

@@ -59,8 +59,11 @@ class KeptSession(
 
     @property
     def is_empty(self) -> bool:
-        """True if it has neither a grasp nor an outcome."""
-        return not self.grasps and (self.trust is None or not self.trust.learner.outcomes)
+        """True if it has neither a grasp nor an outcome of its sensors."""
+        trust = self.trust
+        # Without learning only the warm-up counts; the slips are of the sensors before, too.
+        taught = trust is not None and (trust.learner.outcomes or trust.risk.proven)
+        return not (self.grasps or taught)
 
 
 def load(path: Path) -> KeptSession:

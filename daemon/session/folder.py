@@ -91,13 +91,13 @@ class SessionFolder:
     def __exit__(self, *_details: object) -> None:
         self.close()
 
-    def load(self) -> list[KeptSession | SessionFileError]:
-        """Return what `look` finds, the last used first. Raises `SessionFileError`."""
+    def load(self) -> Found:
+        """Return what `look` finds. Raises `SessionFileError`."""
         found = look(self.path)
         self._kept = {n: kept for n, kept in found.items() if isinstance(kept, KeptSession)}
         self._damaged = [number for number in found if number not in self._kept]
         self._running = None
-        return list(found.values())
+        return found
 
     def save(self, sessions: Sequence[KeptSession]) -> None:
         """Keep these sessions, first the one that runs, in place of those that were loaded.

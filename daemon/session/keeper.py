@@ -164,7 +164,7 @@ class SessionKeeper(SensorWatch):
 
     def _restore(self, pipeline: Pipeline) -> None:
         try:
-            found = self._folder.load()
+            found = [*self._folder.load().values()]
         except SessionFileError as error:
             found = [error]
         for at, damaged in enumerate(found):
@@ -257,8 +257,9 @@ class SessionKeeper(SensorWatch):
         learned = None if trust is None else trust.learner
         proves = tared and not is_of_unknown_sensors(former)
         proven = trust.risk.proven if proves and trust is not None else 0
+        budget = None if trust is None else self._budget_of(trust)
         try:
-            self._sensors_exchanged(Exchanged(former.statistics, learned, proven, tared))
+            self._sensors_exchanged(Exchanged(former.statistics, learned, proven, budget, tared))
         except ValueError as error:
             log.warning("what was kept of these sensors %s; a new session begins", error)
             return False
@@ -268,6 +269,13 @@ class SessionKeeper(SensorWatch):
             grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
             log.warning("these sensors were there before: their session%s continues", grasps)
         return True
+
+    def _budget_of(self, former: TrustState) -> float | None:
+        """Return the budget that was kept, if it is of the risk that is set now."""
+        if self._trust is None:
+            return None
+        is_same = former.risk.max_slip_when_stable == self._trust.risk.limits.max_slip_when_stable
+        return former.risk.budget if is_same else None
 
 
 class Continued(NamedTuple):

@@ -128,15 +128,17 @@ class Trust:
         book = self.lifts
         return self.risk.figures(book.outstanding, book.announced, book.awaited)
 
-    def sensors_exchanged(self, learned: LearnerState | None = None, proven: int = 0) -> None:
+    def sensors_exchanged(
+        self, learned: LearnerState | None = None, proven: int = 0, budget: float | None = None
+    ) -> None:
         """Learn from the start, or from `learned`. Raises `ValueError` for another model's.
 
-        `proven`: outcomes that count for the warm-up.
+        `proven`, `budget`: of the risk, as in `Exchanged`.
         """
         self.learner.reset()
         if learned is not None:
             self.learner.restore(learned)
-        self.risk.exchanged(proven)
+        self.risk.exchanged(proven, budget)
         self.lifts.exchanged()
 
     def state(self) -> TrustState:

@@ -206,12 +206,14 @@ class Risk:
         if self.limits.max_slip_when_stable is not None:
             self.take(stable=True, slipped=True, proves=False)
 
-    def exchanged(self, proven: int = 0) -> None:
+    def exchanged(self, proven: int = 0, budget: float | None = None) -> None:
         """Keep what slipped, not what was saved up: a sensor was exchanged.
 
-        `proven`: outcomes that are known of the sensors that are there now.
+        `proven`, `budget`: of the sensors that are there now, as they were known last.
         """
         self.budget = min(self.budget, BUDGET_START)
+        if budget is not None:  # not below what the slips that are counted lead to
+            self.budget = min(self.budget, max(budget, -float(self.slips)))
         self.proven = proven
 
     def state(self) -> RiskState:

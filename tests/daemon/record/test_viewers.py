@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.exchange import Exchanged
+from graspd.daemon.judge.exchange import NOTHING_KNOWN, Exchanged
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.publish.messages import State
@@ -271,7 +271,7 @@ def test_questions_around_an_event_stay_around_it(tmp_path: Path, event: str) ->
     if event == "skipped":
         writing.on_event(LoopEvent.SKIPPED)
     else:
-        writing.exchanged(None)
+        writing.exchanged(NOTHING_KNOWN)
     writing.on_event(LoopEvent.ASKED)
     writing.send(b"tactile.right", tactile(0, *REST.tolist()))
     writing.close()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import Finger
-from graspd.daemon.judge.exchange import Exchanged
+from graspd.daemon.judge.exchange import NOTHING_KNOWN, Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion, Requests
 from graspd.daemon.session.file import KeptSession
@@ -121,15 +121,14 @@ class FakeJudge:
         """`hear`: called at each exchange."""
         self.session, self.trust, self.read_rest, self.hear = session, part, read_rest, hear
 
-    def sensors_exchanged(self, known: Exchanged | None = None) -> None:
+    def sensors_exchanged(self, known: Exchanged = NOTHING_KNOWN) -> None:
         self.hear()
         if self.session is not None:
             self.session.reset()
-            if known is not None and known.session is not None:
+            if known.session is not None:
                 self.session.restore(known.session)
         if self.trust is not None:
-            learned, proven = (None, 0) if known is None else (known.learned, known.proven)
-            self.trust.sensors_exchanged(learned, proven)
+            self.trust.sensors_exchanged(known.learned, known.proven, known.budget)
 
 
 def session_keeper(

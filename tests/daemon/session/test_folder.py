@@ -23,9 +23,12 @@ from msgspec.structs import replace
 from graspd.daemon.session.file import KeptSession, SessionFileError, load
 from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.trust.lift_book import LIFTS_MAX
+from graspd.daemon.trust.trust import Trust
 from graspd.models.session_statistics import SessionState
+from graspd.models.trust.risk import RiskLimits
 from tests.daemon.session.learning import (
     FINGERS,
+    INPUTS,
     calibration,
     judge,
     kept_in,
@@ -151,12 +154,22 @@ def test_an_exchange_right_after_a_save_loses_no_session(tmp_path: Path) -> None
     assert kept_grasps(tmp_path) == [2, 1]
 
 
+def test_a_count_of_the_risk_is_no_empty_session() -> None:
+    """Without learning an outcome moves nothing else."""
+    part = Trust("model", INPUTS, RiskLimits(0.1), learns=False)
+    assert KeptSession(None, FINGERS, {}, part.state()).is_empty
+    judge(part, 1)
+    tell(part, 1)
+    assert part.learner.outcomes == 0
+    assert not KeptSession(None, FINGERS, {}, part.state()).is_empty
+
+
 def test_starts_without_a_grasp_evict_no_session(tmp_path: Path) -> None:
     taught = [KeptSession(state(each), FINGERS, {}) for each in (5, 4, 3, 2, 1)]
     with SessionFolder(tmp_path) as folder:
         folder.save(taught)
         for serial in "AB":
-            others = [each for each in folder.load() if isinstance(each, KeptSession)]
+            others = [each for each in folder.load().values() if isinstance(each, KeptSession)]
             folder.save([KeptSession(None, FINGERS, {"ff": serial}), *others])
             assert kept_grasps(tmp_path) == [0, 5, 4, 3, 2, 1]
         folder.save([KeptSession(state(6), FINGERS, {}), *taught])
@@ -236,7 +249,7 @@ def test_a_file_that_cannot_be_read_is_never_replaced(tmp_path: Path, spoil: str
     }[spoil]
     path.write_bytes(spoiled)
     with SessionFolder(tmp_path) as folder:
-        (problem,) = folder.load()
+        (problem,) = folder.load().values()
         assert str(problem).startswith(f"{path}: not a session")
         for grasps in (3, 4):
             save(folder, grasps)
@@ -295,7 +308,7 @@ def test_files_with_other_names_are_let_alone(tmp_path: Path) -> None:
     for name in names:
         (tmp_path / name).write_bytes(b"?")
     with SessionFolder(tmp_path) as folder:
-        assert folder.load() == []
+        assert folder.load() == {}
         save(folder, 1)
     assert {path.name for path in tmp_path.iterdir()} == {*names, "lock", "1.session"}
 

@@ -23,6 +23,7 @@ from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.session.keeper import SessionKeeper
 from graspd.daemon.session.sensors import FIT_GRASPS, LOOK_EVERY, moved_fingers
+from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import TactileReading
 from graspd.drivers.twins.grasps.grasp_script import EndPoint
@@ -31,8 +32,11 @@ from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_
 from graspd.models import zoo
 from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
+from graspd.models.trust.risk import BUDGET_START
 from tests.daemon.fakes import FINGERS, MS, Clock, reading
 from tests.daemon.session.learning import (
+    BOOT,
+    INPUTS,
     NOBODY,
     SHORT,
     calibration,
@@ -325,6 +329,30 @@ def test_a_relay_that_restarts_is_no_exchange(tmp_path: Path) -> None:
         look(keeper)
         keeper.save()
     assert (session.grasps, part.learner.outcomes, part.risk.proven) == (0, 0, 0)
+
+
+def test_sensors_that_return_have_their_slips_back(tmp_path: Path) -> None:
+    """The run between did not learn: its session has no outcomes, and is the last one."""
+    former, now = trust(), trust()
+    for grasp in (1, 2):
+        named = GraspId(BOOT, grasp)
+        former.lifts.note(named, bytes(8 * (INPUTS + 2)), stable=True)
+        former.outcome(named, slipped=True)
+    with SessionFolder(tmp_path / "right") as folder:
+        between = KeptSession(calibration().state(), FINGERS, dict.fromkeys(FINGERS, "B"))
+        first = KeptSession(
+            calibration().state(), FINGERS, dict.fromkeys(FINGERS, "A"), former.state()
+        )
+        folder.save([between, first])
+        driver = sensors(**dict.fromkeys(FINGERS, "B"))
+        keeper = session_keeper(calibration(), driver, folder, part=now)
+        look(keeper)
+        assert now.risk.budget == BUDGET_START
+        driver.known = dict.fromkeys(FINGERS, "A")
+        look(keeper)
+        keeper.save()
+    assert now.risk.budget == pytest.approx(BUDGET_START - 2 * 0.9)
+    assert now.learner.outcomes == 2
 
 
 def test_sensors_without_numbers_have_each_their_session(tmp_path: Path) -> None:

@@ -186,6 +186,18 @@ def test_the_warm_up_asks_for_lifts_of_unsure_grasps() -> None:
     assert (rule.warm_up_left, rule.slips) == (3, 1)
 
 
+@pytest.mark.parametrize(("known", "left"), [(1.5, 1.5), (-9.0, -2.0), (8.0, 3.2), (None, 3.2)])
+def test_sensors_that_return_add_nothing_to_the_budget(known: float | None, left: float) -> None:
+    """Two of two lifts slip under a share of 0.1: 3.2 of 5 slips are left."""
+    rule = risk(0.1)
+    for _ in range(2):
+        rule.take(stable=True, slipped=True, proves=True)
+    rule.exchanged(7, known)
+    assert (rule.proven, rule.slips) == (7, 2)
+    assert rule.budget == pytest.approx(left)
+    risk(0.1).restore(rule.state())
+
+
 def test_a_share_of_withheld_grasps_is_lifted_under_supervision() -> None:
     rule, none = risk(0.05, explore=0.05), risk(0.05)
     chosen = [rule.supervised(Permission.WITHHELD, "boot", grasp) for grasp in range(20_000)]
