@@ -7,6 +7,7 @@ commutes with filling. A normalised image is one small matrix product and one di
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import StrEnum
 
 import numpy as np
@@ -46,15 +47,19 @@ class Composition(StrEnum):
     """Below one another: (fingers * height) x width x 1."""
 
 
-def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
+def fill_matrix(
+    layout: Layout, fill: Fill, electrodes: Iterable[int] = range(ELECTRODES)
+) -> NDArray[np.float64]:
     """Return the matrix (pixels, 25) from [24 counts, their maximum] to a filled image.
 
-    Pixels are in row-major order. Each row sums to one.
+    Pixels are in row-major order. Each row sums to one. `electrodes`: places, 0..23, of those that
+    work, at least one; a pixel of another is filled like one without an electrode.
     """
     height, width = layout.shape
     matrix = np.zeros((height, width, ELECTRODES + 1))
     filled = np.zeros((height, width), dtype=bool)
-    for electrode, pixel in enumerate(zip(layout.rows, layout.columns, strict=True)):
+    for electrode in electrodes:
+        pixel = layout.rows[electrode], layout.columns[electrode]
         matrix[*pixel, electrode] = 1.0
         filled[pixel] = True
     if fill is Fill.LEAST_CONTACT:

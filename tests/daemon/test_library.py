@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import json
 import pickle
 import re
@@ -327,16 +328,39 @@ def test_a_stream_is_judged_as_replay_judges_it() -> None:
     assert got == expected
 
 
+def examples() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+
+
 def test_the_example_of_the_page_runs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(ROOT)
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    exec(compile(example, "LIBRARY.md", "exec"), {})
+    exec(compile(examples()[0], "LIBRARY.md", "exec"), {})
     said = capsys.readouterr().out
     assert "slipped" in said
     assert "Name: ff_biotac_1" in said
     assert re.search(r"^0 +1 +(stable|slip|unknown) ", said, re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def fonts() -> None:
+    """Matplotlib opens its fonts once, and keeps them open."""
+    pytest.importorskip("matplotlib", reason="needs the extra `report`")
+    graspd.plot_grasp(np.full((3, 24), 2000)).savefig(io.BytesIO())
+
+
+def test_the_drawing_of_the_page_is_made(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    fonts: None,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    today = graspd.read_grasps(DEMO_DAY)[:50]
+    exec(compile(examples()[1], "LIBRARY.md", "exec"), {"graspd": graspd, "today": today})
+    assert capsys.readouterr().out == "(9, 12, 11, 3)\n"
+    assert (tmp_path / "grasp.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import graspd
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS
 from graspd.models.layout import D1, LAYOUTS, Layout
 from graspd.models.tactile_image import Fill, Normalisation, TactileImager, fill_matrix
@@ -28,10 +30,11 @@ D1_PIXELS = list(
 )
 
 
-def plain_filled(counts: list[int], least_contact: bool) -> Image:
+def plain_filled(counts: Sequence[int | None], least_contact: bool) -> Image:
+    """Return an image; None is a broken electrode."""
     image: list[list[float | None]] = [[None] * 11 for _ in range(12)]
     for (row, column), count in zip(D1_PIXELS, counts, strict=True):
-        image[row][column] = float(count)
+        image[row][column] = None if count is None else float(count)
     while any(pixel is None for line in image for pixel in line):
         before = [line[:] for line in image]
         for row in range(12):
@@ -39,7 +42,7 @@ def plain_filled(counts: list[int], least_contact: bool) -> Image:
                 if before[row][column] is not None:
                     continue
                 if least_contact:
-                    image[row][column] = float(max(counts))
+                    image[row][column] = float(max(filter(None, counts)))
                     continue
                 near = []
                 for r in range(max(row - 1, 0), min(row + 2, 12)):
@@ -159,3 +162,53 @@ def test_a_buffer_of_another_shape_or_with_gaps_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match="C-contiguous"):
         TactileImager(3).build(np.ones((3, 24)), np.empty(shape, np.float32)[..., ::step])
+
+
+@pytest.mark.parametrize("fill", ["neighbour-mean", "least-contact"])
+def test_images_of_a_user_are_the_filled_ones(fill: str) -> None:
+    drawn = np.random.default_rng(7).integers(1, 4096, (2, 3, 24)).tolist()
+    drawn[0][1][:4] = [None] * 4  # broken, in a corner
+    drawn[1][2][23] = None
+    images = graspd.tactile_images(drawn, fill=fill)
+    assert images.shape == (2, 12, 11, 3)
+    for image, grasp in zip(images, drawn, strict=True):
+        plain = [plain_filled(finger, fill == "least-contact") for finger in grasp]
+        np.testing.assert_allclose(image, np.moveaxis(np.array(plain), 0, 2), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("layout", "shape"), [("D2a", (6, 5)), ("D2b", (6, 5)), ("D3", (4, 7))])
+def test_images_have_the_size_of_their_layout(layout: str, shape: tuple[int, int]) -> None:
+    counts = np.full((1, 2, 24), 2000.0)
+    counts[0, 1] = np.nan
+    images = graspd.tactile_images(counts, layout)
+    assert images.shape == (1, *shape, 2)
+    np.testing.assert_allclose(images[..., 0], 2000.0)
+    assert np.isnan(images[..., 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"layout": "D4"}, "'D4': they are D1, D2a, D2b, D3"),
+        ({"fill": "mean"}, "'mean': they are least-contact, neighbour-mean"),
+    ],
+)
+def test_another_layout_or_fill_is_refused_by_name(wrong: dict[str, str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        graspd.tactile_images(np.zeros((1, 3, 24)), **wrong)
+
+
+def test_a_drawing_has_each_electrodes_number_on_its_pixel() -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra `report`")
+    counts = np.arange(72.0).reshape(3, 24)
+    counts[2, 4] = np.nan
+    *panels, _scale = graspd.plot_grasp(counts).axes
+    assert [panel.get_title() for panel in panels] == ["ff", "mf", "th"]
+    for panel in panels:
+        places = {int(text.get_text()): text.get_position() for text in panel.texts}
+        expected = enumerate(D1_PIXELS, start=1)
+        assert places == {number: (column, row) for number, (row, column) in expected}
+    red = [text.get_text() for panel in panels for text in panel.texts if text.get_color() == "red"]
+    assert red == ["5"]
+    with pytest.raises(ValueError, match="draws one grasp, and 2 were given"):
+        graspd.plot_grasp(np.stack([counts, counts]))

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from graspd import client
     from graspd.daemon.library import GraspModel, judge, load
     from graspd.daemon.record.frames import read_grasps, read_recording
+    from graspd.models.pictures import plot_grasp, tactile_images
 
 __all__ = [
     "GraspModel",
@@ -19,16 +20,20 @@ __all__ = [
     "client",
     "judge",
     "load",
+    "plot_grasp",
     "read_grasps",
     "read_recording",
+    "tactile_images",
 ]
 
 _MODULES = {
     "GraspModel": "graspd.daemon.library",
     "judge": "graspd.daemon.library",
     "load": "graspd.daemon.library",
+    "plot_grasp": "graspd.models.pictures",
     "read_grasps": "graspd.daemon.record.frames",
     "read_recording": "graspd.daemon.record.frames",
+    "tactile_images": "graspd.models.pictures",
 }
 
 
