@@ -185,6 +185,8 @@ class DatagramDriver(Opened, Generic[Stream]):
     """Time without a good datagram after which the link is lost, ns."""
     exhausted = False
     live = True
+    _fingers: tuple[str, ...] = ()
+    """Fingers whose sensors stand behind the sender."""
 
     def __init__(
         self,
@@ -228,7 +230,8 @@ class DatagramDriver(Opened, Generic[Stream]):
 
     @property
     def serials(self) -> dict[str, str]:
-        return {}
+        """The sender for each finger, because datagrams have no serial number."""
+        return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
 
     def describe(self) -> dict[str, Fact]:
         facts = {"source": Fact(str(self._endpoint)), **self.link.describe()}

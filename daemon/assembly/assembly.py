@@ -16,6 +16,7 @@ from graspd.daemon.process.files import write_atomically
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import (
     CanTactile,
+    DatagramsTactile,
     PalmJoints,
     PalmTactile,
     ReplayTactile,
@@ -138,7 +139,7 @@ def build_drivers(plan: Plan) -> list[Driver]:
     with _section("tactile"):
         drivers = [_tactile(plan)]
     if isinstance(scene.joints, StreamJoints):
-        from graspd.drivers.joints import JointStreamDriver
+        from graspd.drivers.datagrams.joints import JointStreamDriver
 
         with _section("joints"):
             drivers.append(JointStreamDriver(scene.joints.source, only_from=scene.joints.only_from))
@@ -196,6 +197,10 @@ def _tactile(plan: Plan) -> Driver:
 
             calibration = joints.calibration if isinstance(joints, PalmJoints) else None
             return PalmDriver(fingers=fingers, calibration=calibration, **arguments)
+        case DatagramsTactile():
+            from graspd.drivers.datagrams.tactile import TactileStreamDriver
+
+            return TactileStreamDriver(fingers=fingers, hand=plan.scene.hand.name, **arguments)
 
 
 def _replay(plan: Plan, options: ReplayTactile) -> Driver:

@@ -110,7 +110,7 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
 def _warnings(wanted: scene.Scene) -> list[str]:
     warnings = [] if (absent := _absent(wanted.tactile)) is None else [absent]
     for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
-        if not isinstance(section, scene_drivers.PalmTactile | scene_drivers.StreamJoints):
+        if not isinstance(section, scene_drivers.UdpSection):
             continue
         address = ip_address(Endpoint.parse(section.source).address)
         if section.only_from is None and address.is_unspecified:

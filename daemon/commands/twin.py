@@ -24,8 +24,12 @@ log = logging.getLogger("graspd")
 SPI_PATH = Path("/tmp/graspd-twin")
 CAN_GROUP = "239.74.163.2"
 """Default multicast group of python-can's `udp_multicast`."""
-PALM_TARGET = "udp://127.0.0.1:9870"
-JOINT_TARGET = "udp://127.0.0.1:9871"
+TARGETS = {
+    "palm": "udp://127.0.0.1:9870",
+    "joints": "udp://127.0.0.1:9871",
+    "datagrams": "udp://127.0.0.1:9872",
+}
+"""Address to which a twin of datagrams sends by default."""
 PROBABILITIES = {
     "bit-flip": "one random bit of it flips",
     "drop": "it is lost",
@@ -37,6 +41,7 @@ KINDS = {
     "can": "a CAN board on any python-can bus",
     "palm": "a Shadow hand's palm over UDP",
     "joints": "a stream of joint angles over UDP",
+    "datagrams": "a program that sends counts as JSON over UDP",
 }
 
 
@@ -45,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kinds = parser.add_subparsers(
         dest="kind", metavar="KIND", required=True, help="what to stand in for"
     )
-    spi, can, palm, joints = (
+    spi, can, palm, joints, datagrams = (
         kinds.add_parser(name, help=text, description=f"Stands in for {text}.")
         for name, text in KINDS.items()
     )
@@ -67,19 +72,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0x100,
         help="of its frames (default: 0x100)",
     )
-    for kind, target in ((palm, PALM_TARGET), (joints, JOINT_TARGET)):
-        kind.add_argument("--to", default=target, help=f"where to send (default: {target})")
-    for kind in (spi, can):
+    for name, target in TARGETS.items():
+        help_text = f"where to send (default: {target})"
+        kinds.choices[name].add_argument("--to", default=target, help=help_text)
+    for kind in (spi, can, datagrams):
         kind.add_argument(
             "--rate", type=float, default=100.0, metavar="HZ", help="sweeps/s (default: 100)"
         )
+    for kind in (spi, can):
         kind.add_argument(
             "--sequence",
             choices=sorted(SEQUENCES),
             default="electrodes",
             help="channels that a sweep samples, as in a scene (default: electrodes)",
         )
-    for kind in (spi, can, palm):
+    for kind in (spi, can, palm, datagrams):
         kind.add_argument(
             "--recording",
             type=Path,
@@ -88,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help="play this recording, row by row (default: synthetic grasps)",
         )
         kind.add_argument("--loop", action="store_true", help="play recordings for ever")
-    for kind in (spi, can, palm, joints):
+    for kind in (spi, can, palm, joints, datagrams):
         _add_faults(kind)
 
 
@@ -231,11 +238,13 @@ def _serve_can(
 def _serve_datagrams(
     args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
 ) -> Mapping[str, int]:
-    from graspd.drivers.twins.datagrams import JointTwin, PalmTwin
+    from graspd.drivers.twins.datagrams import DatagramTwin, JointTwin, PalmTwin, TactileTwin
 
-    twin: JointTwin | PalmTwin
+    twin: DatagramTwin
     if args.kind == "palm":
         twin = PalmTwin(_counts(args, PALM_RATE_HZ), faults=faults)
+    elif args.kind == "datagrams":
+        twin = TactileTwin(_counts(args, args.rate), rate_hz=args.rate, faults=faults)
     else:
         twin = JointTwin(faults=faults)
     log.info("%s to %s", args.kind, args.to)

@@ -50,7 +50,8 @@ class Cause(StrEnum):
     REPEATED = "repeated"
     """Old data was sent again."""
     PALM_MODE = "palm-mode"
-    JOINTS = "joints"
+    MESSAGES = "messages"
+    """JSON messages are not as their page says."""
     RECORDING = "recording"
     SENSOR_ABSENT = "sensor-absent"
     SENSOR_TWICE = "sensor-twice"
@@ -77,7 +78,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.PORT_HELD: _LOSS
     | _NOISE
     | {Cause.LINK_LOST, Cause.DAMAGED, Cause.CLOCK, Cause.RESTARTED},
-    Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.REPEATED, Cause.RESTARTED},
+    Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.MESSAGES, Cause.REPEATED, Cause.RESTARTED},
     Cause.DAMAGED: _LOSS | _NOISE | {Cause.CLOCK, Cause.RESTARTED},
     Cause.BUS_ERRORS: _LOSS | {Cause.LINK_LOST},
     Cause.COMPUTER_BUSY: _LOSS | {Cause.CLOCK, Cause.OUT_OF_ORDER, Cause.RESTARTED},
@@ -88,7 +89,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.RESTARTED: _LOSS,
     Cause.SETTINGS: _LOSS,
     Cause.PALM_MODE: _LOSS,
-    Cause.JOINTS: frozenset({Cause.FRAMES_LOST}),
+    Cause.MESSAGES: frozenset({Cause.FRAMES_LOST, Cause.RESTARTED, Cause.SENSOR_WORDS}),
     Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
 }
 """Consequences of each cause. They are not reported beside it."""

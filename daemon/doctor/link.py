@@ -33,7 +33,8 @@ BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, L
 """Causes that a link shows between its losses; they are not reported beside the losses."""
 NOT_OURS: dict[Cause, tuple[str, ...]] = {
     Cause.VERSION: ("bad_lengths",),
-    Cause.JOINTS: ("bad_messages",),
+    Cause.MESSAGES: ("bad_messages",),
+    Cause.FOREIGN_SENDER: ("other_hands",),
     Cause.BITRATE: ("error_frames", "bus_off"),
     Cause.NOT_A_BRIDGE: ("bad_cobs", "bad_crc", "too_long", "unknown_frames"),
     Cause.PALM_MODE: ("service_packets", "empty_packets", "nonsense_packets"),
@@ -45,7 +46,9 @@ NOT_OURS: dict[Cause, tuple[str, ...]] = {
 """Counters of a link that receives data but gives no reading; the first that is not 0 counts."""
 NOT_OURS_ADVICE = {
     Cause.VERSION: "No known palm sends this length. Other firmware, or a relay that adds bytes.",
-    Cause.JOINTS: "The messages are not joint angles: see deploy/wire/JOINTS.md.",
+    Cause.MESSAGES: "They are of another form than deploy/wire/TACTILE.md or JOINTS.md.",
+    Cause.FOREIGN_SENDER: "They are of another hand. Compare hand.name, or give each hand a port.",
+    Cause.REPEATED: "Their numbers or times do not rise: the same data comes again and again.",
     Cause.BITRATE: "Set the interface to the board's bit rate.",
     Cause.NOT_A_BRIDGE: f"Check the baud rate. If it is no bridge yet: {FLASH}",
     Cause.PALM_MODE: "The palm is in a service mode or starting. Let the hand's driver start it.",
@@ -71,14 +74,17 @@ COUNTERS: dict[Cause, tuple[str, ...]] = {
     Cause.SETTINGS: ("unexpected_channels",),
     Cause.FRAMES_LOST: (
         *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps", "interrupted_sweeps"),
-        *("interrupted_rounds", "controller_overflows"),
+        *("interrupted_rounds", "controller_overflows", "late_messages"),
         *("unsynchronised_frames", "unsynchronised_packets"),
     ),
     Cause.OUT_OF_ORDER: (
         *("reordered", "reordered_frames", "reordered_packets", "late_frames", "late_packets"),
     ),
     Cause.PALM_MODE: ("service_packets", "empty_packets"),
-    Cause.JOINTS: ("bad_messages", "unknown_names", "bad_angles"),
+    Cause.MESSAGES: (
+        *("bad_messages", "unknown_names", "bad_angles", "bad_counts", "wrong_sizes"),
+        "other_hands",
+    ),
     Cause.RECORDING: ("cut_off", "malformed"),
 }
 """Counters of a link that is up. Others show at the electrodes or are harmless."""
@@ -96,7 +102,7 @@ ADVICE = {
     Cause.FRAMES_LOST: f"Data is lost or late. {AGAIN} the load of bus, hub and this computer.",
     Cause.OUT_OF_ORDER: f"Frames overtake each other. {AGAIN} the relay or hub on the way.",
     Cause.PALM_MODE: "The palm is in a service mode, or late. Let the hand's own driver start it.",
-    Cause.JOINTS: "Unknown joints and wrong angles are left out: see deploy/wire/JOINTS.md.",
+    Cause.MESSAGES: "What does not fit is left out: see deploy/wire/TACTILE.md or JOINTS.md.",
     Cause.RECORDING: "The recording is damaged or ends in the middle. Record it again.",
 }
 TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
@@ -186,8 +192,11 @@ def device_findings(
         if "why" in facts:
             what = f"{what}: {facts['why'].text}"
         counters, trouble = counters or {}, TROUBLES[link.fault]
-        losses = counters.get("link_losses", 0)
-        if losses and link.fault in BETWEEN:
+        losses, old = counters.get("link_losses", 0), counters.get("old_messages", 0)
+        if old > counters.get("readings", 0):
+            what = f"{what}, but {old} old messages"
+            trouble = Trouble(Cause.REPEATED, NOT_OURS_ADVICE[Cause.REPEATED])
+        elif losses and link.fault in BETWEEN:
             what += f"; it was up and was lost {losses} {'time' if losses == 1 else 'times'}"
             trouble = TROUBLES[LinkCause.DISCONNECTED]
         elif trouble.cause is Cause.SILENT:

@@ -18,7 +18,7 @@ from graspd.daemon.doctor.finding import Cause, Finding, Level, fine
 from graspd.daemon.publish.listener import PublishError, user_id
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.scene import Scene
-from graspd.daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
+from graspd.daemon.scene.drivers import CanTactile, Section, SpiTactile, UdpSection
 from graspd.drivers.udp import Endpoint
 from graspd.models.contract import ModelError
 
@@ -67,7 +67,7 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
             return [_denied(finding, port)]
         case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_HELD:
             return [_held(finding, computer.file_holders(port))]
-        case PalmTactile(source=source) | StreamJoints(source=source), Cause.PORT_HELD:
+        case UdpSection(source=source), Cause.PORT_HELD:
             number = Endpoint.parse(source).port
             return [_held(finding, computer.port_holders("udp", number))]
     return [finding]

@@ -114,21 +114,34 @@ class CanTactile(Section):
     """More arguments of the interface, as `{ host = "10.0.0.7", port = 29536 }` of socketcand."""
 
 
-class PalmTactile(Section):
+class UdpSection(Section):
+    """Section of a driver that listens to UDP."""
+
+    source: UdpSource
+    """`udp://ADDRESS:PORT` to listen on."""
+    only_from: Address | None = None
+    """IP address of the sender; without it any may send."""
+
+
+class PalmTactile(UdpSection):
     """`[tactile]` with `driver = "palm"`: status packets of the hand's palm."""
 
     driver: Literal["palm"]
     """Selects this driver."""
-    source: UdpSource
-    """`udp://ADDRESS:PORT` to listen on."""
-    only_from: Address | None = None
-    """IP address of the relay; without it any may send."""
     heed_finger_bits: bool = True
     """False for a palm that never sets the bits of valid fingers."""
 
 
+class DatagramsTactile(UdpSection):
+    """`[tactile]` with `driver = "datagrams"`: counts from elsewhere (deploy/wire/TACTILE.md)."""
+
+    driver: Literal["datagrams"]
+    """Selects this driver."""
+
+
 Tactile = Annotated[
-    ReplayTactile | SpiTactile | CanTactile | PalmTactile, Field(discriminator="driver")
+    ReplayTactile | SpiTactile | CanTactile | PalmTactile | DatagramsTactile,
+    Field(discriminator="driver"),
 ]
 """Section of a tactile driver; its key `driver` tells which."""
 
@@ -142,15 +155,11 @@ class PalmJoints(Section):
     """Calibration of the hand, as deploy/calibration/example_hand.toml."""
 
 
-class StreamJoints(Section):
+class StreamJoints(UdpSection):
     """`[joints]` with `driver = "stream"`: joint angles from elsewhere (deploy/wire/JOINTS.md)."""
 
     driver: Literal["stream"]
     """Selects this driver."""
-    source: UdpSource
-    """`udp://ADDRESS:PORT` to listen on."""
-    only_from: Address | None = None
-    """IP address of the sender; without it any may send."""
 
 
 Joints = Annotated[PalmJoints | StreamJoints, Field(discriminator="driver")]

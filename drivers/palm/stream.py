@@ -335,11 +335,6 @@ class PalmDriver(DatagramDriver[PalmStream]):
             self._fingers, calibration=self._calibration, heed_finger_bits=self._heed_finger_bits
         )
 
-    @property
-    def serials(self) -> dict[str, str]:
-        """The sender for each finger, because packets have no serial number."""
-        return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
-
     def fileno(self) -> int | None:
         """Return the socket; None while no round can end, for 71 wakes a second, not 1000."""
         return None if self._clock() < self._attention_ns else super().fileno()

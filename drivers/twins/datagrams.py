@@ -1,4 +1,4 @@
-"""Twins that send UDP datagrams: a Shadow hand's palm, and a stream of joint angles."""
+"""Twins that send UDP datagrams: a Shadow hand's palm, and streams of counts and of angles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from graspd.biotac import FINGERS
-from graspd.drivers.joints import JointMessage
+from graspd.drivers.datagrams.joints import JointMessage
+from graspd.drivers.datagrams.messages import Stamp, write_message
 from graspd.drivers.palm.packet import (
     CHANNELS,
     COMMAND_SENSOR_DATA,
@@ -41,13 +42,14 @@ OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
 PAC_COUNT = 2048
 ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
 """Words of a finger without a sensor, from a real recording; its electrodes are 0."""
-OUTAGE_CYCLES = 500
-"""Cycles that a broken link is silent, half a second; the palm goes on meanwhile."""
+OUTAGE_NS = 600_000_000
+"""Time that a broken link is silent, ns; the sender continues meanwhile."""
 LATER_VERSION_BYTES = 4
 """Bytes by which packets of a later kind of palm are longer."""
 
 JOINTS = ("FFJ3", "MFJ3", "THJ5")
-JOINT_RATE_HZ = 100.0
+RATE_HZ = 100.0
+"""Messages of joints a second, and by default of counts."""
 SWING_S = 4.0
 SWING_RAD = 0.2
 MIDDLE_RAD = 0.4
@@ -58,14 +60,35 @@ BEHIND_MAX_NS = 100_000_000
 
 
 class DatagramTwin(ABC):
-    """Base of twins that send UDP datagrams at a steady pace."""
+    """Base of twins that send UDP datagrams at a steady pace, one a cycle."""
 
     period_ns: int
     """Time between two cycles, ns."""
 
+    def __init__(self, faults: LinkFaults) -> None:
+        self._faults = faults
+        self._injector = LinkFaultInjector(faults)
+        self.injected = self._injector.injected
+        """Number of faults by name; `silenced`: datagrams made while the link was broken."""
+
     @abstractmethod
+    def datagrams(self) -> Iterator[bytes]:
+        """Yield the datagram of each cycle, without faults of the link."""
+
     def cycles(self) -> Iterator[list[bytes]]:
         """Yield the datagrams of each cycle, with faults of the link."""
+        silent = 0
+        for data in self.datagrams():
+            if silent:
+                silent -= 1
+                self.injected["silenced"] += 1
+                yield []
+            elif self._injector.breaks_here():
+                silent = OUTAGE_NS // self.period_ns
+                yield [*self._injector.flush(), data[: len(data) // 2]]
+            else:
+                yield self._injector.spoil(data)
+        yield self._injector.flush()
 
     def serve(self, target: str, stop: threading.Event) -> None:
         """Send to `udp://ADDRESS:PORT` until `stop` is set or the end. Raises `ValueError`."""
@@ -105,13 +128,10 @@ class PalmTwin(DatagramTwin):
     ) -> None:
         """Raises `ValueError` for a fault that datagrams cannot have."""
         faults.refuse("the palm", "one_byte_at_a_time")
+        super().__init__(faults)
         self._counts = iter(counts)
         self._rows = {finger: row for row, finger in enumerate(fingers)}
         self._palm = palm
-        self._faults = faults
-        self._injector = LinkFaultInjector(faults)
-        self.injected = self._injector.injected
-        """Number of faults by name; `silenced`: packets made while the link was broken."""
         self._random = np.random.default_rng(seed)
         self._dead = frozenset(faults.dead_electrodes)
 
@@ -121,23 +141,10 @@ class PalmTwin(DatagramTwin):
             for position in range(ROUND):
                 yield self._packet(position, counts)
 
-    def cycles(self) -> Iterator[list[bytes]]:
-        silent = 0
+    def datagrams(self) -> Iterator[bytes]:
+        later = bytes(LATER_VERSION_BYTES) if self._faults.wrong_version else b""
         for packet in self.packets():
-            if silent:
-                silent -= 1
-                self.injected["silenced"] += 1
-                yield []
-                continue
-            data = packet.to_bytes()
-            if self._faults.wrong_version:
-                data += bytes(LATER_VERSION_BYTES)
-            if self._injector.breaks_here():
-                silent = OUTAGE_CYCLES
-                yield [*self._injector.flush(), data[: len(data) // 2]]
-                continue
-            yield self._injector.spoil(data)
-        yield self._injector.flush()
+            yield packet.to_bytes() + later
 
     def _packet(self, position: int, counts: Counts) -> PalmPacket:
         sensors = np.array(SENSORS_AT_REST)
@@ -172,21 +179,57 @@ class PalmTwin(DatagramTwin):
         return int(counts[row, channel.electrode])
 
 
-class JointTwin(DatagramTwin):
+class MessageTwin(DatagramTwin):
+    """Base of twins that send JSON messages; `stuck_clock`: all have one number and time."""
+
+    period_ns = round(1e9 / RATE_HZ)
+
+    def _stamps(self) -> Iterator[Stamp]:
+        numbers = itertools.repeat(0) if self._faults.stuck_clock else itertools.count()
+        return (Stamp(number, number * self.period_ns / 1e9) for number in numbers)
+
+
+class JointTwin(MessageTwin):
     """Send messages of joints that swing slowly."""
 
-    period_ns = round(1e9 / JOINT_RATE_HZ)
-
     def __init__(self, faults: LinkFaults = LinkFaults()) -> None:  # noqa: B008 (immutable)
-        """Raises `ValueError` for a fault that datagrams cannot have."""
-        faults.refuse("the joint stream", "burst_frames", "one_byte_at_a_time")
+        """Raises `ValueError` for a fault that messages of joints cannot have."""
+        faults.refuse("the joint stream", "burst_frames", "one_byte_at_a_time", "wrong_version")
         faults.refuse("the joint stream", "dead_electrodes", "unplugged_fingers")
-        self._injector = LinkFaultInjector(faults)
-        self.injected = self._injector.injected
+        super().__init__(faults)
 
-    def cycles(self) -> Iterator[list[bytes]]:
+    def datagrams(self) -> Iterator[bytes]:
         behind = 0.1 * np.arange(len(JOINTS))
-        for seq in itertools.count():
-            t_s = seq / JOINT_RATE_HZ
-            angles = MIDDLE_RAD + SWING_RAD * np.sin(2.0 * math.pi * t_s / SWING_S - behind)
-            yield self._injector.spoil(JointMessage(seq, t_s, JOINTS, angles).to_bytes())
+        for seq, stamp in enumerate(self._stamps()):
+            phase = 2.0 * math.pi * seq / RATE_HZ / SWING_S
+            angles = MIDDLE_RAD + SWING_RAD * np.sin(phase - behind)
+            yield JointMessage(stamp, JOINTS, angles).to_bytes()
+
+
+class TactileTwin(MessageTwin):
+    """Send counts, shape (fingers, 24) for each message; an unplugged finger has all counts 0."""
+
+    def __init__(
+        self,
+        counts: Iterable[Counts],
+        fingers: Sequence[str] = ("ff", "mf", "th"),
+        *,
+        rate_hz: float = RATE_HZ,
+        faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
+    ) -> None:
+        """Raises `ValueError` for a fault that messages of counts cannot have."""
+        faults.refuse("the tactile stream", "one_byte_at_a_time", "wrong_version")
+        super().__init__(faults)
+        self.period_ns = round(1e9 / rate_hz)
+        self._counts = iter(counts)
+        self._fingers = tuple(fingers)
+
+    def datagrams(self) -> Iterator[bytes]:
+        dead = tuple(zip(*self._faults.dead_electrodes, strict=True))
+        for stamp, sound in zip(self._stamps(), self._counts, strict=False):
+            counts = sound.copy()
+            counts[list(self._faults.unplugged_fingers)] = 0
+            if dead:
+                counts[dead] = 0
+            by_finger = dict(zip(self._fingers, counts.tolist(), strict=True))
+            yield write_message(stamp, counts=by_finger)

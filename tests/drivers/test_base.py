@@ -35,7 +35,7 @@ from graspd.drivers.biotac import (
 )
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.frames import CanCounters
-from graspd.drivers.joints import JointCounters, JointStreamDriver
+from graspd.drivers.datagrams.joints import JointCounters, JointStreamDriver
 from graspd.drivers.link import Link, LinkState
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.palm.stream import PalmDriver

@@ -10,7 +10,9 @@ from graspd.drivers.base import Reading, TactileReading
 from graspd.drivers.biotac import SEQUENCES, encode_word
 from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.can.samples import SampleAssembler
-from graspd.drivers.joints import JointMessage, JointStream
+from graspd.drivers.datagrams.joints import JointMessage, JointStream
+from graspd.drivers.datagrams.messages import Stamp, write_message
+from graspd.drivers.datagrams.tactile import TactileStream
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.spi.sweeps import BridgeCounters, DeviceClock, SweepDecoder
 from tests.drivers.spi.bridge_bench import hello, sweep
@@ -52,10 +54,20 @@ def test_a_bridge_that_is_started_again_interrupts() -> None:
 def test_joint_messages_of_a_new_start_interrupt() -> None:
     stream, readings = JointStream(), []
     for seq in (*range(50, 60), *range(20), 5000):
-        message = JointMessage(seq, None, ("FFJ3",), np.zeros(1))
+        message = JointMessage(Stamp(seq, None), ("FFJ3",), np.zeros(1))
         readings += stream.receive(message.to_bytes(), 0) or []
     # Ten of the old numbers are dropped; 5000 is more than a thousand ahead.
     assert interrupted(list(readings)) == [10, 20]
+
+
+def test_counts_of_a_new_start_and_after_a_lost_link_interrupt() -> None:
+    stream, readings = TactileStream(("ff",), "right"), list[Reading]()
+    for place, seq in enumerate((*range(50, 60), *range(20), 5000, 5001)):
+        if place == 31:
+            stream.interrupt()
+        data = write_message(Stamp(seq, None), counts={"ff": [2602] * 24})
+        readings += stream.receive(data, 0) or []
+    assert interrupted(readings) == [10, 20, 21]
 
 
 def test_each_turn_of_a_looped_stream_interrupts(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from graspd.drivers.base import Driver, Reading
 from graspd.drivers.can.driver import CanBridgeDriver
-from graspd.drivers.joints import JointStreamDriver
+from graspd.drivers.datagrams.joints import JointStreamDriver
 from graspd.drivers.palm.stream import PalmDriver
 from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from graspd.drivers.spi.driver import SpiBridgeDriver

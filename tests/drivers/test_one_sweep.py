@@ -19,7 +19,9 @@ from graspd.drivers.base import Reading
 from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.frames import CanFrame, encode_sample
 from graspd.drivers.can.stream import CanStream
-from graspd.drivers.joints import JointMessage, JointStream
+from graspd.drivers.datagrams.joints import JointMessage, JointStream
+from graspd.drivers.datagrams.messages import Stamp, write_message
+from graspd.drivers.datagrams.tactile import TactileStream
 from graspd.drivers.link import LinkState
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
@@ -129,6 +131,18 @@ def bridge_log(_first: int) -> Feed:
     return lambda unit: feed(LineEvent.RECEIVED, spi_sweep(unit), T0 + (unit.at + 10) * MS)
 
 
+def messages(_first: int) -> Feed:
+    stream = TactileStream(FINGERS, "right")
+
+    def feed(unit: Unit) -> Sequence[Reading]:
+        counts = counts_of(number_of(unit.index, unit.boot)).tolist()
+        by_finger = dict(zip(FINGERS, counts, strict=True))
+        data = write_message(Stamp(unit.index, None), counts=by_finger)
+        return stream.receive(data, unit.at * MS) or ()
+
+    return feed
+
+
 @dataclass(frozen=True)
 class Assembler:
     """A link whose driver assembles sweeps of units."""
@@ -146,6 +160,7 @@ class Assembler:
 ASSEMBLERS = {
     "bridge": Assembler(bridge, 1, silent=11),
     "log of a bridge": Assembler(bridge_log, 1, silent=11),
+    "datagrams": Assembler(messages, 1, silent=11),
     "palm": Assembler(palm, ROUND, silent=25, steady_sweeps=2),  # it may begin within a round
     "log of samples": Assembler(
         bus_log,
@@ -190,7 +205,7 @@ def test_of_joints_a_message_is_a_reading_and_none_comes_after_a_later_one(
     last: tuple[int, int] = (0, -1)
     for unit in arrivals(plan, silent=5):
         angle = 0.001 * (unit.index % 1000) + unit.boot / 2**20
-        message = JointMessage(unit.index, None, ("FFJ3", "MFJ3"), np.full(2, angle))
+        message = JointMessage(Stamp(unit.index, None), ("FFJ3", "MFJ3"), np.full(2, angle))
         for reading in stream.receive(message.to_bytes(), unit.at) or ():
             assert set(reading.position_rad.tolist()) == {angle}
             assert (unit.boot, unit.index) > last

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from graspd.drivers.base import Fact, LinkCause, LinkError, Reading
-from graspd.drivers.joints import JointStreamDriver
+from graspd.drivers.datagrams.joints import JointStreamDriver
 from graspd.drivers.link import LinkState
 from graspd.drivers.udp import (
     Datagram,

@@ -18,7 +18,8 @@ import numpy as np
 
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.publish.messages import Verdict
-from graspd.drivers.joints import JointMessage
+from graspd.drivers.datagrams.joints import JointMessage
+from graspd.drivers.datagrams.messages import Stamp
 from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ
@@ -172,7 +173,7 @@ def joints_frozen(plan: Plan) -> Outcome:
                         angles = 0.8 + rng.normal(0.0, 0.0003, len(JOINT_NAMES))
                     elif not frozen_ns:
                         frozen_ns.append(time.monotonic_ns())
-                    message = JointMessage(seq, None, JOINT_NAMES, angles)
+                    message = JointMessage(Stamp(seq, None), JOINT_NAMES, angles)
                     sender.sendto(message.to_bytes(), ("127.0.0.1", port))
 
         def since_ns() -> int | None:

@@ -31,11 +31,13 @@ SCENES = {
     "can": 'driver = "can"\ninterface = "udp_multicast"\nchannel = "{group}"\n'
     'sequence = "electrodes"\narbitration_id = {id}',
     "palm": 'driver = "palm"\nsource = "udp://127.0.0.1:{port}"',
+    "datagrams": 'driver = "datagrams"\nsource = "udp://127.0.0.1:{port}"',
 }
 TWINS: dict[str, list[str]] = {
     "spi": ["--path", "{folder}/bridge"],
     "can": ["--channel", "{group}", "--arbitration-id", "{id}"],
     "palm": ["--to", "udp://127.0.0.1:{port}"],
+    "datagrams": ["--to", "udp://127.0.0.1:{port}"],
 }
 PORT = free_port(socket.SOCK_DGRAM)
 

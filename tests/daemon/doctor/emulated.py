@@ -20,10 +20,11 @@ from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Finding, Level
 from graspd.drivers.base import Driver, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
-from graspd.drivers.joints import JointStreamDriver
+from graspd.drivers.datagrams.joints import JointStreamDriver
+from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.palm.stream import PalmDriver
 from graspd.drivers.spi.driver import SpiBridgeDriver
-from graspd.drivers.twins.datagrams import JointTwin, PalmTwin
+from graspd.drivers.twins.datagrams import DatagramTwin, JointTwin, PalmTwin, TactileTwin
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -36,6 +37,7 @@ from tests.kit.scenes import written
 MS = 1_000_000
 FINGERS = ("ff", "mf", "th")
 NO_FAULTS = LinkFaults()
+LOOPBACK = "udp://127.0.0.1:0"
 
 
 class Hand:
@@ -94,44 +96,47 @@ def can(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver,
 
 
 @contextlib.contextmanager
-def palm(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver, Step]]:
-    """Packets over UDP, one a millisecond."""
-    clock = Clock()
-    cycles = PalmTwin(hand, faults=faults).cycles()
-    driver = PalmDriver("udp://127.0.0.1:0", clock=clock)
+def _udp(
+    twin: DatagramTwin, driver: PalmDriver | JointStreamDriver | TactileStreamDriver, clock: Clock
+) -> Iterator[tuple[Driver, Step]]:
+    """What a twin sends over UDP, at its own pace."""
+    cycles = twin.cycles()
     with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
 
         def step() -> None:
-            clock.now_ns += MS
+            clock.now_ns += twin.period_ns
             for datagram in next(cycles):
                 sender.sendto(datagram, ("127.0.0.1", driver.port or 0))
 
         yield driver, step
 
 
-@contextlib.contextmanager
-def joints(_hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver, Step]]:
-    """Joint angles over UDP, at 100 Hz."""
+def palm(hand: Hand, _folder: Path, faults: LinkFaults) -> Link:
+    """Packets, one a millisecond."""
     clock = Clock()
-    cycles = JointTwin(faults=faults).cycles()
-    driver = JointStreamDriver("udp://127.0.0.1:0", clock=clock)
-    with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    return _udp(PalmTwin(hand, faults=faults), PalmDriver(LOOPBACK, clock=clock), clock)
 
-        def step() -> None:
-            clock.now_ns += 10 * MS
-            for datagram in next(cycles):
-                sender.sendto(datagram, ("127.0.0.1", driver.port or 0))
 
-        yield driver, step
+def datagrams(hand: Hand, _folder: Path, faults: LinkFaults) -> Link:
+    """Counts as JSON, at 100 Hz."""
+    clock = Clock()
+    return _udp(TactileTwin(hand, faults=faults), TactileStreamDriver(LOOPBACK, clock=clock), clock)
+
+
+def joints(_hand: Hand, _folder: Path, faults: LinkFaults) -> Link:
+    """Joint angles, at 100 Hz."""
+    clock = Clock()
+    return _udp(JointTwin(faults), JointStreamDriver(LOOPBACK, clock=clock), clock)
 
 
 LINKS: dict[str, Callable[[Hand, Path, LinkFaults], Link]] = {
     "spi": spi,
     "can": can,
     "palm": palm,
+    "datagrams": datagrams,
     "joints": joints,
 }
-STEPS_PER_S = {"spi": 100, "can": 100, "palm": 1000, "joints": 100}
+STEPS_PER_S = {"spi": 100, "can": 100, "palm": 1000, "datagrams": 100, "joints": 100}
 
 
 def listen(driver: Driver, step: Step, steps: int, statistics: ElectrodeStatistics) -> None:

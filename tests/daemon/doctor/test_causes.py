@@ -24,7 +24,7 @@ from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Finding, Level
 from graspd.daemon.doctor.surroundings import can_finding
-from graspd.drivers.joints import JointStreamDriver
+from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.twins import spi as spi_twin
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -43,6 +43,7 @@ from tests.daemon.doctor.emulated import (
 )
 from tests.daemon.processes import start, wait_for
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
+from tests.kit.clock import Clock
 from tests.kit.crowd import crowded
 from tests.ports import free_port
 
@@ -365,11 +366,38 @@ def test_the_doctor_listens_above_descriptor_1024(tmp_path: Path, healthy: str) 
         assert look(tmp_path, healthy) == []
 
 
-def test_a_sender_that_only_from_refuses_is_named() -> None:
-    driver = JointStreamDriver("udp://127.0.0.1:0", only_from="127.0.0.2")
-    with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.sendto(b'{"joints": {"FFJ3": 0.1}}', ("127.0.0.1", driver.port or 0))
+SWEEP = json.dumps({"counts": {finger: [*range(2000, 2024)] for finger in FINGERS}})
+UNTIMED = SWEEP.encode()
+NUMBERED = SWEEP.replace("{", '{"seq": 5, ', 1).encode()
+
+
+@pytest.mark.parametrize(
+    ("only_from", "data", "cause", "says"),
+    [
+        ("127.0.0.2", NUMBERED, Cause.FOREIGN_SENDER, "of 127.0.0.1 are refused by only_from"),
+        (
+            None,
+            NUMBERED.replace(b"{", b'{"hand": "left", ', 1),
+            Cause.FOREIGN_SENDER,
+            "other hands",
+        ),
+        (None, UNTIMED, Cause.MESSAGES, "but 20 bad messages"),
+        (None, NUMBERED, Cause.REPEATED, "but 19 old messages"),
+        (None, b"", Cause.SILENT, "link greeting"),
+    ],
+    ids=["refused", "another hand", "no number", "all repeats", "nothing"],
+)
+def test_datagrams_that_give_no_reading_are_explained(
+    only_from: str | None, data: bytes, cause: Cause, says: str
+) -> None:
+    clock = Clock()
+    driver = TactileStreamDriver("udp://127.0.0.1:0", only_from=only_from, clock=clock)
+    with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for _ in range(20 if data else 0):
+            sender.sendto(data, ("127.0.0.1", driver.port or 0))
+            driver.read_ready()
+        clock.now_ns += 500_000_000
         driver.read_ready()
-        (told,) = doctor.examine(driver, None, 1.0)
-    assert (told.level, told.cause) == (Level.ERROR, Cause.FOREIGN_SENDER)
-    assert "datagrams of 127.0.0.1 are refused by only_from" in told.what
+        (told,) = doctor.examine(driver, ElectrodeStatistics(FINGERS), 1.0)
+    assert (told.level, told.cause) == (Level.ERROR, cause)
+    assert says in told.what

@@ -25,7 +25,8 @@ from graspd.daemon.doctor.link import (
 from graspd.daemon.record.player import McapCounters
 from graspd.drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
 from graspd.drivers.can.frames import CanCounters
-from graspd.drivers.joints import JointCounters
+from graspd.drivers.datagrams.joints import JointCounters
+from graspd.drivers.datagrams.tactile import TactileCounters
 from graspd.drivers.palm.packet import PalmCounters
 from graspd.drivers.recordings.csv_player import ReplayCounters
 from graspd.drivers.spi.sweeps import BridgeCounters
@@ -233,7 +234,8 @@ def test_a_recording_has_no_link() -> None:
 
 
 def test_counters_that_are_told_exist_and_have_a_cause_and_advice() -> None:
-    kinds = (BridgeCounters, CanCounters, PalmCounters, JointCounters, ReplayCounters, McapCounters)
+    messages = (JointCounters, TactileCounters)
+    kinds = (BridgeCounters, CanCounters, PalmCounters, *messages, ReplayCounters, McapCounters)
     told = {name for names in COUNTERS.values() for name in names}
     names = {name for kind in kinds for name in kind().as_dict()}
     others = {name for names in NOT_OURS.values() for name in names}

@@ -43,7 +43,8 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
             "spi": Cause.DAMAGED,
             "can": Cause.DAMAGED,
             "palm": Cause.DAMAGED,
-            "joints": Cause.JOINTS,
+            "datagrams": Cause.MESSAGES,
+            "joints": Cause.MESSAGES,
         },
     ),
     "lost frames": (LinkFaults(drop_probability=0.05), dict.fromkeys(LINKS, Cause.FRAMES_LOST)),
@@ -57,7 +58,7 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
     ),
     "a link that breaks": (
         LinkFaults(disconnect_every_frames=50),
-        dict.fromkeys(("spi", "palm"), Cause.LINK_LOST),
+        dict.fromkeys(("spi", "palm", "datagrams", "joints"), Cause.LINK_LOST),
     ),
     "another protocol version": (
         LinkFaults(wrong_version=True),
@@ -65,19 +66,19 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
     ),
     "a dead electrode": (
         LinkFaults(dead_electrodes=((2, 23),)),
-        dict.fromkeys(("spi", "can", "palm"), Cause.ELECTRODE_DEAD),
+        dict.fromkeys(("spi", "can", "palm", "datagrams"), Cause.ELECTRODE_DEAD),
     ),
     "one sensor unplugged": (
         LinkFaults(unplugged_fingers=(1,)),
-        dict.fromkeys(("spi", "can", "palm"), Cause.SENSOR_ABSENT),
+        dict.fromkeys(("spi", "can", "palm", "datagrams"), Cause.SENSOR_ABSENT),
     ),
     "all sensors unplugged": (
         LinkFaults(unplugged_fingers=(0, 1, 2)),
-        dict.fromkeys(("spi", "palm"), Cause.SENSOR_ABSENT),
+        dict.fromkeys(("spi", "palm", "datagrams"), Cause.SENSOR_ABSENT),
     ),
     "a clock that stands": (
         LinkFaults(stuck_clock=True),
-        {"spi": Cause.CLOCK, "palm": Cause.REPEATED},
+        {"spi": Cause.CLOCK, **dict.fromkeys(("palm", "datagrams", "joints"), Cause.REPEATED)},
     ),
     "a silent board": (LinkFaults(drop_probability=1.0), dict.fromkeys(LINKS, Cause.SILENT)),
 }

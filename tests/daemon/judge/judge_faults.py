@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from graspd.biotac import COUNT_MAX
 from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.datagrams.tactile import TactileStream
 from graspd.drivers.palm.packet import ROUND
 from graspd.drivers.palm.stream import PalmStream
-from graspd.drivers.twins.datagrams import PalmTwin
+from graspd.drivers.twins.datagrams import PalmTwin, TactileTwin
 from graspd.drivers.twins.faults import LinkFaults
 from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.fault_bench import Fault, Step
@@ -206,6 +207,26 @@ def on_a_palm_link(faults: LinkFaults) -> Fault:
     return spoil
 
 
+def in_datagrams(faults: LinkFaults, *, delay_ms: int = 0) -> Fault:
+    """A fault between a sender of JSON and the host, and a delay that was not there before."""
+
+    def spoil(sound: Sequence[Step]) -> list[Step]:
+        counts = [step.tactile.counts for step in sound if step.tactile is not None]
+        sent = TactileTwin(counts, FINGERS, faults=faults).cycles()
+        stream = TactileStream(FINGERS, "right")
+        for data in next(sent):
+            stream.receive(data, sound[0].now_ns)
+        steps: list[Step] = []
+        for step, datagrams in zip(sound[1:], sent, strict=False):
+            steps.append(dataclasses.replace(step, tactile=None))
+            now_ns = step.now_ns + delay_ms * MS
+            readings = [made for data in datagrams for made in stream.receive(data, now_ns) or ()]
+            steps += [Step(now_ns, reading, None) for reading in readings]
+        return sorted(steps, key=lambda step: step.now_ns)
+
+    return spoil
+
+
 def ring_on_a_palm(sweeps: int) -> Fault:
     """The same between palm and host, with packets that lack nothing."""
     link = on_a_palm_link(LinkFaults())
@@ -266,6 +287,13 @@ FAULTS: dict[str, Fault] = {
     "palm, unplugged": on_a_palm_link(LinkFaults(unplugged_fingers=(2,))),
     "palm, ring of 8": ring_on_a_palm(8),
     "palm's request stands": on_a_palm_link(LinkFaults(stuck_clock=True)),
+    "JSON, drops half": in_datagrams(LinkFaults(drop_probability=0.5)),
+    "JSON, sent twice": in_datagrams(LinkFaults(duplicate_probability=1.0)),
+    "JSON, reordered": in_datagrams(LinkFaults(reorder_probability=0.3)),
+    "JSON, disconnects": in_datagrams(LinkFaults(disconnect_every_frames=8)),
+    "JSON, unplugged": in_datagrams(LinkFaults(unplugged_fingers=(2,))),
+    "JSON, topic repeats": in_datagrams(LinkFaults(stuck_clock=True)),
+    "JSON, queue of 0.15 s": in_datagrams(LinkFaults(), delay_ms=150),
 }
 """`one`, `nine`: electrodes of one finger. Those of a palm come through its packets."""
 EARLIER = {

@@ -83,6 +83,13 @@ palm, dead electrode  =               =               =               =         
 palm, unplugged       sensor-missing  sensor-missing  sensor-missing  sensor-missing  sensor-missing
 palm, ring of 8       frozen          frozen          frozen          frozen          frozen
 palm's request stands stale           stale           stale           stale           stale
+JSON, drops half      =               =               =               =               =
+JSON, sent twice      =               =               =               =               =
+JSON, reordered       =               =               =               =               =
+JSON, disconnects     stale           stale           stale           ~stale          stale
+JSON, unplugged       sensor-missing  sensor-missing  sensor-missing  sensor-missing  sensor-missing
+JSON, topic repeats   stale           stale           stale           stale           stale
+JSON, queue of 0.15 s stale           stale           stale           stale           stale
 """
 """`=`: as without the fault, reading by reading, for it is harmless there. A reason: always
 `unknown`, and of the reasons that the sound grasp does not give at that reading this one comes most

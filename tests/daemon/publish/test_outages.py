@@ -19,7 +19,8 @@ import numpy as np
 
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.messages import Verdict
-from graspd.drivers.joints import JointMessage
+from graspd.drivers.datagrams.joints import JointMessage
+from graspd.drivers.datagrams.messages import Stamp
 from graspd.drivers.twins.spi import SpiTwin
 from tests.bench.attacks.doors import hand
 from tests.bench.attacks.hang_ups import HANG_UPS, hang_up
@@ -70,7 +71,7 @@ def send_joints(port: int, flow: threading.Event, stop: threading.Event) -> None
         while not stop.wait(JOINT_PERIOD_S):
             if flow.is_set():
                 angles = 0.8 + JOINT_NOISE_RAD * random.standard_normal(len(JOINTS))
-                message = JointMessage(seq, None, JOINTS, angles)
+                message = JointMessage(Stamp(seq, None), JOINTS, angles)
                 with contextlib.suppress(OSError):  # the daemon is not there
                     sender.send(message.to_bytes())
                 seq += 1

@@ -66,7 +66,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (
             "[tactile]\ndriver = 'i2c'\nrecordings = ['a']",
             "tactile.driver",
-            "there are: replay, spi, can, palm",
+            "there are: replay, spi, can, palm, datagrams",
         ),
         ("[tactile]\ndriver = 'spii'", "tactile.driver", "no driver 'spii'; did you mean spi?"),
         ("[tactile]\ndriver = 'replay'\nrecordings = []", "tactile.recordings", "at least 1"),

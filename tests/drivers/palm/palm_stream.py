@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from graspd.drivers.joints import JointStreamDriver
+from graspd.drivers.datagrams.joints import JointStreamDriver
+from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.palm.packet import Palm, PalmCounters, PalmPacket
 from graspd.drivers.palm.stream import PalmDriver, PalmStream
 from graspd.drivers.twins.datagrams import PalmTwin
@@ -104,7 +105,7 @@ def flags(reading: TactileReading, fault: ElectrodeFault) -> list[list[int]]:
 class Sender:
     """Sends datagrams to a driver from a socket of its own."""
 
-    def __init__(self, driver: PalmDriver | JointStreamDriver) -> None:
+    def __init__(self, driver: PalmDriver | JointStreamDriver | TactileStreamDriver) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         assert driver.port is not None
         self.target = ("127.0.0.1", driver.port)

@@ -12,12 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd.drivers.base import JOINTS, JointReading
-from graspd.drivers.joints import (
+from graspd.drivers.datagrams.joints import (
     JointCounters,
     JointMessage,
     JointStream,
     JointStreamDriver,
 )
+from graspd.drivers.datagrams.messages import Order, Stamp
 from graspd.drivers.link import LinkState
 from graspd.drivers.twins.datagrams import JointTwin
 from graspd.drivers.twins.faults import LinkFaults
@@ -59,7 +60,7 @@ def test_the_example_of_the_documentation_is_read() -> None:
         '{"seq": 1041, "t": 12.31, "joints": {"FFJ3": 0.51, "FFJ4": -0.02, "THJ5": 0.3}}'
     )
     assert found is not None
-    assert (found.seq, found.t_s) == (1041, 12.31)
+    assert found.stamp == (1041, 12.31)
     assert found.names == ("FFJ3", "FFJ4", "THJ5")
     assert found.position_rad.tolist() == [0.51, -0.02, 0.3]
     assert not any(counters.as_dict().values())
@@ -156,13 +157,13 @@ def test_damage_of_a_message_leaves_no_number_that_is_no_angle(
 
 
 def test_a_message_is_written_as_it_is_read() -> None:
-    sent = JointMessage(7, 1.5, ("FFJ3", "WRJ2"), np.array([0.1, -0.2]))
+    sent = JointMessage(Stamp(7, 1.5), ("FFJ3", "WRJ2"), np.array([0.1, -0.2]))
     found, _ = parse(sent.to_bytes())
     assert found is not None
-    assert (found.seq, found.t_s, found.names) == (7, 1.5, ("FFJ3", "WRJ2"))
+    assert (found.stamp, found.names) == ((7, 1.5), ("FFJ3", "WRJ2"))
     assert np.array_equal(found.position_rad, sent.position_rad)
     with pytest.raises(ValueError, match="not JSON compliant"):
-        JointMessage(7, 1.5, ("FFJ3",), np.array([math.nan])).to_bytes()
+        JointMessage(Stamp(7, 1.5), ("FFJ3",), np.array([math.nan])).to_bytes()
 
 
 @pytest.mark.parametrize(("length", "taken"), [(4096, True), (4097, False)])
@@ -184,10 +185,11 @@ def test_a_number_fits_into_a_signed_integer_of_64_bits(seq: int, taken: bool) -
 def test_a_jump_by_more_than_a_thousand_is_a_new_start(
     step: int, missed: int, restarts: int
 ) -> None:
-    stream = JointStream()
+    counters = JointCounters()
+    order = Order(counters)
     for seq in (5, 5 + step):
-        assert stream.admits(JointMessage(seq, None, (), np.empty(0)))
-    assert (stream.counters.missed_readings, stream.counters.restarts) == (missed, restarts)
+        assert order.admits(Stamp(seq, None))
+    assert (counters.missed_readings, counters.restarts) == (missed, restarts)
 
 
 @pytest.mark.parametrize(

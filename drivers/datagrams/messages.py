@@ -1,0 +1,144 @@
+"""JSON datagrams: one object a message, put in order by its sender's number and time."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from graspd.drivers.udp import DatagramCounters
+
+DATAGRAM_BYTES_MAX = 4096
+"""Longest message, bytes; 28 joints in full precision or five fingers take about 900."""
+SILENCE_NS: Final = 500_000_000
+"""Timeout of a link, ns: 50 messages at 100 Hz. A sender of 10 Hz passes."""
+NUMBER_MAX: Final = (1 << 63) - 1
+"""Largest number, either sign, that is read."""
+SEQ_JUMP_MAX: Final = 1000
+"""Largest jump ahead of `seq` that counts as a loss; after a larger one the sender restarted."""
+OLD_MESSAGES_MAX: Final = 10
+"""Old messages in a row, each after the one before, that may have been delayed; one more: a
+restart."""
+
+
+@dataclass(slots=True)
+class MessageCounters(DatagramCounters):
+    """Counters of messages. `missed_readings` stays 0 if the sender sends no `seq`."""
+
+    bad_messages: int = 0
+    old_messages: int = 0
+    """Messages that came again or after a later one; dropped."""
+    restarts: int = 0
+    unknown_names: int = 0
+    """Names that no joint or finger of a Shadow hand has; left out."""
+
+
+class Stamp(NamedTuple):
+    """Place of a message in its sender's stream."""
+
+    seq: int | None
+    """Number of the message, one more each time; None if the sender sends none."""
+    t_s: float | None
+    """Sender's own time, s, with any zero; None if the sender sends none."""
+
+    def is_after(self, other: Stamp) -> bool:
+        """Return False if the number or the time, where both have it, is not after the other."""
+        pairs = zip(self, other, strict=True)
+        return all(own is None or its is None or own > its for own, its in pairs)
+
+
+UNSTAMPED: Final = Stamp(None, None)
+
+
+class Message(NamedTuple):
+    """One message."""
+
+    stamp: Stamp
+    hand: object
+    """Name of the hand; None if the sender sends none."""
+    values: Mapping[str, Any]
+    """Measured values by name."""
+
+
+def write_message(stamp: Stamp, **fields: object) -> bytes:
+    """Return the datagram; fields that are None are left out. Raises `ValueError` for NaN."""
+    whole = {"seq": stamp.seq, "t": stamp.t_s, **fields}
+    message = {name: value for name, value in whole.items() if value is not None}
+    return json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
+
+
+def read_message(data: bytes, key: str) -> Message | None:
+    """Return the message of a datagram, with the values of `key`; None if it is not valid."""
+    if len(data) > DATAGRAM_BYTES_MAX:
+        return None
+    try:
+        # JSON has no NaN; as text it costs only the value that has it.
+        fields = json.loads(data.decode(), object_pairs_hook=_without_doubles, parse_constant=str)
+    except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
+        return None
+    if not isinstance(fields, dict) or not isinstance(fields.get(key), dict):
+        return None
+    seq, t_s = fields.get("seq"), fields.get("t")
+    if seq is not None and (type(seq) is not int or not 0 <= seq <= NUMBER_MAX):
+        return None
+    if t_s is not None:
+        t_s = number(t_s)
+        if math.isnan(t_s):
+            return None
+    return Message(Stamp(seq, t_s), fields.get("hand"), fields[key])
+
+
+def number(value: object) -> float:
+    """Return `value` if it is a finite number, else NaN. Booleans and text are no numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    return float(value) if abs(value) <= NUMBER_MAX else math.nan
+
+
+class Order:
+    """Tells which messages of a sender are new, and counts those that are lost."""
+
+    def __init__(self, counters: MessageCounters) -> None:
+        self._counters = counters
+        self._last = UNSTAMPED
+        """Newest number and time."""
+        self._last_old = UNSTAMPED
+        self._old_in_a_row = 0
+
+    def admits(self, stamp: Stamp) -> bool:
+        """Return True if the message is after those before, or the first of a new start."""
+        if not stamp.is_after(self._last):
+            if not self._has_restarted(stamp):
+                self._counters.old_messages += 1
+                return False
+            self._counters.restarts += 1
+            self._last = UNSTAMPED
+        last = self._last
+        if stamp.seq is not None and last.seq is not None:
+            self._count_gap(stamp.seq - last.seq - 1)
+        seq = last.seq if stamp.seq is None else stamp.seq
+        self._last = Stamp(seq, last.t_s if stamp.t_s is None else stamp.t_s)
+        self._old_in_a_row = 0
+        return True
+
+    def _has_restarted(self, stamp: Stamp) -> bool:
+        if not stamp.is_after(self._last_old):
+            self._old_in_a_row = 0
+        self._old_in_a_row += 1
+        self._last_old = stamp
+        return self._old_in_a_row > OLD_MESSAGES_MAX
+
+    def _count_gap(self, missed: int) -> None:
+        if missed > SEQ_JUMP_MAX:
+            self._counters.restarts += 1
+        else:
+            self._counters.missed_readings += missed
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    by_key = dict(pairs)
+    if len(by_key) < len(pairs):
+        raise ValueError("a key stands twice")
+    return by_key

@@ -1,0 +1,182 @@
+"""The tactile stream: one JSON object of counts per datagram; see deploy/wire/TACTILE.md."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS
+from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.datagrams.messages import (
+    DATAGRAM_BYTES_MAX,
+    SILENCE_NS,
+    UNSTAMPED,
+    Message,
+    MessageCounters,
+    Order,
+    read_message,
+)
+from graspd.drivers.udp import DatagramDriver
+
+CLOCK_STEP_NS: Final = 1_000_000_000
+"""Delay of the first message after a restart, ns, from which its time has another zero."""
+DRIFT: Final = 1000
+"""Clocks of two computers differ by less than one part in this; NTP slews by half of it."""
+LATE_NS: Final = 100_000_000
+"""Delay of a message, ns, from which it is counted as late: the usual age limit."""
+
+
+@dataclass(slots=True)
+class TactileCounters(MessageCounters):
+    """Counters of tactile messages."""
+
+    other_hands: int = 0
+    """Messages that name another hand; dropped."""
+    late_messages: int = 0
+    """Messages that took 100 ms longer than the quickest before; handed over with that age."""
+    absent_fingers: int = 0
+    """Fingers of the hand that a message lacks, or with all counts 0 or all 4095."""
+    wrong_sizes: int = 0
+    """Fingers without 24 counts: of another sensor."""
+    bad_counts: int = 0
+    """Values that are not a whole number in 0..4095."""
+
+
+class SenderClock:
+    """Bounds the age of messages by their sender's time, which may have any zero.
+
+    The quickest message so far is taken to be on the way for no time. A delay that was there from
+    the first message on, or that grows by less than 1 ms a second, is not seen.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns: int | None = None
+        """Smallest difference of reception and sender's time, ns; it grows with the drift."""
+        self._received_ns = 0
+
+    def made_ns(self, t_s: float | None, received_ns: int, *, restarted: bool = False) -> int:
+        """Return when a message was made at the latest, monotonic ns.
+
+        `t_s`: the sender's time, s, later than in the call before unless it `restarted`; None: not
+        known.
+        """
+        if t_s is None:
+            return received_ns
+        sent_ns = round(t_s * 1e9)
+        offset_ns = received_ns - sent_ns
+        if self._offset_ns is not None:
+            drift_ns = (received_ns - self._received_ns) // DRIFT
+            known_ns = self._offset_ns + drift_ns
+            if not restarted or offset_ns - known_ns < CLOCK_STEP_NS:
+                offset_ns = min(offset_ns, known_ns)
+        self._offset_ns, self._received_ns = offset_ns, received_ns
+        return sent_ns + offset_ns
+
+
+class TactileStream:
+    """Decoder of one sender's tactile messages into readings. A `DatagramStream`."""
+
+    sender_kind = "tactile stream"
+
+    def __init__(self, fingers: Sequence[str], hand: str) -> None:
+        """`fingers`: the rows of a reading. `hand`: name of the hand; messages may name it."""
+        self.counters = TactileCounters()
+        self._fingers = tuple(fingers)
+        self._hand = hand
+        self._order = Order(self.counters)
+        self._clock = SenderClock()
+        self._interrupted = False
+
+    def interrupt(self) -> None:
+        """Let the next reading not continue those before. The order of messages is kept, so that
+        no old one is taken for new."""
+        self._interrupted = self.counters.readings > 0
+
+    def receive(self, data: bytes, t_ns: int) -> list[TactileReading] | None:
+        """Return the reading of a message; None if the message is dropped."""
+        message, counters = read_message(data, "counts"), self.counters
+        if message is None or message.stamp == UNSTAMPED:
+            counters.bad_messages += 1
+            return None
+        if message.hand not in (None, self._hand):
+            counters.other_hands += 1
+            return None
+        restarts = counters.restarts
+        if not self._order.admits(message.stamp):
+            return None
+        restarted = counters.restarts > restarts
+        self._interrupted |= restarted
+        made_ns = self._clock.made_ns(message.stamp.t_s, t_ns, restarted=restarted)
+        counters.late_messages += t_ns - made_ns > LATE_NS
+        return [self._reading(message, made_ns)]
+
+    def _reading(self, message: Message, t_ns: int) -> TactileReading:
+        counters = self.counters
+        counters.unknown_names += sum(name not in FINGERS for name in message.values)
+        shape = (len(self._fingers), ELECTRODES)
+        counts, faults = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint8)
+        for row, finger in enumerate(self._fingers):
+            values = self._counts(message.values.get(finger))
+            if values is None:
+                faults[row] = ElectrodeFault.MISSING
+                continue
+            bad = [value is None for value in values]
+            counters.bad_counts += sum(bad)
+            faults[row, bad] = ElectrodeFault.NOT_A_COUNT
+            counts[row] = [value or 0 for value in values]
+        seq = counters.readings + counters.missed_readings
+        counters.readings += 1
+        counters.faulty_readings += bool(faults.any())
+        interrupted, self._interrupted = self._interrupted, False
+        return TactileReading(t_ns, seq, counts, faults, interrupted=interrupted)
+
+    def _counts(self, values: object) -> list[int | None] | None:
+        """Return the counts of a finger, None where it is none; None if it has no sensor."""
+        if values is None:
+            self.counters.absent_fingers += 1
+            return None
+        if not isinstance(values, list) or len(values) != ELECTRODES:
+            self.counters.wrong_sizes += 1
+            return None
+        counts = [_count(value) for value in values]
+        if set(counts) in ({0}, {COUNT_MAX}):
+            self.counters.absent_fingers += 1
+            return None
+        return counts
+
+
+def _count(value: object) -> int | None:
+    """Return a whole number in 0..4095, such as 2795 or 2795.0; None for anything else."""
+    if type(value) is float and value.is_integer():
+        value = int(value)
+    return value if type(value) is int and 0 <= value <= COUNT_MAX else None
+
+
+class TactileStreamDriver(DatagramDriver[TactileStream]):
+    """Driver of the tactile stream: one `TactileReading` per message."""
+
+    name = "datagrams"
+    bytes_max = DATAGRAM_BYTES_MAX
+    silence_ns = SILENCE_NS
+    period_ns: int | None = None
+
+    def __init__(
+        self,
+        source: str,
+        fingers: Sequence[str] = ("ff", "mf", "th"),
+        hand: str = "right",
+        *,
+        only_from: str | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`hand`: its name; messages that name another one are dropped."""
+        self._fingers = tuple(fingers)
+        self._hand = hand
+        super().__init__(source, only_from=only_from, clock=clock)
+
+    def _new_stream(self) -> TactileStream:
+        return TactileStream(self._fingers, self._hand)

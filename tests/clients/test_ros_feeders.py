@@ -1,0 +1,212 @@
+"""The feeders for ROS, with stand-ins for what they import of ROS, and the drivers they feed."""
+
+from __future__ import annotations
+
+import runpy
+import socket
+import sys
+from array import array
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+from graspd.drivers.base import JointReading, TactileReading
+from graspd.drivers.datagrams.joints import JointStreamDriver
+from graspd.drivers.datagrams.tactile import TactileStreamDriver
+from tests.clients.building import CPP
+from tests.drivers.one_sweep import tactile
+from tests.drivers.palm.palm_stream import joints
+from tests.kit.waiting import wait_until
+
+FOLDER = CPP.parent / "ros"
+START_S = 1_700_000_000
+SENSORS = 5
+"""Of `BiotacAll.tactiles`: first, middle, ring and little finger, thumb (sr_robot_msgs)."""
+
+
+@dataclass
+class Stamp:
+    """`ros::Time`, and `builtin_interfaces/Time` of ROS 2."""
+
+    sec: int
+    nanosec: int
+
+    def to_sec(self) -> float:
+        return self.sec + self.nanosec / 1e9
+
+
+@dataclass
+class Header:
+    """`std_msgs/Header`; `seq` is not read in ROS 2, which has none."""
+
+    seq: int
+    stamp: Stamp
+
+
+@dataclass
+class Biotac:
+    """`sr_robot_msgs/Biotac`. An absent sensor shows this memory (Shadow's documentation)."""
+
+    pac0: int = 0
+    pac1: int = 0
+    pdc: int = -9784
+    tac: int = 32518
+    tdc: int = 0
+    electrodes: array[int] = field(default_factory=lambda: array("h", [0] * 24))
+
+
+@dataclass
+class BiotacAll:
+    header: Header
+    tactiles: list[Biotac]
+
+
+@dataclass
+class JointState:
+    header: Header
+    name: list[str]
+    position: tuple[float, ...]
+
+
+def header(number: int) -> Header:
+    return Header(number, Stamp(START_S, number * 10_000_000))
+
+
+def sweep(number: int, *, repeats: int | None = None) -> BiotacAll:
+    """Counts of a hand with three sensors: 100 times the place of the sensor, and the number."""
+    sensors = [Biotac() for _ in range(SENSORS)]
+    for place in (0, 1, 4):
+        counts = [1000 + 100 * place + number] * 24
+        sensors[place] = Biotac(pdc=2779, tac=2006, tdc=2247, electrodes=array("h", counts))
+    return BiotacAll(header(number if repeats is None else repeats), sensors)
+
+
+ARM = JointState(header(900), ["ra_elbow_joint"], (1.5,))
+BOTH = JointState(header(1), ["rh_FFJ3", "lh_FFJ3", "rh_THJ5"], (0.5, 0.9, -0.1))
+MESSAGES = (
+    *(sweep(number) for number in (1, 2, 3)),
+    *(sweep(4, repeats=3), sweep(5, repeats=3)),
+    sweep(6),
+    *(ARM, BOTH, JointState(header(2), BOTH.name, ())),
+)
+"""The topic repeats its third message twice. Joints of an arm come on the topic of the hand's."""
+
+
+class Ros:
+    """The parts of `rospy` and of `rclpy` that the feeders use; spinning plays the messages."""
+
+    def __init__(self, parameters: dict[str, object]) -> None:
+        self._parameters = parameters
+        self.subscribed: dict[str, tuple[type, Callable[[Any], None]]] = {}
+
+    def init_node(self, name: str) -> None:
+        assert name == "graspd_feeder"
+
+    def get_param(self, name: str, default: object) -> object:
+        return self._parameters.get(name.removeprefix("~"), default)
+
+    def subscribe(self, topic: str, kind: type, callback: Callable[[Any], None]) -> None:
+        self.subscribed[topic] = kind, callback
+
+    def spin(self, _node: object = None) -> None:
+        for message in MESSAGES:
+            topic = "/rh/tactile" if isinstance(message, BiotacAll) else "/joint_states"
+            kind, callback = self.subscribed[topic]
+            assert isinstance(message, kind)
+            callback(message)
+
+    def modules(self) -> dict[str, dict[str, object]]:
+        def create_subscription(
+            kind: type, topic: str, callback: Callable[[Any], None], qos: object
+        ) -> None:
+            assert qos == "sensor data"
+            self.subscribe(topic, kind, callback)
+
+        def subscriber(
+            topic: str, kind: type, callback: Callable[[Any], None], queue_size: int
+        ) -> None:
+            assert queue_size == 1, "an old message is not to be sent"
+            self.subscribe(topic, kind, callback)
+
+        def create_node(name: str) -> SimpleNamespace:
+            self.init_node(name)
+            return SimpleNamespace(
+                declare_parameter=lambda *each: SimpleNamespace(value=self.get_param(*each)),
+                create_subscription=create_subscription,
+            )
+
+        return {
+            "rospy": {
+                "init_node": self.init_node,
+                "get_param": self.get_param,
+                "Subscriber": subscriber,
+                "spin": self.spin,
+            },
+            "rclpy": {
+                "init": lambda: None,
+                "create_node": create_node,
+                "spin": self.spin,
+            },
+            "rclpy.qos": {"qos_profile_sensor_data": "sensor data"},
+            "sensor_msgs": {},
+            "sensor_msgs.msg": {"JointState": JointState},
+            "sr_robot_msgs": {},
+            "sr_robot_msgs.msg": {"BiotacAll": BiotacAll},
+        }
+
+
+def free_ports() -> int:
+    """Return a UDP port that is free, as are those before and after it."""
+    while True:
+        with ExitStack() as stack:
+            probes = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(3)]
+            try:
+                probes[0].bind(("", 0))
+                middle: int = probes[0].getsockname()[1]
+                probes[1].bind(("", middle - 1))
+                probes[2].bind(("", middle + 1))
+            except OSError:
+                continue
+            return middle
+
+
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+@pytest.mark.parametrize("name", ["feed_ros1.py", "feed_ros2.py"])
+def test_a_feeder_sends_what_the_topics_have(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len((FOLDER / name).read_text().splitlines()) <= 40
+    port = free_ports()
+    for module, holds in Ros({"port": port}).modules().items():
+        stand_in = ModuleType(module)
+        vars(stand_in).update(holds)
+        monkeypatch.setitem(sys.modules, module, stand_in)
+    sweeps: list[TactileReading] = []
+    angles: list[JointReading] = []
+    with (
+        TactileStreamDriver(f"udp://127.0.0.1:{port}") as hand,
+        JointStreamDriver(f"udp://127.0.0.1:{port - 1}") as fingers,
+    ):
+        left = runpy.run_path(str(Path(FOLDER / name)))
+
+        def all_came() -> bool:
+            sweeps.extend(tactile(hand.read_ready()))
+            angles.extend(joints(fingers.read_ready()))
+            return len(sweeps) + hand.counters.as_dict()["old_messages"] == 6 and bool(angles)
+
+        wait_until(all_came)
+        left["SENDER"].close()
+        assert hand.sender == f"udp://127.0.0.1:{port + 1}"
+    assert [reading.counts.tolist() for reading in sweeps] == [
+        [[1000 + number] * 24, [1100 + number] * 24, [1400 + number] * 24]
+        for number in (1, 2, 3, 6)
+    ]
+    assert not any(reading.faults.any() for reading in sweeps)
+    (reading,) = angles
+    assert dict(zip(reading.names, reading.position_rad, strict=True)) == {
+        "FFJ3": 0.5,
+        "THJ5": -0.1,
+    }

@@ -1,0 +1,283 @@
+"""The tactile stream: what is a message, what a count, how old it is, and from whom."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
+from graspd.drivers.datagrams.tactile import SenderClock, TactileStream, TactileStreamDriver
+from graspd.drivers.twins.datagrams import TactileTwin
+from graspd.drivers.twins.faults import LinkFaults
+from graspd.drivers.udp import Datagram
+from tests.drivers.one_sweep import counts_of, number_of, tactile
+from tests.drivers.palm.palm_stream import DatagramClock, Sender, flags
+from tests.drivers.test_udp_link import Receiver
+
+MS = 1_000_000
+FINGERS = ("ff", "mf", "th")
+LOOPBACK = "udp://127.0.0.1:0"
+COUNTS = list(range(2000, 2024))
+
+
+def message(counts: object = None, **fields: object) -> bytes:
+    """A datagram with counts of three fingers, and number 1, unless told otherwise."""
+    whole = {"seq": 1, "counts": dict.fromkeys(FINGERS, COUNTS) if counts is None else counts}
+    return json.dumps({**whole, **fields}).encode()
+
+
+def received(*data: bytes) -> tuple[list[TactileReading], dict[str, int]]:
+    """Return the readings of datagrams 10 ms apart, and the counters that are not 0."""
+    stream = TactileStream(FINGERS, "right")
+    readings: list[TactileReading] = []
+    for number, each in enumerate(data):
+        readings += stream.receive(each, number * 10 * MS) or ()
+    return readings, {name: n for name, n in stream.counters.as_dict().items() if n}
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"seq": 7, "t": 12.5, "hand": "right", "v": 3},
+        {"counts": {"lf": None, **dict.fromkeys(FINGERS, [2795.0] * 24)}},
+        {"seq": None, "t": 0},
+    ],
+)
+def test_a_message_is_a_reading(fields: dict[str, object]) -> None:
+    (reading,), counters = received(message(**fields))
+    assert reading.counts.tolist() in ([COUNTS] * 3, [[2795] * 24] * 3)
+    assert not reading.faults.any()
+    assert counters == {"readings": 1}
+
+
+@pytest.mark.parametrize(
+    ("data", "counter"),
+    [
+        (b"", "bad_messages"),
+        (b'{"seq": 1}', "bad_messages"),
+        (message(counts=[COUNTS] * 3), "bad_messages"),
+        (message(seq=None), "bad_messages"),
+        (message(seq=-1), "bad_messages"),
+        (message(seq=1.0), "bad_messages"),
+        (message(t="now"), "bad_messages"),
+        (message(t=1e300), "bad_messages"),
+        (message(t=float("nan")), "bad_messages"),
+        (message(pad=" " * 4096), "bad_messages"),
+        (b'{"seq": 1, "counts": {"ff": [], "ff": []}}', "bad_messages"),
+        (message(hand="left"), "other_hands"),
+        (message(hand=["right"]), "other_hands"),
+    ],
+)
+def test_another_message_is_counted_and_dropped(data: bytes, counter: str) -> None:
+    assert received(data) == ([], {counter: 1})
+
+
+@pytest.mark.parametrize(
+    ("finger", "faults", "counter", "number"),
+    [
+        (None, {ElectrodeFault.MISSING: 24}, "absent_fingers", 1),
+        ([0] * 24, {ElectrodeFault.MISSING: 24}, "absent_fingers", 1),
+        ([4095] * 24, {ElectrodeFault.MISSING: 24}, "absent_fingers", 1),
+        (COUNTS[:19], {ElectrodeFault.MISSING: 24}, "wrong_sizes", 1),
+        ([*COUNTS, 2024], {ElectrodeFault.MISSING: 24}, "wrong_sizes", 1),
+        ("2000", {ElectrodeFault.MISSING: 24}, "wrong_sizes", 1),
+        ([*COUNTS[:21], 4096, -1, 0.5], {ElectrodeFault.NOT_A_COUNT: 3}, "bad_counts", 3),
+        ([*COUNTS[:20], None, True, "7", float("nan")], {ElectrodeFault.NOT_A_COUNT: 4},
+         "bad_counts", 4),
+        ([0, 4095, *COUNTS[:22]], {}, None, 0),
+    ],
+)  # fmt: skip
+def test_what_is_no_count_costs_no_other(
+    finger: object, faults: dict[ElectrodeFault, int], counter: str | None, number: int
+) -> None:
+    (reading,), counters = received(message({"ff": COUNTS, "mf": finger, "th": COUNTS}))
+    assert reading.counts[[0, 2]].tolist() == [COUNTS] * 2
+    for fault in ElectrodeFault:
+        assert len(flags(reading, fault)) == faults.get(fault, 0)
+    assert not reading.counts[reading.faults != 0].any()
+    assert counters == {
+        "readings": 1,
+        **({} if counter is None else {"faulty_readings": 1, counter: number}),
+    }
+
+
+def test_a_finger_without_a_name_is_left_out_and_counted() -> None:
+    (reading,), counters = received(message(dict.fromkeys((*FINGERS, "rf", "FF"), COUNTS)))
+    assert reading.counts.tolist() == [COUNTS] * 3
+    assert counters == {"readings": 1, "unknown_names": 1}
+
+
+@pytest.mark.parametrize(
+    ("stamps", "taken"),
+    [
+        ([{"seq": n} for n in (5, 5, 4, 6)], [0, 3]),
+        ([{"seq": None, "t": n} for n in (5, 5, 4, 6)], [0, 3]),
+        ([{"seq": n, "t": 1} for n in range(20)], [0]),
+        ([{"seq": 1, "t": n} for n in range(20)], [0]),
+        ([{"seq": 5}, {"seq": None, "t": 9}, {"seq": 5}, {"seq": None, "t": 9}], [0, 1]),
+        ([{"seq": n, "t": n / 100} for n in (500, *range(12))], [0, 11, 12]),
+    ],
+    ids=["by number", "by time", "time stands", "number stands", "in turns", "a new start"],
+)
+def test_what_is_not_new_is_dropped(stamps: list[dict[str, Any]], taken: list[int]) -> None:
+    readings, counters = received(*[
+        message({"ff": [1000 + place] * 24}, **stamp) for place, stamp in enumerate(stamps)
+    ])  # fmt: skip
+    assert [int(reading.counts[0, 0]) - 1000 for reading in readings] == taken
+    assert counters["old_messages"] == len(stamps) - len(taken)
+
+
+@pytest.mark.parametrize(
+    ("sent", "made"),
+    [
+        # Sender's time, s; reception and result, ms.
+        ([(5.0, 100), (5.01, 110), (5.02, 150), (5.03, 151)], [100, 110, 120.04, 130.041]),
+        ([(5.0, 150), (5.01, 110), (5.02, 120)], [150, 110, 120]),
+        ([(5.0, 100), (None, 150), (5.02, 160)], [100, 150, 120.06]),
+        # A clock that is too slow by 0.05 %, and a queue that grows by 1 %.
+        ([(0.0, 0), (1.0, 1000.5), (2.0, 2001)], [0, 1000.5, 2001]),
+        ([(0.0, 0), (1.0, 1010), (2.0, 2020)], [0, 1001.01, 2002.02]),
+    ],
+)
+def test_no_message_is_younger_than_its_delay(
+    sent: list[tuple[float | None, float]], made: list[float]
+) -> None:
+    clock = SenderClock()
+    found = [clock.made_ns(t_s, round(received_ms * MS)) / MS for t_s, received_ms in sent]
+    assert found == pytest.approx(made, abs=0.001)
+
+
+@pytest.mark.parametrize(("zero_s", "made_ms"), [(4.5, 1511), (3.0, 2020)])
+def test_a_restart_may_have_another_zero_of_time(zero_s: float, made_ms: float) -> None:
+    clock = SenderClock()
+    clock.made_ns(5.0, 1000 * MS)
+    made_ns = clock.made_ns(zero_s + 1.01, 2020 * MS, restarted=True)
+    assert made_ns / MS == pytest.approx(made_ms, abs=0.03)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> DatagramClock:
+    clock = DatagramClock()
+    clock.rule(monkeypatch)
+    return clock
+
+
+@pytest.fixture
+def driver(clock: DatagramClock) -> Iterator[TactileStreamDriver]:
+    with TactileStreamDriver(LOOPBACK, FINGERS, "right", clock=clock) as driver:
+        yield driver
+
+
+def test_a_gap_is_a_loss_and_a_new_sender_other_sensors(
+    driver: TactileStreamDriver, clock: DatagramClock
+) -> None:
+    with Sender(driver) as sender, Sender(driver) as other:
+        sender.send(message(seq=3), message(seq=4), message(seq=7))
+        readings = tactile(driver.read_ready())
+        first = dict.fromkeys(FINGERS, f"udp://127.0.0.1:{sender.port}")
+        assert driver.serials == first
+        other.send(message(seq=9))
+        assert list(driver.read_ready()) == []
+        clock.now_ns += 500 * MS
+        assert list(driver.read_ready()) == []
+        other.send(message(seq=9))
+        readings += tactile(driver.read_ready())
+        assert driver.serials == dict.fromkeys(FINGERS, f"udp://127.0.0.1:{other.port}")
+    assert [reading.seq for reading in readings] == [0, 1, 4, 6]
+    assert [reading.interrupted for reading in readings] == [False, False, False, True]
+    assert driver.counters.missed_readings == 3
+    assert driver.counters.foreign_datagrams == 1
+
+
+def test_a_twin_sends_what_a_driver_reads() -> None:
+    faults = LinkFaults(dead_electrodes=((0, 6),), unplugged_fingers=(1,))
+    sweeps = [counts_of(number_of(number)) for number in range(3)]
+    sent = [data for cycle in TactileTwin(sweeps, faults=faults).cycles() for data in cycle]
+    readings, counters = received(*sent)
+    assert counters == {"readings": 3, "faulty_readings": 3, "absent_fingers": 3}
+    assert [reading.counts[2].tolist() for reading in readings] == [
+        sweep[2].tolist() for sweep in sweeps
+    ]
+    assert {int(reading.counts[0, 6]) for reading in readings} == {0}
+    with pytest.raises(ValueError, match="wrong-version"):
+        TactileTwin(sweeps, faults=LinkFaults(wrong_version=True))
+
+
+HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
+ACTIONS = ("send", "lose", "copy", "late", "stall", "stale", "stranger", "short", "left", "rail")
+
+
+@st.composite
+def links(draw: st.DrawFn) -> list[tuple[str, int]]:
+    """Draw what becomes of each message, and for how many periods it is held back."""
+    action = st.tuples(st.sampled_from(ACTIONS), st.integers(1, 20))
+    runs = draw(st.lists(st.tuples(action, st.integers(1, 12)), min_size=1, max_size=15))
+    return [("send", 0), *(each for each, times in runs for _ in range(times))]
+
+
+def arrivals(plan: list[tuple[str, int]]) -> list[tuple[int, Datagram, int]]:
+    """Return reception in ns, datagram and place of its sweep; the sender's time is 10 ms a sweep.
+
+    A stranger's datagram, or one that must give no count, has place -1.
+    """
+    found: list[tuple[int, Datagram, int]] = []
+    held_until = 0
+    for place, (action, periods) in enumerate(plan):
+        good = {finger: [number_of(place)] * 24 for finger in FINGERS}
+        stamp = {"seq": place, "t": 70.0 + place / 100}
+        now = max(place, held_until)
+        if action == "stall":  # a queue before the sender's socket
+            now = held_until = max(held_until, place + periods)
+        sender = THERE if action == "stranger" else HERE
+        data = message(good, **stamp)
+        if action == "short":
+            data = message({**good, "mf": good["mf"][:19]}, **stamp)
+        elif action == "rail":
+            data = message({**good, "mf": [0] * 24}, **stamp)
+        elif action == "left":
+            data = message(good, hand="left", **stamp)
+        elif action == "stale":  # counted by the sender, but the topic repeats its last sweep
+            data = message(good, seq=place, t=70.0 + (place - 1) / 100)
+        elif action == "late":
+            now += periods
+        if action != "lose":
+            lost = action in ("stranger", "left")
+            found.append((now, Datagram(data, 0, sender), -1 if lost else place))
+        if action == "copy":
+            found.append((now + periods, Datagram(data, 0, sender), place))
+    found.sort(key=lambda each: each[0])  # those of one time stay in their order
+    return [(10 * MS * periods, datagram, place) for periods, datagram, place in found]
+
+
+@settings(max_examples=300, deadline=None)
+@given(links())
+def test_no_count_is_older_than_its_reading_says(plan: list[tuple[str, int]]) -> None:
+    receiver, clock = Receiver(), DatagramClock()
+    start_ns = clock.now_ns
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("graspd.drivers.udp.DatagramReceiver", lambda *_: receiver)
+        driver = TactileStreamDriver(LOOPBACK, FINGERS, "right", clock=clock)
+        driver.open()
+        last = -1
+        for received_ns, datagram, place in arrivals(plan):
+            clock.now_ns = start_ns + received_ns
+            receiver.waiting.append(datagram)
+            readings: list[Reading] = [*driver.read_ready(), *driver.read_ready()]
+            if driver.sender != "udp://127.0.0.1:7":
+                return  # after 0.5 s of silence: other sensors
+            for reading in tactile(readings):
+                sound = reading.faults == 0
+                assert set(reading.counts[sound].tolist()) == {number_of(place)}
+                assert place > last or driver.counters.as_dict()["restarts"]
+                # The first message came at once; clocks may drift by 0.1 %.
+                sent_ns = start_ns + 10 * MS * place
+                assert reading.t_ns <= sent_ns + received_ns // 1000
+                assert not sound[1].any() or plan[place][0] not in ("short", "rail")
+                last = place
+        driver.close()
+    assert last >= 0, "the first message is read"
