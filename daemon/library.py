@@ -21,6 +21,7 @@ from graspd.daemon.assembly.plan import require_mcap
 from graspd.daemon.assembly.sources import Source, Tables
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
+from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
@@ -150,11 +151,14 @@ def judge(
     """Yield the verdict on each reading, as `graspd replay RECORDING...` says it.
 
     `recordings`: grasp tables or streams (CSV), or the files of one run in order (MCAP). `model`:
-    a name or a path; by default the one that judged then, of CSV files small-session.
+    a name or a path; by default the one that judged then, of CSV files small-session. A warning at
+    the end says why nothing, or little, was judged.
     Raises `SceneError`, `RecordingError` or `ModelError`.
     """
     if isinstance(recordings, str | os.PathLike):
         recordings = [recordings]
+    said: list[str] = []
+    why = Unjudged(said.append)
     with ExitStack() as stack:
         paths = stack.enter_context(files_of([Path(path) for path in recordings]))
         parts = _parts(paths, {} if model is None else {"path": _path(model).absolute()})
@@ -164,13 +168,18 @@ def judge(
         around.open_drivers()
         while not driver.exhausted:
             for reading in driver.read_ready():
+                why.on_reading(reading)
                 if isinstance(reading, JointReading):
                     pipeline.observe_joints(reading)
                     continue
                 received_ns = time.monotonic_ns()
                 judgement = pipeline.judge(reading)
+                why.add(judgement, reading.made_ns)
                 yield outbox.verdict(judgement, received_ns, assembly.NO_SILENCE_NS)[0]
                 pipeline.learn()
+    why.end(driver.counters)
+    if said:
+        warnings.warn("\n".join(dict.fromkeys(said)), stacklevel=2)
 
 
 def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:

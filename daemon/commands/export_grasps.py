@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     export = collect(args.recordings)
     write_lines(_summary(export))
     if not export.grasps:
-        complain("no judged grasp with an outcome: nothing is written")
+        complain(f"no judged grasp with an outcome: nothing is written: {_why(export)}")
         return FAILED
     try:
         if args.parquet:
@@ -90,6 +90,17 @@ def _summary(export: Export) -> str:
     }
     counted = [f"{count} {what}" for what, count in further.items() if count]
     return "; ".join([f"{len(grasps)} grasps, {slipped} slipped", *counted])
+
+
+def _why(export: Export) -> str:
+    """Return why there is no grasp, in words."""
+    if export.repaired:
+        return "all were judged with repaired electrodes"
+    if export.without_outcome:
+        return "the controller told no outcome"
+    if export.unjoined:
+        return "the grasps of these outcomes were judged in other recordings"
+    return "no grasp was judged; `graspd replay` says why"
 
 
 def _name(text: str) -> str:

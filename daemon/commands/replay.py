@@ -25,6 +25,7 @@ from graspd.daemon.run.day_table import PUBLISHED, DayTable
 from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.run.replaying import Controller, trained_on
 from graspd.daemon.run.summary import Printer, trained_on_line
+from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.session import file as session_file
@@ -150,7 +151,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 0 when the recordings were played to their end."""
+    """Replay; 0 when the recordings were played to their end, 1 when nothing was judged."""
     if args.wait is not None and args.publish is None:
         raise UsageError("--wait is for subscribers: it needs --publish")
     if args.only_lifted and args.recordings and not args.outcomes:
@@ -185,6 +186,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         if isinstance(source, Tables):
             shown.result.trained_on = trained_on(args.recordings, model)
         told = [shown]
+    why = Unjudged(complain)
     controller = Controller(only_lifted=args.only_lifted)
     if args.outcomes:
         told.append(controller)
@@ -204,13 +206,15 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
             if not came and stop.received is None:
                 where = f"{sockets.endpoint} within {args.wait:g} s"
                 raise PublishError(f"no subscriber of {where}")
-        companions = [*around.companions, *told]
+        companions = [*around.companions, *told, why]
         loop = Loop(parts.drivers, pipeline, around.build_outbox(), stop, companions, timing)
         stack.callback(lambda: shown.summary(pipeline.trust))
         stack.callback(loop.close)
         stack.callback(controller.tell)
         loop.run()
-    return 0 if stop.received is None else 128 + stop.received
+    if stop.received is not None:
+        return 128 + stop.received
+    return 0 if why.end(parts.drivers[0].counters) else 1
 
 
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:

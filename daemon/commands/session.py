@@ -21,6 +21,7 @@ from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
 from graspd.daemon.run.replaying import trained_on
+from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.scene import drivers as scene_drivers
 from graspd.daemon.scene.scene import GateMode
 from graspd.daemon.session.file import KeptSession, SessionFileError
@@ -210,7 +211,9 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
     session, trust = pipeline.session, pipeline.trust
     with SessionFolder(wanted.session_path) as folder:
         before = list(_readable(folder.load()).values())
-        judgements = _judge(plan, pipeline)
+        unjudged = Unjudged(complain)
+        judgements = _judge(plan, pipeline, unjudged)
+        unjudged.end()
         readings = len(judgements)
         outcomes = 0 if trust is None else trust.learner.outcomes
         grasps, state = outcomes, None
@@ -323,7 +326,7 @@ def _check(plan: Plan, model: TactileModel, state: SessionState) -> None:
     pipeline = assembly.build_pipeline(plan, model, learns=False)
     if pipeline.session is not None:
         pipeline.session.restore(state)
-    again = _judge(plan, pipeline)
+    again = _judge(plan, pipeline, Unjudged(lambda _: None))
     unlike = sum(Reason.NEVER_SEEN in judgement.reasons for judgement in again)
     if 2 * unlike > len(again):
         trained = sum(file.rows for file in model.contract.datasets)
@@ -345,14 +348,16 @@ def _on_recordings(
     return wanted.model_copy(update=changes)
 
 
-def _judge(plan: Plan, pipeline: Pipeline) -> list[Judgement]:
+def _judge(plan: Plan, pipeline: Pipeline, unjudged: Unjudged) -> list[Judgement]:
     """Judge the recordings; tell each known outcome after its grasp."""
     judgements: list[Judgement] = []
     for reading in _readings(plan):
+        unjudged.on_reading(reading)
         if isinstance(reading, JointReading):
             pipeline.observe_joints(reading)
             continue
         judgement = pipeline.judge(reading)
+        unjudged.add(judgement, reading.made_ns)
         if not judgement.moment.judged:
             continue
         judgements.append(judgement)

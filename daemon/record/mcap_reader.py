@@ -47,9 +47,9 @@ RATIO_MAX: Final = 100
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
-    *(OverflowError, MemoryError),
+    *(OverflowError, MemoryError, OSError),
 )
-"""Exceptions of the library for a damaged file; huge lengths cause the last two."""
+"""Exceptions for a damaged file; huge lengths cause `OverflowError` and `MemoryError`."""
 _MESSAGE: Final = struct.Struct("<HIQQ")
 """Channel, number, log time and publish time, before the content of a message."""
 

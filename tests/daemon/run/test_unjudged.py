@@ -1,0 +1,85 @@
+"""Where nothing is judged, every summary says why in words, and the exit code is 1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from graspd import judge
+from graspd.daemon.cli import main
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+
+Change = Callable[[pd.DataFrame], pd.DataFrame]
+REST_ROWS, GRASP_ROWS = 100, 300
+"""Rows of the open hand with which the demo begins, and rows until the first grasp is over."""
+
+
+def times(factor: float) -> Change:
+    return lambda stream: stream.assign(t=stream.t * factor)
+
+
+def every(rows: int) -> Change:
+    return lambda stream: stream.iloc[::rows]
+
+
+def in_degrees(stream: pd.DataFrame) -> pd.DataFrame:
+    joints = [name for name in stream.columns if "J" in name]
+    return stream.assign(**{name: stream[name] * 57.29578 for name in joints})
+
+
+def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
+    """The thumb rests where it is in the first row, with noise of three counts."""
+    thumb = [name for name in stream.columns if name.startswith("th_")]
+    noise = np.random.default_rng(1).normal(0.0, 3.0, (len(stream), len(thumb)))
+    stream.loc[:, thumb] = (stream[thumb].iloc[0].to_numpy() + noise).round().astype(int)
+    return stream
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (times(1e3), "readings are 10 s apart: is the time in milliseconds?"),
+        (times(1e6), "readings are 10000 s apart: is the time in microseconds?"),
+        (times(1e-6), "readings are 0.01 us apart: is the time in seconds, with fractions?"),
+        (lambda stream: stream.assign(t=stream.t // 1.0), "readings are 0 us apart"),
+        (every(10), "readings are 100 ms apart (10 Hz): a grasp settles from 20 Hz on"),
+        (in_degrees, "rad is not a joint angle: is it in degrees?"),
+        (lambda stream: stream[REST_ROWS:], "no second of an open hand comes first"),
+        (lambda stream: stream[: REST_ROWS + 5], "no finger touched: the hand was open"),
+        (without_thumb, "th never touched: all required fingers hold a grasp"),
+    ],
+)
+def test_a_stream_without_a_judgement_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Change, cause: str
+) -> None:
+    path = tmp_path / "stream.csv"
+    change(pd.read_csv(DEMO_RECORDING)[:GRASP_ROWS]).to_csv(path, index=False)
+    assert main(["replay", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert "nothing was judged:" in said
+    assert cause in said
+    with pytest.warns(UserWarning, match="nothing was judged") as warned:
+        list(judge(path))
+    assert cause in str(warned[0].message)
+
+
+def test_a_table_of_broken_sensors_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = pd.read_csv(DEMO_TABLE)
+    electrodes = [name for name in table.columns if "biotac" in name]
+    random = np.random.default_rng(1)
+    table[electrodes] = random.choice([0, 4095], (len(table), len(electrodes)))
+    table.to_csv(tmp_path / "table.csv", index=False)
+    assert main(["replay", str(tmp_path / "table.csv")]) == 1
+    said = capsys.readouterr().err
+    assert f"{len(table)} of {len(table)} readings saturated: electrodes at 0 or 4095" in said
+
+
+def test_what_is_judged_needs_no_word(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(DEMO_RECORDING)]) == 0
+    assert capsys.readouterr().err == ""
