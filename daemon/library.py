@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from graspd.drivers.base import JointReading
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
 from graspd.models import trial, zoo
 from graspd.models.contract import CLASSES, ModelError, SessionInput
-from graspd.models.counts import check_fingers, counts_of
+from graspd.models.counts import check_fingers, column_names, counts_of, write_csv
 from graspd.models.judge.grasp_judge import Examined, GraspJudge
 from graspd.models.runtime import read
 
@@ -144,23 +145,21 @@ def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> Gr
 
 
 def judge(
-    recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | ArrayLike,
     *,
     model: str | os.PathLike[str] | None = None,
 ) -> Iterator[Verdict]:
     """Yield the verdict on each reading, as `graspd replay RECORDING...` says it.
 
-    `recordings`: grasp tables or streams (CSV), or the files of one run in order (MCAP). `model`:
-    a name or a path; by default the one that judged then, of CSV files small-session. A warning at
-    the end says why nothing, or little, was judged.
-    Raises `SceneError`, `RecordingError` or `ModelError`.
+    `recordings`: grasp tables or streams (CSV), or the files of one run in order (MCAP); or a table
+    as `read_grasps` and `read_recording` return it. `model`: a name or a path; by default the one
+    that judged then, of CSV files and tables small-session. A warning at the end says why nothing,
+    or little, was judged. Raises `SceneError`, `RecordingError`, `ModelError` or `ValueError`.
     """
-    if isinstance(recordings, str | os.PathLike):
-        recordings = [recordings]
     said: list[str] = []
     why = Unjudged(said.append)
     with ExitStack() as stack:
-        paths = stack.enter_context(files_of([Path(path) for path in recordings]))
+        paths = stack.enter_context(files_of(_files(recordings, stack)))
         parts = _parts(paths, {} if model is None else {"path": _path(model).absolute()})
         pipeline, driver = parts.pipeline, parts.drivers[0]
         around = Assembly(parts, stack)
@@ -180,6 +179,24 @@ def judge(
     why.end(driver.counters)
     if said:
         warnings.warn("\n".join(dict.fromkeys(said)), stacklevel=2)
+
+
+def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
+    """Return the paths of recordings; a table is written into a file until `stack` closes."""
+    if column_names(recordings):
+        return [write_csv(recordings, stack.enter_context(TemporaryDirectory()))]
+    if isinstance(recordings, str | os.PathLike):
+        recordings = [recordings]
+    try:
+        paths = [Path(path) for path in recordings]
+    except TypeError as error:
+        given = type(recordings).__name__
+        raise ValueError(
+            f"it judges files and tables, not {given}: GraspModel.predict takes counts"
+        ) from error
+    if not paths:
+        raise ValueError("no recording was given")
+    return paths
 
 
 def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:

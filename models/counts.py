@@ -5,8 +5,10 @@ The names of a table's columns, and the values by name, are all that is asked of
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,6 +61,19 @@ def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
     return tuple(finger for finger in FINGERS if electrode_columns(finger)[0] in names)
 
 
+def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
+    """Write a table into a file, a missing value as an empty cell; return its path.
+
+    Raises `ValueError` for a column that is there twice.
+    """
+    names, path = column_names(table), Path(folder, "table.csv")
+    _refuse_twice(names, names)
+    columns = [np.ma.array(_without_na(table[name])).tolist() for name in names]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([names, *zip(*columns, strict=True)])
+    return path
+
+
 def check_fingers(fingers: Sequence[str]) -> None:
     """Raise `ValueError` for a name that is not a finger's, or that is there twice."""
     unknown = [finger for finger in fingers if finger not in FINGERS]
@@ -75,11 +90,15 @@ def _of_table(table: Any, names: Sequence[str], fingers: Sequence[str]) -> NDArr
         begin = ", ".join(map(str, names[:3]))
         first = missing[0] if missing else "ff_biotac_1"
         raise ValueError(f"the table has no column {first}; its columns begin with {begin}")
+    _refuse_twice(needed, names)
+    columns = [_numbers(_without_na(table[name]), f"the column {name}") for name in needed]
+    return np.stack(columns, axis=-1).reshape(-1, len(fingers), ELECTRODES)
+
+
+def _refuse_twice(needed: Sequence[str], names: Sequence[str]) -> None:
     twice = [name for name in needed if names.count(name) > 1]
     if twice:
         raise ValueError(f"the table has the column {twice[0]} more than once")
-    columns = [_numbers(_without_na(table[name]), f"the column {name}") for name in needed]
-    return np.stack(columns, axis=-1).reshape(-1, len(fingers), ELECTRODES)
 
 
 def _without_na(column: Any) -> Any:  # noqa: ANN401

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import functools
 import io
 import json
@@ -326,6 +327,41 @@ def test_a_stream_is_judged_as_replay_judges_it() -> None:
     got = [{name: each[name] for name in names} for each in judged]
     assert {each["verdict"] for each in got} >= {"stable", "unknown"}
     assert got == expected
+
+
+@pytest.mark.parametrize(
+    "given", ["columns by name", "Arrow", "polars", "pandas of its own integers"]
+)
+def test_a_table_is_judged_as_its_file(
+    counts: NDArray[np.float64], tmp_path: Path, given: str
+) -> None:
+    values = counts[:12].copy()
+    values[3, 1, 7] = np.nan
+    held = columns(values)
+    rows = [
+        ["" if each is None else each for each in row] for row in zip(*held.values(), strict=True)
+    ]
+    with (path := tmp_path / "grasps.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([list(held), *rows])
+    told = [
+        [(each.verdict, each.p_slip, each.reasons) for each in graspd.judge(recording, model="mlp")]
+        for recording in (path, GIVEN[given](values))
+    ]
+    assert {each[0] for each in told[0]} >= {"stable", "slip"}
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (np.zeros((1, 3, 24)), "files and tables, not ndarray: GraspModel.predict takes counts"),
+        ([[2000]], "files and tables, not list"),
+        ([], "no recording was given"),
+    ],
+)
+def test_what_is_no_recording_is_refused(given: Any, words: str) -> None:  # noqa: ANN401
+    with pytest.raises(ValueError, match=words):
+        list(graspd.judge(given))
 
 
 def examples() -> list[str]:
