@@ -61,7 +61,7 @@ def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoi
             pass
         looked_ns = clock.now_ns
         publisher.send(b"verdict.right", verdict(1, Decision.STABLE))
-        time.sleep(0.2)
+        time.sleep(2.0)  # to look before it is there would empty the queue
         clock.now_ns += 900 * MS
         view = View(endpoint)
         for topic, payload in feed.take():
