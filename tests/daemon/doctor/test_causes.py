@@ -41,10 +41,11 @@ from tests.daemon.doctor.emulated import (
     refused,
     scene_of,
 )
-from tests.daemon.processes import start, wait_for
+from tests.daemon.processes import start
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
 from tests.kit.clock import Clock
 from tests.kit.crowd import crowded
+from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
 
@@ -155,12 +156,15 @@ def test_a_reader_without_a_lock_is_told_with_its_pid(tmp_path: Path, healthy: s
 def test_a_port_that_graspd_itself_holds_is_told(tmp_path: Path, healthy: str) -> None:
     scene = scene_of(tmp_path, healthy)
     with start("run", scene) as daemon:
-        wait_for(tmp_path / "graspd")
-        (told,) = look(tmp_path, scene.read_text())
-        while told["cause"] == "socket-held":  # it opens the port after the sockets
-            (told,) = look(tmp_path, scene.read_text())
+        found: list[dict[str, str]] = []
+
+        def is_held() -> bool:  # it opens the port after the sockets, and locks it then
+            found[:] = look(tmp_path, scene.read_text())
+            return [each["cause"] for each in found] == ["port-held"]
+
+        wait_until(is_held)
         daemon.send_signal(signal.SIGTERM)
-    assert told["cause"] == "port-held"
+    (told,) = found
     assert f"PID {daemon.pid}, " in told["what"]
     assert f"run {scene}" in told["what"]
     assert told["advice"].startswith("graspd itself runs")
