@@ -125,5 +125,5 @@ class LinkLogs(Source):
             raise ValueError("link logs are of the drivers can and spi")
         from graspd.drivers.recordings.can_log import CanLog
 
-        board = tactile.model_dump(exclude={"driver", "interface", "channel", "bitrate", "options"})
+        board = tactile.model_dump(exclude={"driver", "interface", "bitrate", "options"})
         return CanLog(self._paths, fingers, speed=speed, **board)

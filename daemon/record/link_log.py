@@ -53,9 +53,9 @@ def tap_of(driver: Driver, section: Tactile) -> Tap | None:
     """Return a tap on a CAN or serial link; None for other drivers."""
     if isinstance(section, CanTactile):
         from graspd.drivers.can.driver import CanBridgeDriver
-        from graspd.drivers.recordings.can_log import encode_frames
+        from graspd.drivers.recordings.can_log import bus_name, encode_frames
 
-        name = section.channel.replace(" ", "_")
+        name = bus_name(section.channel)
         tap = Tap(".can.log", lambda _, offset_ns, frames: encode_frames(frames, offset_ns, name))
         if isinstance(driver, CanBridgeDriver):
             driver.tap(tap.take)

@@ -1,47 +1,43 @@
-"""The link log of a CAN bus: text as `candump -L` writes and `canplayer` reads it.
-
-A line is `(1436509052.249713) can0 100#0D3A1F`: seconds, bus, id of three or eight digits, data. A
-remote frame has `R` instead of data. Bit 29 of an id marks an error frame (can-utils, lib.c and
-linux/can.h). python-can's own reader drops the classes of an error frame, reads most as data, takes
-half a byte for a whole one, and ends at the first line that is none.
-"""
+"""The logs of CAN buses as a driver, and the frames of a link as lines of `candump -L`."""
 
 from __future__ import annotations
 
-import re
+import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Unpack
 
 from graspd.drivers.base import Reading, RecordingError
-from graspd.drivers.can.frames import (
-    ERR_FLAG,
-    ERROR,
-    EXTENDED,
-    EXTENDED_ID_MAX,
-    LOST,
-    REMOTE,
-    STANDARD_ID_MAX,
-    CanFrame,
-    Stamped,
-)
+from graspd.drivers.can.frames import ERR_FLAG, ERROR, EXTENDED, LOST, REMOTE, CanFrame, Stamped
 from graspd.drivers.can.stream import BoardOptions, CanStream
-from graspd.drivers.recordings.kinds import open_recording, read_lines
+from graspd.drivers.recordings.can_files import read_asc, read_blf, read_trc
+from graspd.drivers.recordings.candump import ANY_BUS, NS_PER_S, Line, read_candump
+from graspd.drivers.recordings.kinds import PAGE, Kind, kind_of, open_recording, read_lines
 from graspd.drivers.recordings.player import LinkLogDriver
 
 NS_PER_US: Final = 1000
+IDS_MAX: Final = 4096
+"""Most pairs of bus and id that are counted; standard frames of one bus have half as many."""
+SHOWN_MAX: Final = 8
+"""Most buses or ids in a message."""
+SHOWN_LENGTH_MAX: Final = 80
+"""Most characters of a line in a message."""
+SET_BACK_NS: Final = 1_000_000_000
+"""Fall of the time, ns, from which on the clock was set or another log begins."""
+STEPS_SHARE: Final = 0.25
+"""Share of times that are not above the one before, from which on they are steps."""
 
-_LINE: Final = re.compile(
-    r"\(([0-9]{1,11})\.([0-9]{6})\) (\S{1,64}) ([0-9A-F]{3}|[0-9A-F]{8})#"
-    r"(?:((?:[0-9A-F]{2}){0,8})|(R[0-9A-F]?))(?: [RT])?\s*",
-    re.IGNORECASE | re.ASCII,
-)
+_TEXTS: Final = {Kind.CANDUMP: read_candump, Kind.ASC: read_asc, Kind.TRC: read_trc}
+
+_log = logging.getLogger(__name__)
 
 
 def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
     """Return a frame as a line of `candump -L`. `wall_ns`: arrival, ns since 1970."""
-    seconds, rest_ns = divmod(wall_ns, 1_000_000_000)
+    seconds, rest_ns = divmod(wall_ns, NS_PER_S)
     word = frame.arbitration_id
     if frame.flags & ERROR:
         identifier = f"{word | ERR_FLAG:08X}"
@@ -61,23 +57,61 @@ def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> by
     return "".join(lines).encode()
 
 
-def frame_of(line: str) -> tuple[int, str, CanFrame] | None:
-    """Return a line's time, ns since 1970, bus and frame; None if it is no such line."""
-    match = _LINE.fullmatch(line)
-    if match is None:
-        return None
-    wall_ns = int(match[1]) * 1_000_000_000 + int(match[2]) * NS_PER_US
-    word, data = int(match[4], 16), bytes.fromhex(match[5] or "")
-    flags = REMOTE if match[6] else 0
-    if len(match[4]) == 8:
-        flags |= ERROR if word & ERR_FLAG else EXTENDED
-    elif word > STANDARD_ID_MAX:
-        return None
-    return wall_ns, match[3], CanFrame(word & EXTENDED_ID_MAX, data, flags)
+def bus_name(channel: str) -> str:
+    """Return the name of a scene's channel in a log, where names have no spaces."""
+    return channel.replace(" ", "_")
+
+
+def read_log(path: Path) -> Iterator[Line]:
+    """Yield what a CAN log of any kind has. Raises `RecordingError`."""
+    kind = kind_of(path)
+    with open_recording(path) as stream:
+        if kind is Kind.BLF:
+            yield from read_blf(stream)
+            return
+        if kind not in _TEXTS:
+            raise RecordingError(path, f"is {kind.value}, not a CAN log; {PAGE} lists those")
+        lines = (line.decode("latin-1") for line in read_lines(path, stream))
+        yield from _TEXTS[kind](lines)
+
+
+@dataclass(slots=True)
+class Survey:
+    """Buses, ids and strange lines of a log, counted before it is played."""
+
+    lines: int = 0
+    strange: int = 0
+    """Lines that were not understood."""
+    first: str = ""
+    """The first of them, with its number."""
+    frames: Counter[tuple[str, int | None]] = field(default_factory=Counter)
+    """Frames of a bus and arbitration id; None: CAN FD."""
+    has_steps: bool = False
+    """True if times are since the frame before (`candump -td`)."""
+
+    @classmethod
+    def of(cls, path: Path) -> Survey:
+        """Read a log once. Raises `RecordingError`."""
+        survey, steps, still, last_ns = cls(), 0, 0, -1
+        for number, text, logged in read_log(path):
+            survey.lines += 1
+            if logged is None:
+                survey.strange += 1
+                survey.first = survey.first or f"line {number}, {text.strip()[:SHOWN_LENGTH_MAX]!r}"
+                continue
+            if logged.may_be_step and logged.t_ns is not None:
+                steps += 1
+                still += logged.t_ns <= last_ns
+                last_ns = logged.t_ns
+            key = logged.bus, None if logged.frame is None else logged.frame.arbitration_id
+            if logged.t_ns is not None and (key in survey.frames or len(survey.frames) < IDS_MAX):
+                survey.frames[key] += 1
+        survey.has_steps = still > STEPS_SHARE * steps
+        return survey
 
 
 class CanLog(LinkLogDriver[CanFrame]):
-    """Play candump text through the driver's `CanStream`."""
+    """Play CAN logs through the driver's `CanStream`, one bus of them."""
 
     stream: CanStream
 
@@ -86,31 +120,100 @@ class CanLog(LinkLogDriver[CanFrame]):
         paths: Sequence[Path],
         fingers: Sequence[str],
         *,
+        channel: str | None = None,
         speed: float | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """Take the arguments of `RecordedDriver` and `CanStream`. Raises `ValueError`."""
+        """`channel`: the bus to play, of logs of several. Others: of `RecordedDriver`, `CanStream`.
+
+        Raises `ValueError`.
+        """
         super().__init__(paths, speed, clock)
         self._fingers, self._board = fingers, board
+        self._channel = None if channel is None else bus_name(channel)
         self._bus: str | None = None
+        self._surveys: dict[Path, Survey] = {}
+        self._shift_ns = self._last_ns = 0
         self.begin()
 
+    def open(self) -> None:
+        """Read the logs once, to choose the bus and report what is strange, then start."""
+        self._surveys = {path: Survey.of(path) for path in self.paths}
+        frames: Counter[tuple[str, int | None]] = Counter()
+        for path, survey in self._surveys.items():
+            if survey.strange == survey.lines:
+                problem = f"no line was understood: {survey.first}; record with `candump -L`"
+                raise RecordingError(path, problem)
+            if survey.strange:
+                _log.warning(
+                    "%s: %d of %d lines were not understood; the first is %s",
+                    path,
+                    survey.strange,
+                    survey.lines,
+                    survey.first,
+                )
+            frames += survey.frames
+        self._bus = self._choose({bus for bus, _ in frames})
+        self._warn_of_ids(frames)
+        super().open()
+
+    def _choose(self, buses: set[str]) -> str:
+        """Return the bus to play. Raises `RecordingError` if that is not clear."""
+        names = ", ".join(sorted(buses)[:SHOWN_MAX])
+        if len(buses) == 1:
+            (only,) = buses
+            if self._channel not in (None, only):
+                _log.warning(
+                    "%s: has no channel %s; played is %s", self.paths[0], self._channel, only
+                )
+            return only
+        if self._channel not in buses:
+            problem = f"has the channels {names}: set tactile.channel to one of them"
+            raise RecordingError(self.paths[0], problem)
+        _log.info("%s: has the channels %s; played is %s", self.paths[0], names, self._channel)
+        return self._channel
+
+    def _warn_of_ids(self, frames: Counter[tuple[str, int | None]]) -> None:
+        """Warn if no frame of the bus has the board's arbitration id."""
+        wanted = self._board.get("arbitration_id")
+        ids = {key[1]: count for key, count in frames.items() if key[0] == self._bus}
+        if wanted is None or wanted in ids:
+            return
+        most = sorted(ids, key=lambda each: -ids[each])[:SHOWN_MAX]
+        names = ", ".join("CAN FD" if each is None else f"{each:#x}" for each in most)
+        _log.warning(
+            "%s: no frame has tactile.arbitration_id %#x; there are %s",
+            self.paths[0],
+            wanted,
+            names,
+        )
+
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
-        with open_recording(path) as stream:
-            for number, line in enumerate(read_lines(path, stream), 1):
-                timed_frame = frame_of(line.decode("ascii", "replace"))
-                if timed_frame is None:
-                    continue
-                wall_ns, bus, frame = timed_frame
-                if bus != self._bus and self._bus is not None:
-                    problem = f"is of bus {bus!r}, those before of {self._bus!r}; play one alone"
-                    raise RecordingError(path, problem, line=number)
-                self._bus = bus
-                yield wall_ns, frame
+        has_steps, since_ns = self._surveys[path].has_steps, 0
+        for _, _, logged in read_log(path):
+            if logged is None:
+                continue
+            if logged.t_ns is not None:
+                since_ns = logged.t_ns + (since_ns if has_steps else 0)
+            if logged.bus not in (self._bus, ANY_BUS):
+                continue
+            if logged.frame is None:
+                self.stream.counters.malformed_frames += 1
+                continue
+            yield self._going_on(since_ns), logged.frame
+
+    def _going_on(self, t_ns: int) -> int:
+        """Return a time that does not fall where the clock was set back: the link was silent."""
+        t_ns += self._shift_ns
+        if t_ns < self._last_ns - SET_BACK_NS:
+            self._shift_ns += self._last_ns + SET_BACK_NS - t_ns
+            t_ns = self._last_ns + SET_BACK_NS
+        self._last_ns = t_ns
+        return t_ns
 
     def begin(self) -> None:
-        self._bus = None
+        self._shift_ns = self._last_ns = 0
         self.stream = CanStream("link log", self._fingers, **self._board)
         self.stream.link.greeting()
 

@@ -62,16 +62,19 @@ _MAGIC: Final = {
     b"#ROSBAG V2.0": Kind.ROS1_BAG,
     b"LOGG": Kind.BLF,
     b";$FILEVERSION": Kind.TRC,
+    b";#########": Kind.TRC,  # version 1.0
 }
 _BYTE_ORDER_MARKS: Final = (b"\xef\xbb\xbf", b"\xff\xfe", b"\xfe\xff")
+_SPACE: Final = rb"(?:[ \t]|\x1b\[[0-9;]*m)"
+"""A blank, or the code of a colour."""
 _CANDUMP_LINE: Final = re.compile(
-    rb"^[ \t]*(?:\([^)\r\n]{1,40}\))?[ \t]*[!-~]{1,64}[ \t]+"
-    rb"(?:[0-9A-F]{3}|[0-9A-F]{8})(?:#[0-9A-FR#_. \t]*|[ \t]+\[ ?[0-9]{1,2}\][ \t].*)"
-    rb"(?:[ \t]+[RT])?[ \t]*\r?$",
+    rb"^" + _SPACE + rb"*(?:\([^)\r\n]{1,40}\))?" + _SPACE + rb"*[!-~]{1,64}" + _SPACE + rb"+"
+    rb"(?:(?:[0-9A-F]{3}|[0-9A-F]{8})#[0-9A-FR#_. \t]*(?:[ \t]+[RT])?"
+    rb"|(?:[RT]X [-B] [-E][ \t]+)?[0-9A-F]{1,8}[ \t]+\[ ?[0-9]{1,2}\].*)[ \t]*\r?$",
     re.IGNORECASE | re.MULTILINE,
 )
 """A frame as candump writes it into a file, `can0 100#0D3A`, or shows it, `can0 100 [2] 0D 3A`."""
-_ASC_LINE: Final = re.compile(rb"^base (?:hex|dec)\s+timestamps ", re.IGNORECASE | re.MULTILINE)
+_ASC_LINE: Final = re.compile(rb"^base\s+(?:hex|dec)\b", re.IGNORECASE | re.MULTILINE)
 _SQLITE: Final = b"SQLite format 3\0"
 _SERIAL_EVENTS: Final = frozenset((1, 2, 3))
 """Types of the records of `graspd.drivers.recordings.serial_log`."""

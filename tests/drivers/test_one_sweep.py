@@ -24,7 +24,8 @@ from graspd.drivers.datagrams.messages import Stamp, write_message
 from graspd.drivers.datagrams.tactile import TactileStream
 from graspd.drivers.link import LinkState
 from graspd.drivers.palm.stream import PalmStream
-from graspd.drivers.recordings.can_log import CanLog, frame_of, line_of
+from graspd.drivers.recordings.can_log import CanLog, line_of
+from graspd.drivers.recordings.candump import parse
 from graspd.drivers.recordings.serial_log import SerialLog, encode_records, parse_records
 from graspd.drivers.spi.driver import LineEvent
 from graspd.drivers.spi.messages import FrameParser, Ping, Sweep, encode
@@ -90,10 +91,11 @@ def bus_log(_first: int) -> Feed:
 
     def feed(unit: Unit) -> Sequence[Reading]:
         frame = sample(unit, SEQUENCES["electrodes"])
-        logged = frame_of(line_of(frame, unit.at * SLOT_NS, "can0"))
+        logged = parse(line_of(frame, unit.at * SLOT_NS, "can0"))
         assert logged is not None
-        t_ns, _, frame = logged
-        return log.feed(t_ns, frame)
+        assert logged.t_ns is not None
+        assert logged.frame is not None
+        return log.feed(logged.t_ns, logged.frame)
 
     return feed
 

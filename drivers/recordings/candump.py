@@ -1,0 +1,127 @@
+"""Lines of candump, as it writes them to a file (`-L`, `-l`) or shows them on a terminal.
+
+In a file: `(1436509052.249713) can0 100#0D3A1F`: seconds, bus, id of three or eight digits, data.
+On a terminal: ` (1436509052.249713)  can0  100   [3]  0D 3A 1F   '.:.'`. The time has any number
+of decimals. With `-ta` and `-tA` it is since 1970, with `-tz` since the first frame, and with `-td`
+since the frame before. A remote frame has `R` or `remote request` instead of data, a frame of
+CAN FD `##` or a length of two digits. Bit 29 of an id marks an error frame (can-utils: candump.c,
+lib.c; linux/can.h). python-can's own reader drops the classes of an error frame, reads most as
+data, takes half a byte for a whole one, and ends at the first line that is not a frame.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from typing import Final, NamedTuple
+
+from graspd.drivers.can.frames import (
+    ERR_FLAG,
+    ERROR,
+    EXTENDED,
+    EXTENDED_ID_MAX,
+    LOST,
+    REMOTE,
+    STANDARD_ID_MAX,
+    CanFrame,
+)
+
+NS_PER_S: Final = 1_000_000_000
+_LINE: Final = re.compile(
+    r"""\s*
+    \((?P<date>\d{4}-\d\d-\d\d\ \d\d:\d\d:)?(?P<seconds>\d{1,11})(?:\.(?P<decimals>\d{1,18}))?\)
+    \s+(?P<bus>\S{1,64})\s+
+    (?:
+        (?P<id>[0-9A-F]{3}|[0-9A-F]{8})\#
+        (?:(?P<data>(?:[0-9A-F]{2}){0,8})|(?P<remote>R[0-9A-F]?)|(?P<fd>\#[0-9A-F]+))
+        (?:_[9A-F])?(?:\s[RT])?
+    |
+        (?:[RT]X\ [-B]\ [-E]\s+)?(?P<shown_id>[0-9A-F]{1,8})\s+
+        (?:
+            \[\s?(?P<length>[0-8])\](?:
+                (?P<shown>(?:\s+[0-9A-F]{2}){0,8})(?:\s+(?:ERRORFRAME.*|'.*'))?
+                |\s+(?P<shown_remote>remote\ request)
+            )
+            |(?P<shown_fd>\[\d\d\](?:\s[\s0-9A-F]*)?)
+        )
+    )\s*""",
+    re.IGNORECASE | re.ASCII | re.VERBOSE,
+)
+_DROPS: Final = re.compile(
+    r"DROPCOUNT: dropped \d+ CAN frames? on '([^',]*)[^']*' socket.*", re.ASCII
+)
+"""Line of `candump -d` where the kernel dropped frames."""
+_COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
+ANY_BUS: Final = "any"
+"""Bus of a loss that is of all of them."""
+
+
+class Logged(NamedTuple):
+    """A frame of a CAN log with its time and bus."""
+
+    t_ns: int | None
+    """Time by the log's clock, ns; None: that of the frame before."""
+    bus: str
+    frame: CanFrame | None
+    """None: a frame of CAN FD."""
+    may_be_step: bool = False
+    """True if the time may be that since the frame before."""
+
+
+Line = tuple[int, str, Logged | None]
+"""A line's number and text, and what it has; None: it was not understood."""
+
+
+def read_candump(lines: Iterable[str]) -> Iterator[Line]:
+    """Yield the lines that are not blank and not comments (`#`)."""
+    for number, text in enumerate(lines, 1):
+        if text.strip() and not text.startswith("#"):
+            yield number, text, parse(text)
+
+
+def parse(text: str) -> Logged | None:
+    """Return what a line has; None if it is not one of candump."""
+    if "\x1b" in text:
+        text = _COLOUR.sub("", text)
+    found = _LINE.fullmatch(text)
+    if found is None:
+        drops = _DROPS.fullmatch(text.rstrip())
+        return None if drops is None else Logged(None, drops[1], CanFrame(0, b"", LOST))
+    t_ns, frame, is_fd = _time_of(found), _frame_of(found), found["fd"] or found["shown_fd"]
+    if t_ns is None or (frame is None and not is_fd):
+        return None
+    may_be_step = found["shown_id"] is not None and found["date"] is None
+    return Logged(t_ns, found["bus"], None if is_fd else frame, may_be_step)
+
+
+def _time_of(found: re.Match[str]) -> int | None:
+    decimals = (found["decimals"] or "")[:9].ljust(9, "0")
+    seconds = int(found["seconds"])
+    if found["date"]:
+        try:
+            date = datetime.fromisoformat(f"{found['date']}{seconds:02}")
+        except ValueError:
+            return None
+        seconds = round(date.replace(tzinfo=UTC).timestamp())
+    return seconds * NS_PER_S + int(decimals)
+
+
+def _frame_of(found: re.Match[str]) -> CanFrame | None:
+    """Return the frame of a line; None for an id or length that cannot be."""
+    digits = found["id"] or found["shown_id"]
+    data = bytes.fromhex(found["data"] or found["shown"] or "")
+    is_remote = bool(found["remote"] or found["shown_remote"])
+    if found["length"] and not is_remote and len(data) != int(found["length"]):
+        return None
+    return frame_of(int(digits, 16), data, is_long=len(digits) > 3, is_remote=is_remote)
+
+
+def frame_of(word: int, data: bytes, *, is_long: bool, is_remote: bool) -> CanFrame | None:
+    """Return a frame; None for an id that cannot be. `is_long`: the id is of 29 bits."""
+    flags = REMOTE if is_remote else 0
+    if is_long:
+        flags |= ERROR if word & ERR_FLAG else EXTENDED
+    elif word > STANDARD_ID_MAX:
+        return None
+    return CanFrame(word & EXTENDED_ID_MAX, data, flags)
