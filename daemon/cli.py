@@ -20,6 +20,7 @@ from typing import NoReturn
 from graspd.daemon import __version__
 from graspd.daemon.commands.arguments import Parser, UsageError
 from graspd.daemon.process import logs
+from graspd.daemon.process.files import is_linux
 from graspd.daemon.process.text import complain
 from graspd.extras import needs
 
@@ -62,6 +63,8 @@ EXTRAS = {
     "report": "train,report",
 }
 """Extra that a command needs to run; its help works without."""
+LINUX = {"run", "doctor", "keys"}
+"""Commands that need Linux, also for their help."""
 LIBRARIES = ("onnxruntime", "numpy", "pyzmq", "python-can", "pyserial")
 """Libraries whose versions `--version` prints."""
 WRONG = 2
@@ -76,6 +79,9 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     """Return the named command with its arguments. Raises `SystemExit` for a wrong line."""
     arguments = sys.argv[1:] if arguments is None else arguments
     named = next((word for word in arguments if not word.startswith("-")), None)
+    if named in LINUX and not is_linux():
+        complain(f"graspd {named} needs Linux")
+        raise SystemExit(WRONG)
     parser = _parser(lambda name: name == named)
     if not arguments:
         parser.print_help(sys.stderr)

@@ -25,6 +25,9 @@ OUTAGE_NS: Final = 2_000_000_000
 WARNINGS_MAX = 8
 """Most warnings in one outage, each for another reason; the log cannot fill up."""
 
+READABLE: Final = 1
+"""POLLIN of poll(2), which Python has not on all systems."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -46,7 +49,7 @@ def longest_silence_ns(period_ns: int | None) -> int:
     return max(SILENCE_PERIODS * (period_ns or 0), SILENCE_MIN_NS)
 
 
-def is_ready(descriptor: int, event: int = select.POLLIN) -> bool:
+def is_ready(descriptor: int, event: int = READABLE) -> bool:
     """Return True if the descriptor has this event of `poll` now, or is broken."""
     poll = select.poll()
     poll.register(descriptor, event)

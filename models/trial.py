@@ -94,14 +94,8 @@ def _try(path: Path, content: bytes) -> None:
 
 def main() -> None:
     """Try the model on stdin, in its own process; print why it is refused."""
-    import ctypes
-    import resource
-    import signal
-
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    with suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
-        resource.setrlimit(resource.RLIMIT_CPU, (round(TRIAL_S), round(TRIAL_S) + 1))
+    with suppress(ModuleNotFoundError):  # else only its time is limited
+        _limit_process()
     path, file = Path(sys.argv[1]), ModelFile(sys.stdin.buffer.read())
     try:
         check_operators(path, file.data)
@@ -115,3 +109,19 @@ def main() -> None:
     except ModelError as error:
         sys.stdout.write(str(error))
         sys.exit(REFUSED)
+
+
+def _limit_process() -> None:
+    """Limit memory and processor time, and end with the parent.
+
+    Raises `ModuleNotFoundError` if the system has no such limits.
+    """
+    import ctypes
+    import resource
+    import signal
+
+    with suppress(AttributeError):  # as where prctl is missing
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    with suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (round(TRIAL_S), round(TRIAL_S) + 1))

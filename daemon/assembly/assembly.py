@@ -12,7 +12,7 @@ from pathlib import Path
 from graspd.daemon.assembly.plan import Plan, is_mcap
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Pipeline
-from graspd.daemon.process.files import write_atomically
+from graspd.daemon.process.files import require_linux, write_atomically
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import (
     CanTactile,
@@ -127,8 +127,12 @@ def _and_sensors(scene: Scene) -> str:
 
 def refuse_absent_processors(scene: Scene) -> None:
     """Raise `SceneError` if this computer lacks a processor of `[realtime]`."""
+    cpus = scene.realtime and scene.realtime.cpus
+    if not cpus:
+        return
+    require_linux("realtime.cpus")
     number = os.sysconf("SC_NPROCESSORS_CONF")
-    for cpu in (scene.realtime and scene.realtime.cpus) or ():
+    for cpu in cpus:
         if cpu >= number:
             raise SceneError(f"realtime.cpus: no processor {cpu}: there are 0 to {number - 1}")
 

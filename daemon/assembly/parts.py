@@ -17,7 +17,6 @@ from graspd.daemon.assembly.plan import Plan, require_mcap
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Answer, Companion, at_once
 from graspd.daemon.publish.outbox import Outbox, Output
-from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.scene import Record
@@ -27,6 +26,7 @@ from graspd.drivers.base import Driver
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
+    from graspd.daemon.publish.sockets import Sockets
     from graspd.daemon.record.link_log import Tap
     from graspd.daemon.record.mcap import RecordingHeader
     from graspd.daemon.record.recorder import Recorder
@@ -83,6 +83,8 @@ class Assembly:
 
     def open_sockets(self, high_water_mark: int | None = None) -> Sockets:
         """Open the sockets, as `Sockets` does."""
+        from graspd.daemon.publish.sockets import Sockets
+
         sockets = Sockets(self._parts.scene, high_water_mark=high_water_mark)
         self._stack.callback(sockets.close)
         self._outputs.append(sockets)

@@ -16,11 +16,12 @@ from graspd.daemon.assembly.plan import require_mcap
 from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
 from graspd.daemon.commands.arguments import UsageError, within
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.process.files import require_linux
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.sleep import Sleep
 from graspd.daemon.process.text import complain, printable
+from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.companion import Companion
-from graspd.daemon.publish.listener import PublishError
 from graspd.daemon.run.day_table import PUBLISHED, DayTable
 from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.run.replaying import Controller, trained_on
@@ -154,6 +155,8 @@ def run(args: argparse.Namespace) -> int:
     """Replay; 0 when the recordings were played to their end, 1 when nothing was judged."""
     if args.wait is not None and args.publish is None:
         raise UsageError("--wait is for subscribers: it needs --publish")
+    if args.publish is not None:
+        require_linux("--publish")
     if args.only_lifted and args.recordings and not args.outcomes:
         raise UsageError("--only-lifted says which outcomes are told: it needs --outcomes")
     if args.max_slip_when_stable and args.recordings and not args.outcomes:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import complain
-from graspd.daemon.publish.listener import PublishError
+from graspd.daemon.publish import PublishError
 from graspd.daemon.run.loop import Ended
 from graspd.daemon.run.runner import run_scene
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError

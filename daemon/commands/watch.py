@@ -12,6 +12,7 @@ import zmq
 
 from graspd.daemon import scene
 from graspd.daemon.commands.arguments import UsageError
+from graspd.daemon.process.files import is_linux
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import complain
 from graspd.daemon.watch.feed import Feed, load_keys
@@ -73,7 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show until stopped; 1 if the port cannot be had. Raises `UsageError`."""
-    os.nice(NICENESS)
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
     with contextlib.ExitStack() as stack:
         hands = _hands(args, stack)
         if args.foxglove:
@@ -146,6 +148,8 @@ def where_to_look(endpoint: str, scene_path: Path | None = None) -> tuple[str, s
 
 
 def _terminal(hands: list[HandFeed]) -> int:
+    if not is_linux():
+        raise UsageError("watch draws on a terminal of Linux alone; see --web")
     if not sys.stdout.isatty():
         raise UsageError("watch draws on a terminal; see --web")
     try:

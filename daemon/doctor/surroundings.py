@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import grp
 import os
 import socket
 import stat
@@ -15,7 +14,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.finding import Cause, Finding, Level, fine
-from graspd.daemon.publish.listener import PublishError, user_id
+from graspd.daemon.publish import PublishError
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.drivers import CanTactile, Section, SpiTactile, UdpSection
@@ -129,6 +128,8 @@ def realtime_findings(wanted: Scene) -> list[Finding]:
 
 
 def _denied(finding: Finding, port: str) -> Finding:
+    import grp  # not everywhere, and rarely needed
+
     try:
         group = grp.getgrgid(os.stat(port).st_gid).gr_name
     except (OSError, KeyError):
@@ -211,6 +212,8 @@ def _of_port(name: str, address: str) -> Iterator[Finding]:
 def _of_group(name: str, group: str | None) -> Iterator[Finding]:
     if group is None:
         return
+    import grp  # as above
+
     try:
         number = grp.getgrnam(group).gr_gid
     except KeyError:
@@ -224,7 +227,12 @@ def _of_group(name: str, group: str | None) -> Iterator[Finding]:
 
 
 def _of_users(wanted: Scene) -> Iterator[Finding]:
-    for user in () if wanted.ask is None else wanted.ask.tell or ():
+    users = None if wanted.ask is None else wanted.ask.tell
+    if not users:
+        return
+    from graspd.daemon.publish.listener import user_id  # as above
+
+    for user in users:
         try:
             user_id(user)
         except PublishError as problem:

@@ -1,4 +1,4 @@
-"""Read files without waiting; replace files in one step."""
+"""Read files without waiting; replace files in one step. Works where Python lacks POSIX, too."""
 
 from __future__ import annotations
 
@@ -13,6 +13,24 @@ class SceneError(Exception):
     """The scene is missing or wrong; the text has one line per mistake, with its key."""
 
 
+def is_linux() -> bool:
+    """Return True if Python has the calls of Linux that the daemon rests on."""
+    return hasattr(os, "eventfd")
+
+
+def require_linux(what: str) -> None:
+    """Raise `SceneError` if `what` needs Linux and this is another system."""
+    if not is_linux():
+        raise SceneError(f"{what} needs Linux")
+
+
+def open_flags(flags: int, *names: str) -> int:
+    """Return flags for `os.open` of a binary file: `flags`, and those that this system has."""
+    for name in ("O_BINARY", "O_CLOEXEC", *names):
+        flags |= getattr(os, name, 0)
+    return flags
+
+
 def read_regular(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file, without waiting for the writer of a pipe.
 
@@ -20,7 +38,7 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "not a regular file")
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+    with open(os.open(path, open_flags(os.O_RDONLY, "O_NONBLOCK")), "rb") as file:
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise OSError(errno.EFBIG, f"larger than {max_bytes} bytes")
@@ -33,12 +51,12 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
     Readers always see a whole file, also after a power cut. After an `OSError` it is the old one.
     """
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
-    handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    handle = os.open(part, open_flags(os.O_WRONLY | os.O_CREAT | os.O_EXCL), 0o600)
     try:
         with open(handle, "wb") as file:
             file.write(content)
             file.flush()
-            os.fchmod(handle, mode)
+            os.chmod(part, mode)
             os.fsync(handle)
         os.replace(part, path)
     except OSError:
@@ -49,7 +67,9 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Let the names in a folder last through a power cut, where its file system can."""
+    """Let the names in a folder last through a power cut, where the system can do that."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         with suppress(OSError):

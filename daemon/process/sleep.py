@@ -11,8 +11,14 @@ SLEPT_NS = 50_000_000
 LOOKS = 3
 """Number of looks at the clocks at the start; the scheduler interrupts some of them."""
 
-boottime_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
-"""Time since the computer was started, ns, sleep included (clock_gettime(2))."""
+boottime_ns = (
+    partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
+    if hasattr(time, "CLOCK_BOOTTIME")
+    else time.monotonic_ns
+)
+"""Time since the computer was started, ns, sleep included (clock_gettime(2)).
+
+Elsewhere than on Linux: the monotonic clock, which may leave sleep out."""
 
 
 class Sleep:

@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 SWITCH_S: Final = 0.0005
 """Python's switch interval after the first job, s: the longest wait of the loop."""
-PROCESSORS: Final = frozenset(os.sched_getaffinity(0))
+PROCESSORS: Final = frozenset(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ())
 """Processors at the start, before realtime mode restricts the loop to some of them."""
 
 log = logging.getLogger("graspd")

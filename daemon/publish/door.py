@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Final
 import zmq
 
 from graspd.daemon.process.worker import PROCESSORS
-from graspd.daemon.publish import porter
-from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish import PublishError, porter
+from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.porter import (
     ASK_QUEUE,
     CLOSE_S,

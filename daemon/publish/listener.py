@@ -13,15 +13,10 @@ import stat
 from contextlib import ExitStack
 from pathlib import Path
 
+from graspd.daemon.publish import PublishError
+
 BACKLOG = 100
 """Connections that wait to be accepted, as in libzmq."""
-
-
-class PublishError(Exception):
-    """An endpoint cannot be opened, or its thread has ended."""
-
-    taken: str | None = None
-    """Endpoint that another program uses; None: the error has another cause."""
 
 
 class Listener:

@@ -61,6 +61,10 @@ class Ended(Enum):
     """Readings from before the sleep may look new."""
 
 
+POLL = getattr(selectors, "PollSelector", selectors.DefaultSelector)
+"""Selector by poll(2); where there is none, recordings are replayed by another one."""
+
+
 @dataclass(frozen=True, slots=True)
 class LoopTiming:
     """Clocks and waits of the loop."""
@@ -72,8 +76,8 @@ class LoopTiming:
     sleep: Sleep = field(default_factory=Sleep)
     rest: Callable[[float], None] = time.sleep
     """Function that puts this thread to sleep, s."""
-    selector: Callable[[], selectors.BaseSelector] = selectors.PollSelector
-    """Selector: poll(2), which waits in whole milliseconds.
+    selector: Callable[[], selectors.BaseSelector] = POLL
+    """Selector: `POLL`, which waits in whole milliseconds.
 
     A driver that reopens a device mostly gets the same descriptor, which epoll(7) would not notice.
     """

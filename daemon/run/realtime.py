@@ -6,7 +6,6 @@ import ctypes
 import gc
 import logging
 import os
-import resource
 from contextlib import suppress
 from typing import Self
 
@@ -83,6 +82,8 @@ class RealtimeMode(Companion):
             )
 
     def _lock(self) -> None:
+        import resource  # not everywhere; `graspd check` loads this module
+
         # With a limit, later allocations would fail, which is worse than unlocked memory.
         unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
         problem = "limited"

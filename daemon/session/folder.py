@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import re
@@ -12,7 +11,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, Self
 
-from graspd.daemon.process.files import sync_folder
+from graspd.daemon.process.files import require_linux, sync_folder
 from graspd.daemon.session.file import KeptSession, SessionFileError, load, write
 
 log = logging.getLogger("graspd")
@@ -53,9 +52,15 @@ class SessionFolder:
         self._lock: int | None = None
 
     def lock(self) -> None:
-        """Make and lock the folder, once. Raises `SessionFileError` if it is in use."""
+        """Make and lock the folder, once. Raises `SessionFileError` if it is in use.
+
+        Raises `SceneError` where there is no Linux.
+        """
         if self._lock is not None:
             return
+        require_linux("to keep a session")
+        import fcntl
+
         try:
             if not self.path.is_dir():
                 self.path.mkdir()

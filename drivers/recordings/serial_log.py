@@ -16,8 +16,7 @@ from graspd.drivers.base import Reading
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.player import LinkLogDriver
-from graspd.drivers.spi.conversation import Conversation
-from graspd.drivers.spi.driver import LineEvent
+from graspd.drivers.spi.conversation import Conversation, LineEvent
 from graspd.drivers.spi.messages import FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960

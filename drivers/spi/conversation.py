@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import Final
 
 from graspd.drivers.base import DeviceFault, Fact, LinkCause, Reading, TactileReading, sensor_rows
@@ -42,6 +43,14 @@ PERIOD_MAX_NS = 1_000_000_000
 """Longest accepted time between sweeps, ns. Silence of a slower bridge is noticed too late."""
 
 _FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
+
+
+class LineEvent(IntEnum):
+    """Kind of an event on a line, as passed to the tap and written to a link log."""
+
+    RECEIVED = 1
+    SENT = 2
+    OPENED = 3
 
 
 class Conversation:

@@ -13,14 +13,13 @@ import select
 import termios
 import time
 from collections.abc import Callable, Sequence
-from enum import IntEnum
 
 import serial
 
 from graspd.drivers.base import DriverError, Fact, LinkCause, LinkError, Opened, Reading
 from graspd.drivers.link import LinkState, is_ready
 from graspd.drivers.protocol_polled import SCHEME, PolledSerial, refuse_url
-from graspd.drivers.spi.conversation import NAME, NONCES, Conversation
+from graspd.drivers.spi.conversation import NAME, NONCES, Conversation, LineEvent
 from graspd.drivers.spi.messages import Stop, encode
 from graspd.drivers.spi.sweeps import BridgeCounters
 
@@ -171,14 +170,6 @@ class SpiBridgeDriver(Opened):
     def _lose(self, error: LinkError) -> None:
         self._line.close()
         self.conversation.lost(error.cause, str(error), self._clock())
-
-
-class LineEvent(IntEnum):
-    """Kind of an event on a line, as passed to the tap and written to a link log."""
-
-    RECEIVED = 1
-    SENT = 2
-    OPENED = 3
 
 
 class SerialLine:

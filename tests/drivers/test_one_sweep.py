@@ -27,7 +27,7 @@ from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.can_log import CanLog, line_of
 from graspd.drivers.recordings.candump import parse
 from graspd.drivers.recordings.serial_log import SerialLog, encode_records, parse_records
-from graspd.drivers.spi.driver import LineEvent
+from graspd.drivers.spi.conversation import LineEvent
 from graspd.drivers.spi.messages import FrameParser, Ping, Sweep, encode
 from graspd.drivers.twins.datagrams import PalmTwin
 from tests.drivers.can.can_words import SLOT_NS, word

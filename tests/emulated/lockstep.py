@@ -10,7 +10,8 @@ from pathlib import Path
 
 from graspd.drivers.base import TactileReading
 from graspd.drivers.link import LinkState
-from graspd.drivers.spi.driver import LineEvent, SpiBridgeDriver
+from graspd.drivers.spi.conversation import LineEvent
+from graspd.drivers.spi.driver import SpiBridgeDriver
 from tests.drivers.spi.bridge_c import START, frame
 from tests.emulated.board import MS, Board
 

@@ -13,7 +13,8 @@ import pytest
 from graspd.drivers.base import TactileReading
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from graspd.drivers.spi.driver import LineEvent, SpiBridgeDriver
+from graspd.drivers.spi.conversation import LineEvent
+from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
 from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.spi.bridge_c import pattern

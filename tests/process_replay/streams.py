@@ -21,8 +21,7 @@ from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.recordings.can_log import line_of
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from graspd.drivers.recordings.serial_log import encode_records
-from graspd.drivers.spi.conversation import Conversation
-from graspd.drivers.spi.driver import LineEvent
+from graspd.drivers.spi.conversation import Conversation, LineEvent
 from graspd.drivers.spi.messages import (
     DIGEST,
     FrameParser,

@@ -19,8 +19,9 @@ import pytest
 import zmq
 
 from graspd.daemon.process.signals import StopSignal
+from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.door import Door
-from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.porter import QUESTIONS_MAX, Frames, Plan
 from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message, processes
 from tests.kit.waiting import wait_until

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from graspd.daemon.publish.listener import Listener, PublishError
+from graspd.daemon.publish import PublishError
+from graspd.daemon.publish.listener import Listener
 from tests.daemon.publish.doors import Publisher
 
 

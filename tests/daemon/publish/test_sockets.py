@@ -16,7 +16,7 @@ import zmq
 
 from graspd.daemon import scene
 from graspd.daemon.judge.reasons import Reason
-from graspd.daemon.publish.listener import PublishError
+from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.trust.lift_book import GraspId
 from tests.daemon.fakes import Clock

@@ -28,7 +28,7 @@ from graspd.drivers.recordings.kinds import (
     read_lines,
 )
 from graspd.drivers.recordings.serial_log import encode_records
-from graspd.drivers.spi.driver import LineEvent
+from graspd.drivers.spi.conversation import LineEvent
 from tests.drivers.recordings.tables import table, write
 
 HEADER = struct.Struct("<BQI")

@@ -19,7 +19,7 @@ from graspd.drivers.recordings.serial_log import (
     encode_records,
     parse_records,
 )
-from graspd.drivers.spi.driver import LineEvent
+from graspd.drivers.spi.conversation import LineEvent
 from graspd.drivers.spi.messages import FrameParser
 from tests.drivers.palm.palm_stream import MS
 from tests.kit.clock import Clock

@@ -11,7 +11,8 @@ import pytest
 import serial
 
 from graspd.drivers.base import DriverError, LinkError
-from graspd.drivers.spi.driver import LineEvent, SerialLine
+from graspd.drivers.spi.conversation import LineEvent
+from graspd.drivers.spi.driver import SerialLine
 
 
 class Port:

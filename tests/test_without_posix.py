@@ -1,0 +1,127 @@
+"""What is not the daemon runs where Python lacks POSIX, by `tests/without_posix.py`."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from graspd.drivers.recordings.csv_player import DEMO_DAY
+from tests.daemon.processes import GRASPD, TIMEOUT_S, start
+from tests.ports import free_port
+
+WITHOUT = (sys.executable, str(Path(__file__).with_name("without_posix.py")))
+SCENES = Path(__file__).parents[1] / "deploy" / "scenes"
+GRASPS = DEMO_DAY.with_name("synthetic_grasps.csv")
+STREAM = DEMO_DAY.with_name("synthetic_stream.csv")
+JUDGE = f"""
+import graspd
+grasps = graspd.read_grasps({str(GRASPS)!r})
+model = graspd.load("small-session")
+print(model.predict_proba(grasps, session=grasps).tolist())
+print(sum(verdict.judged for verdict in graspd.judge({str(GRASPS)!r})))
+"""
+TIMES = re.compile(r"in [0-9.]+ s| +[0-9]+ us")
+"""What differs from run to run."""
+NEED_LINUX = {
+    "commands.run",
+    *(f"publish.{name}" for name in ("door", "listener", "porter", "questions", "sockets")),
+    "watch.terminal",
+}
+DRIVERS_THAT_NEED_IT = {"spi.driver", "twins.spi"}
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the first second of a stream, and the first forty grasps."""
+    folder = tmp_path_factory.mktemp("short")
+    for path, rows in ((GRASPS, 41), (STREAM, 301)):
+        lines = path.read_text().splitlines(keepends=True)[:rows]
+        (folder / path.name).write_text("".join(lines))
+    return folder
+
+
+def without(*arguments: object, program: Sequence[str] = WITHOUT) -> tuple[int, str, str]:
+    """Run graspd without POSIX; return exit code, stdout without times, and stderr."""
+    done = subprocess.run(
+        [*program, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    return done.returncode, TIMES.sub("", done.stdout), done.stderr
+
+
+def test_only_what_needs_linux_is_not_imported() -> None:
+    code, refused, problem = without("--refused")
+    assert code == 0, problem
+    expected = {f"graspd.daemon.{name}" for name in NEED_LINUX}
+    expected |= {f"graspd.drivers.{name}" for name in DRIVERS_THAT_NEED_IT}
+    assert set(refused.split()) == expected
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"replay {GRASPS.name} --verbose",
+        f"replay {STREAM.name}",
+        "models",
+        "models small-session",
+        f"check {SCENES / 'demo.toml'}",
+        "scene --example can",
+    ],
+)
+def test_commands_print_the_same(line: str, short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(short)
+    code, out, problem = without(*line.split())
+    assert code == 0, problem
+    assert out == without(*line.split(), program=GRASPD)[1]
+
+
+def test_library_judges_the_same() -> None:
+    code, out, problem = without("-c", JUDGE)
+    assert code == 0, problem
+    assert out == without("-c", JUDGE, program=(sys.executable,))[1]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "run demo.toml",
+        "doctor demo.toml",
+        "keys --help",
+        "replay --publish tcp://127.0.0.1:1",
+        f"session reset {SCENES / 'spi.toml'}",
+    ],
+)
+def test_what_needs_linux_says_so(line: str) -> None:
+    code, out, problem = without(*line.split())
+    assert (code, out) == (2, "")
+    assert problem.startswith("graspd: ")
+    assert problem.endswith(" needs Linux\n")
+    assert problem.count("\n") == 1
+
+
+def test_page_is_served_until_interrupted() -> None:
+    port = free_port()
+    words = ("watch", "--web", SCENES / "demo.toml", "--port", port)
+    with start(*words, program=WITHOUT) as watch:
+        assert watch.stdout is not None
+        assert f"http://127.0.0.1:{port}/" in watch.stdout.readline()
+        watch.send_signal(signal.SIGINT)
+        assert watch.wait(TIMEOUT_S) == 0
+
+
+def test_model_is_trained_and_tried(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    words = ("--own", GRASPS, "--folds", 2, "--only", "cv", "--quiet", "--out", tmp_path)
+    code, _, problem = without("train", "small-session", *words)
+    assert code == 0, problem
+    (made,) = tmp_path.glob("*.onnx")
+    assert without("models", made)[0] == 0
