@@ -33,9 +33,6 @@ STANDS_NS = 100_000_000
 CHANGE_COUNTS = 40.0
 """Largest mean change of a finger's electrodes since the judgement, counts. Above it the grasp is a
 different one, and must settle again."""
-GAP_NS = 100_000_000
-"""Time without a usable reading after which the grasp must settle again, ns. No verdict rests on
-readings with a longer silence between them."""
 RELEASE_NS = 100_000_000
 """How long the gate stays in `released` before `idle`, ns."""
 JUST_SHORT_NS = LONG_NS - 1_000_000
@@ -148,14 +145,14 @@ class Question:
 class Gate:
     """Follows the grasps of one hand."""
 
-    def __init__(self, fingers: Sequence[Finger], limits: HandLimits) -> None:
-        """`fingers` are those of the readings, in their order."""
+    def __init__(self, fingers: Sequence[Finger], limits: HandLimits, motion: Motion) -> None:
+        """`fingers`: those of the readings, in their order. `motion`: how they move."""
         required = fingers if limits.required is None else limits.required
         self._fingers = tuple(fingers)
         self.required = frozenset(fingers).intersection(required)
         """Fingers that must touch."""
         self._settles_ns = SHORT_NS if limits.gate.early else LONG_NS
-        self.motion = Motion(len(fingers), limits.gate.false_alarms, early=limits.gate.early)
+        self._motion = motion
         self.phase, self._still = Phase(), Stillness()
         self._question = Question(limits.on_request, limits.gate.request_ns)
         self._reference = np.zeros((len(fingers), ELECTRODES), dtype=np.float32)
@@ -173,29 +170,6 @@ class Gate:
         """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
         self._question.ask()
 
-    def skip(self, t_ns: int) -> None:
-        """Take in the time of a reading that cannot be used, ns."""
-        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= GAP_NS:
-            self.restart(t_ns)
-
-    def observe(
-        self,
-        t_ns: int,
-        counts: NDArray[np.uint16],
-        usable: NDArray[np.bool_] | None,
-        *,
-        touches: bool,
-    ) -> None:
-        """Take in the motion of a reading of `t_ns`, before `step`; `counts`: shape (fingers, 24).
-
-        `usable`: electrodes that can be used, shape (fingers, 24); None: all. `touches` is True if
-        any finger touches.
-        """
-        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= GAP_NS:
-            self.restart(t_ns)
-        self._last_ns = t_ns
-        self.motion.add(t_ns, counts, usable, wanted=touches or not self.required)
-
     def step(
         self,
         t_ns: int,
@@ -208,13 +182,15 @@ class Gate:
         in_time: bool = True,
         fresh: bool = True,
     ) -> Moment:
-        """Take in the median of the reading just observed; return where in a grasp it is.
+        """Take in a reading of `t_ns` whose motion is known; return where in a grasp it is.
 
-        `objections` of other parts keep the grasp from settling: no tare, joints that move. The
-        grasp is judged only `in_time` and by `fresh` values, or by the newest once the verdict is
-        too old to stand. `fingers` goes into the moment as it is.
+        `median`: counts, shape (fingers, 24). `usable`: electrodes that can be used, same shape;
+        None: all. `objections` of other parts keep the grasp from settling: no tare, joints that
+        move. The grasp is judged only `in_time` and by `fresh` values, or by the newest once the
+        verdict is too old to stand. `fingers` goes into the moment as it is.
         """
-        phase, still, motion = self.phase, self._still, self.motion
+        phase, still, motion = self.phase, self._still, self._motion
+        self._last_ns = t_ns
         if self._question.asked:
             self._question.follow(t_ns)
         still.touch(t_ns, self.required.issubset(touching))
@@ -252,8 +228,8 @@ class Gate:
             is_asked = still.early or self._question.is_asked
             reasons = (Reason.SETTLING if is_asked else Reason.NOT_ASKED,)
         changes, phase.changes = phase.changes, []
-        motion, motion_limits = self._nearest_to_limit() if self.motion.looked else self._not_looked
-        strict = self.motion.strict
+        looked, strict = self._motion.looked, self._motion.strict
+        motion, motion_limits = self._nearest_to_limit() if looked else self._not_looked
         return Moment(
             grasp=phase.grasp,
             state=phase.state,
@@ -273,13 +249,16 @@ class Gate:
         )
 
     def restart(self, t_ns: int) -> None:
-        """Have the grasp settle again: readings are missing, or time went back."""
+        """Have the grasp settle again, and forget the motion: readings are missing.
+
+        Call it too where `t_ns`, the time of the next one, went back.
+        """
         if self._last_ns is not None and t_ns < self._last_ns:
             self._opened_ns = t_ns
             self._question.restart()
         self._last_ns = t_ns
         self._still.restart(t_ns)
-        self.motion.reset()
+        self._motion.reset()
         self._objections = (Reason.SEQUENCE_GAP,)
         self._go(ways.GAP, t_ns)
 
@@ -296,7 +275,7 @@ class Gate:
         if not self._still.touches:
             not_tared = (Reason.NOT_TARED,) if Reason.NOT_TARED in objections else ()
             return (*not_tared, Reason.NO_CONTACT)
-        if not self.motion.known:
+        if not self._motion.known:
             return (*objections, Reason.SEQUENCE_GAP)
         return objections if limits.early else (*objections, Reason.MOVING)
 
@@ -365,7 +344,7 @@ class Gate:
         """Per finger: motion in the window closer to its limit, and that limit."""
         motion: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
-        now, most = self.motion, self.motion.loose if self._still.sure else self.motion.strict
+        now, most = self._motion, self._motion.loose if self._still.sure else self._motion.strict
         windows = now.fast, most.fast, now.slow, most.slow
         for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * slide_limit:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from graspd.biotac import ELECTRODES, Finger
 from graspd.daemon.judge.contact import Contact
 from graspd.daemon.judge.decision import HandLimits
-from graspd.daemon.judge.gate import GAP_NS, Gate
+from graspd.daemon.judge.gate import Gate
 from graspd.daemon.judge.health import NO_COUNT, Checked
 from graspd.daemon.judge.reasons import OPEN, FingerState, GateState, Moment, Reason
+from graspd.daemon.judge.stillness import Motion
 from graspd.drivers.base import JointReading
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
 MEDIAN_SWEEPS = 3
 """Fresh sweeps whose median is judged: a value that is wrong in one of them does not count."""
+GAP_NS = 100_000_000
+"""Time without a usable reading after which the grasp must settle again, ns. No verdict rests on
+readings with a longer silence between them."""
 OUTAGE_NS = 1_000_000_000
 """Time without a usable reading after which tare and noise are forgotten, ns.
 
@@ -151,7 +155,8 @@ class HandTracker:
 
             self._joints = JointMotion()
         self.on_request = limits.on_request
-        self.gate = Gate(fingers, limits)
+        self.motion = Motion(len(fingers), limits.gate.false_alarms, early=limits.gate.early)
+        self.gate = Gate(fingers, limits, self.motion)
         self._words = [FingerWord() for _ in fingers]
         self._last_ns: int | None = None
         """Time of the last usable reading."""
@@ -194,7 +199,7 @@ class HandTracker:
     def forget(self) -> None:
         """Forget tare and grasp. Call when sensors were exchanged, or may have been."""
         self._contact.forget()
-        self.gate.motion.forget()
+        self.motion.forget()
         self._fresh.reset()
         self.restart()
 
@@ -234,7 +239,8 @@ class HandTracker:
         Return where in a grasp the hand is, and the counts to judge; None: judge nothing.
         """
         if checked.reasons:
-            self.gate.skip(t_ns)
+            if self._is_after_gap(t_ns):
+                self.gate.restart(t_ns)
             return self._now(), None
         self._follow_time(t_ns)
         usable = None if checked.broken is None else ~checked.broken
@@ -248,7 +254,8 @@ class HandTracker:
         joints = None if self._joints is None else self._joints.objection(t_ns)
         if joints is not None:
             objections = (*objections, joints)
-        self.gate.observe(t_ns, counts, usable, touches=any(touching))
+        touches = any(touching)
+        self.motion.add(t_ns, counts, usable, wanted=touches or not self.gate.required)
         moment = self.gate.step(
             t_ns,
             median,
@@ -273,7 +280,7 @@ class HandTracker:
         self, t_ns: int, touching: list[bool], tared: list[bool]
     ) -> dict[Finger, FingerState | None]:
         """Return what each finger feels by the reading just observed."""
-        motion, loose = self.gate.motion, self.gate.motion.loose
+        motion, loose = self.motion, self.motion.loose
         feelings: dict[Finger, FingerState | None] = {}
         for place, finger in enumerate(self._fingers):
             word = self._words[place]
@@ -291,17 +298,18 @@ class HandTracker:
 
     def _follow_time(self, t_ns: int) -> None:
         """Forget what does not continue at the time of a usable reading."""
-        last_ns = self._last_ns
-        if last_ns is not None and not 0 <= t_ns - last_ns <= GAP_NS:
-            self._fresh.reset()
-            if t_ns - last_ns > OUTAGE_NS:
-                self._contact.forget()
-                self.gate.motion.forget()
-        self._last_ns = t_ns
-        if self._interrupted:
+        if self._last_ns is not None and t_ns - self._last_ns > OUTAGE_NS:
+            self._contact.forget()
+            self.motion.forget()
+        if self._interrupted or self._is_after_gap(t_ns):
             self._interrupted = False
             self._fresh.reset()
             self.gate.restart(t_ns)
+        self._last_ns = t_ns
+
+    def _is_after_gap(self, t_ns: int) -> bool:
+        """Return True if a reading of `t_ns` does not continue the last usable one."""
+        return self._last_ns is not None and not 0 <= t_ns - self._last_ns <= GAP_NS
 
     def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
         return tuple(compress(self._fingers, which.tolist()))

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from graspd.biotac import Finger
-from graspd.daemon.judge.gate import GAP_NS
+from graspd.daemon.judge.hand import GAP_NS
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import ADVICE, OPEN, UNREADABLE, Reason
 from graspd.daemon.publish.companion import Companion, PublishedVerdict

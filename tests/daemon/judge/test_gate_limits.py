@@ -34,11 +34,17 @@ from tests.daemon.judge.test_gate import (
 NOTHING: tuple[Finger, ...] = ()
 
 
+def gate_of(limits: HandLimits) -> tuple[Gate, Motion]:
+    """A gate, and the motion that it looks at."""
+    motion = Motion(3, limits.gate.false_alarms, early=limits.gate.early)
+    return Gate(FINGERS, limits, motion), motion
+
+
 class Steps:
     """Feeds a gate constant counts, so that times and limits can be told to the nanosecond."""
 
     def __init__(self, *, on_request: bool = False, limits: GateLimits = GATE) -> None:
-        self.gate = Gate(FINGERS, HandLimits(on_request=on_request, gate=limits))
+        self.gate, self.motion = gate_of(HandLimits(on_request=on_request, gate=limits))
         self.now = self.gate.moment(NOTHING)
         self.t_ns = START_NS
         self._changes: list[GateChange] = []
@@ -51,10 +57,13 @@ class Steps:
         objections: tuple[Reason, ...] = (),
     ) -> GateState | None:
         """One reading: all electrodes of FF read `counts`, the others 3000."""
-        self.t_ns += round(after_ms * MS)
+        after_ns = round(after_ms * MS)
+        self.t_ns += after_ns
         median = np.full(SHAPE, 3000, dtype=np.uint16)
         median[0] = round(counts)
-        self.gate.observe(self.t_ns, median, ALL, touches=bool(touching))
+        if not 0 <= after_ns <= 100 * MS:
+            self.gate.restart(self.t_ns)
+        self.motion.add(self.t_ns, median, ALL, wanted=bool(touching))
         self.now = self.gate.step(self.t_ns, median, ALL, touching, objections)
         assert self.now.judges or not self.now.judged
         self._changes += self.now.changes
@@ -136,7 +145,7 @@ def test_a_verdict_is_refreshed_after_50_ms_or_by_old_values_after_100(
     judged = []
     for place in range(1, 23):
         t_ns = steps.t_ns + place * 10 * MS
-        steps.gate.observe(t_ns, sweep, ALL, touches=True)
+        steps.motion.add(t_ns, sweep, ALL)
         if steps.gate.step(t_ns, sweep, ALL, FINGERS, fresh=fresh).judges:
             judged.append(place)
     assert judged == list(range(first, 23, first))
@@ -220,7 +229,7 @@ def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> Non
     for place in range(50):
         median[0, :12] = 4095 * (place % 2)
         steps.t_ns += 10 * MS
-        steps.gate.observe(steps.t_ns, median.copy(), usable, touches=True)
+        steps.motion.add(steps.t_ns, median.copy(), usable)
         assert steps.gate.step(steps.t_ns, median, usable, FINGERS).settled
 
 
@@ -228,12 +237,15 @@ def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> Non
 def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
     random = np.random.default_rng(seed)
     required = FINGERS if seed % 2 == 0 else ("ff", "th")
-    gate = Gate(FINGERS, HandLimits(on_request=seed % 3 == 0, required=required, gate=GATE))
+    gate, motion = gate_of(HandLimits(on_request=seed % 3 == 0, required=required, gate=GATE))
     changes: list[GateChange] = []
     touching, median, t_ns = NOTHING, np.full(SHAPE, 3000), START_NS
     for _ in range(4000):
         usual = random.random() < 0.97
-        t_ns += 10 * MS if usual else round(MS * random.choice([0, 1, 90, 101, 5000, -20]))
+        step_ns = 10 * MS if usual else round(MS * random.choice([0, 1, 90, 101, 5000, -20]))
+        t_ns += step_ns
+        if not 0 <= step_ns <= 100 * MS:
+            gate.restart(t_ns)
         if random.random() < 0.02:
             touching = tuple(compress(FINGERS, random.random(3) < random.choice([0.1, 0.9])))
         if random.random() < 0.01:
@@ -242,11 +254,10 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
             gate.ask()
         objections = (Reason.JOINTS_LATE,) if random.random() < 0.02 else ()
         if random.random() < 0.05:
-            gate.skip(t_ns)
             now = gate.moment(touching)
         else:
             sweep, usable = median.astype(np.uint16), random.random(SHAPE) < (0.9 + 0.1 * usual)
-            gate.observe(t_ns, sweep, usable, touches=bool(touching))
+            motion.add(t_ns, sweep, usable, wanted=bool(touching))
             now = gate.step(
                 *(t_ns, sweep, usable, touching, objections),
                 in_time=random.random() < 0.8,
@@ -297,7 +308,7 @@ def test_a_grasp_that_slides_slowly_while_settled_must_settle_anew() -> None:
     for sweep in range(100):
         if steps.step(counts=3000 + 0.65 * sweep) is not GateState.SETTLED:
             break
-    assert steps.gate.motion.loose.early, "nothing moves fast"
+    assert steps.motion.loose.early, "nothing moves fast"
     assert steps.now.reasons == (Reason.MOVING,)
     assert steps.take_changes()[-1].cause is GateCause.MOVED
 

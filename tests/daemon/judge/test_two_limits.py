@@ -26,7 +26,7 @@ def test_a_settled_grasp_goes_on_where_it_would_not_settle() -> None:
     steps = Steps(on_request=True)
     steps.hold()
     trembling(steps, 4.0)
-    strict, loose = steps.gate.motion.strict, steps.gate.motion.loose
+    strict, loose = steps.motion.strict, steps.motion.loose
     assert not strict.sure
     assert loose.sure
     assert (steps.now.state, steps.now.reasons) == (GateState.SETTLED, (Reason.NOT_ASKED,))
@@ -42,7 +42,7 @@ def test_a_settled_grasp_goes_on_where_it_would_not_settle() -> None:
     trembling(steps, 4.0)
     assert steps.now.state is GateState.CLOSING
     assert steps.now.reasons == (Reason.MOVING,)
-    strict = steps.gate.motion.strict
+    strict = steps.motion.strict
     assert steps.now.motion_limits is not None
     assert steps.now.motion_limits["ff"] in np.round((strict.fast[0], strict.slow[0]), 2)
 
