@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,12 +37,12 @@ def tactile_images(
     broken = np.isnan(values)
     sound = np.where(broken, 0.0, values)
     terms = np.concatenate([sound, sound.max(axis=2, keepdims=True)], axis=2)
-    images = terms @ fill_matrix(places, Fill(fill)).T
+    images = terms @ _matrix(places, Fill(fill), tuple(range(ELECTRODES))).T
     for grasp, finger in np.argwhere(broken.any(axis=2)):
-        work = np.flatnonzero(~broken[grasp, finger]).tolist()
+        work = tuple(np.flatnonzero(~broken[grasp, finger]).tolist())
         images[grasp, finger] = np.nan
         if work:
-            images[grasp, finger] = fill_matrix(places, Fill(fill), work) @ terms[grasp, finger]
+            images[grasp, finger] = _matrix(places, Fill(fill), work) @ terms[grasp, finger]
     return images.transpose(0, 2, 1).reshape(len(values), *places.shape, values.shape[1])
 
 
@@ -73,6 +74,12 @@ def plot_grasp(counts: ArrayLike, layout: str = "D1", *, fill: str = "neighbour-
         _number_electrodes(axes, LAYOUTS[layout], np.isnan(one[0, finger]))
     figure.colorbar(drawn, ax=panels, label="count (contact lowers it)")
     return figure
+
+
+@lru_cache(maxsize=64)
+def _matrix(layout: Layout, fill: Fill, electrodes: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the fill matrix; the same few electrodes are broken in all grasps of a hand."""
+    return fill_matrix(layout, fill, electrodes)
 
 
 def _number_electrodes(axes: Axes, layout: Layout, broken: NDArray[np.bool_]) -> None:

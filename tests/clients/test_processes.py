@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from deploy.clients.python.graspd_client import Client
 from tests.clients.building import asked, compiled_probe
 from tests.clients.test_both_ask import false_daemon, told
 from tests.conftest import ROOT
@@ -56,6 +60,14 @@ def test_a_forked_process_gets_an_error_at_once(tmp_path: Path) -> None:
     places = [f"ipc://{tmp_path}/{end}" for end in ("out", "ask")]
     with false_daemon(tmp_path, told()):
         subprocess.run([sys.executable, "-c", FORKS, *places], check=True, cwd=ROOT, timeout=60)
+
+
+def test_a_client_is_not_pickled_and_says_so(tmp_path: Path) -> None:
+    with (
+        Client(f"ipc://{tmp_path}/out") as graspd,
+        pytest.raises(TypeError, match="make one in each process"),
+    ):
+        pickle.dumps(graspd)
 
 
 def test_in_cpp_signals_end_no_call_and_a_fork_is_told_so() -> None:

@@ -328,6 +328,9 @@ class _Hand:
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)
 
+    def __reduce__(self) -> str:
+        raise TypeError("a client belongs to its process: make one in each process")
+
     def _check_process(self) -> None:
         """Raise `RuntimeError` after a fork: ZeroMQ's thread is the parent's alone."""
         if os.getpid() != self._pid:
