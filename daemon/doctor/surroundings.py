@@ -14,10 +14,12 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.finding import Cause, Finding, Level, fine
+from graspd.daemon.doctor.link import TROUBLES
 from graspd.daemon.publish import PublishError
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.drivers import CanTactile, Section, SpiTactile, UdpSection
+from graspd.drivers.base import LinkCause
 from graspd.drivers.udp import Endpoint
 from graspd.models.contract import ModelError
 
@@ -29,6 +31,7 @@ NOT_HEARD = frozenset(
     {Cause.INTERFACE_MISSING, Cause.INTERFACE_DOWN, Cause.LINK_DOWN, Cause.SILENT, Cause.BITRATE}
 )
 """Causes that the kernel's state of the CAN interface may explain."""
+NO_DATA = TROUBLES[LinkCause.SILENT]
 HELD_BY_GRASPD = (
     "graspd itself runs: see graspd watch. To look from here, end it first "
     "(systemctl stop 'graspd@*')."
@@ -69,6 +72,9 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
         case UdpSection(source=source), Cause.PORT_HELD:
             number = Endpoint.parse(source).port
             return [_held(finding, computer.port_holders("udp", number))]
+        case UdpSection(source=source), Cause.SILENT if finding.advice == NO_DATA.advice:
+            advice = f"Let its program send to {source}. Another computer cannot send to 127.0.0.1."
+            return [replace(finding, advice=advice)]
     return [finding]
 
 

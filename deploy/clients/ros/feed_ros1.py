@@ -9,7 +9,8 @@ from sr_robot_msgs.msg import BiotacAll
 
 ORDER = ["ff", "mf", "rf", "lf", "th"]  # of BiotacAll.tactiles
 rospy.init_node("graspd_feeder")
-SIDE, HAND = rospy.get_param("~side", "rh"), rospy.get_param("~hand", "right")
+SIDE = rospy.get_param("~side", "rh")
+HAND = rospy.get_param("~hand", "left" if SIDE == "lh" else "right")
 FINGERS = rospy.get_param("~fingers", "ff mf th").split()
 ADDRESS = rospy.get_param("~address", "127.0.0.1")
 PORT = rospy.get_param("~port", 9872)  # of the counts; that of the joints is one less
@@ -18,8 +19,7 @@ SENDER.bind(("", PORT + 1))  # fixed: counts that come from another port are of 
 
 
 def _send(port: int, message: object, **values: object) -> None:
-    header = message.header
-    stamp = {"seq": header.seq or None, "t": header.stamp.to_sec() or None}
+    stamp = {"seq": message.header.seq or None, "t": message.header.stamp.to_sec() or None}
     SENDER.sendto(json.dumps({**stamp, **values}).encode(), (ADDRESS, port))
 
 

@@ -12,7 +12,7 @@ ORDER = ["ff", "mf", "rf", "lf", "th"]  # of BiotacAll.tactiles
 rclpy.init()
 NODE = rclpy.create_node("graspd_feeder")
 SIDE = NODE.declare_parameter("side", "rh").value
-HAND = NODE.declare_parameter("hand", "right").value
+HAND = NODE.declare_parameter("hand", "left" if SIDE == "lh" else "right").value
 FINGERS = NODE.declare_parameter("fingers", "ff mf th").value.split()
 TO = NODE.declare_parameter("address", "127.0.0.1").value
 PORT = NODE.declare_parameter("port", 9872).value  # of the counts; the joints' is one less

@@ -321,6 +321,7 @@ def test_a_socket_that_graspd_holds_is_told(tmp_path: Path, pid: int) -> None:
         fcntl.flock(held, fcntl.LOCK_EX)
         told = look(tmp_path, text)
     assert [finding["cause"] for finding in told] == ["silent", "socket-held"]
+    assert "send to udp://127.0.0.1:" in told[0]["advice"]
     assert f"PID {pid}, " in told[1]["what"]
 
 
