@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from graspd.daemon.assembly.plan import Plan, is_mcap
+from graspd.daemon.assembly.plan import Plan, recorded_kind
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.files import require_linux, write_atomically
@@ -25,6 +25,7 @@ from graspd.daemon.scene.drivers import (
 )
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import Driver, DriverError, LinkError
+from graspd.drivers.recordings.kinds import BAGS, Kind
 from graspd.models import trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
@@ -209,9 +210,14 @@ def _tactile(plan: Plan) -> Driver:
 
 def _replay(plan: Plan, options: ReplayTactile) -> Driver:
     fingers, speed = plan.scene.hand.fingers, 1.0 if options.pace == "realtime" else None
-    if is_mcap(options):
-        if options.loop or options.outcomes:
-            raise ValueError("MCAP files are replayed as they are: no loop or outcomes")
+    kind = recorded_kind(options)
+    if kind is not Kind.TEXT and (options.loop or options.outcomes):
+        raise ValueError(f"{kind.value} is replayed as it is: no loop or outcomes")
+    if kind in BAGS:
+        from graspd.drivers.recordings.bag import BagDriver
+
+        return BagDriver(options.recordings, fingers, speed=speed)
+    if kind is Kind.MCAP:
         from graspd.daemon.record.player import McapReplayDriver
 
         return McapReplayDriver(options.recordings, fingers, speed=speed)

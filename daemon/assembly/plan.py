@@ -9,6 +9,7 @@ from graspd.daemon.judge.decision import GateLimits, HandLimits
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.scene import GateMode
+from graspd.drivers.recordings.kinds import BAGS, Kind, kind_of_all
 from graspd.extras import require
 
 
@@ -30,7 +31,13 @@ class Plan:
         options, mode, joints = scene.tactile, scene.gate.mode, scene.joints is not None
         if not isinstance(options, ReplayTactile):
             return cls(scene, mode or "settled", joints)
-        if is_mcap(options):
+        kind = recorded_kind(options)
+        if kind in BAGS:
+            from graspd.drivers.recordings.bag import has_joints
+
+            joints = joints or any(map(has_joints, options.recordings))
+            return cls(scene, mode or "settled", joints, options.recordings)
+        if kind is Kind.MCAP:
             from graspd.daemon.record.mcap_reader import header_of
 
             recorded = [header_of(path).joints for path in options.recordings]
@@ -65,21 +72,29 @@ class Plan:
         )
 
 
-def is_mcap(options: ReplayTactile) -> bool:
-    """Return True for recordings of graspd, False for tables and streams.
+def recorded_kind(options: ReplayTactile) -> Kind:
+    """Return what the recordings are: MCAP, bags, or `Kind.TEXT` for tables and streams.
 
     Raises `RecordingError` for files of two kinds, `SceneError` for those of another kind, or if
-    the package that reads MCAP is missing.
+    the package that reads them is missing.
     """
-    from graspd.drivers.recordings.kinds import Kind, kind_of_all
-
     kind = kind_of_all(options.recordings)
     if kind is Kind.MCAP:
         require_mcap("replaying MCAP")
+    elif kind in BAGS:
+        require_bags()
     elif kind is not Kind.TEXT:
         first = options.recordings[0]
         raise SceneError(f"tactile.recordings: {first} is {kind.value}: `graspd replay` plays it")
-    return kind is Kind.MCAP
+    return kind
+
+
+def require_bags() -> None:
+    """Raise `SceneError`, with advice, without the package of the extra `bag`."""
+    try:
+        require("rosbags", "reading a ROS bag", "bag")
+    except ModuleNotFoundError as error:
+        raise SceneError(str(error)) from error
 
 
 def require_mcap(what: str) -> None:

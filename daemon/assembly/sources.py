@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from graspd.biotac import Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Parts
@@ -16,8 +17,10 @@ from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import CanTactile, SpiTactile
 from graspd.daemon.scene.scene import Hand
+from graspd.drivers.base import Driver
 from graspd.drivers.recordings.csv_player import ReplayDriver
-from graspd.drivers.recordings.kinds import CAN_LOGS, Kind, kind_of_all
+from graspd.drivers.recordings.kinds import BAGS, CAN_LOGS, Kind, kind_of_all
+from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
@@ -61,7 +64,7 @@ class Source:
 
 
 class Tables(Source):
-    """Grasp tables and streams, which do not say how they were judged."""
+    """Grasp tables, streams and ROS bags, which do not say how they were judged."""
 
     def __init__(
         self,
@@ -74,7 +77,7 @@ class Tables(Source):
     ) -> None:
         """`sections`: of the scene, where it differs from one that plays `paths`.
 
-        `rate_hz`, `loop`, `strict`: as of `ReplayDriver`.
+        `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags.
         """
         self._paths = [path.absolute() for path in paths]
         self._driver = partial(ReplayDriver, self._paths, rate_hz=rate_hz, loop=loop, strict=strict)
@@ -88,7 +91,23 @@ class Tables(Source):
         """Make the parts for the model's fingers."""
         hand = Hand(fingers=model.contract.fingers)
         plan = Plan.of(replayed.model_copy(update={"hand": hand}))
+        if kind_of_all(self._paths) in BAGS:
+            return Parts.of(plan, model, self._bags(hand.fingers, speed))
         return Parts.of(plan, model, self._driver(hand.fingers, speed=speed))
+
+    def _bags(self, fingers: Sequence[Finger], speed: float | None) -> Driver:
+        """Return the driver of bags. Raises `SceneError` if they lack one of the fingers."""
+        from graspd.drivers.recordings.bag import BagDriver, fingers_of
+
+        for path in self._paths:
+            found = fingers_of(path)
+            if not set(fingers).issubset(found):
+                names = ", ".join(zoo.judging(found)) or "no model"
+                raise SceneError(
+                    f"{path}: has sensors on {', '.join(found) or 'no finger'}, the model judges "
+                    f"{', '.join(fingers)}; of the zoo, {names} judges these: --model"
+                )
+        return BagDriver(self._paths, fingers, speed=speed)
 
 
 class LinkLogs(Source):

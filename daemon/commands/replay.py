@@ -33,7 +33,7 @@ from graspd.daemon.session import file as session_file
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_DAY
 from graspd.drivers.recordings.csv_rows import SLIPPED
-from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
+from graspd.drivers.recordings.kinds import BAGS, Kind, files_of, kind_of_all
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError
@@ -56,10 +56,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         type=Path,
         metavar="RECORDING",
-        help="grasp tables or streams (CSV, Parquet); what `graspd run` has recorded (MCAP); what "
-        "came over a link (a CAN log, serial bytes); each packed by gzip or not, known by its "
-        "content; - is standard input; without any, the demo: a synthetic day, with --outcomes "
-        "and --max-slip-when-stable 0.05",
+        help="grasp tables or streams (CSV, Parquet); what `graspd run` has recorded (MCAP); ROS "
+        "bags; what came over a link (a CAN log, serial bytes); each packed by gzip or not, "
+        "known by its content; - is standard input; without any, the demo: a synthetic day, with "
+        "--outcomes and --max-slip-when-stable 0.05",
     )
     parser.add_argument(
         "--scene", type=Path, help="of a link log: the scene that says how to decode it"
@@ -242,7 +242,7 @@ def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
 def _source(args: argparse.Namespace) -> Source:
     """Return what plays the recordings. Imports only what this kind of them needs."""
     kind = kind_of_all(args.recordings)
-    if kind is Kind.TEXT:
+    if kind is Kind.TEXT or kind in BAGS:
         return _tables(args)
     if args.outcomes or args.min_confidence is not None or _risk(args):
         raise UsageError(
@@ -253,8 +253,6 @@ def _source(args: argparse.Namespace) -> Source:
         raise UsageError("what graspd has recorded is played as it is: no --loop or --strict")
     if kind in LINK_LOGS:
         return LinkLogs(args.recordings, args.scene)
-    if kind is not Kind.MCAP:
-        raise RecordingError(args.recordings[0], f"is {kind.value}, which is not read yet")
     require_mcap("replaying MCAP")
     from graspd.daemon.assembly.recordings import RecordedRun
 
@@ -265,6 +263,8 @@ def _tables(args: argparse.Namespace) -> Tables:
     """Return tables that are judged as the command line says."""
     if args.scene is not None:
         raise UsageError("--scene is for what came over a link")
+    if (args.loop or args.strict) and kind_of_all(args.recordings) in BAGS:
+        raise UsageError("a ROS bag is played as it is: no --loop or --strict")
     sections: dict[str, dict[str, Any]] = {}
     if args.min_confidence is not None:
         sections["model"] = {"min_confidence": args.min_confidence}

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.plan import Plan, is_mcap
+from graspd.daemon.assembly.plan import Plan, recorded_kind
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
@@ -370,7 +370,7 @@ def _judge(plan: Plan, pipeline: Pipeline, unjudged: Unjudged) -> list[Judgement
 
 def _readings(plan: Plan) -> Iterator[Reading]:
     tactile = plan.scene.tactile
-    if isinstance(tactile, scene_drivers.ReplayTactile) and is_mcap(tactile):
+    if isinstance(tactile, scene_drivers.ReplayTactile) and recorded_kind(tactile) is Kind.MCAP:
         yield from _recorded_grasps(tactile.recordings, plan.scene.hand.fingers)
     else:
         yield from _played(plan)

@@ -15,12 +15,13 @@ from graspd.biotac import electrode_columns
 from graspd.drivers.base import JointReading, RecordingError, TactileReading
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, Row, columns_of, read_rows
-from graspd.drivers.recordings.kinds import Kind, kind_of
+from graspd.drivers.recordings.kinds import BAGS, Kind, kind_of
 from graspd.extras import require
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
     from graspd.daemon.record.player import McapReplayDriver
+    from graspd.drivers.recordings.bag import BagDriver
 
 
 def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
@@ -55,12 +56,21 @@ def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
 def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
     """Return a stream, one row a reading: `t` in seconds, counts, then joint angles in radians.
 
-    `path`: CSV or MCAP. A count that is missing or damaged is NaN; an angle is the newest one.
+    `path`: CSV, MCAP or a ROS bag. A count that is missing or damaged is NaN; an angle is the
+    newest one.
     Raises `RecordingError`.
     """
     path = Path(path)
-    driver: ReplayDriver | McapReplayDriver
-    if kind_of(path) is Kind.MCAP:
+    driver: ReplayDriver | McapReplayDriver | BagDriver
+    fingers: tuple[str, ...]
+    kind = kind_of(path)
+    if kind in BAGS:
+        require("rosbags", "reading a ROS bag", "bag")
+        from graspd.drivers.recordings.bag import BagDriver, fingers_of
+
+        fingers = fingers_of(path)
+        driver = BagDriver([path], fingers)
+    elif kind is Kind.MCAP:
         require("mcap", "read_recording of MCAP", "record")
         from graspd.daemon.record.mcap_reader import header_of
         from graspd.daemon.record.player import McapReplayDriver

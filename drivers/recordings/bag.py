@@ -1,0 +1,277 @@
+"""Driver that plays ROS bags of a Shadow hand with BioTac SP sensors, without ROS. Extra `bag`.
+
+Topics: one of type sr_robot_msgs/BiotacAll, such as `/rh/tactile`, and sensor_msgs/JointState,
+`/joint_states`. Times are those of the headers, or of the bag where a header has none. The topic
+comes at 100 Hz, the sensors' values at 71.43 Hz.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import compress
+from pathlib import Path
+from typing import Any, Final
+
+import apsw
+import numpy as np
+from numpy.typing import NDArray
+from rosbags import rosbag1, rosbag2
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS, Finger
+from graspd.drivers.base import (
+    DriverCounters,
+    ElectrodeFault,
+    JointReading,
+    Reading,
+    RecordingError,
+    TactileReading,
+    joint_name,
+)
+from graspd.drivers.recordings.kinds import Kind, kind_of
+from graspd.drivers.recordings.player import RecordedDriver
+
+TACTILE: Final = "sr_robot_msgs/msg/BiotacAll"
+JOINTS: Final = "sensor_msgs/msg/JointState"
+HANDS: Final = ("rh", "lh")
+"""First part of a topic, and of the names of joints; the right hand is preferred."""
+DEFINITIONS: Final = {
+    TACTILE: "std_msgs/Header header\nsr_robot_msgs/Biotac[5] tactiles\n",
+    "sr_robot_msgs/msg/Biotac": (
+        "int16 pac0\nint16 pac1\nint16 pdc\nint16 tac\nint16 tdc\nint16[] electrodes\n"
+    ),
+}
+"""Messages as Shadow publishes them, for bags that do not hold their definitions."""
+FORMER_ELECTRODES: Final = 19
+"""Electrodes of a BioTac that is not an SP."""
+LOOKED_AT: Final = 20
+"""Messages that say which fingers have a sensor."""
+REPEAT_NS: Final = 1_000_000_000
+"""A message older than the one before by up to this is a repeat; by more, the clock was set."""
+
+_DAMAGE = (
+    *(rosbag1.ReaderError, rosbag2.ReaderError, SerdeError, TypesysError, apsw.Error),
+    *(ValueError, LookupError, AssertionError, RuntimeError, struct.error),
+    *(OSError, EOFError, MemoryError, OverflowError),
+)
+"""Exceptions of the library for a damaged bag."""
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class BagCounters(DriverCounters):
+    """Counters of a replay."""
+
+    repeats: int = 0
+    """Messages of the time or with the very counts of the one before, which were dropped."""
+    malformed: int = 0
+    """Messages without five sensors."""
+
+
+class BagDriver(RecordedDriver[Reading]):
+    """Play the bags of one run, at most one reading per call of `read_ready`."""
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        fingers: Sequence[str],
+        *,
+        speed: float | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`fingers`: those to play, in this order. `speed`: factor of real time; None: fast."""
+        super().__init__(paths, speed, clock)
+        self._rows = [list[str](FINGERS).index(finger) for finger in fingers]
+        self._fingers = tuple(fingers)
+        self._reset()
+
+    def _reset(self) -> None:
+        self.counters = BagCounters()
+        self.period_ns: int | None = None
+        """Shortest time between two readings as played, ns; None: not known yet."""
+        self._last_ns: int | None = None
+        self._last: NDArray[np.int16] | None = None
+
+    def open(self) -> None:
+        """Check that each bag has these fingers, then start. Raises `RecordingError`."""
+        self.close()
+        self._reset()
+        for path in self.paths:
+            found = fingers_of(path)
+            missing = [finger for finger in self._fingers if finger not in found]
+            if missing:
+                raise RecordingError(
+                    path, f"has no sensor on {', '.join(missing)}, only on {', '.join(found)}"
+                )
+        self.start(self._items())
+
+    def read_ready(self) -> Sequence[Reading]:
+        """Return the next reading if it is due."""
+        taken = self.take()
+        if taken is None:
+            return ()
+        at_ns, reading = taken
+        if isinstance(reading, TactileReading):
+            self.counters.faulty_readings += bool(reading.faults.any())
+        return [self.hand_over(reading, at_ns)]
+
+    def _items(self) -> Generator[tuple[int, Reading], None, None]:
+        for path in self.paths:
+            with _opened(path) as bag:
+                for t_ns, message in bag.messages():
+                    reading = self._reading_of(path, t_ns, message)
+                    if reading is not None:
+                        yield t_ns, reading
+
+    def _reading_of(self, path: Path, t_ns: int, message: Any) -> Reading | None:  # noqa: ANN401
+        if not hasattr(message, "tactiles"):
+            return _joints(t_ns, message)
+        sensors = sensors_of(path, message)
+        if sensors is None:
+            self.counters.malformed += 1
+            return None
+        last_ns, values = self._last_ns, sensors[self._rows]
+        if last_ns is not None and 0 <= last_ns - t_ns < REPEAT_NS:
+            self.counters.repeats += 1
+            return None
+        if self._last is not None and np.array_equal(values, self._last):
+            self.counters.repeats += 1
+            return None
+        if last_ns is not None and t_ns > last_ns:
+            step_ns = round((t_ns - last_ns) / (self.speed or 1.0))
+            self.period_ns = min(step_ns, self.period_ns or step_ns)
+        self._last_ns, self._last = t_ns, values
+        wrong = (values < 0) | (values > COUNT_MAX)
+        faults = wrong * np.uint8(ElectrodeFault.NOT_A_COUNT)
+        counts = np.where(wrong, 0, values).astype(np.uint16)
+        self.counters.readings += 1
+        return TactileReading(t_ns, self.counters.readings - 1, counts, faults)
+
+
+class _Bag:
+    """An open bag."""
+
+    def __init__(
+        self, path: Path, reader: rosbag1.Reader | rosbag2.Reader, *, is_ros1: bool
+    ) -> None:
+        self._path, self._reader = path, reader
+        store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+        types = dict[str, Any]()
+        for name, definition in DEFINITIONS.items():
+            types |= get_types_from_msg(definition, name)
+        for connection in reader.connections:
+            if connection.msgdef.format is MessageDefinitionFormat.MSG:
+                types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
+        store.register({name: each for name, each in types.items() if name not in store.fielddefs})
+        self._decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        self.tactile = self._choose(TACTILE)
+        if self.tactile is None:
+            topics = ", ".join(sorted({each.topic for each in reader.connections})) or "no topic"
+            raise RecordingError(path, f"has no topic of sr_robot_msgs/BiotacAll, but {topics}")
+        hand = self.tactile.topic.strip("/").partition("/")[0]
+        self._others = tuple(f"{other}_" for other in HANDS if hand in HANDS and other != hand)
+        """Begin of the names of another hand's joints."""
+        self.joints = self._choose(JOINTS)
+
+    def _choose(self, kind: str) -> Connection | None:
+        """Return the topic of this type; of several the one of the right hand, or the shortest."""
+        found = [each for each in self._reader.connections if each.msgtype == kind]
+        found.sort(key=lambda each: (not each.topic.startswith("/rh/"), len(each.topic)))
+        if kind == JOINTS:
+            found.sort(key=lambda each: each.topic != "/joint_states")
+        for other in found[1:]:
+            if other.topic != found[0].topic:
+                _log.warning("%s: %s is left out", self._path, other.topic)
+        return found[0] if found else None
+
+    def messages(self) -> Iterator[tuple[int, Any]]:
+        """Yield times, ns, and messages of both topics. Raises `RecordingError` for damage."""
+        topics = {each.topic for each in (self.tactile, self.joints) if each is not None}
+        chosen = [each for each in self._reader.connections if each.topic in topics]
+        try:
+            for connection, bag_ns, content in self._reader.messages(connections=chosen):
+                message: Any = self._decode(content, connection.msgtype)
+                stamp = message.header.stamp
+                t_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+                if connection.msgtype == JOINTS:
+                    message.name = [
+                        "" if name.startswith(self._others) else name for name in message.name
+                    ]
+                yield t_ns or bag_ns, message
+        except _DAMAGE as error:
+            raise RecordingError(self._path, f"is damaged: {error}") from error
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Bag]:
+    is_ros1 = kind_of(path) is Kind.ROS1_BAG
+    try:
+        reader = rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path)
+        reader.open()
+    except _DAMAGE as error:
+        advice = "; `rosbag reindex` may mend it" if is_ros1 else ""
+        raise RecordingError(path, f"cannot be read: {error}{advice}") from error
+    try:
+        try:
+            bag = _Bag(path, reader, is_ros1=is_ros1)
+        except (TypesysError, AssertionError, SyntaxError) as error:
+            raise RecordingError(path, f"has a wrong message definition: {error}") from error
+        yield bag
+    finally:
+        reader.close()
+
+
+def sensors_of(path: Path, message: Any) -> NDArray[np.int16] | None:  # noqa: ANN401
+    """Return the electrodes of a message, shape (5, 24), in the order of `FINGERS`.
+
+    None if it is malformed. Raises `RecordingError` for another sensor.
+    """
+    electrodes = [np.asarray(each.electrodes) for each in message.tactiles]
+    if any(len(each) == FORMER_ELECTRODES for each in electrodes):
+        problem = f"is of a BioTac with {FORMER_ELECTRODES} electrodes; an SP has {ELECTRODES}"
+        raise RecordingError(path, problem)
+    if [len(each) for each in electrodes] != [ELECTRODES] * len(FINGERS):
+        return None
+    return np.array(electrodes, dtype=np.int16)
+
+
+def fingers_of(path: Path) -> tuple[Finger, ...]:
+    """Return the fingers with a sensor: an absent one has values at a rail, or no counts."""
+    seen = np.zeros(len(FINGERS), dtype=np.intp)
+    number = 0
+    with _opened(path) as bag:
+        for _, message in bag.messages():
+            sensors = sensors_of(path, message) if hasattr(message, "tactiles") else None
+            if sensors is None:
+                continue
+            good = (sensors > 0) & (sensors < COUNT_MAX)
+            seen += np.count_nonzero(good, axis=1) > ELECTRODES // 2
+            number += 1
+            if number == LOOKED_AT:
+                break
+    if not number:
+        raise RecordingError(path, "has no message with five sensors of 24 electrodes")
+    return tuple(compress(FINGERS, seen > number // 2))
+
+
+def has_joints(path: Path) -> bool:
+    """Return True if the bag has joint angles."""
+    with _opened(path) as bag:
+        return bag.joints is not None and bag.joints.msgcount > 0
+
+
+def _joints(t_ns: int, message: Any) -> JointReading | None:  # noqa: ANN401
+    """Return the angles of a hand's joints; None: there is none."""
+    pairs = zip(message.name, message.position, strict=False)
+    angles = {joint: float(angle) for name, angle in pairs if (joint := joint_name(name))}
+    if not angles:
+        return None
+    position_rad = np.array(list(angles.values()))
+    return JointReading(t_ns, 0, tuple(angles), position_rad)

@@ -1,0 +1,214 @@
+"""Bags of ROS 1 and 2 are judged as the same stream is; nothing stale or absent becomes a count."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+from graspd import judge, read_recording
+from graspd.biotac import electrode_columns
+from graspd.daemon.cli import main
+from graspd.drivers.base import DriverError, RecordingError, TactileReading
+from graspd.drivers.recordings.bag import BagDriver
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from tests.drivers.recordings.bags import WITH_ARRAY, BagOf, Sweep
+
+START_NS = 1_542_585_600_000_000_000
+PERIOD_NS = 10_000_000
+JOINTS = ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
+ROWS = 300
+"""Of the demo: one grasp."""
+
+
+def demo() -> pd.DataFrame:
+    return pd.read_csv(DEMO_RECORDING)[:ROWS]
+
+
+def sweeps_of(stream: pd.DataFrame, **joints: str) -> list[Sweep]:
+    """`joints`: prefix of the joints' names."""
+    prefix = joints.get("prefix", "rh_")
+    return [
+        Sweep(
+            START_NS + round(row["t"] * 1e9),
+            {
+                finger: row[electrode_columns(finger)].to_numpy(dtype=np.int16)
+                for finger in ("ff", "mf", "th")
+            },
+            {prefix + name: float(row[name]) for name in JOINTS},
+        )
+        for _, row in stream.drop(columns=["object", "slipped"]).iterrows()
+    ]
+
+
+def noise(number: int, seed: int = 1) -> list[Sweep]:
+    """Sweeps that never repeat."""
+    counts = np.random.default_rng(seed).integers(1000, 3000, (number, 3, 24), dtype=np.int16)
+    return [
+        Sweep(START_NS + index * PERIOD_NS, dict(zip(("ff", "mf", "th"), sweep, strict=True)))
+        for index, sweep in enumerate(counts)
+    ]
+
+
+def readings_of(path: Path, fingers: tuple[str, ...] = ("ff", "mf", "th")) -> list[TactileReading]:
+    found: list[TactileReading] = []
+    with BagDriver([path], fingers) as driver:
+        while not driver.exhausted:
+            found += [each for each in driver.read_ready() if isinstance(each, TactileReading)]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("version", "name", "options", "biotac"),
+    [
+        (1, "hand.bag", {}, {}),
+        (1, "HAND_1", {}, {}),
+        (1, "hand.bag", {}, {"biotac": WITH_ARRAY}),
+        (2, "hand", {"storage_plugin": StoragePlugin.SQLITE3}, {}),
+        (2, "hand", {"storage_plugin": StoragePlugin.MCAP}, {}),
+        (2, "hand", {"storage_plugin": StoragePlugin.SQLITE3, "version": 8}, {}),
+    ],
+)
+def test_a_bag_is_judged_as_its_stream(
+    tmp_path: Path, version: int, name: str, options: dict[str, Any], biotac: dict[str, str]
+) -> None:
+    demo().drop(columns=["object", "slipped"]).to_csv(tmp_path / "stream.csv", index=False)
+    path = BagOf(version, **biotac).write(tmp_path / name, sweeps_of(demo()), **options)
+    as_stream, as_bag = list(judge(tmp_path / "stream.csv")), list(judge(path))
+    assert sum(verdict.judged for verdict in as_bag) == 1
+    assert [(v.verdict, v.p_slip, v.reasons, v.gate) for v in as_bag] == [
+        (v.verdict, v.p_slip, v.reasons, v.gate) for v in as_stream
+    ]
+    assert main(["replay", str(path)]) == 0
+    frame, wanted = read_recording(path), demo()
+    columns = [name for name in wanted.columns if name not in ("t", "object", "slipped")]
+    assert (frame[columns] == wanted[columns]).all().all()
+    assert np.allclose(frame["t"] - frame["t"][0], wanted["t"], atol=1e-6)
+
+
+def test_a_single_file_of_a_bag_is_read(tmp_path: Path) -> None:
+    folder = BagOf(2).write(tmp_path / "hand", noise(30))
+    (storage,) = folder.glob("*.db3")
+    assert len(readings_of(storage)) == 30
+
+
+@pytest.mark.parametrize(
+    ("change", "left", "repeats"),
+    [
+        (lambda sweeps: sweeps, 70, 0),
+        # The topic at 100 Hz repeats 2 of 7 of what comes at 71.43 Hz, with the same stamp or not.
+        (lambda sweeps: held(sweeps, same_stamp=True), 50, 20),
+        (lambda sweeps: held(sweeps, same_stamp=False), 50, 20),
+        (lambda sweeps: sweeps[:40] + sweeps[30:], 70, 10),
+    ],
+)
+def test_a_repeat_is_dropped_and_counted(
+    tmp_path: Path, change: Callable[[list[Sweep]], list[Sweep]], left: int, repeats: int
+) -> None:
+    path = BagOf(1).write(tmp_path / "hand.bag", change(noise(70)))
+    with BagDriver([path], ("ff", "mf", "th")) as driver:
+        while not driver.exhausted:
+            driver.read_ready()
+    assert driver.counters.readings == left
+    assert driver.counters.repeats == repeats
+
+
+def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
+    """Each fourth and seventh of seven is the one before."""
+    found: list[Sweep] = []
+    for number, sweep in enumerate(sweeps):
+        if number % 7 in (3, 6):
+            sweep = found[-1] if same_stamp else found[-1]._replace(t_ns=sweep.t_ns)
+        found.append(sweep)
+    return found
+
+
+def test_a_hand_that_stands_still_in_the_topic_is_not_judged(tmp_path: Path) -> None:
+    sweeps = sweeps_of(demo())
+    stuck = [sweeps[110]._replace(t_ns=sweep.t_ns) for sweep in sweeps[110:]]
+    path = BagOf(1).write(tmp_path / "hand.bag", [*sweeps[:110], *stuck])
+    with pytest.warns(UserWarning, match="nothing was judged"):
+        assert {verdict.verdict for verdict in judge(path)} == {"unknown"}
+
+
+def test_absent_sensors_and_values_that_are_no_counts_are_broken(tmp_path: Path) -> None:
+    sweeps = noise(30)
+    sweeps[25].electrodes["ff"][:3] = -22072, 32570, 5000
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
+    faulty = readings_of(path)[25].faults
+    assert np.argwhere(faulty).tolist() == [[0, 0], [0, 1], [0, 2]]
+    with pytest.raises(RecordingError, match="no sensor on rf, only on ff, mf, th"):
+        readings_of(path, ("ff", "rf"))
+
+
+@pytest.mark.parametrize(
+    ("fingers", "name"), [(("ff", "mf"), "small-session-ff-mf"), (("ff", "th"), "ff-th")]
+)
+def test_a_hand_with_two_sensors_gets_the_name_of_its_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fingers: tuple[str, ...], name: str
+) -> None:
+    sweeps = [
+        sweep._replace(electrodes={finger: sweep.electrodes[finger] for finger in fingers})
+        for sweep in noise(30)
+    ]
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
+    assert main(["replay", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert f"has sensors on {', '.join(fingers)}" in said
+    assert name in said
+
+
+def test_a_former_biotac_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sweeps = [
+        sweep._replace(electrodes={f: counts[:19] for f, counts in sweep.electrodes.items()})
+        for sweep in noise(30)
+    ]
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
+    assert main(["replay", str(path)]) == 2
+    assert "BioTac with 19 electrodes; an SP has 24" in capsys.readouterr().err
+
+
+def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps_of(demo()[:30], prefix="lh_"))
+    assert "FFJ3" not in read_recording(path)
+    left = BagOf(1).write(
+        tmp_path / "left.bag", sweeps_of(demo()[:30], prefix="lh_"), topic="/lh/tactile"
+    )
+    assert (read_recording(left)["FFJ3"] == demo()["FFJ3"][:30]).all()
+
+
+def test_a_bag_without_the_topic_names_its_topics(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rosbags import rosbag1
+
+    bag = BagOf(1)
+    with rosbag1.Writer(tmp_path / "arm.bag") as writer:
+        where = writer.add_connection(
+            "/arm/joints", "sensor_msgs/msg/JointState", typestore=bag.store
+        )
+        message = bag.joints(START_NS, {"a": 0.0})
+        writer.write(where, START_NS, bag.store.serialize_ros1(message, message.__msgtype__))
+    assert main(["replay", str(tmp_path / "arm.bag")]) == 2
+    assert "no topic of sr_robot_msgs/BiotacAll, but /arm/joints" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_damage_of_a_bag_raises_anything_else(tmp_path: Path, seed: int) -> None:
+    chance = random.Random(seed)
+    path = BagOf(1).write(tmp_path / "hand.bag", noise(20))
+    data = bytearray(path.read_bytes())
+    if seed % 4 == 0:
+        del data[chance.randrange(len(data)) :]
+    for _ in range(chance.randrange(5)):
+        data[chance.randrange(len(data))] = chance.randrange(256)
+    path.write_bytes(bytes(data))
+    with contextlib.suppress(DriverError):
+        readings_of(path)
