@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
 from graspd.drivers.datagrams.tactile import SenderClock, TactileStream, TactileStreamDriver
 from graspd.drivers.twins.datagrams import TactileTwin
 from graspd.drivers.twins.faults import LinkFaults
-from graspd.drivers.udp import Datagram
+from tests.drivers.datagrams.network import FINGERS, Plan, arrivals, links, message
 from tests.drivers.one_sweep import counts_of, number_of, tactile
 from tests.drivers.palm.palm_stream import DatagramClock, Sender, flags
 from tests.drivers.test_udp_link import Receiver
 
 MS = 1_000_000
-FINGERS = ("ff", "mf", "th")
 LOOPBACK = "udp://127.0.0.1:0"
 COUNTS = list(range(2000, 2024))
-
-
-def message(counts: object = None, **fields: object) -> bytes:
-    """A datagram with counts of three fingers, and number 1, unless told otherwise."""
-    whole = {"seq": 1, "counts": dict.fromkeys(FINGERS, COUNTS) if counts is None else counts}
-    return json.dumps({**whole, **fields}).encode()
 
 
 def received(*data: bytes) -> tuple[list[TactileReading], dict[str, int]]:
@@ -208,55 +199,9 @@ def test_a_twin_sends_what_a_driver_reads() -> None:
         TactileTwin(sweeps, faults=LinkFaults(wrong_version=True))
 
 
-HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
-ACTIONS = ("send", "lose", "copy", "late", "stall", "stale", "stranger", "short", "left", "rail")
-
-
-@st.composite
-def links(draw: st.DrawFn) -> list[tuple[str, int]]:
-    """Draw what becomes of each message, and for how many periods it is held back."""
-    action = st.tuples(st.sampled_from(ACTIONS), st.integers(1, 20))
-    runs = draw(st.lists(st.tuples(action, st.integers(1, 12)), min_size=1, max_size=15))
-    return [("send", 0), *(each for each, times in runs for _ in range(times))]
-
-
-def arrivals(plan: list[tuple[str, int]]) -> list[tuple[int, Datagram, int]]:
-    """Return reception in ns, datagram and place of its sweep; the sender's time is 10 ms a sweep.
-
-    A stranger's datagram, or one that must give no count, has place -1.
-    """
-    found: list[tuple[int, Datagram, int]] = []
-    held_until = 0
-    for place, (action, periods) in enumerate(plan):
-        good = {finger: [number_of(place)] * 24 for finger in FINGERS}
-        stamp = {"seq": place, "t": 70.0 + place / 100}
-        now = max(place, held_until)
-        if action == "stall":  # a queue before the sender's socket
-            now = held_until = max(held_until, place + periods)
-        sender = THERE if action == "stranger" else HERE
-        data = message(good, **stamp)
-        if action == "short":
-            data = message({**good, "mf": good["mf"][:19]}, **stamp)
-        elif action == "rail":
-            data = message({**good, "mf": [0] * 24}, **stamp)
-        elif action == "left":
-            data = message(good, hand="left", **stamp)
-        elif action == "stale":  # counted by the sender, but the topic repeats its last sweep
-            data = message(good, seq=place, t=70.0 + (place - 1) / 100)
-        elif action == "late":
-            now += periods
-        if action != "lose":
-            lost = action in ("stranger", "left")
-            found.append((now, Datagram(data, 0, sender), -1 if lost else place))
-        if action == "copy":
-            found.append((now + periods, Datagram(data, 0, sender), place))
-    found.sort(key=lambda each: each[0])  # those of one time stay in their order
-    return [(10 * MS * periods, datagram, place) for periods, datagram, place in found]
-
-
 @settings(max_examples=300, deadline=None)
 @given(links())
-def test_no_count_is_older_than_its_reading_says(plan: list[tuple[str, int]]) -> None:
+def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
     receiver, clock = Receiver(), DatagramClock()
     start_ns = clock.now_ns
     with pytest.MonkeyPatch.context() as patch:
@@ -264,7 +209,7 @@ def test_no_count_is_older_than_its_reading_says(plan: list[tuple[str, int]]) ->
         driver = TactileStreamDriver(LOOPBACK, FINGERS, "right", clock=clock)
         driver.open()
         last = -1
-        for received_ns, datagram, place in arrivals(plan):
+        for received_ns, datagram, place in arrivals(plan, lambda at: [[number_of(at)] * 24] * 3):
             clock.now_ns = start_ns + received_ns
             receiver.waiting.append(datagram)
             readings: list[Reading] = [*driver.read_ready(), *driver.read_ready()]
