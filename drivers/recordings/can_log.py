@@ -13,6 +13,7 @@ from typing import Final, Unpack
 from graspd.drivers.base import Reading, RecordingError
 from graspd.drivers.can.frames import ERR_FLAG, ERROR, EXTENDED, LOST, REMOTE, CanFrame, Stamped
 from graspd.drivers.can.stream import BoardOptions, CanStream
+from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.can_files import read_asc, read_blf, read_trc
 from graspd.drivers.recordings.candump import ANY_BUS, NS_PER_S, Line, read_candump
 from graspd.drivers.recordings.kinds import PAGE, Kind, kind_of, open_recording, read_lines
@@ -215,9 +216,11 @@ class CanLog(LinkLogDriver[CanFrame]):
     def begin(self) -> None:
         self._shift_ns = self._last_ns = 0
         self.stream = CanStream("link log", self._fingers, **self._board)
-        self.stream.link.greeting()
 
     def feed(self, t_ns: int, record: CanFrame) -> Sequence[Reading]:
+        if self.stream.link.state is LinkState.CLOSED:
+            self.stream.link.start(t_ns)
+            self.stream.link.greeting()
         self.stream.watch(t_ns)
         readings, trouble = self.stream.receive([(record, t_ns, t_ns)])
         self.stream.watch(t_ns)

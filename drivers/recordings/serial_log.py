@@ -7,6 +7,7 @@ is `t: u64` (monotonic ns) and the bytes.
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,16 +18,17 @@ from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.player import LinkLogDriver
 from graspd.drivers.spi.conversation import Conversation, LineEvent
-from graspd.drivers.spi.messages import FrameParser, encode_frame
+from graspd.drivers.spi.messages import FrameCounters, FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960
 """Most bytes of one record; a frame has at most 1024. Longer pieces are cut."""
 
-CHUNK_BYTES: Final = 65_536
+CHUNK_BYTES: Final = 4096
 
 _TIME: Final = struct.Struct("<Q")
 _EVENTS: Final = frozenset(event.value for event in LineEvent)
 
+_log = logging.getLogger(__name__)
 
 Record = tuple[LineEvent, bytes]
 """An event on the line, and the bytes of one read or write."""
@@ -49,6 +51,10 @@ def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[tuple[int, Reco
             yield t_ns, (LineEvent(kind), payload[_TIME.size :])
 
 
+def _damaged(counters: FrameCounters) -> int:
+    return counters.bad_cobs + counters.bad_crc + counters.too_long
+
+
 class SerialLog(LinkLogDriver[Record]):
     """Play serial link logs through the driver's `Conversation`; nothing is sent."""
 
@@ -68,10 +74,16 @@ class SerialLog(LinkLogDriver[Record]):
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, Record]]:
-        parser = FrameParser()
+        parser, first_end = FrameParser(), 0
         with open_recording(path) as stream:
             while chunk := stream.read(CHUNK_BYTES):
                 yield from parse_records(parser, chunk)
+                if not first_end and _damaged(parser.counters):
+                    first_end = parser.counters.bytes
+        if damaged := _damaged(parser.counters):
+            total = damaged + parser.counters.frames
+            text = "%s: %d of %d records were damaged; the first is before byte %d"
+            _log.warning(text, path, damaged, total, first_end)
 
     def begin(self) -> None:
         self.stream = Conversation("link log", self._fingers, self._sensors)

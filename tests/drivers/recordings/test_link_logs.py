@@ -71,6 +71,20 @@ def test_damage_costs_the_record_that_is_damaged_and_the_one_after_it_at_most(
     assert all(record in made for record in found)
 
 
+def test_damaged_records_are_counted_and_the_first_is_placed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "line.serial"
+    content = bytearray(encoded([(at, (LineEvent.RECEIVED, bytes(80))) for at in range(200)]))
+    size = len(content) // 200
+    for number in (120, 150):
+        content[number * size + 20] ^= 0x40
+    path.write_bytes(content)
+    driver = SerialLog([path], ("ff", "mf", "th"))
+    assert len(list(driver.records(path))) == 198
+    assert "2 of 200 records were damaged; the first is before byte 12288" in caplog.text
+
+
 @given(st.binary(max_size=3000))
 def test_no_bytes_make_the_record_parser_raise(data: bytes) -> None:
     list(parse_records(FrameParser(), data))
