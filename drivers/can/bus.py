@@ -81,6 +81,7 @@ class CanBus:
         if bitrate is not None:
             self._options["bitrate"] = bitrate
         self._stamped = interface in STAMPED_INTERFACES
+        self._may_hang = interface == "socketcand"
         self._clock = clock
         self._wall_clock = wall_clock
         self._bus: can.BusABC | None = None
@@ -178,7 +179,8 @@ class CanBus:
                 # slcan returns no frame for an adapter's answer, although frames wait behind it.
                 if self.descriptor is None or not is_ready(self.descriptor):
                     self._idle_ns = before_ns
-                    self._notice_quiet(before_ns, bool(frames))
+                    if self._may_hang:
+                        self._notice_quiet(before_ns, bool(frames))
                     return
                 continue
             frame = _frame_of(message)
@@ -194,7 +196,7 @@ class CanBus:
         """Have a connection that may be lost opened again."""
         if received:
             self._received_ns = now_ns
-        elif self._interface == "socketcand" and now_ns - self._received_ns > QUIET_NS:
+        elif now_ns - self._received_ns > QUIET_NS:
             text = f"no frame from the server for {QUIET_NS / 1e9:g} s"
             self.failure = LinkError(LinkCause.TIMEOUT, text)
 

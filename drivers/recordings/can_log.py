@@ -156,12 +156,14 @@ class CanLog(LinkLogDriver[CanFrame]):
                 )
             frames += survey.frames
         self._bus = self._choose({bus for bus, _ in frames})
-        self._warn_of_ids(frames)
+        self._check_ids(frames)
         super().open()
 
     def _choose(self, buses: set[str]) -> str:
         """Return the bus to play. Raises `RecordingError` if that is not clear."""
         names = ", ".join(sorted(buses)[:SHOWN_MAX])
+        if not buses:
+            raise RecordingError(self.paths[0], "has no frame")
         if len(buses) == 1:
             (only,) = buses
             if self._channel not in (None, only):
@@ -175,10 +177,13 @@ class CanLog(LinkLogDriver[CanFrame]):
         _log.info("%s: has the channels %s; played is %s", self.paths[0], names, self._channel)
         return self._channel
 
-    def _warn_of_ids(self, frames: Counter[tuple[str, int | None]]) -> None:
-        """Warn if no frame of the bus has the board's arbitration id."""
+    def _check_ids(self, frames: Counter[tuple[str, int | None]]) -> None:
+        """Warn if no frame of the bus has the board's arbitration id; raise if all are CAN FD."""
         wanted = self._board.get("arbitration_id")
         ids = {key[1]: count for key, count in frames.items() if key[0] == self._bus}
+        if set(ids) == {None}:
+            problem = "has frames of CAN FD alone; SynTouch's board sends classic ones"
+            raise RecordingError(self.paths[0], problem)
         if wanted is None or wanted in ids:
             return
         most = sorted(ids, key=lambda each: -ids[each])[:SHOWN_MAX]

@@ -325,8 +325,19 @@ def test_lines_that_are_not_understood_are_counted(
     assert len(readings) == 2
     assert log.stream.counters.frames == 48
     assert f"2 of 50 lines were not understood; the first is line 51, '{'x' * 80}'" in caplog.text
-    path.write_text("can0  5A1   [3]  0D 3A 1F\n")
-    with pytest.raises(RecordingError, match=r"no line was understood: line 1, 'can0 .*candump -L"):
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("can0  5A1   [3]  0D 3A 1F\n", r"no line was understood: line 1, 'can0 .*candump -L"),
+        ("(1.0) can0 5A1##00D3A1F\n", "has frames of CAN FD alone"),
+    ],
+)
+def test_a_log_without_frames_of_a_board_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "bus.log"
+    path.write_text(text)
+    with pytest.raises(RecordingError, match=says):
         played([path])
 
 
