@@ -5,16 +5,16 @@ from __future__ import annotations
 import asyncio
 import inspect
 from pathlib import Path
+from selectors import DefaultSelector
 
 import pytest
-from zmq.asyncio import Poller
 
 from deploy.clients.python.graspd_client import AsyncClient, Client, Decision
 from tests.clients.test_both_ask import DEADLINE_S, PATIENT_MS, false_daemon, of, told
 from tests.kit.waiting import wait_until
 
 PATIENT_S = PATIENT_MS / 1e3
-SHORT_S = 0.05
+SHORT_S, HOURS_S = 0.05, 1e6
 
 
 def made(folder: Path, *, ask: bool = True) -> AsyncClient:
@@ -60,12 +60,12 @@ def test_without_a_daemon_it_is_no_in_time(tmp_path: Path) -> None:
 def test_it_waits_without_looking_again_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, same_computer: bool
 ) -> None:
-    looks: list[float] = []
-    poll = Poller.poll
+    looks: list[float | None] = []
+    select = DefaultSelector.select
 
-    def noted(poller: Poller, timeout: float = -1) -> object:
+    def noted(selector: DefaultSelector, timeout: float | None = None) -> object:
         looks.append(timeout)
-        return poll(poller, timeout)
+        return select(selector, timeout)
 
     async def waits() -> None:
         out = f"ipc://{tmp_path}/out"
@@ -73,9 +73,9 @@ def test_it_waits_without_looking_again_and_again(
             await graspd.verdict(0.3)
             await graspd.wait_for_grasp(0.3)
 
-    monkeypatch.setattr(Poller, "poll", noted)
+    monkeypatch.setattr(DefaultSelector, "select", noted)
     asyncio.run(waits())
-    assert len(looks) < 10, "one for each call, and for what the clocks round off"
+    assert len(looks) < 20, "a few for each call, and for what the clocks round off"
 
 
 def test_other_tasks_go_on_while_it_waits(tmp_path: Path) -> None:
@@ -107,3 +107,16 @@ def test_a_call_meanwhile_is_refused_and_a_cancelled_one_ends(tmp_path: Path) ->
     with false_daemon(tmp_path, of("unknown")) as heard:
         asyncio.run(overlaps())
         wait_until(lambda: heard.count(b"not-lifting") == 2)
+
+
+def test_closing_ends_a_task_that_waits(tmp_path: Path) -> None:
+    async def closes() -> None:
+        graspd = made(tmp_path)
+        waiting = asyncio.create_task(graspd.may_i_lift(HOURS_S))
+        await asyncio.sleep(SHORT_S)
+        graspd.close()
+        answer = await waiting
+        assert (bool(answer), answer.verdict.reasons) == (False, ("closed",))
+        assert await graspd.wait_for_grasp(HOURS_S) is None
+
+    asyncio.run(closes())

@@ -1,18 +1,24 @@
-"""Clients in a program that forks, and in one that gets signals."""
+"""Clients in a program that forks, has threads, or gets signals."""
 
 from __future__ import annotations
 
 import pickle
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
 
 from deploy.clients.python.graspd_client import Client
 from tests.clients.building import asked, compiled_probe
 from tests.clients.test_both_ask import false_daemon, told
 from tests.conftest import ROOT
+
+HOURS_S, LIMIT_S = 1e6, 60.0
 
 FORKS = """
 import asyncio, os, sys
@@ -68,6 +74,26 @@ def test_a_client_is_not_pickled_and_says_so(tmp_path: Path) -> None:
         pytest.raises(TypeError, match="make one in each process"),
     ):
         pickle.dumps(graspd)
+
+
+def test_a_second_thread_is_refused_and_may_close(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits, poll = threading.Event(), zmq.zmq_poll
+
+    def noted(*given: Any) -> object:  # noqa: ANN401
+        waits.set()
+        return poll(*given)
+
+    monkeypatch.setattr(zmq, "zmq_poll", noted)
+    with ThreadPoolExecutor(1) as other, Client(f"ipc://{tmp_path}/out") as graspd:
+        lifting = other.submit(graspd.may_i_lift, HOURS_S)
+        assert waits.wait(LIMIT_S)
+        with pytest.raises(RuntimeError, match="one call at a time"):
+            graspd.verdict()
+        graspd.close()
+        assert lifting.result().verdict.reasons == ("closed",)
+        assert graspd.verdict().reasons == ("closed",)
 
 
 def test_in_cpp_signals_end_no_call_and_a_fork_is_told_so() -> None:

@@ -19,9 +19,11 @@ import json
 import logging
 import os
 import re
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from numbers import Real
@@ -298,6 +300,8 @@ class _Hand:
         self._asks = ask_endpoint is not None
         self._closed = self._behind = False
         self._pid = os.getpid()
+        self._turn = threading.Lock()
+        """Held by the call that is under way."""
         self._lifts: dict[tuple[str, int], bool] = {}
         """Grasps whose lift was allowed, the oldest first, and whether graspd has the outcome."""
         self._last = self._telling = "", 0
@@ -331,19 +335,11 @@ class _Hand:
     def __reduce__(self) -> str:
         raise TypeError("a client belongs to its process: make one in each process")
 
-    def _check_process(self) -> None:
-        """Raise `RuntimeError` after a fork: ZeroMQ's thread is the parent's alone."""
-        if os.getpid() != self._pid:
-            raise RuntimeError(
-                f"this client is of process {self._pid}: make another one in this process, "
-                f"{os.getpid()}, after the fork"
-            )
-
     def _verdict(self, due_ns: int) -> Waits[Verdict]:
+        while not self._closed and not self._drain() and (yield from self._wait(due_ns)):
+            pass
         if self._closed:
             return Verdict(Decision.UNKNOWN, ("closed",))
-        while not self._drain() and (yield from self._wait(due_ns)):
-            pass
         if self._behind:
             return Verdict(Decision.UNKNOWN, ("behind",))
         return self._newest.at(time.monotonic_ns())
@@ -366,8 +362,7 @@ class _Hand:
                     decided = decided.unknown("late")
             allowed = question.permits(decided)
         finally:
-            if not self._closed:
-                self._link.asking.hang_up(lifts=allowed)
+            self._link.asking.hang_up(lifts=allowed)
         decided = question.at_the_end(decided)
         waited_s = (time.monotonic_ns() - began_ns) / 1e9
         answer = LiftAnswer(decided, waited_s, supervised is True and decided.supervised)
@@ -433,11 +428,37 @@ class _Hand:
         return self._told
 
     def close(self) -> None:
-        """Close the sockets. May be called again; every verdict is unknown from then on."""
+        """Close the sockets. May be called again; every verdict is unknown from then on.
+
+        A call that is under way, of another thread or task, ends soon and closes them.
+        """
         if not self._closed and os.getpid() == self._pid:
             self._closed = True
-            self._link.close()
             self._allow(("", 0))
+            self._close_if_idle()
+
+    def _close_if_idle(self) -> None:
+        if self._turn.acquire(blocking=False):
+            self._link.close()
+            self._turn.release()
+
+    @contextmanager
+    def _one_call(self, steps: Waits[Any]) -> Iterator[None]:
+        """Refuse a call after a fork, for ZeroMQ's thread is the parent's, and a second call."""
+        if os.getpid() != self._pid:
+            raise RuntimeError(
+                f"this client is of process {self._pid}: make another one in this process, "
+                f"{os.getpid()}, after the fork"
+            )
+        if not self._turn.acquire(blocking=False):
+            raise RuntimeError("another call is under way: one call at a time, or two clients")
+        try:
+            yield
+        finally:
+            steps.close()
+            self._turn.release()
+            if self._closed:
+                self._close_if_idle()
 
     def _allow(self, lift: tuple[str, int]) -> None:
         """The hand lifts this grasp; what was lifted before is over, and should have been told."""
@@ -611,23 +632,23 @@ class Client(_Hand):
         self.close()
 
     def _finish(self, steps: Waits[_T]) -> _T:
-        while True:
-            self._check_process()
-            try:
-                timeout_ms = next(steps)
-            except StopIteration as end:
-                result: _T = end.value
-                return result
-            self._link.wait(timeout_ms)
+        with self._one_call(steps):
+            while True:
+                try:
+                    timeout_ms = next(steps)
+                except StopIteration as end:
+                    result: _T = end.value
+                    return result
+                self._link.wait(timeout_ms)
 
 
 class AsyncClient(_Hand):
     """`Client` for asyncio: the same rules, and what waits there is awaited here.
 
-    One call at a time: another one meanwhile raises `RuntimeError`. A call may be cancelled.
+    A call sleeps until a socket wakes the loop, and may be cancelled.
     """
 
-    _is_busy = False
+    _woken: Any = None  # a future: who waits
 
     async def verdict(self, wait_s: float = 0.0) -> Verdict:
         """As `Client.verdict`."""
@@ -666,26 +687,42 @@ class AsyncClient(_Hand):
         self.close()
 
     async def _finish(self, steps: Waits[_T]) -> _T:
-        from zmq.asyncio import Poller  # only here: it loads asyncio
-
-        self._check_process()
-        if self._is_busy:
-            raise RuntimeError("another call is under way: one call at a time, or two clients")
-        self._is_busy = True
-        try:
+        with self._one_call(steps):
             while True:
                 try:
                     timeout_ms = next(steps)
                 except StopIteration as end:
                     result: _T = end.value
                     return result
-                poller = Poller()
-                for each in self._link.sockets:
-                    poller.register(each, zmq.POLLIN)
-                await poller.poll(max(timeout_ms, 1))
+                await self._sleep(max(timeout_ms, 1) / 1e3)
+
+    async def _sleep(self, timeout_s: float) -> None:
+        """Sleep until a message or an answer waits, up to `timeout_s`."""
+        import asyncio  # only here: it takes time
+
+        loop, sockets = asyncio.get_running_loop(), self._link.sockets
+        self._woken = loop.create_future()
+        for each in sockets:
+            loop.add_reader(each.FD, self._wake)
+        timer = loop.call_later(timeout_s, self._wake)
+        # A descriptor tells only of what comes later. To ask for `EVENTS` makes it tell.
+        if any(int(each.EVENTS) & zmq.POLLIN for each in sockets):
+            self._wake()
+        try:
+            await self._woken
         finally:
-            steps.close()
-            self._is_busy = False
+            timer.cancel()
+            for each in sockets:
+                loop.remove_reader(each.FD)
+
+    def _wake(self) -> None:
+        if self._woken is not None and not self._woken.done():
+            self._woken.set_result(None)
+
+    def close(self) -> None:
+        """As `Client.close`; a waiting task is woken."""
+        super().close()
+        self._wake()
 
 
 class _Message(NamedTuple):
