@@ -1,6 +1,7 @@
 """The scene: one TOML file that describes a hand, and how to judge its grasps."""
 
 # Without postponed annotations, as in `graspd.daemon.scene.drivers`.
+import codecs
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -311,6 +312,8 @@ def load(path: Path) -> Scene:
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene: {error.strerror}") from error
     except UnicodeDecodeError as error:
+        if error.object.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise SceneError(f"{path}: is UTF-16; save it as UTF-8") from error
         raise SceneError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from error
     try:
         data = toml.loads(text)

@@ -163,7 +163,9 @@ def test_two_mistakes_are_two_lines(tmp_path: Path) -> None:
     [
         (b"[tactile\n", "not TOML"),
         (b"a = 1\na = 2\n", "not TOML"),
-        (b"\xff\xfe\x00", "not a text file"),
+        (b"\xff\x00", "not a text file"),
+        (b"\xff\xfe[\x00", "is UTF-16; save it as UTF-8"),
+        (b"\xfe\xff\x00[", "is UTF-16; save it as UTF-8"),
         (b"a = " + b"[" * 20_000, "not TOML that can be read: nested too deeply"),
         (b"a = " + b"9" * 5000, "not TOML: Exceeds the limit"),
         (b"[" + b"a" * 10_000 + b"]\n[" + b"a" * 10_000 + b"]", r"not TOML: .{320}$"),
