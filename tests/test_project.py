@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
@@ -39,12 +40,12 @@ def test_the_installed_package_has_the_version() -> None:
     assert version("graspd") == VERSION
 
 
-def names_in_wheel(project: Path, folder: Path) -> list[str]:
-    """Build the wheel of a source tree, and return the names of its files."""
+def wheel_of(project: Path, folder: Path) -> dict[str, int]:
+    """Build the wheel of a source tree, and return the checksum of each file, by its name."""
     build(project, "wheel", folder)
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as content:
-        return sorted(content.namelist())
+        return {file.filename: file.CRC for file in content.infolist()}
 
 
 def build(project: Path, kind: str, folder: Path) -> None:
@@ -52,17 +53,49 @@ def build(project: Path, kind: str, folder: Path) -> None:
     subprocess.run(command, cwd=project, check=True, capture_output=True)
 
 
-def test_a_wheel_holds_one_package_also_from_an_sdist(tmp_path: Path) -> None:
-    names = names_in_wheel(ROOT, tmp_path / "wheel")
-    tops = {name.partition("/")[0] for name in names}
-    assert tops == {f"graspd-{VERSION}.{kind}" for kind in ("data", "dist-info")} | {"graspd"}
-    assert {"graspd/daemon/cli.py", "graspd/models/zoo/cnn1.onnx", "graspd/py.typed"} <= set(names)
-    build(ROOT, "sdist", tmp_path)
-    (packed,) = tmp_path.glob("*.tar.gz")
+def unpacked_sdist(folder: Path) -> Path:
+    build(ROOT, "sdist", folder)
+    (packed,) = folder.glob("*.tar.gz")
     with tarfile.open(packed) as content:
-        content.extractall(tmp_path / "sdist", filter="data")
-    (unpacked,) = (tmp_path / "sdist").iterdir()
-    assert names_in_wheel(unpacked, tmp_path / "second") == names
+        assert not any(file.issym() or file.islnk() for file in content)
+        content.extractall(folder / "sdist", filter="data")
+    (unpacked,) = (folder / "sdist").iterdir()
+    return unpacked
+
+
+def without_links(folder: Path) -> Path:
+    """Copy the source tree as git checks it out on Windows: a link is a file with its target."""
+    for name in ("daemon", "drivers", "models", "deploy"):
+        shutil.copytree(ROOT / name, folder / name, symlinks=True)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    links = [path for path in folder.rglob("*") if path.is_symlink()]
+    assert links
+    for path in links:
+        target = str(path.readlink())
+        path.unlink()
+        path.write_text(target)
+    return folder
+
+
+@pytest.mark.parametrize("source", [unpacked_sdist, without_links])
+def test_a_wheel_is_the_same_from_any_archive(
+    source: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    files = wheel_of(ROOT, tmp_path / "wheel")
+    tops = {name.partition("/")[0] for name in files}
+    assert tops == {f"graspd-{VERSION}.{kind}" for kind in ("data", "dist-info")} | {"graspd"}
+    modules = (
+        "client.py",
+        "daemon/cli.py",
+        "daemon/scene/examples/spi.toml",
+        "models/zoo/cnn1.onnx",
+    )
+    assert {f"graspd/{name}" for name in (*modules, "py.typed")} <= set(files)
+    assert not [name for name in files if "tests" in name or name.endswith((".pyc", ".so"))]
+    folder = tmp_path / "source"
+    folder.mkdir()
+    assert wheel_of(source(folder), tmp_path / "again") == files
 
 
 @pytest.mark.parametrize(("name", "pattern"), PLACES.items())

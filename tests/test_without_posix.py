@@ -119,7 +119,7 @@ def test_page_is_served_until_interrupted() -> None:
 
 
 def test_model_is_trained_and_tried(tmp_path: Path) -> None:
-    pytest.importorskip("torch")
+    pytest.importorskip("torch", reason="needs the extra `train`")
     words = ("--own", GRASPS, "--folds", 2, "--only", "cv", "--quiet", "--out", tmp_path)
     code, _, problem = without("train", "small-session", *words)
     assert code == 0, problem
