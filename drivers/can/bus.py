@@ -61,13 +61,9 @@ class CanBus:
     ) -> None:
         """`bitrate`: bit/s; None: that of the interface. `options`: more arguments of it.
 
-        Raises `ValueError` for a rate of socketcan, and for what can never be opened.
+        Raises `ValueError` for what can never be opened.
         """
-        refuse_unusable(interface, channel, options)
-        if interface == "socketcan" and bitrate is not None:
-            raise ValueError(
-                "bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`"
-            )
+        refuse_unusable(interface, channel, bitrate, options)
         self.failure: LinkError | None = None
         """Why the bus broke; None while it works."""
         self.more = False

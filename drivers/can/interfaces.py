@@ -56,6 +56,11 @@ _LIBRARIES: Final = {"kvaser": "canlib", "neousys": "wdt_dio", "pcan": "pcanbasi
 _WINDOWS: Final = frozenset(
     {"etas", "iscan", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector"}
 )
+_BITRATES: Final = {
+    "slcan": (10, 20, 50, 83.3, 100, 125, 250, 500, 750, 1000),
+    "seeedstudio": (10, 20, 50, 100, 125, 200, 250, 400, 500, 800, 1000),
+}
+"""Rates that an adapter knows, kbit/s; others take any."""
 _OWN_KEYS: Final = frozenset({"interface", "channel", "bitrate"})
 _TYPES: Final[dict[str, dict[str, type]]] = {
     "socketcand": {"host": str, "port": int, "tcp_tune": bool},
@@ -69,7 +74,7 @@ _ARGUED: Final = frozenset({"gs_usb", "slcan", "socketcan", "socketcand", "udp_m
 logging.getLogger("can").setLevel(logging.CRITICAL)
 
 
-def refuse_unusable(interface: str, channel: str, options: Options) -> None:
+def refuse_unusable(interface: str, channel: str, bitrate: int | None, options: Options) -> None:
     """Raise `ValueError` for what can never be opened on this computer. Opens nothing."""
     if interface not in can.VALID_INTERFACES:
         raise ValueError(f"interface: {_what_there_is(interface)}")
@@ -81,6 +86,7 @@ def refuse_unusable(interface: str, channel: str, options: Options) -> None:
         missing = f"the library lib{_LIBRARIES[interface]}.so"
         raise ValueError(f"interface: {_named(interface)} needs {missing}: {_page(interface)}")
     _refuse_channel(interface, channel)
+    _refuse_bitrate(interface, bitrate)
     _refuse_options(interface, options)
 
 
@@ -137,8 +143,22 @@ def _refuse_channel(interface: str, channel: str) -> None:
             from graspd.drivers.protocol_polled import refuse_url
 
             refuse_url(channel)
+        if get_type_hints(_constructor(interface)).get("channel") is int:
+            int(channel)
     except ValueError as error:
         raise ValueError(f"channel {channel}: {error}") from error
+
+
+def _refuse_bitrate(interface: str, bitrate: int | None) -> None:
+    """Raise `ValueError` for a bit rate that is not set here, or that the adapter lacks."""
+    known = _BITRATES.get(interface)
+    if interface == "socketcan" and bitrate is not None:
+        raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
+    if interface == "canalystii" and bitrate is None:
+        raise ValueError(f"bitrate: {_named(interface)} needs one")
+    if known and bitrate is not None and bitrate / 1000 not in known:
+        rates = ", ".join(f"{rate * 1000:.0f}" for rate in known)
+        raise ValueError(f"bitrate: {_named(interface)} has {rates}")
 
 
 def _refuse_options(interface: str, options: Options) -> None:

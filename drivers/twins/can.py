@@ -55,7 +55,7 @@ class CanTwin(Opened):
         """
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
-        refuse_unusable(interface, channel, {})
+        refuse_unusable(interface, channel, None, {})
         faults.refuse("CAN", "one_byte_at_a_time", "wrong_version", "stuck_clock")
         self._fingers = len(fingers)
         self._channels = SEQUENCES[sequence]

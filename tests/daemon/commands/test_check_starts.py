@@ -49,6 +49,10 @@ def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -
         (SOCKETCAND + "port = 1, tune = true }", "options.tune: python-can's interface 'socketca"),
         (SOCKETCAND + "port = 1, bitrate = 1 }", "options.bitrate: is a key of its own"),
         ('interface = "slcan"\noptions = { timeout = 1.0 }', "options.timeout: must be 0.0"),
+        (
+            'interface = "slcan"\nbitrate = 123456',
+            "bitrate: python-can's interface 'slcan' has",
+        ),
         ('interface = "slcan"\nchannel = "foo://x"', "channel foo://x: invalid URL"),
         ('interface = "udp_multicast"', "channel can0: 'can0' does not appear to be an IP"),
         ('channel = "a-name-of-16-byte"', "channel a-name-of-16-byte: longer than 15 bytes"),
