@@ -68,9 +68,11 @@ def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
     """
     names, path = column_names(table), Path(folder, "table.csv")
     _refuse_twice(names, names)
-    columns = [np.ma.array(_without_na(table[name])).tolist() for name in names]
+    columns: list[Any] = [np.ma.array(_without_na(table[name])) for name in names]
+    # An outcome is 0 or 1 in a file.
+    columns = [each.astype(int) if each.dtype.kind == "b" else each for each in columns]
     with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([names, *zip(*columns, strict=True)])
+        csv.writer(file).writerows([names, *zip(*(each.tolist() for each in columns), strict=True)])
     return path
 
 

@@ -351,6 +351,17 @@ def test_a_table_is_judged_as_its_file(
     assert told[0] == told[1]
 
 
+@pytest.mark.filterwarnings("ignore:of 300 grasps 177 were not judged")
+def test_what_the_readers_return_is_judged_as_its_file() -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    told = [
+        [(each.verdict, each.p_slip) for each in graspd.judge(given, model="mlp")]
+        for given in (DEMO_DAY, graspd.read_grasps(DEMO_DAY))
+    ]
+    assert len(told[0]) == 300
+    assert told[0] == told[1]
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
