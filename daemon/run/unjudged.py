@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from graspd.biotac import Finger
+from graspd.daemon.judge.contact import WINDOW
 from graspd.daemon.judge.hand import GAP_NS
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import ADVICE, OPEN, UNREADABLE, Reason
@@ -127,7 +128,7 @@ class Unjudged(Companion):
         elif damage := self._damage_in_words():
             yield damage
         elif self._fingers and not self._was_tared:
-            yield "no second of an open hand comes first: it is not known where the fingers rest"
+            yield self._rest_in_words()
         elif self._fingers and not self._touched:
             yield "no finger touched: the hand was open all the time"
         else:
@@ -135,6 +136,14 @@ class Unjudged(Companion):
                 yield f"{', '.join(missing)} never touched: all required fingers hold a grasp"
             for reason, number in self.not_judged.most_common(CAUSES_MAX):
                 yield f"{number} {reason}: {ADVICE[reason]}"
+
+    def _rest_in_words(self) -> str:
+        """Return for how long the hand must be open at the rate of the readings."""
+        rest_s = WINDOW * median(self._steps_s) if self._steps_s else 1.0
+        return (
+            f"no {WINDOW} readings of an open hand come first ({rest_s:.2g} s at this rate): it is "
+            "not known where the fingers rest"
+        )
 
     def _damage_in_words(self) -> str | None:
         """Return why most readings cannot be used; None: most can."""
