@@ -61,6 +61,8 @@ def plot_grasp(counts: ArrayLike, layout: str = "D1", *, fill: str = "neighbour-
     one = counts_of(counts)
     if len(one) != 1:
         raise ValueError(f"it draws one grasp, and {len(one)} were given")
+    if np.isnan(one).all():
+        raise ValueError("no electrode of this grasp works")
     images = tactile_images(one, layout, fill=fill)[0]
     number = images.shape[2]
     titles = fingers_of(names) or (TABLE_FINGERS if number == len(TABLE_FINGERS) else ())

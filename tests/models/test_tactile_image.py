@@ -212,3 +212,5 @@ def test_a_drawing_has_each_electrodes_number_on_its_pixel() -> None:
     assert red == ["5"]
     with pytest.raises(ValueError, match="draws one grasp, and 2 were given"):
         graspd.plot_grasp(np.stack([counts, counts]))
+    with pytest.raises(ValueError, match="no electrode of this grasp works"):
+        graspd.plot_grasp(counts * np.nan)
