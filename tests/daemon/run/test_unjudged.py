@@ -49,7 +49,7 @@ def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
         (every(10), "readings are 100 ms apart (10 Hz): a grasp settles from 20 Hz on"),
         (in_degrees, "rad is not a joint angle: is it in degrees?"),
         (lambda stream: stream[REST_ROWS:], "no 100 readings of an open hand come first (1 s at"),
-        (every(2), "no 100 readings of an open hand come first (2 s at"),
+        (every(4), "no 100 readings of an open hand come first (4 s at"),
         (lambda stream: stream[: REST_ROWS + 5], "no finger touched: the hand was open"),
         (without_thumb, "th never touched: all required fingers hold a grasp"),
     ],
