@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
 from graspd.drivers.datagrams.tactile import SenderClock, TactileStream, TactileStreamDriver
@@ -95,6 +96,28 @@ def test_what_is_no_count_costs_no_other(
         "readings": 1,
         **({} if counter is None else {"faulty_readings": 1, counter: number}),
     }
+
+
+ANY = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=24) | st.dictionaries(st.sampled_from((*FINGERS, "x")), inner)
+    ),
+    max_leaves=30,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.dictionaries(st.sampled_from((*FINGERS, "rf", "x")), ANY), ANY, ANY, ANY)
+def test_any_json_is_a_reading_or_counted(
+    counts: dict[str, object], seq: object, t_s: object, hand: object
+) -> None:
+    readings, counters = received(message(counts, seq=seq, t=t_s, hand=hand))
+    dropped = counters.get("bad_messages", 0) + counters.get("other_hands", 0)
+    assert len(readings) + dropped == 1
+    for reading in readings:
+        assert reading.counts.max() <= 4095
+        assert not reading.counts[reading.faults != 0].any()
 
 
 def test_a_finger_without_a_name_is_left_out_and_counted() -> None:
