@@ -10,10 +10,9 @@ from selectors import DefaultSelector
 import pytest
 
 from deploy.clients.python.graspd_client import AsyncClient, Client, Decision
-from tests.clients.test_both_ask import DEADLINE_S, PATIENT_MS, false_daemon, of, told
+from tests.clients.test_both_ask import DEADLINE_S, false_daemon, of, told
 from tests.kit.waiting import wait_until
 
-PATIENT_S = PATIENT_MS / 1e3
 SHORT_S, HOURS_S = 0.05, 1e6
 
 
@@ -32,11 +31,11 @@ def test_it_takes_what_the_client_takes() -> None:
 def test_a_lift_is_allowed_and_told_once(tmp_path: Path) -> None:
     async def lifts() -> None:
         async with made(tmp_path) as graspd:
-            answer = await graspd.may_i_lift(PATIENT_S)
+            answer = await graspd.may_i_lift(HOURS_S)
             assert answer
             assert (await graspd.verdict()).decision is Decision.STABLE
-            assert await graspd.tell(answer.verdict, "slipped", "mug", PATIENT_S)
-            again = await graspd.may_i_lift(SHORT_S, supervised=True)
+            assert await graspd.tell(answer.verdict, "slipped", "mug", HOURS_S)
+            again = await graspd.may_i_lift(1.0, supervised=True)
             assert (bool(again), again.verdict.reasons) == (False, ("outcome-told",))
             assert graspd.unreported == 0
         assert (await graspd.verdict()).reasons == ("closed",)
@@ -93,19 +92,20 @@ def test_other_tasks_go_on_while_it_waits(tmp_path: Path) -> None:
 
 
 def test_a_call_meanwhile_is_refused_and_a_cancelled_one_ends(tmp_path: Path) -> None:
-    async def overlaps() -> None:
+    async def overlaps(heard: list[bytes]) -> None:
         async with made(tmp_path) as graspd:
-            waiting = asyncio.create_task(graspd.may_i_lift(PATIENT_S))
-            await asyncio.sleep(SHORT_S)
+            waiting = asyncio.create_task(graspd.may_i_lift(HOURS_S))
+            while not heard:
+                await asyncio.sleep(SHORT_S)
             with pytest.raises(RuntimeError, match="one call at a time"):
                 await graspd.verdict()
             waiting.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await waiting
-            assert not await graspd.may_i_lift(SHORT_S)
+            assert not await graspd.may_i_lift(1.0)  # long enough to connect
 
     with false_daemon(tmp_path, of("unknown")) as heard:
-        asyncio.run(overlaps())
+        asyncio.run(overlaps(heard))
         wait_until(lambda: heard.count(b"not-lifting") == 2)
 
 
