@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Unpack
+from typing import BinaryIO, Final, Unpack
 
 from graspd.drivers.base import Reading, RecordingError
 from graspd.drivers.can.frames import ERR_FLAG, ERROR, EXTENDED, LOST, REMOTE, CanFrame, Stamped
@@ -16,7 +17,14 @@ from graspd.drivers.can.stream import BoardOptions, CanStream
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.can_files import read_asc, read_blf, read_trc
 from graspd.drivers.recordings.candump import ANY_BUS, NS_PER_S, Line, read_candump
-from graspd.drivers.recordings.kinds import PAGE, Kind, kind_of, open_recording, read_lines
+from graspd.drivers.recordings.kinds import (
+    LINE_BYTES_MAX,
+    PAGE,
+    Kind,
+    kind_of,
+    open_recording,
+    reason,
+)
 from graspd.drivers.recordings.player import LinkLogDriver
 
 NS_PER_US: Final = 1000
@@ -32,6 +40,8 @@ STEPS_SHARE: Final = 0.25
 """Share of times that are not above the one before, from which on they are steps."""
 
 _TEXTS: Final = {Kind.CANDUMP: read_candump, Kind.ASC: read_asc, Kind.TRC: read_trc}
+_ENCODINGS: Final = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb": "utf-8-sig"}
+"""Encodings by the first two bytes of a byte order mark."""
 
 _log = logging.getLogger(__name__)
 
@@ -72,8 +82,19 @@ def read_log(path: Path) -> Iterator[Line]:
             return
         if kind not in _TEXTS:
             raise RecordingError(path, f"is {kind.value}, not a CAN log; {PAGE} lists those")
-        lines = (line.decode("latin-1") for line in read_lines(path, stream))
-        yield from _TEXTS[kind](lines)
+        try:
+            yield from _TEXTS[kind](_lines(stream))
+        except OSError as error:
+            raise RecordingError(path, reason(error)) from error
+
+
+def _lines(stream: BinaryIO) -> Iterator[str]:
+    """Yield lines of text in any encoding; a line that is too long comes in pieces."""
+    encoding = _ENCODINGS.get(stream.read(2), "latin-1")
+    stream.seek(0)
+    with io.TextIOWrapper(stream, encoding, errors="replace") as text:
+        while line := text.readline(LINE_BYTES_MAX):
+            yield line
 
 
 @dataclass(slots=True)

@@ -64,7 +64,7 @@ _MAGIC: Final = {
     b";$FILEVERSION": Kind.TRC,
     b";#########": Kind.TRC,  # version 1.0
 }
-_BYTE_ORDER_MARKS: Final = (b"\xef\xbb\xbf", b"\xff\xfe", b"\xfe\xff")
+_UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
 _SPACE: Final = rb"(?:[ \t]|\x1b\[[0-9;]*m)"
 """A blank, or the code of a colour."""
 _CANDUMP_LINE: Final = re.compile(
@@ -147,18 +147,20 @@ def _kind_of(head: bytes) -> Kind | None:
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return kind
-    if head.startswith(_BYTE_ORDER_MARKS):
-        return Kind.TEXT
+    if head.startswith(_UTF16):
+        head = head.decode("utf-16", "replace").encode()
     if any(head.startswith(magic) for magic in _OTHERS):
         return None
+    if _ASC_LINE.search(head):
+        return Kind.ASC
+    if _CANDUMP_LINE.search(head):
+        return Kind.CANDUMP
     if b"\0" in head:
         from graspd.drivers.spi.messages import FrameParser
 
         events = (event for event, _ in FrameParser().feed(head))
         return Kind.SERIAL if not _SERIAL_EVENTS.isdisjoint(events) else None
-    if _ASC_LINE.search(head):
-        return Kind.ASC
-    return Kind.CANDUMP if _CANDUMP_LINE.search(head) else Kind.TEXT
+    return Kind.TEXT
 
 
 def open_recording(path: Path) -> BinaryIO:

@@ -341,6 +341,18 @@ def test_a_log_without_frames_of_a_board_is_refused(tmp_path: Path, text: str, s
         played([path])
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-8-sig"])
+def test_a_log_of_another_encoding_and_with_a_torn_end_is_read(
+    tmp_path: Path, encoding: str
+) -> None:
+    """PowerShell writes UTF-16; a computer that lost power leaves zeros."""
+    path = tmp_path / "bus.txt"
+    mark = "\ufeff" if encoding == "utf-16-be" else ""
+    path.write_text(mark + "".join(lines_of(3)) + "\0" * 100, encoding)
+    readings, _ = played([path])
+    assert len(readings) == 3
+
+
 def test_an_id_that_no_frame_has_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "bus.log"
     path.write_text("".join(lines_of(2)).replace(" 5A1#", " 0A2#"))
