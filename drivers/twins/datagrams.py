@@ -217,7 +217,9 @@ class TactileTwin(MessageTwin):
         rate_hz: float = RATE_HZ,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
     ) -> None:
-        """Raises `ValueError` for a fault that messages of counts cannot have."""
+        """Raises `ValueError` for a rate, 1/s, or a fault that messages of counts cannot have."""
+        if not 0.0 < rate_hz <= 1000.0:
+            raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
         faults.refuse("the tactile stream", "one_byte_at_a_time", "wrong_version")
         super().__init__(faults)
         self.period_ns = round(1e9 / rate_hz)

@@ -220,6 +220,9 @@ def test_a_twin_sends_what_a_driver_reads() -> None:
     assert {int(reading.counts[0, 6]) for reading in readings} == {0}
     with pytest.raises(ValueError, match="wrong-version"):
         TactileTwin(sweeps, faults=LinkFaults(wrong_version=True))
+    for rate_hz in (0.0, float("nan"), 1000.1):
+        with pytest.raises(ValueError, match="at most 1000"):
+            TactileTwin(sweeps, rate_hz=rate_hz)
 
 
 @settings(max_examples=300, deadline=None)
