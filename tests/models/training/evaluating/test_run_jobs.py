@@ -1,14 +1,10 @@
-"""Sweeps: here, on a cluster that loses a worker, and after an interruption."""
+"""Sweeps: here, on a cluster, and after an interruption."""
 
 from __future__ import annotations
 
 import contextlib
-import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,9 +22,29 @@ from graspd.models.training.systems.registry import System
 from tests.models.training.samples import sessions
 
 GRASPS = sessions(120)
-ROOT = Path(__file__).parents[4]
-START_S = 100.0
-"""How long a scheduler or a worker may take to start on a busy machine."""
+CLUSTER = """
+from distributed import LocalCluster
+with LocalCluster(
+    n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", host="127.0.0.1",
+    dashboard_address=None,
+) as cluster:
+    print(cluster.scheduler_address, flush=True)
+    input()
+"""
+
+
+@contextlib.contextmanager
+def cluster() -> Iterator[str]:
+    """The address of a scheduler and its worker, in a process of their own."""
+    words = [sys.executable, "-c", CLUSTER]
+    with subprocess.Popen(
+        words, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield process.stdout.readline().strip()
+        finally:
+            process.kill()
 
 
 def forest(trees: int) -> System:
@@ -74,84 +90,25 @@ def test_an_interrupted_sweep_goes_on_and_runs_nothing_twice(
     assert_same(results, {job: run(job, GRASPS) for job in wanted})
 
 
-def test_a_cluster_may_lose_a_worker_and_then_its_scheduler(tmp_path: Path) -> None:
+def test_a_cluster_gives_what_this_computer_gives(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
-    wanted, more = some_jobs(8, trees=40), some_jobs(8, trees=30)
-    found: dict[Job, JobResult] = {}
-    with cluster(tmp_path) as (address, scheduler, workers):
-        results = run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address)
-        next(results)
-        workers[0].kill()
-        # Dask runs a lost job again, or cancels it: then the next run has what is stored.
-        with contextlib.suppress(ClusterError):
-            found.update(results)
-        assert workers[0].wait(START_S) == -signal.SIGKILL
-        found.update(run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address))
-        assert workers[1].poll() is workers[2].poll() is None
-        results = run_jobs(more, GRASPS, tmp_path / "more", dask=address)
-        next(results)
-        scheduler.kill()
-        with pytest.raises(ClusterError, match=r"the cluster (does not answer|lost a job)"):
-            list(results)
+    wanted = some_jobs(4)
+    with cluster() as address:
+        found = dict(run_jobs(wanted, GRASPS, tmp_path, dask=address))
     assert_same(found, {job: jobs.run(job, GRASPS) for job in wanted})
-    assert_same(dict(run_jobs(wanted, GRASPS, tmp_path / "ours")), found)
-    assert 1 <= len(list((tmp_path / "more").iterdir())) < 8
 
 
-Process = subprocess.Popen[bytes]
+def test_a_job_that_the_cluster_lost_ends_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
 
+    def lost(*_: object) -> None:
+        raise distributed.client.FutureCancelledError("key", "already forgotten")
 
-@contextlib.contextmanager
-def cluster(folder: Path) -> Iterator[tuple[str, Process, list[Process]]]:
-    """Address, scheduler and three workers, each a process of its own, on loopback."""
-    import distributed
-
-    place = folder / "scheduler.json"
-    with contextlib.ExitStack() as stack:
-        scheduler = stack.enter_context(
-            started(
-                *("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
-                *("--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(place)),
-                folder=folder,
-            )
-        )
-        address = _address(place)
-        options = ("--nthreads", "1", "--no-nanny", "--no-dashboard")
-        running = [
-            stack.enter_context(started("dask_worker", address, *options, folder=folder))
-            for _ in range(3)
-        ]
-        with distributed.Client(  # type: ignore[no-untyped-call]
-            address, timeout=START_S, set_as_default=False
-        ) as client:
-            client.wait_for_workers(3, timeout=START_S)
-        yield address, scheduler, running
-
-
-@contextlib.contextmanager
-def started(module: str, *arguments: str, folder: Path) -> Iterator[Process]:
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    with (folder / "cluster.log").open("ab") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.{module}", *arguments],
-            cwd=folder,
-            env=environment,
-            stdout=log,
-            stderr=log,
-        )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait(START_S)
-
-
-def _address(place: Path) -> str:
-    deadline_s = time.monotonic() + START_S
-    while time.monotonic() < deadline_s:
-        with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
-            address = json.loads(place.read_text())["address"]
-            assert isinstance(address, str)
-            return address
-        time.sleep(0.05)
-    pytest.fail("the scheduler did not start")
+    monkeypatch.setattr(jobs, "_run", lost)
+    with (
+        cluster() as address,
+        pytest.raises(ClusterError, match="the cluster lost a job"),
+    ):
+        list(run_jobs(some_jobs(2), GRASPS, tmp_path, dask=address))
