@@ -18,7 +18,7 @@ from graspd.daemon.record.topics import Judged, Topic, decode_judged
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED
-from graspd.drivers.recordings.kinds import open_recording
+from graspd.drivers.recordings.kinds import Kind, kind_of, open_recording
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +90,9 @@ def collect(paths: Sequence[Path]) -> Export:
     """
     export = Export()
     for path in paths:
+        kind = kind_of(path)
+        if kind is not Kind.MCAP:
+            raise RecordingError(path, f"is {kind.value}, not what `graspd run` has recorded")
         with open_recording(path) as stream:
             recording = McapReader(path, stream)
             header = recording.header

@@ -39,6 +39,8 @@ def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
         from graspd.daemon.record.export import collect
 
         return grasps_of(collect([path]), "unknown")
+    if kind is not Kind.TEXT:
+        raise RecordingError(path, f"is {kind.value}, which does not say how lifts ended")
     fingers, columns = _fingers(path), columns_of(path, ())
     if columns.is_stream:
         raise RecordingError(path, "is a stream and no grasp table: read_recording reads it")
@@ -91,6 +93,8 @@ def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
                 else:
                     rows.append(reading)
                     joints.append(dict(angles))
+    if not rows:
+        raise RecordingError(path, "has no readings")
     times = pd.DataFrame({TIME: [reading.made_ns / 1e9 for reading in rows]})
     return pd.concat([times, _counts(rows, fingers), pd.DataFrame(joints)], axis=1)
 

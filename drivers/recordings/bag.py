@@ -35,7 +35,7 @@ from graspd.drivers.base import (
     TactileReading,
     joint_name,
 )
-from graspd.drivers.recordings.kinds import Kind, kind_of
+from graspd.drivers.recordings.kinds import Kind, is_packed, kind_of
 from graspd.drivers.recordings.player import RecordedDriver
 
 TACTILE: Final = "sr_robot_msgs/msg/BiotacAll"
@@ -212,6 +212,8 @@ class _Bag:
 @contextmanager
 def _opened(path: Path) -> Iterator[_Bag]:
     is_ros1 = kind_of(path) is Kind.ROS1_BAG
+    if is_packed(path):
+        raise RecordingError(path, "is a packed bag: `gunzip` it first")
     try:
         reader = rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path)
         reader.open()

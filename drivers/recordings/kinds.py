@@ -180,6 +180,14 @@ def open_recording(path: Path) -> BinaryIO:
     raise RecordingError(path, "is a directory" if stat.S_ISDIR(mode) else "is not a regular file")
 
 
+def is_packed(path: Path) -> bool:
+    """Return True for a gzip file. Raises `OSError`."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_GZIP)) == _GZIP
+
+
 class _Unpacked(io.RawIOBase):
     """The content of a gzip file. A damaged file, or one that grows too much, is an `OSError`."""
 

@@ -16,6 +16,7 @@ import msgspec
 import pytest
 import zmq
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from msgspec.structs import replace
 
 from graspd import judge, read_recording
@@ -129,6 +130,28 @@ def three_seconds(folder: Path) -> Path:
     lines = DEMO_RECORDING.read_text().splitlines(keepends=True)
     (folder / "short.csv").write_text("".join(lines[:300]))
     return folder / "short.csv"
+
+
+def test_a_filtered_recording_is_judged_with_a_warning(
+    lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As `mcap filter` leaves it: no metadata."""
+    path = tmp_path / "filtered.mcap"
+    with lab.files[0].open("rb") as source, path.open("wb") as target:
+        writer = Writer(target)
+        writer.start(profile="", library="another tool")
+        for schema, channel, message in make_reader(source).iter_messages():
+            kind = 0
+            if schema is not None:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+            topic = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            writer.add_message(topic, message.log_time, message.data, message.publish_time)
+        writer.finish()
+    verdicts = list(judge(path, model="cnn1"))
+    assert "has dropped the record `graspd`" in caplog.text
+    assert "was judged by" not in caplog.text
+    said = [verdict["p_slip"] for verdict in of_kind(lab.files[0], "verdict") if verdict["judged"]]
+    assert [verdict.p_slip for verdict in verdicts if verdict.judged][:1] == said[:1]
 
 
 def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:

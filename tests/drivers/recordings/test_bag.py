@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ import pandas as pd
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from graspd import judge, read_recording
+from graspd import judge, read_grasps, read_recording
 from graspd.biotac import electrode_columns
 from graspd.daemon.cli import main
 from graspd.drivers.base import DriverError, RecordingError, TactileReading
@@ -163,6 +164,15 @@ def test_a_hand_with_two_sensors_gets_the_name_of_its_model(
     said = capsys.readouterr().err
     assert f"has sensors on {', '.join(fingers)}" in said
     assert name in said
+
+
+def test_a_packed_bag_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
+    path.write_bytes(gzip.compress(path.read_bytes()))
+    assert main(["replay", str(path)]) == 2
+    assert "is a packed bag: `gunzip` it first" in capsys.readouterr().err
+    with pytest.raises(RecordingError, match="does not say how lifts ended"):
+        read_grasps(path)
 
 
 def test_a_former_biotac_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
