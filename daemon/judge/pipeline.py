@@ -19,7 +19,6 @@ from graspd.daemon.judge.decision import (
     Limits,
     decide,
 )
-from graspd.daemon.judge.exchange import NOTHING_KNOWN, Exchanged
 from graspd.daemon.judge.health import Health
 from graspd.daemon.judge.reasons import OPEN, WATCHED_LIFT, Decision, GateState, Moment, Reason
 from graspd.daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
@@ -32,6 +31,7 @@ from graspd.models.trust.risk import RiskOutcomes
 
 if TYPE_CHECKING:
     from graspd.daemon.judge.every_reading import EveryReading
+    from graspd.daemon.judge.exchange import Exchanged
     from graspd.daemon.judge.hand import HandTracker
     from graspd.daemon.trust.trust import Trust
     from graspd.models.session_statistics import SessionState
@@ -159,11 +159,17 @@ class Pipeline:
         """In a replay: the next reading was late when it was live; `judged`: the network ran."""
         self._late = judged
 
-    def sensors_exchanged(self, known: Exchanged = NOTHING_KNOWN) -> None:
+    def sensors_exchanged(self, known: Exchanged | None = None) -> None:
         """Forget session, grasp and maybe the tare: the sensors are others.
 
-        Go on from what is `known` of them. Raises `ValueError` if that is of another model.
+        Go on from what is `known` of them; None: nothing. Raises `ValueError` if that is of
+        another model.
         """
+        if known is None:
+            # A scene that keeps no session never needs it.
+            from graspd.daemon.judge.exchange import NOTHING_KNOWN
+
+            known = NOTHING_KNOWN
         self._forget_opinion()
         self._to_learn = None
         self.needs_session = True
