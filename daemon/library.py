@@ -26,6 +26,7 @@ from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
+from graspd.drivers.recordings.layout import ReadAs
 from graspd.models import trial, zoo
 from graspd.models.contract import CLASSES, ModelError, SessionInput
 from graspd.models.counts import check_fingers, column_names, counts_of, write_csv
@@ -148,19 +149,23 @@ def judge(
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | ArrayLike,
     *,
     model: str | os.PathLike[str] | None = None,
+    read_as: ReadAs | None = None,
+    rate_hz: float | None = None,
 ) -> Iterator[Verdict]:
     """Yield the verdict on each reading, as `graspd replay RECORDING...` says it.
 
-    `recordings`: grasp tables or streams (CSV), or the files of one run in order (MCAP); or a table
+    `recordings`: grasp tables or streams, or the files of one run in order (MCAP); or a table
     as `read_grasps` and `read_recording` return it. `model`: a name or a path; by default the one
-    that judged then, of CSV files and tables small-session. A warning at the end says why nothing,
-    or little, was judged. Raises `SceneError`, `RecordingError`, `ModelError` or `ValueError`.
+    that judged then, of tables and streams small-session. `read_as` and `rate_hz` decide for tables
+    that may be streams (deploy/RECORDING.md). A warning at the end says why nothing, or little, was
+    judged. Raises `SceneError`, `RecordingError`, `ModelError` or `ValueError`.
     """
     said: list[str] = []
     why = Unjudged(said.append)
     with ExitStack() as stack:
         paths = stack.enter_context(files_of(_files(recordings, stack)))
-        parts = _parts(paths, {} if model is None else {"path": _path(model).absolute()})
+        chosen = {} if model is None else {"path": _path(model).absolute()}
+        parts = _parts(paths, chosen, read_as, rate_hz)
         pipeline, driver = parts.pipeline, parts.drivers[0]
         around = Assembly(parts, stack)
         outbox = around.build_outbox()
@@ -199,8 +204,10 @@ def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
     return paths
 
 
-def _parts(paths: Sequence[Path], model: dict[str, Any]) -> Parts:
-    source: Source = Tables(paths, {})
+def _parts(
+    paths: Sequence[Path], model: dict[str, Any], read_as: ReadAs | None, rate_hz: float | None
+) -> Parts:
+    source: Source = Tables(paths, {}, read_as=read_as, rate_hz=rate_hz)
     if kind_of_all(paths) is Kind.MCAP:
         require_mcap("judging MCAP")
         from graspd.daemon.assembly.recordings import RecordedRun

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ JOINTS = (
     *("WRJ1", "WRJ2", "FFJ0", "MFJ0", "RFJ0", "LFJ0"),
 )
 """Joints of the Shadow hand: 24 with sensors, then J0, the sum of J1 and J2, of four fingers."""
+ANGLE_MAX_RAD = math.radians(200)
+"""Largest angle, rad: J0, the sum of two joints, reaches 180 degrees. More is another unit."""
 
 
 def joint_name(column: str) -> str | None:

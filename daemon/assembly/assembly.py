@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from graspd.daemon.assembly.plan import Plan, recorded_kind
+from graspd.daemon.assembly.plan import NO_SWEEPS, Plan, recorded_kind
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.files import require_linux, write_atomically
@@ -218,12 +218,21 @@ def _replay(plan: Plan, options: ReplayTactile) -> Driver:
 
         return BagDriver(options.recordings, fingers, speed=speed)
     if kind is Kind.MCAP:
+        if plan.mode == "every":
+            raise ValueError(NO_SWEEPS)
         from graspd.daemon.record.player import McapReplayDriver
 
         return McapReplayDriver(options.recordings, fingers, speed=speed)
+    from graspd.drivers.recordings.columns import SLIPPED
     from graspd.drivers.recordings.csv_player import ReplayDriver
-    from graspd.drivers.recordings.csv_rows import SLIPPED
 
     if options.outcomes and plan.without_outcomes:
         raise ValueError(f"outcomes needs the column `{SLIPPED}` in every recording")
-    return ReplayDriver(options.recordings, fingers, speed=speed, loop=options.loop)
+    return ReplayDriver(
+        options.recordings,
+        fingers,
+        speed=speed,
+        loop=options.loop,
+        read_as=options.read_as,
+        rate_hz=options.rate_hz,
+    )

@@ -12,6 +12,8 @@ from graspd.daemon.scene.scene import GateMode
 from graspd.drivers.recordings.kinds import BAGS, Kind, kind_of_all
 from graspd.extras import require
 
+NO_SWEEPS = "gate mode `every` judges each row of a grasp table; a sweep of a stream is no grasp"
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -35,6 +37,8 @@ class Plan:
         if kind in BAGS:
             from graspd.drivers.recordings.bag import has_joints
 
+            if mode == "every":
+                raise SceneError(f"{options.recordings[0]}: {NO_SWEEPS}")
             joints = joints or any(map(has_joints, options.recordings))
             return cls(scene, mode or "settled", joints, options.recordings)
         if kind is Kind.MCAP:
@@ -42,17 +46,22 @@ class Plan:
 
             recorded = [header_of(path).joints for path in options.recordings]
             return cls(scene, mode or "settled", joints or any(recorded))
-        from graspd.drivers.recordings.csv_rows import columns_of
+        from graspd.drivers.recordings.layout import layout_of
 
-        columns = {path: columns_of(path, scene.hand.fingers) for path in options.recordings}
+        layouts = {
+            path: layout_of(path, scene.hand.fingers, options.read_as, options.rate_hz)
+            for path in options.recordings
+        }
+        streams = [path for path, each in layouts.items() if each.is_stream]
         if mode is None:
-            streams = {each.is_stream for each in columns.values()}
-            if len(streams) > 1:
+            if 0 < len(streams) < len(layouts):
                 raise SceneError("tactile.recordings: both grasp tables and streams; say gate.mode")
-            mode = "settled" if True in streams else "every"
-        joints = joints or any(each.joints for each in columns.values())
-        without = tuple(path for path, each in columns.items() if not each.has_labels)
-        return cls(scene, mode, joints, without)
+            mode = "settled" if streams else "every"
+        if mode == "every" and streams:
+            raise SceneError(f"{streams[0]}: {NO_SWEEPS}")
+        joints = joints or any(each.joints for each in layouts.values())
+        unknown = (path for path, each in layouts.items() if each.columns.slipped is None)
+        return cls(scene, mode, joints, tuple(unknown))
 
     @property
     def hand(self) -> HandLimits | None:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from graspd.biotac import Finger
+from graspd.biotac import FINGERS, Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Parts
@@ -19,7 +19,8 @@ from graspd.daemon.scene.drivers import CanTactile, SpiTactile
 from graspd.daemon.scene.scene import Hand
 from graspd.drivers.base import Driver
 from graspd.drivers.recordings.csv_player import ReplayDriver
-from graspd.drivers.recordings.kinds import BAGS, CAN_LOGS, Kind, kind_of_all
+from graspd.drivers.recordings.kinds import BAGS, CAN_LOGS, Kind, kind_of, kind_of_all
+from graspd.drivers.recordings.layout import ReadAs, layout_of
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 
@@ -71,18 +72,28 @@ class Tables(Source):
         paths: Sequence[Path],
         sections: Mapping[str, dict[str, Any]],
         *,
-        rate_hz: float = 100.0,
+        read_as: ReadAs | None = None,
+        rate_hz: float | None = None,
         loop: bool = False,
         strict: bool = False,
     ) -> None:
         """`sections`: of the scene, where it differs from one that plays `paths`.
 
-        `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags.
+        `read_as`, `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags.
         """
         self._paths = [path.absolute() for path in paths]
-        self._driver = partial(ReplayDriver, self._paths, rate_hz=rate_hz, loop=loop, strict=strict)
+        self._read_as, self._rate_hz = read_as, rate_hz
+        self._driver = partial(
+            ReplayDriver,
+            self._paths,
+            read_as=read_as,
+            rate_hz=rate_hz,
+            loop=loop,
+            strict=strict,
+        )
+        tactile = {"driver": "replay", "recordings": self._paths}
         changes: dict[str, dict[str, Any]] = {
-            "tactile": {"driver": "replay", "recordings": self._paths},
+            "tactile": {**tactile, "read_as": read_as, "rate_hz": rate_hz},
             "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS},
         }
         super().__init__({**sections, **changes}, Path("command line"))
@@ -90,24 +101,38 @@ class Tables(Source):
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
         """Make the parts for the model's fingers."""
         hand = Hand(fingers=model.contract.fingers)
+        for path in self._paths:
+            self._refuse_other_fingers(path, model)
         plan = Plan.of(replayed.model_copy(update={"hand": hand}))
         if kind_of_all(self._paths) in BAGS:
             return Parts.of(plan, model, self._bags(hand.fingers, speed))
         return Parts.of(plan, model, self._driver(hand.fingers, speed=speed))
 
     def _bags(self, fingers: Sequence[Finger], speed: float | None) -> Driver:
-        """Return the driver of bags. Raises `SceneError` if they lack one of the fingers."""
-        from graspd.drivers.recordings.bag import BagDriver, fingers_of
+        from graspd.drivers.recordings.bag import BagDriver
 
-        for path in self._paths:
-            found = fingers_of(path)
-            if not set(fingers).issubset(found):
-                names = ", ".join(zoo.judging(found)) or "no model"
-                raise SceneError(
-                    f"{path}: has sensors on {', '.join(found) or 'no finger'}, the model judges "
-                    f"{', '.join(fingers)}; of the zoo, {names} judges these: --model"
-                )
         return BagDriver(self._paths, fingers, speed=speed)
+
+    def _refuse_other_fingers(self, path: Path, model: TactileModel) -> None:
+        """Raise `SceneError`, with models that fit, if a file lacks fingers of the model."""
+        judged = model.contract.fingers
+        there = self._fingers(path, judged)
+        if missing := [finger for finger in judged if finger not in there]:
+            fits = zoo.judging([finger for finger in FINGERS if finger in there])
+            advice = f": --model {fits[0]} judges these" if fits else ", and no model judges these"
+            raise SceneError(
+                f"{path}: has {', '.join(there) or 'no finger'}; {model.contract.name} also needs "
+                f"{', '.join(missing)}{advice}"
+            )
+
+    def _fingers(self, path: Path, judged: Sequence[Finger]) -> Sequence[str]:
+        if kind_of(path) in BAGS:
+            from graspd.drivers.recordings.bag import fingers_of
+
+            return fingers_of(path)
+        if len(judged) == 1:  # a file of one finger need not name it
+            return judged
+        return layout_of(path, (), self._read_as, self._rate_hz).columns.fingers
 
 
 class LinkLogs(Source):

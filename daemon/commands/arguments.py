@@ -73,3 +73,20 @@ def within(lowest: float, highest: float) -> Callable[[str], float]:
         return value
 
     return parse
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that decide how a table is read."""
+    parser.add_argument(
+        "--as",
+        dest="read_as",
+        choices=("table", "stream"),
+        help="of tables that may be either: each row is a grasp, or each row is a sweep",
+    )
+    parser.add_argument(
+        "--rate-hz",
+        type=within(0.001, 1e4),
+        metavar="HZ",
+        help="rows per second of a stream without times, and of a grasp table as played "
+        "(default: 100)",
+    )

@@ -14,7 +14,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.plan import require_mcap
 from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
-from graspd.daemon.commands.arguments import UsageError, within
+from graspd.daemon.commands.arguments import UsageError, add_reading, within
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.files import require_linux
 from graspd.daemon.process.signals import StopSignal
@@ -31,8 +31,8 @@ from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.endpoints import check_endpoint, is_private
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.columns import SLIPPED
 from graspd.drivers.recordings.csv_player import DEMO_DAY
-from graspd.drivers.recordings.csv_rows import SLIPPED
 from graspd.drivers.recordings.kinds import BAGS, Kind, files_of, kind_of_all
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
@@ -75,9 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FACTOR",
         help="pace at this factor of real time (default: as fast as possible)",
     )
-    parser.add_argument(
-        "--rate", type=pace, default=100.0, metavar="HZ", help="readings/s of a grasp table"
-    )
+    add_reading(parser)
     parser.add_argument("--loop", action="store_true", help="start again at the end, for ever")
     parser.add_argument(
         "--strict", action="store_true", help="stop at the first value that is not a count"
@@ -272,7 +270,14 @@ def _tables(args: argparse.Namespace) -> Tables:
         sections["risk"] = _risk(args)
     elif _risk(args):
         raise UsageError("--warm-up and --explore need --max-slip-when-stable")
-    return Tables(args.recordings, sections, rate_hz=args.rate, loop=args.loop, strict=args.strict)
+    return Tables(
+        args.recordings,
+        sections,
+        read_as=args.read_as,
+        rate_hz=args.rate_hz,
+        loop=args.loop,
+        strict=args.strict,
+    )
 
 
 def _risk(args: argparse.Namespace) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan, recorded_kind
+from graspd.daemon.commands.arguments import add_reading
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
@@ -63,9 +64,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                 nargs="+",
                 type=Path,
                 metavar="RECORDING",
-                help="grasp tables (CSV), or recordings with outcomes (MCAP): twenty grasps of "
-                "different objects or more",
+                help="grasp tables or streams, or recordings with outcomes (MCAP): twenty grasps "
+                "of different objects or more",
             )
+            add_reading(command)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -90,7 +92,14 @@ def run(args: argparse.Namespace) -> int:
         write_lines(f"{printable(str(wanted.session_path))}: {result}")
     else:
         with files_of(args.recordings) as recordings:
-            _seed(wanted, model, recordings)
+            played = scene_drivers.ReplayTactile(
+                driver="replay",
+                recordings=tuple(path.absolute() for path in recordings),
+                pace="fast",
+                read_as=args.read_as,
+                rate_hz=args.rate_hz,
+            )
+            _seed(wanted, model, played)
     return 0
 
 
@@ -203,10 +212,10 @@ def _learned(state: TrustState | None) -> dict[str, Any] | None:
     }
 
 
-def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
+def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.ReplayTactile) -> None:
     """Judge the recordings as the daemon does, tell their outcomes, and keep the session."""
-    mode: GateMode | None = "every" if kind_of_all(recordings) is Kind.MCAP else None
-    plan = Plan.of(_on_recordings(wanted, recordings, mode))
+    mode: GateMode | None = "every" if kind_of_all(played.recordings) is Kind.MCAP else None
+    plan = Plan.of(_on_recordings(wanted, played, mode))
     pipeline = assembly.build_pipeline(plan, model)
     session, trust = pipeline.session, pipeline.trust
     with SessionFolder(wanted.session_path) as folder:
@@ -226,7 +235,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
             _check(plan, model, state)
         elif not outcomes:
             raise DriverError(f"of {readings} readings none is a grasp whose outcome is known")
-        rest = _rest(wanted, model, recordings)
+        rest = _rest(wanted, model, played)
         mine = [kept for kept in before if kept.fingers == tuple(wanted.hand.fingers)]
         if trust is None:  # the scene may learn again later
             learned = next((kept.trust for kept in mine if kept.trust is not None), None)
@@ -244,7 +253,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
     if refused:
         why = ", ".join(f"{reason} {count}" for reason, count in refused.most_common())
         write_lines(f"  nothing was learned from readings that were not judged: {why}")
-    datasets = trained_on(recordings, model)
+    datasets = trained_on(played.recordings, model)
     if datasets:
         complain(
             f"warning: the model was trained on {', '.join(datasets)}: it judges other grasps "
@@ -306,7 +315,7 @@ def _taught(trust: Trust, *, proves: bool) -> TrustState:
 
 
 def _rest(
-    wanted: scene.Scene, model: TactileModel, recordings: list[Path]
+    wanted: scene.Scene, model: TactileModel, recordings: scene_drivers.ReplayTactile
 ) -> tuple[float, ...] | None:
     """Return where the recorded electrodes rest at the first tare; None: that is not recorded."""
     played = Plan.of(_on_recordings(wanted, recordings, mode=None))
@@ -337,14 +346,11 @@ def _check(plan: Plan, model: TactileModel, state: SessionState) -> None:
 
 
 def _on_recordings(
-    wanted: scene.Scene, recordings: list[Path], mode: GateMode | None
+    wanted: scene.Scene, recordings: scene_drivers.ReplayTactile, mode: GateMode | None
 ) -> scene.Scene:
     """Return the scene with recordings in place of its sensors, and without `[risk]`."""
-    replay = scene_drivers.ReplayTactile(
-        driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
-    )
     gate = wanted.gate.model_copy(update={"mode": mode, "max_age_ms": assembly.RECORDED_MAX_AGE_MS})
-    changes = {"tactile": replay, "joints": None, "gate": gate, "risk": None}
+    changes = {"tactile": recordings, "joints": None, "gate": gate, "risk": None}
     return wanted.model_copy(update=changes)
 
 

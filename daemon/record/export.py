@@ -17,7 +17,7 @@ from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
 from graspd.daemon.record.topics import Judged, Topic, decode_judged
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED
+from graspd.drivers.recordings.columns import OBJECT, SLIPPED
 from graspd.drivers.recordings.kinds import Kind, kind_of, open_recording
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,9 +14,11 @@ from numpy.typing import NDArray
 
 from graspd.biotac import electrode_columns
 from graspd.drivers.base import JointReading, RecordingError, TactileReading
+from graspd.drivers.recordings.columns import OBJECT, SLIPPED, TIME
 from graspd.drivers.recordings.csv_player import ReplayDriver
-from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, Row, columns_of, read_rows
-from graspd.drivers.recordings.kinds import BAGS, Kind, kind_of
+from graspd.drivers.recordings.csv_rows import Row, read_rows
+from graspd.drivers.recordings.kinds import BAGS, TABLES, Kind, files_of, kind_of
+from graspd.drivers.recordings.layout import ReadAs, layout_of
 from graspd.extras import require
 
 if TYPE_CHECKING:
@@ -24,45 +27,60 @@ if TYPE_CHECKING:
     from graspd.drivers.recordings.bag import BagDriver
 
 
-def read_grasps(path: str | os.PathLike[str]) -> pd.DataFrame:
+def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) -> pd.DataFrame:
     """Return grasps with known outcome: columns `object`, `slipped` and, finger by finger, counts.
 
-    `path`: a grasp table (CSV, or Parquet from `graspd export-grasps`), or a recording (MCAP).
-    Raises `RecordingError`.
+    `path`: a grasp table, or a recording (MCAP); `-` is standard input. `read_as="table"` decides
+    for a table of which many rows repeat each other. Grasps without an outcome are left out, with a
+    warning that counts them. Raises `RecordingError`.
     """
-    path = Path(path)
+    with files_of([Path(path)]) as (file,):
+        return _grasps(file, read_as)
+
+
+def _grasps(path: Path, read_as: ReadAs | None) -> pd.DataFrame:
     kind = kind_of(path)
-    if kind is Kind.PARQUET:
-        return pd.read_parquet(path)
     if kind is Kind.MCAP:
         require("mcap", "read_grasps of MCAP", "record")
         from graspd.daemon.record.export import collect
 
         return grasps_of(collect([path]), "unknown")
-    if kind is not Kind.TEXT:
+    if kind not in TABLES:
         raise RecordingError(path, f"is {kind.value}, which does not say how lifts ended")
-    fingers, columns = _fingers(path), columns_of(path, ())
-    if columns.is_stream:
+    layout = layout_of(path, (), read_as)
+    if layout.is_stream:
         raise RecordingError(path, "is a stream and no grasp table: read_recording reads it")
-    if not columns.has_labels:
+    if layout.columns.slipped is None:
         raise RecordingError(path, f"has no column `{SLIPPED}`: the outcomes are not known")
-    rows = list(read_rows(path, fingers))
-    notes = [row.annotation for row in rows]
+    every = list(read_rows(path, (), outcomes=True, layout=layout))
+    rows = [row for row in every if row.annotation.slipped is not None]
+    if len(rows) < len(every):
+        left_out = f"{len(every) - len(rows)} of {len(every)} grasps have no outcome"
+        warnings.warn(f"{path}: {left_out}, and are left out", stacklevel=3)
     labels = {
-        OBJECT: [note.object_name for note in notes],
-        SLIPPED: [bool(note.slipped) for note in notes],
+        OBJECT: [row.annotation.object_name for row in rows],
+        SLIPPED: [bool(row.annotation.slipped) for row in rows],
     }
-    return pd.concat([pd.DataFrame(labels), _counts(rows, fingers)], axis=1)
+    return pd.concat([pd.DataFrame(labels), _counts(rows, layout.columns.fingers)], axis=1)
 
 
-def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
+def read_recording(
+    path: str | os.PathLike[str],
+    *,
+    read_as: ReadAs | None = None,
+    rate_hz: float | None = None,
+) -> pd.DataFrame:
     """Return a stream, one row a reading: `t` in seconds, counts, then joint angles in radians.
 
-    `path`: CSV, MCAP or a ROS bag. A count that is missing or damaged is NaN; an angle is the
-    newest one.
-    Raises `RecordingError`.
+    `path`: a stream, a recording (MCAP) or a ROS bag; `-` is standard input. A count that is
+    missing or damaged is NaN; an angle is the newest one. A stream without times needs
+    `read_as="stream"` and `rate_hz`. Raises `RecordingError`.
     """
-    path = Path(path)
+    with files_of([Path(path)]) as (file,):
+        return _readings(file, read_as, rate_hz)
+
+
+def _readings(path: Path, read_as: ReadAs | None, rate_hz: float | None) -> pd.DataFrame:
     driver: ReplayDriver | McapReplayDriver | BagDriver
     fingers: tuple[str, ...]
     kind = kind_of(path)
@@ -80,8 +98,8 @@ def read_recording(path: str | os.PathLike[str]) -> pd.DataFrame:
         fingers = header_of(path).fingers
         driver = McapReplayDriver([path], fingers)
     else:
-        fingers = _fingers(path)
-        driver = ReplayDriver([path], fingers, speed=None)
+        fingers = layout_of(path, (), read_as, rate_hz).columns.fingers
+        driver = ReplayDriver([path], fingers, speed=None, read_as=read_as, rate_hz=rate_hz)
     rows: list[TactileReading] = []
     joints: list[dict[str, float]] = []
     angles: dict[str, float] = {}
@@ -108,14 +126,6 @@ def grasps_of(export: Export, object_name: str) -> pd.DataFrame:
     }
     counts = np.array([each.counts for each in grasps], dtype=np.uint16)
     return pd.concat([pd.DataFrame(labels), _table(counts, export.fingers)], axis=1)
-
-
-def _fingers(path: Path) -> tuple[str, ...]:
-    """Return the fingers that a CSV file has."""
-    fingers = columns_of(path, ()).fingers
-    if not fingers:
-        raise RecordingError(path, "has no columns of electrodes, such as ff_biotac_1")
-    return fingers
 
 
 def _counts(rows: Sequence[TactileReading | Row], fingers: Sequence[str]) -> pd.DataFrame:

@@ -64,7 +64,7 @@ class Section(BaseModel):
 
 
 class ReplayTactile(Section):
-    """`[tactile]` with `driver = "replay"`: recorded CSV files instead of sensors."""
+    """`[tactile]` with `driver = "replay"`: recorded files instead of sensors."""
 
     driver: Literal["replay"]
     """Selects this driver."""
@@ -76,6 +76,10 @@ class ReplayTactile(Section):
     """True: start again at the end."""
     outcomes: bool = False
     """True: tell the recorded outcome of each lift that a verdict allows."""
+    read_as: Literal["table", "stream"] | None = None
+    """Decides for files that may be either (deploy/RECORDING.md)."""
+    rate_hz: Annotated[float, Field(gt=0, le=10_000), unit("1/s")] | None = None
+    """Rows a second of a stream without times, and of a table as played."""
 
 
 class SpiTactile(Section):

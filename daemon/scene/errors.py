@@ -23,7 +23,6 @@ FIXED = "graspd has one value for all scenes: remove the line"
 GONE = {
     ("ReplayTactile", "faults"): "a twin (`graspd twin`) has faults: remove the section",
     ("ReplayTactile", "speed"): "`graspd replay --speed` has it: remove the line",
-    ("ReplayTactile", "rate_hz"): "`graspd replay --rate` has it: remove the line",
     ("ReplayTactile", "strict"): "`graspd replay --strict` has it: remove the line",
     ("SessionSection", "file"): "[session] folder is a folder: name a new one or remove the line",
     ("GateSection", "sweeps"): FIXED,

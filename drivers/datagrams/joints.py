@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.drivers.base import JointReading, joint_name
+from graspd.drivers.base import ANGLE_MAX_RAD, JointReading, joint_name
 from graspd.drivers.datagrams.messages import (
     DATAGRAM_BYTES_MAX,
     SILENCE_NS,
@@ -23,8 +23,6 @@ from graspd.drivers.datagrams.messages import (
 )
 from graspd.drivers.udp import DatagramDriver
 
-ANGLE_MAX_RAD: Final = math.radians(200)
-"""Largest angle, rad: J0, the sum of two joints, reaches 180 degrees. More is another unit."""
 _joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
 """Cache of 64 names: 28 joints with and without prefix, and a few unknown ones."""
 

@@ -1,4 +1,4 @@
-"""Driver that plays CSV tables and streams, in real time or fast."""
+"""Driver that plays tables and streams, in real time or fast."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from graspd.drivers.base import (
     Reading,
     TactileReading,
 )
-from graspd.drivers.recordings.csv_rows import Row, columns_of, read_rows
+from graspd.drivers.recordings.csv_rows import Row, read_rows
+from graspd.drivers.recordings.layout import Layout, ReadAs, layout_of
 from graspd.drivers.recordings.player import RecordedDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
@@ -29,6 +30,10 @@ DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
 """Stream of whole synthetic grasps."""
 SHOW_RECORDING = Path(__file__).parent / "demo" / "synthetic_show.csv"
 """Stream of synthetic grasps that are each held for two seconds, for people to watch."""
+TABLE_RATE_HZ = 100.0
+"""Grasps of a table per second, as played."""
+UNITS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
+"""Names of units of time, by their length in s."""
 IGNORED_COLUMNS_LOGGED = 10
 """Most names of ignored columns in a log line."""
 
@@ -48,7 +53,7 @@ class ReplayCounters(DriverCounters):
 
 
 class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
-    """Play one or more CSV recordings, at most one row per call of `read_ready`.
+    """Play one or more tables and streams, at most one row per call of `read_ready`.
 
     A row gives a `TactileReading` of `fingers`, after a `JointReading` if the file has joints. With
     a `speed`, `t_ns` is when the row was due, else when it is handed over. `recorded_ns` is the
@@ -64,15 +69,20 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
         speed: float | None = 1.0,
-        rate_hz: float = 100.0,
+        rate_hz: float | None = None,
+        read_as: ReadAs | None = None,
         loop: bool = False,
         strict: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`speed`: factor of real time; None: fast. `rate_hz`: grasps of a table per second."""
+        """`speed`: factor of real time; None: fast. `rate_hz`: rows per second where there are no
+        times; a table has 100. `read_as` and `rate_hz` are also as of `layout_of`."""
         super().__init__(paths, speed, clock)
         self._fingers = tuple(fingers)
-        self._table_period_ns = _NS_PER_S / rate_hz
+        self._table_period_ns = _NS_PER_S / (rate_hz or TABLE_RATE_HZ)
+        self._read_as: ReadAs | None = read_as
+        self._rate_hz = rate_hz
+        self._layouts: dict[Path, Layout] = {}
         self._loop = loop
         self._strict = strict
         self._reset()
@@ -90,7 +100,12 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         self._reset()
         ignored: dict[str, None] = {}
         for path in self.paths:
-            ignored.update(dict.fromkeys(columns_of(path, self._fingers).ignored))
+            layout = layout_of(path, self._fingers, self._read_as, self._rate_hz)
+            self._layouts[path] = layout
+            ignored.update(dict.fromkeys(layout.columns.ignored))
+            if layout.unit_s != 1.0 and layout.columns.time is not None:
+                name, unit = layout.columns.time.name, UNITS[layout.unit_s]
+                _log.info("replay: %s: the times of column %s are in %s", path, name, unit)
         if ignored:
             names = ", ".join(map(repr, list(ignored)[:IGNORED_COLUMNS_LOGGED]))
             _log.info("replay: unknown columns ignored: %d, such as %s", len(ignored), names)
@@ -123,7 +138,8 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         """Yield the rows of one file; return the start time of the next file."""
         at_ns, first_s = start_ns, None
         period_ns: int | None = None
-        for index, row in enumerate(read_rows(path, self._fingers, strict=self._strict)):
+        rows = read_rows(path, self._fingers, strict=self._strict, layout=self._layouts[path])
+        for index, row in enumerate(rows):
             if row.t_s is None:
                 period_ns = round(self._table_period_ns)
                 at_ns = start_ns + round(index * self._table_period_ns)

@@ -1,78 +1,37 @@
-"""Read CSV recordings row by row, so that memory does not grow.
+"""Read tables and streams row by row, so that memory does not grow.
 
 A grasp table has one row per grasp, as in the BioTac SP Stability Set. A stream has one row per
-sweep, with a column `t` in seconds and optional joint angles.
+sweep, with a column of times and optional joint angles.
 """
 
 from __future__ import annotations
 
-import csv
 import math
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from operator import itemgetter
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS, electrode_columns
-from graspd.drivers.base import Annotation, ElectrodeFault, RecordingError, joint_name
-from graspd.drivers.recordings.kinds import LINE_BYTES_MAX, open_recording, read_lines
-
-TIME = "t"
-"""Column of seconds, with any zero. Files with it are streams, files without it grasp tables."""
-OBJECT = "object"
-SLIPPED = "slipped"
-TIME_MAX_S = 1e11
-"""Largest time, s (the year 5138). Unix time in ms, us or ns lies above it."""
-SHOWN_LENGTH_MAX = 40
-"""Most characters of a cell in an error message."""
-
-_LABELS = {"0": False, "1": True}
-# ASCII digits only: float() also takes `1_000`, `nan` and digits of other scripts.
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
-# Counts by their usual text: a look-up is ten times as fast as parsing.
-_COUNT_OF_TEXT = {str(count): count for count in range(COUNT_MAX + 1)}
+from graspd.biotac import COUNT_MAX, ELECTRODES
+from graspd.drivers.base import ANGLE_MAX_RAD, Annotation, ElectrodeFault
+from graspd.drivers.recordings.cells import Cells
+from graspd.drivers.recordings.columns import SLIPPED
+from graspd.drivers.recordings.kinds import open_recording
+from graspd.drivers.recordings.layout import Layout, ReadAs, survey, time_value
+from graspd.drivers.recordings.values import (
+    COUNT_OF_TEXT,
+    count_of,
+    number_of,
+    outcome_of,
+    shown,
+)
 
 
 @dataclass(frozen=True, slots=True)
-class Columns:
-    """Names of the columns that are read from a file."""
-
-    electrodes: tuple[str, ...]
-    """Electrode columns, finger by finger, E1 to E24 each."""
-    joints: Mapping[str, str]
-    """Joint name, without hand prefix, by column; empty for a table."""
-    is_stream: bool
-    has_labels: bool
-    ignored: tuple[str, ...]
-    """Columns of unknown names; electrodes of other fingers do not count."""
-    fingers: tuple[str, ...]
-    """Fingers that the file has, asked for or not."""
-
-    @classmethod
-    def of(cls, names: Sequence[str], fingers: Sequence[str]) -> Self:
-        """Return the columns to read for `fingers`. `names`: the header."""
-        own_columns = {name for finger in FINGERS for name in electrode_columns(finger)}
-        own_columns |= {TIME, OBJECT, SLIPPED}
-        is_stream = TIME in names
-        joints: dict[str, str] = {}
-        if is_stream:
-            joints = {name: joint for name in names if (joint := joint_name(name))}
-        return cls(
-            electrodes=tuple(name for finger in fingers for name in electrode_columns(finger)),
-            joints=joints,
-            is_stream=is_stream,
-            has_labels=SLIPPED in names,
-            ignored=tuple(name for name in names if name not in own_columns and name not in joints),
-            fingers=tuple(each for each in FINGERS if electrode_columns(each)[0] in names),
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Row:
     """One row of a file."""
 
@@ -91,9 +50,9 @@ class Row:
 class Recording:
     """The rows of one file. Iterate once.
 
-    `lines`: the result of `read_lines`. The constructor raises `RecordingError` for a wrong header
-    or a file without rows, and iterating raises it for a wrong row. A value that is no count makes
-    its electrode faulty; with `strict` it raises.
+    The constructor raises `RecordingError` for what `survey` refuses, and iterating raises it for a
+    wrong row. A value that is no count makes its electrode faulty; with `strict` it raises. An
+    outcome that cannot be read is not known; with `outcomes` it raises.
 
     A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
     without a line end may be cut off within a value, so all its electrodes are faulty and its
@@ -101,170 +60,142 @@ class Recording:
     """
 
     def __init__(
-        self, path: Path, lines: Iterable[bytes], fingers: Sequence[str], *, strict: bool = False
+        self,
+        path: Path,
+        file: BinaryIO,
+        fingers: Sequence[str],
+        *,
+        strict: bool = False,
+        outcomes: bool = False,
+        read_as: ReadAs | None = None,
+        rate_hz: float | None = None,
+        layout: Layout | None = None,
     ) -> None:
+        """`file`: opened, at its start. `layout`: of this file, if it is known already."""
         self._path = path
         self._strict = strict
-        self._has_end = True
-        self._shape = (len(fingers), ELECTRODES)
+        self._outcomes = outcomes
+        self.layout = layout or survey(path, file, fingers, read_as, rate_hz)
+        columns = self.layout.columns
+        self._cells = Cells(path, file)
+        self._comma = self._cells.decimal_comma
+        self._electrodes = columns.electrodes
+        self._pick = itemgetter(*columns.electrodes)
+        self._shape = len(columns.electrodes) // ELECTRODES, ELECTRODES
+        self._joints = tuple(self.layout.joints)
         self._t_s = -math.inf
-        rows = self._cells(lines)
-        header = next(rows, None)
-        if header is None:
-            raise RecordingError(path, "the file is empty")
-        self._names = [name.strip() for name in header]
-        self.columns = Columns.of(self._names, fingers)
-        self._refuse_header()
-        first = next(rows, None)
-        if first is None:
-            raise RecordingError(path, "the file has a header and no rows")
-        self._rows = chain([first], rows)
+        self._row_number = 0
 
     def __iter__(self) -> Iterator[Row]:
-        for cells in self._rows:
+        for cells in self._cells:
             yield self._row(cells)
-
-    def _cells(self, lines: Iterable[bytes]) -> Iterator[list[str]]:
-        """Yield the cells of each line that is not blank; `_line` is its number."""
-        for self._line, line in enumerate(lines, 1):
-            if len(line) > LINE_BYTES_MAX:
-                raise self._error(f"the line is longer than {LINE_BYTES_MAX} bytes")
-            self._has_end = line.endswith(b"\n")
-            try:
-                text = line.decode("utf-8-sig" if self._line == 1 else "utf-8").rstrip("\r\n")
-                rows = list(csv.reader([text], strict=True)) if text.strip() else []
-            except UnicodeDecodeError as error:
-                problem = "not UTF-8: this is a binary file or has another encoding"
-                raise self._error(problem) from error
-            except csv.Error as error:
-                raise self._error(f"this is not CSV: {error}") from error
-            yield from rows
-
-    def _refuse_header(self) -> None:
-        """Raise if a column is missing or there twice, or a joint under two names."""
-        missing = [name for name in self.columns.electrodes if name not in self._names]
-        if missing:
-            others = f", the first of {len(missing)} that are" if len(missing) > 1 else ""
-            raise self._error(f"this column is missing{others}", missing[0])
-        joints = self.columns.joints
-        read = {*self.columns.electrodes, TIME, OBJECT, SLIPPED, *joints}
-        column_of: dict[str, str] = {}
-        for name in self._names:
-            if name not in read:
-                continue
-            meaning = joints.get(name, name)
-            if meaning in column_of:
-                raise self._error(f"this column is there twice, as {column_of[meaning]} too", name)
-            column_of[meaning] = name
+            self._row_number += 1
 
     def _row(self, cells: Sequence[str]) -> Row:
-        if len(cells) != len(self._names):
-            raise self._error(f"the row has {len(cells)} cells, the header {len(self._names)}")
-        cell_of = dict(zip(self._names, cells, strict=True))
-        counts, faults = self._counts(cell_of)
-        if not self._has_end:
+        counts, faults = self._counts(cells)
+        if not self._cells.has_end:
             if self._strict:
-                raise self._error("the last row has no line end")
+                raise self._cells.error("the last row has no line end")
             faults |= np.uint8(ElectrodeFault.CUT_OFF)
+        place = self.layout.columns.object
         return Row(
             counts=counts,
             faults=faults,
             annotation=Annotation(
                 source=self._path,
-                line=self._line,
-                object_name=cell_of.get(OBJECT, "").strip() or None,
-                slipped=self._slipped(cell_of),
+                line=self._cells.line,
+                object_name=None if place is None else cells[place].strip() or None,
+                slipped=self._slipped(cells),
             ),
-            t_s=self._time_s(cell_of),
-            joint_names=tuple(self.columns.joints.values()),
-            position_rad=self._position_rad(cell_of),
+            t_s=self._time_s(cells),
+            joint_names=self._joints,
+            position_rad=self._position_rad(cells),
         )
 
-    def _counts(self, cell_of: Mapping[str, str]) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    def _counts(self, cells: Sequence[str]) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Return counts and faults of a row, shape (fingers, 24) each."""
-        names = self.columns.electrodes
-        counts = [count_of(cell_of[name]) for name in names]
+        texts = self._pick(cells)
+        counts = list(map(COUNT_OF_TEXT.get, texts))
         faults = np.zeros(self._shape, dtype=np.uint8)
-        for place, count in enumerate(counts):
-            if count is not None:
-                continue
-            if self._strict:
-                problem = f"is not a count, an integer in 0..{COUNT_MAX}"
-                raise self._error(f"{_shown(cell_of[names[place]])} {problem}", names[place])
-            faults.flat[place] = ElectrodeFault.NOT_A_COUNT
-            counts[place] = 0
+        if None in counts:
+            for place, count in enumerate(counts):
+                if count is None:
+                    counts[place] = self._unusual(texts[place], place, faults)
         return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
-    def _slipped(self, cell_of: Mapping[str, str]) -> bool | None:
-        if not self.columns.has_labels:
-            return None
-        label = _LABELS.get(cell_of[SLIPPED].strip())
-        if label is None:
-            problem = f"{_shown(cell_of[SLIPPED])} is not a label: 0 (stable) or 1 (slip)"
-            raise self._error(problem, SLIPPED)
-        return label
+    def _unusual(self, text: str, place: int, faults: NDArray[np.uint8]) -> int:
+        """Return the count in a cell of unusual text; without one, 0 and a fault."""
+        count = count_of(text, decimal_comma=self._comma)
+        if count is not None:
+            return count
+        if self._strict:
+            problem = f"{shown(text)} is not a count, an integer in 0..{COUNT_MAX}"
+            raise self._cells.error(problem, self._name(self._electrodes[place]))
+        faults.flat[place] = ElectrodeFault.NOT_A_COUNT
+        return 0
 
-    def _time_s(self, cell_of: Mapping[str, str]) -> float | None:
-        if not self.columns.is_stream:
+    def _slipped(self, cells: Sequence[str]) -> bool | None:
+        place = self.layout.columns.slipped
+        if place is None:
             return None
-        t_s = number_of(cell_of[TIME])
-        if t_s is None:
-            raise self._error(f"{_shown(cell_of[TIME])} is not a finite number of seconds", TIME)
-        if abs(t_s) > TIME_MAX_S:
-            problem = f"{_shown(cell_of[TIME])} is no time in seconds: another unit?"
-            raise self._error(problem, TIME)
+        try:
+            return outcome_of(cells[place])
+        except ValueError as error:
+            if self._outcomes:
+                raise self._cells.error(str(error), SLIPPED) from error
+            return None
+
+    def _time_s(self, cells: Sequence[str]) -> float | None:
+        layout = self.layout
+        column = layout.columns.time
+        if layout.rate_hz is not None:
+            return self._row_number / layout.rate_hz
+        if not layout.is_stream or column is None:
+            return None
+        value = time_value(column, cells, decimal_comma=self._comma)
+        if value is None:
+            problem = f"{shown(cells[column.places[0]])} is not a time, such as 12.34 in seconds"
+            raise self._cells.error(problem, column.name)
+        t_s = value * layout.unit_s
         if t_s < self._t_s:
-            raise self._error(f"time goes backwards, from {self._t_s} s to {t_s} s", TIME)
+            problem = f"time goes backwards, from {self._t_s} s to {t_s} s"
+            raise self._cells.error(problem, column.name)
         self._t_s = t_s
         return t_s
 
-    def _position_rad(self, cell_of: Mapping[str, str]) -> NDArray[np.float64]:
-        position_rad = np.full(len(self.columns.joints), math.nan)
-        for place, name in enumerate(self.columns.joints):
-            angle = number_of(cell_of[name])
-            if angle is None and self._strict:
-                raise self._error(f"{_shown(cell_of[name])} is not an angle in radians", name)
-            if angle is not None and self._has_end:
-                position_rad[place] = angle
+    def _position_rad(self, cells: Sequence[str]) -> NDArray[np.float64]:
+        position_rad = np.full(len(self._joints), math.nan)
+        for index, place in enumerate(self.layout.joints.values()):
+            angle = number_of(cells[place], decimal_comma=self._comma)
+            is_angle = angle is not None and abs(angle) <= ANGLE_MAX_RAD
+            if self._strict and not is_angle:
+                problem = f"{shown(cells[place])} is not an angle in radians"
+                raise self._cells.error(problem, self._name(place))
+            if is_angle and self._cells.has_end:
+                position_rad[index] = angle
         return position_rad
 
-    def _error(self, problem: str, column: str | None = None) -> RecordingError:
-        if not self._has_end:
-            problem += "; the file ends here without a line end, so it may be cut off"
-        return RecordingError(self._path, problem, line=self._line, column=column)
+    def _name(self, place: int) -> str:
+        return self._cells.names[place]
 
 
-def columns_of(path: Path, fingers: Sequence[str]) -> Columns:
-    """Return the columns of a file. Raises `RecordingError` if it lacks `fingers`."""
-    with open_recording(path) as file:
-        return Recording(path, read_lines(path, file), fingers).columns
-
-
-def read_rows(path: Path, fingers: Sequence[str], *, strict: bool = False) -> Iterator[Row]:
+def read_rows(
+    path: Path,
+    fingers: Sequence[str],
+    *,
+    strict: bool = False,
+    outcomes: bool = False,
+    read_as: ReadAs | None = None,
+    layout: Layout | None = None,
+) -> Iterator[Row]:
     """Yield the rows of a file: see `Recording`. Raises `RecordingError`."""
     with open_recording(path) as file:
-        yield from Recording(path, read_lines(path, file), fingers, strict=strict)
-
-
-def count_of(cell: str) -> int | None:
-    """Return the 12-bit count in a cell; None if it holds no count."""
-    count = _COUNT_OF_TEXT.get(cell)
-    if count is not None:
-        return count
-    number = number_of(cell)
-    if number is None or not number.is_integer() or not 0 <= number <= COUNT_MAX:
-        return None
-    return int(number)
-
-
-def number_of(cell: str) -> float | None:
-    """Return the finite number in a cell; None if it holds none."""
-    cell = cell.strip()
-    if _NUMBER.fullmatch(cell) is None:
-        return None
-    number = float(cell)
-    return number if math.isfinite(number) else None
-
-
-def _shown(cell: str) -> str:
-    return repr(cell if len(cell) <= SHOWN_LENGTH_MAX else cell[:SHOWN_LENGTH_MAX] + "...")
+        yield from Recording(
+            path,
+            file,
+            fingers,
+            strict=strict,
+            outcomes=outcomes,
+            read_as=read_as,
+            layout=layout,
+        )

@@ -111,10 +111,16 @@ def kind_of(path: Path) -> Kind:
     if (path / "metadata.yaml").is_file():
         return Kind.ROS2_BAG
     with open_recording(path) as file:
-        try:
-            head = file.read(HEAD_BYTES)
-        except OSError as error:
-            raise RecordingError(path, reason(error)) from error
+        return kind_of_open(path, file)
+
+
+def kind_of_open(path: Path, file: BinaryIO) -> Kind:
+    """Return what an opened file holds, and rewind it. Raises `RecordingError`."""
+    try:
+        head = file.read(HEAD_BYTES)
+        file.seek(0)
+    except OSError as error:
+        raise RecordingError(path, reason(error)) from error
     if not head:
         raise RecordingError(path, "the file is empty")
     kind = _kind_of(head)

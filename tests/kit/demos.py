@@ -10,13 +10,13 @@ from typing import TextIO
 import numpy as np
 
 from graspd.biotac import COUNT_MAX, TABLE_FINGERS, electrode_columns
+from graspd.drivers.recordings.columns import OBJECT, SLIPPED, TIME
 from graspd.drivers.recordings.csv_player import (
     DEMO_DAY,
     DEMO_RECORDING,
     DEMO_TABLE,
     SHOW_RECORDING,
 )
-from graspd.drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME
 from graspd.drivers.twins.grasps import synthetic
 from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES, Durations
 from graspd.drivers.twins.grasps.synthetic import COUNTS, GraspMixtures, SyntheticGrasps

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+from graspd.drivers.recordings.columns import SLIPPED
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from graspd.drivers.recordings.csv_rows import SLIPPED
 
 
 def written(folder: Path, text: str) -> Path:

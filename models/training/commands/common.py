@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from graspd.drivers.recordings.kinds import files_of
 from graspd.models.training.data.datasets import (
     FEWEST_GRASPS,
     DatasetError,
@@ -16,7 +17,7 @@ from graspd.models.training.data.datasets import (
     read_with_lab_tables,
     unpublished,
 )
-from graspd.models.training.data.protocols import TooFewGraspsError
+from graspd.models.training.data.protocols import TooFewGraspsError, near_copies
 
 
 class WrongInputError(Exception):
@@ -52,6 +53,13 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
         help="a grasp table of your own, as `graspd export-grasps` writes it, that is one session: "
         f"{FEWEST_GRASPS} grasps or more, some that slipped and some that stayed. May be given "
         "several times. Beside the tables of --data, or, without --data, alone",
+    )
+    parser.add_argument(
+        "--as",
+        dest="read_as",
+        choices=("table",),
+        help="of --own: read a table of which many rows repeat each other, as it has several "
+        "readings of each grasp",
     )
     parser.add_argument(
         "--jobs",
@@ -94,10 +102,19 @@ def read_grasps(command: str, args: argparse.Namespace) -> Grasps:
     """
     if args.data is None and not args.own:
         raise WrongInputError("needs --data DIR, --own FILE, or both")
-    grasps = read_with_lab_tables(args.data, args.own)
-    own = lab_table_names(grasps.files)
+    with files_of(args.own) as own:
+        grasps = read_with_lab_tables(args.data, own, args.read_as)
+    if grasps.without_outcome:
+        say(command, f"warning: {grasps.without_outcome} grasps have no outcome, and are left out")
+    if copies := near_copies(grasps):
+        say(
+            command,
+            f"warning: {copies} of {len(grasps)} rows nearly repeat another: each such group is "
+            "kept in one fold, and counts as one grasp",
+        )
+    lab = lab_table_names(grasps.files)
     for name in unpublished(grasps.files):
-        if name not in own:
+        if name not in lab:
             text = f"{name}.csv is not the published table; the figures are of this data only"
             say(command, f"warning: {text}")
     return grasps

@@ -1,14 +1,9 @@
-"""Grasp tables (BTS3) into arrays: one row per grasp, read before the lift, labelled by the lift.
-
-Columns: `object`, `slipped` (0 or 1) and 24 raw counts per finger, `ff_biotac_1` to `th_biotac_24`.
-"""
+"""Grasp tables (BTS3) into arrays: a row per grasp, read before the lift, labelled by the lift."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
-import io
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -17,7 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import COUNT_MAX, ELECTRODES, TABLE_FINGERS, electrode_columns
+from graspd.biotac import TABLE_FINGERS
+from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.columns import OBJECT, SLIPPED
+from graspd.drivers.recordings.csv_rows import read_rows
+from graspd.drivers.recordings.layout import ReadAs, layout_of
 from graspd.models.bts3 import NEW_SESSION, TABLES, WHOLE
 from graspd.models.contract import Dataset
 from graspd.models.training.arrays import Bools, Ints
@@ -32,17 +31,10 @@ ENOUGH_GRASPS = 200
 Trained on 20 grasps of palm_45, the daemon refuses 98 % of the others as unlike the training; on
 100 grasps 20 %, on 200 6 %, on 500 2.5 %.
 """
-COUNT_COLUMNS = tuple(name for finger in TABLE_FINGERS for name in electrode_columns(finger))
 
 
-class DatasetError(Exception):
-    """A grasp table is missing or is not what it claims to be. Give up until it is fixed."""
-
-    def __init__(
-        self, path: Path, problem: str, *, line: int | None = None, column: str | None = None
-    ) -> None:
-        place = str(path) if line is None else f"{path}, line {line}"
-        super().__init__(f"{place if column is None else f'{place}, column {column}'}: {problem}")
+DatasetError = RecordingError
+"""A grasp table is missing or is not what it claims to be. Give up until it is fixed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +49,8 @@ class Grasps:
     """Object name of each grasp."""
     files: tuple[Dataset, ...]
     """Name, digest and rows of each file, in the order of the grasps."""
+    without_outcome: int = 0
+    """Rows of the files that are left out, because their outcome is not known."""
 
     def __len__(self) -> int:
         return len(self.slipped)
@@ -103,35 +97,47 @@ class Grasps:
         return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def read_table(path: Path) -> Grasps:
-    """Read one grasp table (columns above). Raises `DatasetError` with file, line and column."""
+def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
+    """Read the grasps of one table that have an outcome.
+
+    `read_as="table"` decides for a table of which many rows repeat each other. Raises
+    `DatasetError`, with file, line and column.
+    """
     data = _read(path)
-    try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        raise DatasetError(path, "is not text") from error
-    rows = csv.reader(io.StringIO(text, newline=""), strict=True)
-    grasps: list[tuple[str, bool, list[int]]] = []
-    try:
-        header = next(rows, [])
-        _check_header(path, header)
-        for row in rows:
-            if len(row) != len(header):
-                problem = f"has {len(row)} values, not {len(header)}"
-                raise DatasetError(path, problem, line=rows.line_num)
-            cells = dict(zip(header, row, strict=True))
-            grasps.append(_grasp(path, rows.line_num, cells))
-    except csv.Error as error:
-        raise DatasetError(path, f"is not a table: {error}", line=rows.line_num) from error
-    if not grasps:
-        raise DatasetError(path, "has no grasps")
-    objects, slipped, counts = zip(*grasps, strict=True)
+    layout = layout_of(path, TABLE_FINGERS, read_as)
+    if layout.is_stream:
+        raise DatasetError(path, "is a stream: its rows are sweeps, and not grasps")
+    for name, place in ((OBJECT, layout.columns.object), (SLIPPED, layout.columns.slipped)):
+        if place is None:
+            raise DatasetError(path, "column is missing", line=1, column=name)
+    objects: list[str] = []
+    slipped: list[bool] = []
+    counts: list[NDArray[np.uint16]] = []
+    without = 0
+    for row in read_rows(path, TABLE_FINGERS, strict=True, outcomes=True, layout=layout):
+        note = row.annotation
+        if note.slipped is None:
+            without += 1
+            continue
+        if note.object_name is None:
+            raise DatasetError(path, "object has no name", line=note.line, column=OBJECT)
+        objects.append(note.object_name)
+        slipped.append(note.slipped)
+        counts.append(row.counts)
+    if not counts:
+        raise DatasetError(path, "has no grasp with an outcome")
     return Grasps(
-        np.array(counts, dtype=np.uint16).reshape(-1, len(TABLE_FINGERS), ELECTRODES),
+        np.array(counts),
         np.array(slipped, dtype=np.bool_),
-        objects,
-        (Dataset(path.stem, hashlib.sha256(data).hexdigest(), len(grasps)),),
+        tuple(objects),
+        (Dataset(table_name(path), hashlib.sha256(data).hexdigest(), len(counts)),),
+        without,
     )
+
+
+def table_name(path: Path) -> str:
+    """Return the name of a table: that of its file without the endings of packed files."""
+    return Path(path.stem).stem if path.suffix == ".gz" else path.stem
 
 
 def read_all(folder: Path) -> Grasps:
@@ -142,7 +148,9 @@ def read_all(folder: Path) -> Grasps:
     return concatenate([read_table(path) for path in paths if path != paths[-1] or path.exists()])
 
 
-def read_with_lab_tables(folder: Path | None, lab: Sequence[Path]) -> Grasps:
+def read_with_lab_tables(
+    folder: Path | None, lab: Sequence[Path], read_as: ReadAs | None = None
+) -> Grasps:
     """Return the published tables of `folder`, if given, then each lab table.
 
     Raises `DatasetError` for a file that is no grasp table. A lab table is also refused if it has
@@ -153,8 +161,8 @@ def read_with_lab_tables(folder: Path | None, lab: Sequence[Path]) -> Grasps:
     paths: dict[str, Path] = {}
     for path in lab:
         _check_name(path, paths)
-        paths[path.stem] = path
-        parts.append(_read_lab_table(path))
+        paths[table_name(path)] = path
+        parts.append(_read_lab_table(path, read_as))
     grasps = concatenate(parts)
     _check_once(grasps, paths)
     return grasps
@@ -167,6 +175,7 @@ def concatenate(parts: Sequence[Grasps]) -> Grasps:
         np.concatenate([part.slipped for part in parts]),
         tuple(name for part in parts for name in part.objects),
         tuple(file for part in parts for file in part.files),
+        sum(part.without_outcome for part in parts),
     )
 
 
@@ -182,31 +191,6 @@ def lab_table_names(files: Sequence[Dataset]) -> tuple[str, ...]:
     return tuple(file.name for file in files if file.name not in published)
 
 
-def _check_header(path: Path, header: list[str]) -> None:
-    for name in ("object", "slipped", *COUNT_COLUMNS):
-        if header.count(name) != 1:
-            problem = "missing" if name not in header else "there more than once"
-            raise DatasetError(path, f"column is {problem}", line=1, column=name)
-
-
-def _grasp(path: Path, line: int, cells: dict[str, str]) -> tuple[str, bool, list[int]]:
-    """Return object, slip and counts of one row; `cells` are its texts by column."""
-    name, slipped, counts = cells["object"], cells["slipped"], []
-    if not name:
-        raise DatasetError(path, "object has no name", line=line, column="object")
-    if slipped not in ("0", "1"):
-        raise DatasetError(path, f"{slipped!r} is not 0 or 1", line=line, column="slipped")
-    for column in COUNT_COLUMNS:
-        text = cells[column]
-        # No count has more than four digits; int() alone would also take "1_0" or " 7".
-        digits = text.isascii() and text.isdigit() and len(text) <= 4
-        if not digits or int(text) > COUNT_MAX:
-            problem = f"{text[:20]!r} is not a count (0..{COUNT_MAX})"
-            raise DatasetError(path, problem, line=line, column=column)
-        counts.append(int(text))
-    return name, slipped == "1", counts
-
-
 def _read(path: Path) -> bytes:
     try:
         if path.stat().st_size > MAX_TABLE_BYTES:
@@ -217,7 +201,7 @@ def _read(path: Path) -> bytes:
 
 
 def _check_name(path: Path, others: dict[str, Path]) -> None:
-    name = path.stem
+    name = table_name(path)
     if not name.isprintable():
         raise DatasetError(path, "has a name that cannot be printed")
     if name in {table.name for table in TABLES}:
@@ -226,8 +210,8 @@ def _check_name(path: Path, others: dict[str, Path]) -> None:
         raise DatasetError(path, f"has the same name as {others[name]}: rename one")
 
 
-def _read_lab_table(path: Path) -> Grasps:
-    grasps = read_table(path)
+def _read_lab_table(path: Path, read_as: ReadAs | None) -> Grasps:
+    grasps = read_table(path, read_as)
     if len(grasps) < FEWEST_GRASPS:
         raise DatasetError(path, f"has {len(grasps)} grasps, {FEWEST_GRASPS} are the fewest")
     if grasps.slipped.all() or not grasps.slipped.any():

@@ -13,8 +13,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from graspd.drivers.recordings.layout import NEAR_COUNTS
 from graspd.models.bts3 import NEW_SESSION, WHOLE
-from graspd.models.training.arrays import Bools, Ints
+from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps, lab_table_names
 
 EvalProtocol = Literal[
@@ -73,21 +74,64 @@ def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS
     return _MAKERS[protocol](grasps, seed, folds)
 
 
-def folds_of(slipped: Bools, folds: int, seed: int) -> Ints:
-    """Return the fold of each grasp, shape (N,): stratified, shuffled with the seed.
+def near_copies(grasps: Grasps) -> int:
+    """Return the number of rows of lab tables that nearly repeat another row."""
+    _, rows = np.unique(grasp_of(grasps), return_counts=True)
+    return int(rows[rows > 1].sum())
 
-    Raises `TooFewGraspsError` if a class has fewer grasps than folds.
+
+def grasp_of(grasps: Grasps) -> Ints:
+    """Return the number of the grasp that each row is a reading of, shape (N,).
+
+    Rows of lab tables that nearly repeat each other are readings of one grasp; each row of a
+    published table is a grasp of its own.
     """
-    from sklearn.model_selection import StratifiedKFold
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
 
-    fewest = min(int(slipped.sum()), int((~slipped).sum()))
+    number = np.arange(len(grasps))
+    rows = grasps.rows_of(lab_table_names(grasps.files))
+    if not len(rows):
+        return number
+    counts = grasps.counts[rows].reshape(len(rows), -1).astype(np.float32)
+    near = np.zeros((len(rows), len(rows)), dtype=np.bool_)
+    for place in range(len(rows)):
+        apart = np.square(counts[place + 1 :] - counts[place]).mean(axis=1)
+        near[place, place + 1 :] = apart <= NEAR_COUNTS**2
+    if near.any():
+        number[rows] = len(grasps) + connected_components(csr_array(near), directed=False)[1]
+    return number
+
+
+def fewest_grasps(grasps: Grasps) -> int:
+    """Return the number of grasps of the label that fewer have, each with all its readings once."""
+    first = np.unique(grasp_of(grasps), return_index=True)[1]
+    slips = int(grasps.slipped[first].sum())
+    return min(slips, len(first) - slips)
+
+
+def folds_of(grasps: Grasps, folds: int, seed: int) -> Ints:
+    """Return the fold of each row, shape (N,): stratified, shuffled with the seed.
+
+    All readings of a grasp have one fold. Raises `TooFewGraspsError` if a class has fewer grasps
+    than folds.
+    """
+    from sklearn.model_selection import StratifiedGroupKFold, StratifiedKFold
+
+    slipped, grasp = grasps.slipped, grasp_of(grasps)
+    fewest = fewest_grasps(grasps)
     if fewest < folds:
         raise TooFewGraspsError(
             f"{folds} folds need {folds} grasps of each class, one has {fewest}"
         )
-    split = StratifiedKFold(folds, shuffle=True, random_state=seed)
+    places = np.zeros((len(slipped), 1))
+    if len(set(grasp.tolist())) == len(grasps):
+        made = StratifiedKFold(folds, shuffle=True, random_state=seed).split(places, slipped)
+    else:
+        grouped = StratifiedGroupKFold(folds, shuffle=True, random_state=seed)
+        made = grouped.split(places, slipped, grasp)
     fold_of = np.empty(len(slipped), dtype=np.int64)
-    for fold, (_, test) in enumerate(split.split(np.zeros((len(slipped), 1)), slipped)):
+    for fold, (_, test) in enumerate(made):
         fold_of[test] = fold
     return fold_of
 
@@ -114,7 +158,7 @@ def _stratified(
     tables: tuple[str, ...], with_lab: bool, grasps: Grasps, seed: int, folds: int
 ) -> list[Split]:
     rows = _rows(grasps, *tables, with_lab=with_lab)
-    return _leave_out(rows, folds_of(grasps.slipped[rows], folds, seed), folds)
+    return _leave_out(rows, folds_of(grasps.rows(rows), folds, seed), folds)
 
 
 def _grouped(tables: tuple[str, ...], grasps: Grasps, seed: int, folds: int) -> list[Split]:

@@ -12,7 +12,7 @@ from graspd.biotac import COUNT_MAX
 from graspd.models.electrodes import BROKEN_MAX, Electrodes
 from graspd.models.training.arrays import Bools, Numbers
 from graspd.models.training.data.datasets import Grasps
-from graspd.models.training.data.protocols import fold_seed, folds_of
+from graspd.models.training.data.protocols import fewest_grasps, fold_seed, folds_of
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import System
 
@@ -91,9 +91,8 @@ def left_out(grasps: Grasps, seed: int) -> list[Bools]:
 
     Raises `TooFewGraspsError` for less than two grasps of a label.
     """
-    slips = int(grasps.slipped.sum())
-    folds = min(FOLDS, max(2, min(slips, len(grasps) - slips)))
-    fold_of = folds_of(grasps.slipped, folds, seed)
+    folds = min(FOLDS, max(2, fewest_grasps(grasps)))
+    fold_of = folds_of(grasps, folds, seed)
     return [fold_of == fold for fold in range(min(JUDGED_FOLDS, folds))]
 
 

@@ -14,7 +14,12 @@ import numpy as np
 from graspd.models.bts3 import NEW_SESSION, TABLES, WHOLE
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import ENOUGH_GRASPS, Grasps, lab_table_names
-from graspd.models.training.data.protocols import EvalProtocol, TooFewGraspsError, splits
+from graspd.models.training.data.protocols import (
+    EvalProtocol,
+    TooFewGraspsError,
+    grasp_of,
+    splits,
+)
 from graspd.models.training.evaluating.broken import left_out
 from graspd.models.training.evaluating.jobs import Job, jobs_of
 from graspd.models.training.systems.registry import SessionFeatures, System
@@ -132,9 +137,10 @@ def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
     grasps = plan.chosen(grasps)
     objects, slips = len(set(grasps.objects)), int(grasps.slipped.sum())
     own = lab_table_names(grasps.files)
-    if len(own) == len(grasps.files) and len(grasps) < ENOUGH_GRASPS:
+    number = len(set(grasp_of(grasps).tolist()))
+    if len(own) == len(grasps.files) and number < ENOUGH_GRASPS:
         yield (
-            f"{len(grasps)} grasps are few: the daemon will take many others for unlike the "
+            f"{number} grasps are few: the daemon will take many others for unlike the "
             f"training, and call them unknown; {ENOUGH_GRASPS} are enough"
         )
     if not isinstance(plan.system.input, SessionFeatures):

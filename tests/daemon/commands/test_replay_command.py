@@ -102,7 +102,7 @@ def test_the_published_method_of_the_demo_is_its_network_on_every_grasp() -> Non
 def summary_of(*arguments: object) -> dict[str, Any]:
     result = graspd("replay", *arguments, "--json")
     assert result.returncode == 0, result.stderr
-    summary: dict[str, Any] = json.loads(result.stderr)
+    summary: dict[str, Any] = json.loads(result.stderr.splitlines()[0])
     return summary
 
 
@@ -214,7 +214,7 @@ def test_replay_fails_when_nobody_subscribes(tmp_path: Path) -> None:
 def peak_memory_kib(recording: Path) -> int:
     """Peak resident memory of a replay, from the kernel's own account."""
     process = subprocess.Popen(
-        [*GRASPD, "replay", str(recording), "--json"],
+        [*GRASPD, "replay", str(recording), "--json", "--as", "table"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )

@@ -18,8 +18,9 @@ from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.trust import Trust, TrustState
+from graspd.drivers.recordings.columns import SLIPPED
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from graspd.drivers.recordings.csv_rows import SLIPPED, read_rows
+from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.drivers.twins.grasps.grasp_script import EndPoint
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
 from tests.daemon.record.test_export import Writer

@@ -78,7 +78,7 @@ class Writer:
 def sweeps(number: int, seed: int = 0) -> list[NDArray[np.uint16]]:
     """Counts as those of grasps, each electrode different in each sweep: all fresh."""
     base = np.random.default_rng(seed).integers(1500, 2500, (3, 24))
-    return [(base + 7 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
+    return [(base + 37 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
 
 
 def record(path: Path, counts: NDArray[np.uint16]) -> None:
@@ -316,5 +316,5 @@ def test_a_stream_or_a_table_without_outcomes_is_refused(tmp_path: Path) -> None
 
 def test_a_file_without_electrodes_is_refused(tmp_path: Path) -> None:
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(RecordingError, match="no columns of electrodes"):
+    with pytest.raises(RecordingError, match="no column of electrodes is known"):
         read_recording(tmp_path / "other.csv")

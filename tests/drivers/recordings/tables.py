@@ -8,7 +8,6 @@ from pathlib import Path
 
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_rows import Recording, Row
-from graspd.drivers.recordings.kinds import read_lines
 
 FINGERS = ("ff", "mf", "th")
 ELECTRODES = [f"{finger}_biotac_{number}" for finger in FINGERS for number in range(1, 25)]
@@ -17,7 +16,7 @@ TABLE_HEADER = ["object", "slipped", *ELECTRODES]
 
 def count(row: int, electrode: int) -> int:
     """A count that tells its row and its electrode, 0..71."""
-    return 1000 + (row * 73 + electrode) % 2000
+    return 1000 + (row * (37 if electrode % 2 else 87) + electrode) % 2000
 
 
 def cells(row: int, changes: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -69,8 +68,7 @@ PATH = Path("grasps.csv")
 
 
 def rows_of(content: bytes, fingers: Sequence[str] = FINGERS, *, strict: bool = False) -> list[Row]:
-    lines = read_lines(PATH, io.BytesIO(content))
-    return list(Recording(PATH, lines, fingers, strict=strict))
+    return list(Recording(PATH, io.BytesIO(content), fingers, strict=strict))
 
 
 def rows_or_message(content: bytes) -> list[Row] | str:

@@ -13,12 +13,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from graspd.drivers.base import ElectrodeFault, RecordingError
-from graspd.drivers.recordings.csv_rows import (
-    Recording,
-    count_of,
-    number_of,
-)
+from graspd.drivers.recordings.csv_rows import Recording
 from graspd.drivers.recordings.kinds import open_recording, read_lines
+from graspd.drivers.recordings.values import count_of, number_of
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,
@@ -63,7 +60,7 @@ def test_unknown_columns_are_listed_and_columns_of_other_fingers_are_not() -> No
     header = [*TABLE_HEADER, "force", "", "force", "FFJ3"]
     content = ",".join(header).encode() + b"\n" + b"0," * 77 + b"0\n"
     recording = Recording(PATH, io.BytesIO(content), ("mf",))
-    assert recording.columns.ignored == ("force", "", "force", "FFJ3")
+    assert recording.layout.columns.ignored == ("force", "", "force")
 
 
 @pytest.mark.parametrize(
@@ -103,9 +100,12 @@ BAD_FILES = {
     "empty": (b"", "grasps.csv: the file is empty"),
     "only blank lines": (b"\n \r\n\t\n", "grasps.csv: the file is empty"),
     "header only": (table(0), "grasps.csv: the file has a header and no rows"),
-    "NUL in the header": (b"\x7fELF\0\0", "line 1, column ff_biotac_1: this column is missing"),
+    "NUL in the header": (
+        b"\x7fELF\0\0",
+        "looks like a program; deploy/RECORDING.md",
+    ),
     "Latin-1": (table(2, {1: {"object": "x"}}).replace(b"x", b"\xe9"), "line 3: not UTF-8"),
-    "UTF-16": (GOOD.decode().encode("utf-16"), "line 1: not UTF-8"),
+    "odd UTF-16": (GOOD.decode().encode("utf-16")[:-1], "is not utf-16"),
     "one column missing": (
         table(2, columns=[name for name in TABLE_HEADER if name != "mf_biotac_7"]),
         "line 1, column mf_biotac_7: this column is missing",
@@ -114,7 +114,6 @@ BAD_FILES = {
         table(2, columns=TABLE_HEADER[:-24]),
         "line 1, column th_biotac_1: this column is missing, the first of 24 that are",
     ),
-    "semicolons": (GOOD.replace(b",", b";"), "column ff_biotac_1: this column is missing, the f"),
     "electrode twice": (
         table(2, columns=[*TABLE_HEADER, "ff_biotac_3"]),
         "line 1, column ff_biotac_3: this column is there twice",
@@ -132,7 +131,6 @@ BAD_FILES = {
         "line 4: the row has 3 cells, the header 74; the file ends here without a line end",
     ),
     "no line ends": (b"7," * LINE_BYTES_MAX, "line 1: the line is longer than 65536 bytes"),
-    "old Mac line ends": (GOOD.replace(b"\n", b"\r"), "line 1: this is not CSV: new-line"),
     "open quote": (GOOD.replace(b"thing_1", b'"thing_1'), "line 3: this is not CSV: unexpected"),
     "text after a quote": (
         GOOD.replace(b"thing_1", b'"thing"_1'),
@@ -140,15 +138,11 @@ BAD_FILES = {
     ),
     "time not a number": (
         stream(["0", "later"]),
-        "line 3, column t: 'later' is not a finite number of seconds",
+        "line 3, column t: 'later' is not a time",
     ),
     "time backwards": (
         stream(["5", "5.01", "5.0"]),
         "line 4, column t: time goes backwards, from 5.01 s to 5.0 s",
-    ),
-    "time in ns": (
-        stream(["1700000000000000000"]),
-        "line 2, column t: '1700000000000000000' is no time in seconds: another unit?",
     ),
     "joint twice": (
         stream(["0"], {"rh_FFJ3": ["0"], "FFJ3": ["0"]}),
@@ -172,16 +166,18 @@ def test_what_is_no_recording_is_refused_with_file_line_and_column(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("label", ["", "2", "true", "0.0", "01", "\u0661"])
-def test_a_label_is_0_or_1(label: str) -> None:
-    told = rf"line 3, column slipped: {re.escape(repr(label))} is not a label"
+@pytest.mark.parametrize("label", ["2", "yes", "01", "\u0661"])
+def test_an_outcome_that_cannot_be_read_matters_where_needed(label: str) -> None:
+    content = table(2, {1: {"slipped": label}})
+    assert rows_of(content)[1].annotation.slipped is None
+    told = rf"line 3, column slipped: {re.escape(repr(label))} is not an outcome"
     with pytest.raises(RecordingError, match=told):
-        rows_of(table(2, {1: {"slipped": label}}))
+        list(Recording(PATH, io.BytesIO(content), FINGERS, outcomes=True))
 
 
 @pytest.mark.parametrize("t", ["nan", "-inf", "", "1e999", "1_0", "\u0661"])
-def test_a_time_is_a_finite_number(t: str) -> None:
-    with pytest.raises(RecordingError, match=r"line 2, column t: .* is not a finite number"):
+def test_a_time_is_a_number_or_a_clock(t: str) -> None:
+    with pytest.raises(RecordingError, match=r"line 2, column t: .* is not a time"):
         rows_of(stream([t, "1"]))
 
 
@@ -233,8 +229,8 @@ def test_a_stream_gives_times_and_joints_without_hand_prefix() -> None:
 )  # fmt: skip
 def test_joints_are_those_of_the_shadow_hand(column: str, known: bool) -> None:
     recording = Recording(PATH, io.BytesIO(stream(["0"], {column: ["0"]})), FINGERS)
-    assert (recording.columns.ignored == ()) is known
-    assert len(recording.columns.joints) == known
+    assert (recording.layout.columns.ignored == ()) is known
+    assert len(recording.layout.joints) == known
 
 
 @pytest.mark.parametrize("cell", ["nan", "", "1e999"])
@@ -279,9 +275,9 @@ def test_a_sparse_file_of_many_gigabytes_without_a_line_end_is_refused_at_once(
         file.truncate(1 << 36)
     with (
         open_recording(path) as opened,
-        pytest.raises(RecordingError, match="line 1: the line is longer than 65536 bytes"),
+        pytest.raises(RecordingError, match="of a kind that is not known"),
     ):
-        Recording(path, read_lines(path, opened), FINGERS)
+        Recording(path, opened, FINGERS)
 
 
 NOT_COUNTS = [

@@ -97,22 +97,45 @@ def _cell(column: int, value: str) -> Callable[[str], str]:
 
 
 BROKEN: list[tuple[str, Callable[[str], str], str]] = [
-    ("empty file", lambda _: "", "line 1, column object: column is missing"),
-    ("no grasp", lambda text: text.splitlines()[0], "has no grasps"),
-    ("column missing", _header("mf_biotac_7,", ""), "column mf_biotac_7: column is missing"),
-    ("column twice", _header("ff_", "slipped,ff_"), "column slipped: column is there more than"),
-    ("row cut off", lambda text: text[:-40], "line 7: has "),
-    ("value too many", _cell(73, "1,2"), "line 3: has 75 values, not 74"),
+    ("empty file", lambda _: "", "the file is empty"),
+    ("no grasp", lambda text: text.splitlines()[0], "the file has a header and no rows"),
+    ("column missing", _header("mf_biotac_7,", ""), "column mf_biotac_7: this column is missing"),
+    ("column twice", _header("ff_", "slipped,ff_"), "column slipped: this column is there twice"),
+    ("row cut off", lambda text: text[:-40], "line 7: the row has "),
+    ("value too many", _cell(73, "1,2"), "line 3: the row has 75 cells, the header 74"),
     ("no object", _cell(0, ""), "line 3, column object: object has no name"),
-    ("slip not 0 or 1", _cell(1, "yes"), "line 3, column slipped: 'yes' is not 0 or 1"),
-    ("slip empty", _cell(1, ""), "line 3, column slipped: '' is not 0 or 1"),
-    ("not 12 bit", _cell(2, "4096"), "line 3, column ff_biotac_1: '4096' is not a count (0..4095)"),
-    ("negative", _cell(26, "-1"), "line 3, column mf_biotac_1: '-1' is not a count (0..4095)"),
-    ("missing value", _cell(73, ""), "line 3, column th_biotac_24: '' is not a count (0..4095)"),
-    ("a float", _cell(5, "12.5"), "line 3, column ff_biotac_4: '12.5' is not a count (0..4095)"),
-    ("python's own", _cell(5, "1_0"), "line 3, column ff_biotac_4: '1_0' is not a count (0..4095)"),
-    ("huge", _cell(5, "9" * 5000), "line 3, column ff_biotac_4: '99999999999999999999' is not a"),
-    ("open quote", _cell(0, '"ball'), "is not a table"),
+    ("slip not 0 or 1", _cell(1, "yes"), "line 3, column slipped: 'yes' is not an outcome"),
+    (
+        "not 12 bit",
+        _cell(2, "4096"),
+        "line 3, column ff_biotac_1: '4096' is not a count",
+    ),
+    (
+        "negative",
+        _cell(26, "-1"),
+        "line 3, column mf_biotac_1: '-1' is not a count",
+    ),
+    (
+        "missing value",
+        _cell(73, ""),
+        "line 3, column th_biotac_24: '' is not a count",
+    ),
+    (
+        "a float",
+        _cell(5, "12.5"),
+        "line 3, column ff_biotac_4: '12.5' is not a count",
+    ),
+    (
+        "python's own",
+        _cell(5, "1_0"),
+        "line 3, column ff_biotac_4: '1_0' is not a count",
+    ),
+    (
+        "huge",
+        _cell(5, "9" * 5000),
+        "line 3, column ff_biotac_4: '9999999999999999999999999999999999999999...' is",
+    ),
+    ("open quote", _cell(0, '"ball'), "this is not CSV: unexpected end of data"),
 ]
 
 
@@ -144,7 +167,7 @@ def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
 def test_bytes_that_are_not_text_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "palm_down.csv"
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DatasetError, match="is not text"):
+    with pytest.raises(DatasetError, match="is not utf-16"):
         read_table(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from pathlib import Path
 
@@ -180,6 +181,7 @@ def test_each_fold_of_each_seed_trains_from_another_start() -> None:
 
 
 def test_too_few_grasps_of_one_class_are_refused() -> None:
-    slipped = np.array([True] * 9 + [False] * 30)
+    grasps = table("lab", 39, 1)
+    grasps = dataclasses.replace(grasps, slipped=np.array([True] * 9 + [False] * 30))
     with pytest.raises(TooFewGraspsError, match="10 folds need 10 grasps of each class, one has 9"):
-        folds_of(slipped, 10, seed=0)
+        folds_of(grasps, 10, seed=0)

@@ -1,0 +1,236 @@
+"""Columns of tables and streams: the names by which electrodes, joints and times are known."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from graspd.biotac import ELECTRODES, FINGERS
+from graspd.drivers.base import RecordingError, joint_name
+from graspd.drivers.recordings.kinds import PAGE
+
+TIME: Final = "t"
+"""Column of seconds, with any zero, that graspd writes."""
+OBJECT: Final = "object"
+SLIPPED: Final = "slipped"
+OTHER_ELECTRODES: Final = 19
+"""Electrodes of the BioTac, which is another sensor than the BioTac SP."""
+
+_HAND: Final = r"(?:[rl]h_)?(?P<finger>ff|mf|rf|lf|th)"
+SCHEMES: Final[Mapping[str, re.Pattern[str]]] = {
+    example: re.compile(pattern, re.IGNORECASE)
+    for example, pattern in {
+        "ff_biotac_1": rf"{_HAND}_biotac_(?P<number>\d+)",
+        "ff_e1": rf"{_HAND}_?e(?P<number>\d+)",
+        "ff_1": rf"{_HAND}_?(?P<number>\d+)",
+        "field.tactiles0.electrodes0": (
+            r".*tactiles[_\[]?(?P<place>[0-4])\]?[./_]electrodes[_\[]?(?P<number>\d+)\]?"
+        ),
+        "E1": r"(?:e|electrode_?)(?P<number>\d+)",
+    }.items()
+}
+"""Names of electrodes, each scheme by an example; the first that a file has is read. The fourth is
+that of Shadow's message BiotacAll, of ff, mf, rf, lf, th. The last one is of a single finger."""
+
+_PLACES: Final[Mapping[str, int]] = {finger: place for place, finger in enumerate(FINGERS)}
+_UNIT_S: Final = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "msecs", "millis", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "usec", "usecs", "micros", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds"), 1e-9),
+}
+_UNITS: Final = "|".join(sorted(_UNIT_S, key=len, reverse=True))
+_TIME_NAME: Final = re.compile(
+    rf"(?P<before>(?:.*[./])?%?(?:rosbag|log_?)?(?:t|times?|time_?stamp|stamp|date_?time)"
+    rf"[ _./(\[]*)?(?P<unit>{_UNITS})?[)\]]?",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TimeColumn:
+    """Column of times, or columns of whole seconds and nanoseconds."""
+
+    name: str
+    places: tuple[int, ...]
+    unit_s: float | None
+    """Its unit, s, if the name tells it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Places of the columns that are read from a file, from 0."""
+
+    electrodes: tuple[int, ...]
+    """Finger by finger, E1 to E24 each."""
+    joints: Mapping[str, int]
+    """Place of a joint, by its name without hand prefix."""
+    time: TimeColumn | None
+    object: int | None
+    slipped: int | None
+    ignored: tuple[str, ...]
+    """Columns of unknown names; electrodes of other fingers do not count."""
+    fingers: tuple[str, ...]
+    """Fingers that the file has, asked for or not."""
+
+    @classmethod
+    def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int = 1) -> Columns:
+        """Return the columns to read for `fingers`; without any, for all that the file has.
+
+        `names`: the header, of this line. Raises `RecordingError` for what is missing or there
+        twice.
+        """
+        found = _electrodes(path, names, fingers, line)
+        joints: dict[str, int] = {}
+        for place, name in enumerate(names):
+            if joint := joint_name(name):
+                _refuse_twice(path, names, line, joints.get(joint), place)
+                joints[joint] = place
+        time = _time(names)
+        single = {}
+        for wanted in (OBJECT, SLIPPED, *(() if time is None else (time.name,))):
+            places = [place for place, name in enumerate(names) if name == wanted]
+            single[wanted] = places[0] if places else None
+            for place in places[1:]:
+                _refuse_twice(path, names, line, places[0], place)
+        known = {*joints.values(), *(() if time is None else time.places)}
+        known |= {place for electrodes in found.values() for place in electrodes.values()}
+        known |= {place for place in single.values() if place is not None}
+        every = tuple(finger for finger in FINGERS if finger in found)
+        return cls(
+            electrodes=tuple(
+                found[finger][number] for finger in fingers or every for number in range(ELECTRODES)
+            ),
+            joints=joints,
+            time=time,
+            object=single[OBJECT],
+            slipped=single[SLIPPED],
+            ignored=tuple(name for place, name in enumerate(names) if place not in known),
+            fingers=every,
+        )
+
+
+def has_electrodes(names: Sequence[str]) -> bool:
+    """Return True for a header with electrodes of some scheme."""
+    return any(scheme.fullmatch(name) for scheme in SCHEMES.values() for name in names)
+
+
+def _electrodes(
+    path: Path, names: Sequence[str], fingers: Sequence[str], line: int
+) -> dict[str, dict[int, int]]:
+    """Return the places of electrodes, by finger and number from 0."""
+    for example, scheme in SCHEMES.items():
+        found: dict[str, dict[int, int]] = {}
+        for place, name in enumerate(names):
+            if match := scheme.fullmatch(name):
+                finger = _finger(match, fingers)
+                numbers = found.setdefault(finger, {})
+                number = int(match["number"])
+                _refuse_twice(path, names, line, numbers.get(number), place)
+                numbers[number] = place
+        if found:
+            return _whole(path, example, found, fingers, line)
+    problem = f"no column of electrodes is known{_nearest(names)}; {PAGE} has the table of names"
+    raise RecordingError(path, problem, line=line)
+
+
+def _finger(match: re.Match[str], fingers: Sequence[str]) -> str:
+    groups = match.groupdict()
+    if "place" in groups:
+        return FINGERS[int(groups["place"])]
+    if "finger" in groups:
+        return groups["finger"].lower()
+    return fingers[0] if len(fingers) == 1 else ""
+
+
+def _whole(
+    path: Path,
+    example: str,
+    found: dict[str, dict[int, int]],
+    fingers: Sequence[str],
+    line: int,
+) -> dict[str, dict[int, int]]:
+    """Return the electrodes by number from 0; raise if a finger that is asked for lacks some."""
+    if "" in found:
+        asked = f"{len(fingers)} are" if fingers else "none is"
+        problem = f"{example} and so on name no finger, and {asked} asked for: name it, as ff_e1"
+        raise RecordingError(path, problem, line=line)
+    base = min(min(numbers) for numbers in found.values())
+    base = min(base, 1)
+    there = ", ".join(finger for finger in FINGERS if finger in found)
+    for finger in fingers or found:
+        numbers = found.get(finger, {})
+        expected = range(base, base + ELECTRODES)
+        if set(numbers) == set(range(base, base + OTHER_ELECTRODES)):
+            problem = (
+                f"{finger} has {OTHER_ELECTRODES} electrodes: a BioTac, which is another sensor "
+                f"than the BioTac SP with {ELECTRODES}; no model of graspd judges it"
+            )
+            raise RecordingError(path, problem, line=line)
+        missing = [number for number in expected if number not in numbers]
+        if missing:
+            column = re.sub(r"^ff|(?<=tactiles)0", _written(example, finger), example)
+            column = re.sub(r"\d+$", str(missing[0]), column)
+            others = f", the first of {len(missing)} that are" if len(missing) > 1 else ""
+            problem = f"this column is missing{others}; the file has the fingers {there}"
+            raise RecordingError(path, problem, line=line, column=column)
+        if extra := [number for number in numbers if number not in expected]:
+            problem = f"{finger} has electrode {extra[0]}, and they begin at {base}"
+            raise RecordingError(path, problem, line=line)
+    return {
+        finger: {number - base: place for number, place in numbers.items()}
+        for finger, numbers in found.items()
+    }
+
+
+def _written(example: str, finger: str) -> str:
+    return str(_PLACES[finger]) if "tactiles" in example else finger
+
+
+def _nearest(names: Sequence[str]) -> str:
+    """Return the name that is most like one of a scheme, and the names that were looked for."""
+    from difflib import SequenceMatcher  # only where it is needed
+
+    looked = ", ".join(SCHEMES)
+    likeness = [
+        (SequenceMatcher(None, name.lower(), example).ratio(), name, example)
+        for name in names[:200]
+        for example in SCHEMES
+        if re.search(r"\d", name)
+    ]
+    if not likeness:
+        return f": looked for {looked}"
+    _, name, example = max(likeness)
+    return f": looked for {looked}; {name[:60]!r} is nearest to {example}"
+
+
+def _time(names: Sequence[str]) -> TimeColumn | None:
+    """Return the column of times: `t`, else the first with a usual name."""
+    found = [(place, match) for place, name in enumerate(names) if (match := _is_time(name))]
+    found.sort(key=lambda each: names[each[0]] != TIME)
+    if not found:
+        return None
+    place, match = found[0]
+    unit_s = None if match["unit"] is None else _UNIT_S[match["unit"].lower()]
+    if unit_s == 1.0:
+        for other, also in found[1:]:
+            unit = _UNIT_S.get((also["unit"] or "").lower())
+            if unit == 1e-9 and also["before"] == match["before"]:
+                return TimeColumn(names[place], (place, other), unit_s)
+    return TimeColumn(names[place], (place,), unit_s)
+
+
+def _is_time(name: str) -> re.Match[str] | None:
+    match = _TIME_NAME.fullmatch(name)
+    return match if match and (match["before"] or len(match["unit"] or "") > 1) else None
+
+
+def _refuse_twice(
+    path: Path, names: Sequence[str], line: int, before: int | None, place: int
+) -> None:
+    if before is not None:
+        problem = f"this column is there twice, as {names[before]} too"
+        raise RecordingError(path, problem, line=line, column=names[place])

@@ -1,0 +1,279 @@
+"""Table or stream: the rows of a file are grasps or sweeps, by its times or by the rows.
+
+A sweep of a stream is never judged as a grasp, so doubt is refused.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice, pairwise
+from operator import itemgetter
+from pathlib import Path
+from typing import BinaryIO, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.drivers.base import ANGLE_MAX_RAD, RecordingError
+from graspd.drivers.recordings.cells import Cells
+from graspd.drivers.recordings.columns import Columns, TimeColumn
+from graspd.drivers.recordings.kinds import open_recording
+from graspd.drivers.recordings.values import (
+    count_of,
+    is_clock,
+    number_of,
+    problem_with,
+    time_of,
+)
+
+ReadAs = Literal["table", "stream"]
+BLOCK_ROWS: Final = 512
+"""Rows that are compared with each other, and rows at the begin whose values are checked."""
+NEAR_COUNTS: Final = 8.0
+"""Root of the mean square by which rows differ that nearly repeat each other, counts.
+
+Sweeps of a hand at rest differ by 3 to 6. At most 5 % of the published grasps are as near to
+another one; 29 to 65 % of the sweeps of streams at 4 to 100 Hz are.
+"""
+STEP_COUNTS: Final = 25.0
+"""The same of rows that may be sweeps in a row: 75 to 99 % of streams, 8 to 20 % of tables."""
+NEAR_SHARE_MAX: Final = 0.1
+"""Largest share of near rows in a grasp table; the published ones have 5 %."""
+MIDDLE_SHARE_MAX: Final = 0.25
+"""Largest share of steps between near and `STEP_COUNTS` in a table; streams have 40 to 60 %."""
+JUMP_SHARE_MIN: Final = 0.02
+"""Least share of larger steps in a table of several readings of each grasp: 50 readings."""
+STEP_S: Final = (0.002, 0.5)
+"""Shortest and longest usual time between sweeps, s. In each unit other numbers are usual."""
+SLOWEST_S: Final = 1.0
+"""Time between rows, s, above which they may be grasps."""
+EPOCHS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+"""Times since 1970 lie above these numbers if they are in these units, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The columns of a file, and the meaning of its rows."""
+
+    columns: Columns
+    is_stream: bool
+    unit_s: float = 1.0
+    """Unit of the column of times, s."""
+    rate_hz: float | None = None
+    """Sweeps per second, in place of times."""
+
+    @property
+    def joints(self) -> Mapping[str, int]:
+        """Places of joints; a table has none."""
+        return self.columns.joints if self.is_stream else {}
+
+
+def layout_of(
+    path: Path,
+    fingers: Sequence[str],
+    read_as: ReadAs | None = None,
+    rate_hz: float | None = None,
+) -> Layout:
+    """Return the layout of a file; `fingers`: those to read, none for all that it has.
+
+    `read_as` and `rate_hz` decide what is in doubt. Raises `RecordingError`.
+    """
+    with open_recording(path) as file:
+        return survey(path, file, fingers, read_as, rate_hz)
+
+
+def survey(
+    path: Path,
+    file: BinaryIO,
+    fingers: Sequence[str],
+    read_as: ReadAs | None = None,
+    rate_hz: float | None = None,
+) -> Layout:
+    """Return the layout of an opened file, and rewind it: see `layout_of`."""
+    cells = Cells(path, file)
+    columns = Columns.of(path, cells.names, fingers, cells.header_line)
+    rows = _Rows(path, columns, cells)
+    rows.refuse_values()
+    if rows.is_timed(read_as, rate_hz):
+        rows.refuse_degrees()
+        layout = _stream(rows, rate_hz if read_as == "stream" else None)
+        if layout.rate_hz is None:
+            _refuse_slow(rows, layout, read_as)
+    else:
+        _refuse_sweeps(rows, read_as)
+        layout = Layout(columns, is_stream=False)
+    file.seek(0)
+    return layout
+
+
+def _until_damage(rows: Iterator[list[str]]) -> Iterator[list[str]]:
+    """Yield rows up to one that cannot be read; reading the file again raises its error."""
+    try:
+        yield from rows
+    except RecordingError:
+        return
+
+
+class _Rows:
+    """The first rows of a file, and what is known of them."""
+
+    def __init__(self, path: Path, columns: Columns, cells: Cells) -> None:
+        self.path = path
+        self.columns = columns
+        each = iter(cells)
+        first = list(islice(each, 1))
+        if not first:
+            raise RecordingError(path, "the file has a header and no rows")
+        self._others = _until_damage(each)
+        self.first = [*first, *islice(self._others, BLOCK_ROWS - 1)]
+        self._comma = cells.decimal_comma
+        self._electrodes = itemgetter(*columns.electrodes)
+
+    def refuse_values(self) -> None:
+        """Raise if the values of electrodes are something else than counts."""
+        values = [value for cells in self.first for value in self._electrodes(cells)]
+        problem = problem_with(values, decimal_comma=self._comma)
+        if problem is not None:
+            raise RecordingError(self.path, problem)
+
+    def refuse_degrees(self) -> None:
+        """Raise if a joint has angles that no joint reaches, in radians, in a tenth of the rows."""
+        for name, place in self.columns.joints.items():
+            angles = [number_of(row[place], decimal_comma=self._comma) for row in self.first]
+            large = [angle for angle in angles if angle is not None and abs(angle) > ANGLE_MAX_RAD]
+            if 10 * len(large) > len(angles):
+                problem = f"{name} = {large[0]:g} rad is beyond every joint: degrees? write radians"
+                raise RecordingError(self.path, problem)
+
+    def is_timed(self, read_as: ReadAs | None, rate_hz: float | None) -> bool:
+        """Return True for rows with times. Raises if `read_as` says so, and they have none."""
+        if read_as == "stream" and self.columns.time is None and rate_hz is None:
+            raise RecordingError(self.path, "has no column of times: give --rate-hz too")
+        return read_as == "stream" or (read_as is None and self.columns.time is not None)
+
+    def times(self, column: TimeColumn) -> list[float]:
+        """Return the times of the first rows in the unit of the column."""
+        found = [time_value(column, row, decimal_comma=self._comma) for row in self.first]
+        return [value for value in found if value is not None]
+
+    def is_clock(self, column: TimeColumn) -> bool:
+        return is_clock(self.first[0][column.places[0]])
+
+    def blocks(self) -> Iterator[NDArray[np.float32]]:
+        """Yield the counts of all rows, shape (rows, electrodes), up to `BLOCK_ROWS` each."""
+        rows: Iterable[list[str]] = chain(self.first, self._others)
+        while block := list(islice(rows, BLOCK_ROWS)):
+            yield self._counts(block)
+
+    def follow_each_other(self) -> bool:
+        """Return True if most of the first rows are a small step from the row before."""
+        steps = _steps(self._counts(self.first))
+        return 2 * int((steps <= STEP_COUNTS).sum()) > len(steps)
+
+    def _counts(self, rows: Sequence[Sequence[str]]) -> NDArray[np.float32]:
+        counts = [
+            [count_of(cell, decimal_comma=self._comma) or 0 for cell in self._electrodes(row)]
+            for row in rows
+        ]
+        return np.array(counts, dtype=np.float32)
+
+
+def time_value(
+    column: TimeColumn, cells: Sequence[str], *, decimal_comma: bool = False
+) -> float | None:
+    """Return the time of a row in the unit of the column; None if it has none."""
+    value = time_of(cells[column.places[0]], decimal_comma=decimal_comma)
+    if len(column.places) == 1 or value is None:
+        return value
+    rest_ns = number_of(cells[column.places[1]], decimal_comma=decimal_comma)
+    return None if rest_ns is None else value + rest_ns * 1e-9
+
+
+def _stream(rows: _Rows, rate_hz: float | None) -> Layout:
+    """Return the layout of a stream. Raises `RecordingError` if its times mean little."""
+    column = rows.columns.time
+    if column is None or rate_hz is not None:
+        return Layout(rows.columns, is_stream=True, rate_hz=rate_hz)
+    if column.unit_s is not None or rows.is_clock(column):
+        return Layout(rows.columns, is_stream=True, unit_s=column.unit_s or 1.0)
+    times = rows.times(column)
+    step = _median_step(times)
+    usual = [unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if STEP_S[0] <= step * unit <= STEP_S[1]]
+    largest = max(map(abs, times), default=0.0)
+    epoch = next((unit for least, unit in EPOCHS if largest > least), None)
+    unit = epoch or (usual[0] if usual else 1.0)
+    return Layout(rows.columns, is_stream=True, unit_s=unit)
+
+
+def _refuse_slow(rows: _Rows, layout: Layout, read_as: ReadAs | None) -> None:
+    """Raise if the times are those of grasps, or none at all."""
+    column = rows.columns.time
+    if column is None:
+        return
+    times = rows.times(column)
+    step = _median_step(times)
+    if len(times) > 10 and step == 0.0:
+        problem = (
+            "most rows have the time of the row before: say how many there are a second, by "
+            "--as stream --rate-hz"
+        )
+        raise RecordingError(rows.path, problem, column=column.name)
+    if read_as is not None or len(times) < 2:
+        return
+    is_known = layout.unit_s == 1.0 or column.unit_s is not None or abs(times[0]) > EPOCHS[-1][0]
+    step_s = step * layout.unit_s
+    if step_s > SLOWEST_S or not (is_known or rows.follow_each_other()):
+        problem = (
+            f"rows are {step:g} apart: grasps of a table (--as table), or sweeps of a stream "
+            f"{step_s:g} s apart (--as stream)?"
+        )
+        raise RecordingError(rows.path, problem, column=column.name)
+
+
+def _refuse_sweeps(rows: _Rows, read_as: ReadAs | None) -> None:
+    """Raise if rows of a table nearly repeat each other, as the sweeps of a stream do."""
+    number = near = middle = jumps = 0
+    last: NDArray[np.float32] | None = None
+    for block in rows.blocks():
+        number += len(block)
+        near += _near(block)
+        steps = _steps(block if last is None else np.concatenate((last, block)))
+        middle += int(((steps > NEAR_COUNTS) & (steps <= STEP_COUNTS)).sum())
+        jumps += int((steps > STEP_COUNTS).sum())
+        last = block[-1:]
+    if near <= NEAR_SHARE_MAX * number:
+        return
+    problem = f"{near} of {number} rows nearly repeat another: "
+    if read_as is None:
+        problem += (
+            "sweeps of a stream (--as stream, and --rate-hz if it has no times), or several "
+            "readings of each grasp (--as table)?"
+        )
+        raise RecordingError(rows.path, problem)
+    if middle > MIDDLE_SHARE_MAX * number or jumps < JUMP_SHARE_MIN * number:
+        problem += "they change as sweeps of a stream do, and are not grasps of a table"
+        raise RecordingError(rows.path, problem)
+
+
+def _near(block: NDArray[np.float32]) -> int:
+    """Return the number of rows that nearly repeat another row of the block."""
+    is_near = np.zeros(len(block), dtype=np.bool_)
+    for place in range(len(block) - 1):
+        apart = np.square(block[place + 1 :] - block[place]).mean(axis=1)
+        near = apart <= NEAR_COUNTS**2
+        is_near[place + 1 :] |= near
+        is_near[place] |= near.any()
+    return int(is_near.sum())
+
+
+def _steps(block: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return by how much each row differs from the row before, counts; shape (rows - 1,)."""
+    squares: NDArray[np.float32] = np.square(np.diff(block, axis=0)).mean(axis=1)
+    return np.sqrt(squares)
+
+
+def _median_step(times: Sequence[float]) -> float:
+    steps = [abs(after - before) for before, after in pairwise(times)]
+    return statistics.median(steps) if steps else 0.0

@@ -1,0 +1,132 @@
+"""Values in cells: counts, numbers, times and outcomes, and what other values look like."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime, time
+from typing import Final
+
+from graspd.biotac import COUNT_MAX
+
+SHOWN_LENGTH_MAX: Final = 40
+"""Most characters of a cell in an error message."""
+VOLTS_MAX: Final = 5.5
+"""Largest value that looks like a voltage, V."""
+
+# ASCII digits only: float() also takes `1_000`, `nan` and digits of other scripts.
+_NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
+_THOUSANDS: Final = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+")
+COUNT_OF_TEXT: Final = {str(count): count for count in range(COUNT_MAX + 1)}
+"""Counts by their usual text: a look-up is ten times as fast as parsing."""
+_OUTCOMES: Final = {
+    **dict.fromkeys(("0", "0.0", "false", "stable"), False),
+    **dict.fromkeys(("1", "1.0", "true", "slip"), True),
+    **dict.fromkeys(("", "nan", "none", "null", "na", "n/a", "<na>"), None),
+}
+BLANK: Final = frozenset(text for text, slipped in _OUTCOMES.items() if slipped is None)
+"""Texts of a missing value, in small letters."""
+
+
+def number_of(cell: str, *, decimal_comma: bool = False) -> float | None:
+    """Return the finite number in a cell; None if it holds none."""
+    cell = cell.strip()
+    if decimal_comma:
+        cell = cell.replace(",", ".")
+    if _NUMBER.fullmatch(cell) is None:
+        return None
+    number = float(cell)
+    return number if math.isfinite(number) else None
+
+
+def count_of(cell: str, *, decimal_comma: bool = False) -> int | None:
+    """Return the 12-bit count in a cell; None if it holds no count.
+
+    `2,795` is not a count: it may be a mean of 2.8 or 2795.
+    """
+    count = COUNT_OF_TEXT.get(cell)
+    if count is not None:
+        return count
+    if _THOUSANDS.fullmatch(cell.strip()):
+        return None
+    number = number_of(cell, decimal_comma=decimal_comma)
+    if number is None or not number.is_integer() or not 0 <= number <= COUNT_MAX:
+        return None
+    return int(number)
+
+
+def time_of(cell: str, *, decimal_comma: bool = False) -> float | None:
+    """Return a time: a number in any unit, or the seconds of an ISO 8601 text; None: neither."""
+    number = number_of(cell, decimal_comma=decimal_comma)
+    return _clock_s(cell.strip()) if number is None else number
+
+
+def is_clock(cell: str) -> bool:
+    """Return True for a time in ISO 8601, which is in seconds."""
+    return _clock_s(cell.strip()) is not None and number_of(cell) is None
+
+
+def _clock_s(text: str) -> float | None:
+    """Return seconds since 1970, or since midnight for a time of day. No zone means UTC."""
+    if not text.isascii():
+        return None
+    try:
+        day = datetime.fromisoformat(text)
+    except ValueError:
+        pass
+    else:
+        return (day if day.tzinfo else day.replace(tzinfo=UTC)).timestamp()
+    try:
+        clock = time.fromisoformat(text)
+    except ValueError:
+        return None
+    return clock.hour * 3600 + clock.minute * 60 + clock.second + clock.microsecond * 1e-6
+
+
+def outcome_of(cell: str) -> bool | None:
+    """Return how a lift ended: True slip, False stable, None not known. Raises `ValueError`."""
+    text = cell.strip().lower()
+    if text not in _OUTCOMES:
+        problem = "is not an outcome: 0, False or stable; 1, True or slip; blank if it is not known"
+        raise ValueError(f"{shown(cell)} {problem}")
+    return _OUTCOMES[text]
+
+
+def problem_with(cells: Sequence[str], *, decimal_comma: bool) -> str | None:
+    """Return why values of electrodes are no counts, as a whole; None: most of them are.
+
+    A broken electrode has values that are missing or out of range; none has fractions.
+    """
+    given = [cell for cell in cells if cell.strip().lower() not in BLANK]
+    wrong = [cell for cell in given if count_of(cell, decimal_comma=decimal_comma) is None]
+    fractions = [cell for cell in wrong if "." in cell or "," in cell]
+    if 2 * len(wrong) <= len(given) and 20 * len(fractions) <= len(given):
+        return None
+    return (
+        f"{len(wrong)} of {len(given)} values are not counts, whole numbers in 0..{COUNT_MAX}, the "
+        f"first is {shown(wrong[0])}: {_looks_like(wrong, decimal_comma=decimal_comma)}"
+    )
+
+
+def _looks_like(wrong: Sequence[str], *, decimal_comma: bool) -> str:
+    if any(_THOUSANDS.fullmatch(cell.strip()) for cell in wrong):
+        return "write them without a separator of thousands"
+    numbers = [number_of(cell, decimal_comma=decimal_comma) for cell in wrong]
+    values = [abs(number) for number in numbers if number is not None]
+    if 2 * len(values) < len(wrong):
+        return "text in place of numbers?"
+    if any(number is not None and number < 0 for number in numbers):
+        return "differences? graspd takes the counts of the sensor as they are"
+    if max(values) <= 1.0:
+        return f"normalised? multiply by {COUNT_MAX} and round"
+    if max(values) <= VOLTS_MAX:
+        return "volts? graspd takes the counts of the sensor"
+    if max(values) > COUNT_MAX:
+        return "another sensor, or another scale?"
+    return "means of several readings? graspd takes single readings"
+
+
+def shown(cell: str) -> str:
+    """Return a cell in quotes, for a message."""
+    return repr(cell if len(cell) <= SHOWN_LENGTH_MAX else cell[:SHOWN_LENGTH_MAX] + "...")

@@ -1,0 +1,125 @@
+"""What one of graspd's writers makes, each of its readers takes; no sweep becomes a grasp."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graspd import read_grasps, read_recording
+from graspd.drivers.base import DriverError
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.layout import layout_of
+from graspd.models.training.data.datasets import read_table
+from tests.kit.inside import graspd
+
+pd = pytest.importorskip("pandas", reason="needs the extra pandas")
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "pandas": lambda path: read_grasps(DEMO_TABLE).to_csv(path, index=False),
+    "pandas with its index": lambda path: read_grasps(DEMO_TABLE).to_csv(path),
+    "gzip": lambda path: read_grasps(DEMO_TABLE).to_csv(path, index=False, compression="gzip"),
+    "Parquet": lambda path: read_grasps(DEMO_TABLE).to_parquet(path),
+    "Excel in Germany": lambda path: read_grasps(DEMO_TABLE).to_csv(path, sep=";", index=False),
+    "floats": lambda path: floats().to_csv(path, index=False),
+}
+
+
+def floats() -> Any:  # noqa: ANN401
+    frame = read_grasps(DEMO_TABLE)
+    return frame.assign(slipped=frame["slipped"].astype(float))
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_every_reader_takes_what_a_writer_makes(
+    tmp_path: Path, write: Callable[[Path], object]
+) -> None:
+    plain, path = read_grasps(DEMO_TABLE), tmp_path / "written"
+    write(path)
+    again = read_grasps(path)
+    pd.testing.assert_frame_equal(again[plain.columns], plain, check_dtype=False)
+    trained = read_table(path)
+    assert trained.slipped.tolist() == plain["slipped"].tolist()
+    assert trained.counts.reshape(len(plain), -1).tolist() == plain.iloc[:, 2:].to_numpy().tolist()
+    assert not layout_of(path, ("ff", "mf", "th")).is_stream
+
+
+def test_a_stream_that_the_library_writes_is_a_stream(tmp_path: Path) -> None:
+    frame = read_recording(DEMO_RECORDING)
+    frame.iloc[:300].to_csv(tmp_path / "stream", index=False)
+    frame.iloc[:300].to_parquet(tmp_path / "parquet")
+    for name in ("stream", "parquet"):
+        pd.testing.assert_frame_equal(read_recording(tmp_path / name), frame.iloc[:300])
+
+
+def test_grasps_without_an_outcome_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    frame = read_grasps(DEMO_TABLE)
+    frame["slipped"] = frame["slipped"].astype(object)
+    frame.loc[[3, 5], "slipped"] = None
+    frame.to_csv(tmp_path / "grasps.csv", index=False)
+    with pytest.warns(UserWarning, match="2 of 200 grasps have no outcome, and are left out"):
+        assert len(read_grasps(tmp_path / "grasps.csv")) == 198
+    assert read_table(tmp_path / "grasps.csv").without_outcome == 2
+
+
+RENAMED = ("t", "time", "%time", "stamp", "secs", "number", None)
+"""Names of the column of times; None: it is cut off."""
+
+
+def sweeps(name: str | None, keep: slice, seed: int | None, scale: float) -> bytes:
+    """A part of the demo's stream, its times called `name`; with a seed, columns are mixed."""
+    frame = pd.read_csv(io.BytesIO(DEMO_RECORDING.read_bytes()), nrows=1200).iloc[keep]
+    frame["t"] = frame["t"] * scale if scale == 1.0 else (frame["t"] * scale).round().astype(int)
+    frame = frame.drop(columns="t") if name is None else frame.rename(columns={"t": name})
+    if seed is not None:
+        random = np.random.default_rng(seed)
+        frame = frame[random.permutation(frame.columns)]
+        frame = frame if name in RENAMED[:5] else frame.sample(frac=1.0, random_state=seed)
+    text: str = frame.to_csv(index=False)
+    return text.encode()
+
+
+@pytest.mark.parametrize("name", RENAMED)
+@pytest.mark.parametrize(
+    ("keep", "seed"),
+    [
+        (slice(0, 300), None), (slice(0, 1200), 1), (slice(0, 1200, 2), 2), (slice(0, 100), 3),
+        (slice(40, 340), 4), (slice(0, 1200, 7), 5), (slice(0, 1200, 20), 6), (slice(5, 8), 7),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e9])
+def test_a_sweep_of_an_open_hand_is_never_stable(
+    tmp_path: Path, name: str | None, keep: slice, seed: int | None, scale: float
+) -> None:
+    path = tmp_path / "sweeps.csv"
+    path.write_bytes(sweeps(name, keep, seed, scale))
+    places = range(1200)[keep]
+    try:
+        layout = layout_of(path, ("ff", "mf", "th"))
+    except DriverError:
+        return
+    assert layout.is_stream, "a table: each sweep would be judged"
+    step_s = layout.unit_s * scale
+    assert step_s == pytest.approx(1.0) or len(places) < 10
+
+
+@pytest.mark.parametrize(
+    "words", [["replay"], ["session", "seed", "scene.toml"], ["train", "svm", "--own"]]
+)
+def test_no_command_takes_sweeps_without_times_for_grasps(
+    tmp_path: Path, words: Sequence[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweeps.csv").write_bytes(sweeps(None, slice(0, 1200), None, 1.0))
+    (tmp_path / "scene.toml").write_text(
+        '[tactile]\ndriver = "replay"\nrecordings = ["sweeps.csv"]\n'
+        '[session]\nkeep = true\nfolder = "session"\n'
+    )
+    done = graspd(*words, "sweeps.csv")
+    assert done.returncode == 2
+    assert "rows nearly repeat another: sweeps of a stream (--as stream" in done.stderr
+    assert not list(tmp_path.glob("session/*.session"))
+    assert graspd("replay", DEMO_RECORDING, "--gate", "every").returncode == 2

@@ -1,0 +1,312 @@
+"""Other people's tables: dialects, names of columns, times, values; and table or stream."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.csv_rows import Recording, Row, read_rows
+from graspd.drivers.recordings.layout import ReadAs, layout_of
+from tests.drivers.recordings.tables import ELECTRODES, FINGERS, PATH, stream, table, write
+
+PLAIN = table(4)
+
+
+def rows_of(content: bytes, fingers: Sequence[str] = FINGERS) -> list[Row]:
+    return list(Recording(PATH, io.BytesIO(content), fingers))
+
+
+def values(rows: Sequence[Row]) -> list[object]:
+    """Everything that rows say, without the lines where they stand."""
+    return [
+        (row.counts.tolist(), row.faults.any(), row.annotation.object_name, row.annotation.slipped)
+        for row in rows
+    ]
+
+
+def refusal(content: bytes, fingers: Sequence[str] = FINGERS) -> str:
+    with pytest.raises(RecordingError) as caught:
+        rows_of(content, fingers)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def text(change: Callable[[str], str]) -> bytes:
+    return change(PLAIN.decode()).encode()
+
+
+DIALECTS = {
+    "byte order mark": b"\xef\xbb\xbf" + PLAIN,
+    "UTF-16 of Windows": PLAIN.decode().encode("utf-16"),
+    "UTF-16, big end": b"\xfe\xff" + PLAIN.decode().encode("utf-16-be"),
+    "semicolons": PLAIN.replace(b",", b";"),
+    "tabs": PLAIN.replace(b",", b"\t"),
+    "spaces": PLAIN.replace(b",", b" "),
+    "sep line": b"sep=;\r\n" + PLAIN.replace(b",", b";"),
+    "sep line after a mark": b"\xef\xbb\xbfsep=|\n" + PLAIN.replace(b",", b"|"),
+    "comments": b"# lab A\n#\n" + PLAIN,
+    "a comment within": text(lambda it: it.replace("thing_2", "# later\nthing_2")),
+    "a header in a comment": b"# lab A\n# " + PLAIN,
+    "carriage returns": PLAIN.replace(b"\n", b"\r"),
+    "trailing commas in rows": text(lambda it: it.replace("\n", ",\n").replace(",\n", "\n", 1)),
+    "trailing commas everywhere": text(lambda it: it.replace("\n", ",,\n")),
+    "blank rows of commas": PLAIN + b"," * 73 + b"\n",
+    "an index of pandas": text(
+        lambda it: "".join(
+            f"{'' if number == 0 else number - 1},{line}\n"
+            for number, line in enumerate(it.splitlines())
+        )
+    ),
+    "counts with a point": text(lambda it: it.replace("\n", ".0\n").replace("_24.0", "_24")),
+    "decimal comma": PLAIN.replace(b",", b";").replace(b"\n", b",0\n").replace(b"_24,0", b"_24"),
+}
+
+
+@pytest.mark.parametrize("content", DIALECTS.values(), ids=DIALECTS)
+def test_a_table_of_any_dialect_reads_the_same(content: bytes) -> None:
+    assert values(rows_of(content)) == values(rows_of(PLAIN))
+
+
+def test_a_name_in_quotes_may_have_line_breaks() -> None:
+    content = PLAIN.replace(b"thing_1", b'"thing\r\none, # 1"')
+    names = [row.annotation.object_name for row in rows_of(content)]
+    assert names == ["thing_0", "thing\r\none, # 1", "thing_2", "thing_3"]
+    assert rows_of(content)[2].annotation.line == 5
+
+
+def test_a_row_of_many_lines_is_bounded() -> None:
+    content = PLAIN + b'"a' + b'\n","a' * 40_000
+    assert "longer than 65536 characters" in refusal(content)
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["numbers", "floats and texts"])
+def test_parquet_reads_as_its_csv(tmp_path: Path, packed: bool) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs the extra pandas")
+    frame = pandas.read_csv(io.BytesIO(PLAIN))
+    if packed:
+        frame = frame.astype(dict.fromkeys(ELECTRODES, float) | {"slipped": bool})
+    frame.to_parquet(tmp_path / "grasps")
+    assert values(list(read_rows(tmp_path / "grasps", FINGERS))) == values(rows_of(PLAIN))
+
+
+def renamed(name: Callable[[str, int], str], fingers: Sequence[str] = FINGERS) -> bytes:
+    """The plain table, its electrodes called `name(finger, number from 1)`."""
+    header, rest = PLAIN.decode().split("\n", 1)
+    names = {f"{f}_biotac_{n}": name(f, n) for f in fingers for n in range(1, 25)}
+    return (",".join(names.get(each, each) for each in header.split(",")) + "\n" + rest).encode()
+
+
+PLACES = {"ff": 0, "mf": 1, "rf": 2, "lf": 3, "th": 4}
+SCHEMES: dict[str, Callable[[str, int], str]] = {
+    "BioTacSP-DoS": lambda finger, number: f"{finger}_e{number}",
+    "capital letters": lambda finger, number: f"{finger.upper()}_E{number}",
+    "from 0": lambda finger, number: f"{finger}_biotac_{number - 1}",
+    "messages of graspd": lambda finger, number: f"{finger}_{number}",
+    "with the hand": lambda finger, number: f"rh_{finger}_biotac_{number}",
+    "rostopic echo -p": lambda f, number: f"field.tactiles{PLACES[f]}.electrodes{number - 1}",
+    "PlotJuggler": lambda f, number: f"/rh/tactile/tactiles[{PLACES[f]}]/electrodes[{number - 1}]",
+}
+
+
+@pytest.mark.parametrize("name", SCHEMES.values(), ids=SCHEMES)
+def test_electrodes_are_known_by_each_scheme(name: Callable[[str, int], str]) -> None:
+    assert values(rows_of(renamed(name))) == values(rows_of(PLAIN))
+
+
+def test_one_finger_needs_no_name() -> None:
+    content = renamed(lambda _, number: f"E{number}", ["mf"])
+    content = content.replace(b"ff_biotac", b"x").replace(b"th_biotac", b"y")
+    assert [row.counts.tolist() for row in rows_of(content, ["th"])] == [
+        row.counts[1:2].tolist() for row in rows_of(PLAIN)
+    ]
+    assert "E1 and so on name no finger, and 3 are asked for" in refusal(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (lambda f, n: f"{f}_taxels_{n}", "looked for ff_biotac_1, ff_e1, ff_1, field.tactiles0"),
+        (lambda f, n: f"{f}_taxels_{n}", "is nearest to ff_"),
+        (lambda f, n: f"{f}_e{n}" if n < 20 else f"x{f}{n}", "ff has 19 electrodes: a BioTac"),
+        (lambda f, n: f"{f}_e{n - 1}" if n < 20 else f"x{f}{n}", "another sensor than the BioTac"),
+        (lambda f, n: f"{f}_e{n}" if (f, n) != ("mf", 7) else "x", "column mf_e7: this column is"),
+        (lambda f, n: f"{f}_e{n - (f == 'ff')}", "column mf_e0: this column is missing"),
+        (lambda f, n: f"{f}_e{n}" if f != "th" else f"x{n}", "the file has the fingers ff, mf"),
+    ],
+)
+def test_an_unknown_header_is_answered(name: Callable[[str, int], str], said: str) -> None:
+    assert said in refusal(renamed(name))
+
+
+TIMES = ["100.00", "100.01", "100.02", "100.03"]
+
+
+def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
+    """A stream whose column of times is called `name`; several columns by commas."""
+    return stream(cells).replace(b"t,", name.encode() + b",", 1).replace(b",", separator.encode())
+
+
+@pytest.mark.parametrize(
+    ("name", "cells"),
+    [
+        ("t", TIMES), ("time", TIMES), ("Timestamp", TIMES), ("stamp", TIMES), ("secs", TIMES),
+        ("Time (s)", TIMES), ("field.header.stamp", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
+        ("%time", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
+        ("time_ms", ["5", "15", "25", "35"]), ("t_ns", ["0", "10000000", "20000000", "30000000"]),
+        ("timestamp", [f"{1.7e15 + n * 1e4:.0f}" for n in range(4)]),
+        ("time", [f"2023-11-14T22:13:20.{n}Z" for n in ("00", "01", "02", "03")]),
+        ("time", [f"2023-11-14 22:13:20.{n}0000000" for n in ("00", "01", "02", "03")]),
+        ("time", [f"22:13:20.{n}" for n in ("00", "01", "02", "03")]),
+        ("secs,nsecs", [f"1700000000,{n}0000000" for n in range(4)]),
+        ("header.stamp.sec,header.stamp.nanosec", [f"5,{n}0000000" for n in range(4)]),
+    ],
+)  # fmt: skip
+def test_times_are_known_by_usual_names_and_units(name: str, cells: Sequence[str]) -> None:
+    rows = rows_of(timed(name, cells))
+    steps = np.diff([math.nan if row.t_s is None else row.t_s for row in rows])
+    assert steps == pytest.approx([0.01, 0.01, 0.01], abs=1e-6)
+
+
+def test_times_may_have_a_decimal_comma() -> None:
+    content = timed("t", ["0.00", "0.01", "1.120"], ";").replace(b".", b",")
+    assert [row.t_s for row in rows_of(content)] == [0.0, 0.01, 1.12]
+
+
+def sweeps(number: int = 260) -> tuple[list[str], NDArray[np.str_]]:
+    """Header and cells of the begin of the demo's stream: one grasp."""
+    header, *lines = DEMO_RECORDING.read_text().splitlines()[: number + 1]
+    return header.split(","), np.array([line.split(",") for line in lines])
+
+
+def written(names: Sequence[str], cells: NDArray[np.str_]) -> bytes:
+    return "".join(",".join(row) + "\n" for row in [names, *cells.tolist()]).encode()
+
+
+def layout(content: bytes, folder: Path, read_as: ReadAs | None = None) -> bool:
+    return layout_of(write(folder, content), FINGERS, read_as, 100.0).is_stream
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e3, 1e-3), (1e6, 1e-6), (1e9, 1e-9)])
+def test_the_unit_of_times_is_known_by_their_steps(
+    tmp_path: Path, scale: float, unit: float
+) -> None:
+    names, cells = sweeps()
+    place = names.index("t")
+    cells[:, place] = [f"{float(value) * scale:.0f}" for value in cells[:, place]]
+    found = layout_of(write(tmp_path, written(names, cells)), FINGERS)
+    assert found.is_stream
+    assert found.unit_s == unit
+
+
+def test_grasps_with_times_a_minute_apart_are_doubted(tmp_path: Path) -> None:
+    header, *lines = DEMO_TABLE.read_text().splitlines()
+    content = "\n".join(["time," + header, *(f"{60 * n},{line}" for n, line in enumerate(lines))])
+    path = write(tmp_path, content.encode() + b"\n")
+    with pytest.raises(RecordingError, match=r"60 apart: grasps .*--as table.*--as stream"):
+        layout_of(path, FINGERS)
+    assert not layout_of(path, FINGERS, "table").is_stream
+    assert layout_of(path, FINGERS, "stream").is_stream
+
+
+def test_times_that_stand_still_are_refused(tmp_path: Path) -> None:
+    names, cells = sweeps()
+    cells[:, names.index("t")] = "1700000000"
+    with pytest.raises(RecordingError, match="most rows have the time of the row before"):
+        layout(written(names, cells), tmp_path)
+    assert layout(written(names, cells), tmp_path, "stream")
+
+
+@pytest.mark.parametrize("every", [1, 2, 5, 10, 25])
+@pytest.mark.parametrize("mixed", [False, True], ids=["in order", "mixed"])
+def test_sweeps_without_times_are_never_a_table(tmp_path: Path, every: int, mixed: bool) -> None:
+    names, cells = sweeps(2000)
+    cells = cells[::every]
+    if mixed:
+        cells = np.random.default_rng(1).permutation(cells)
+    names[names.index("t")] = "number"
+    content = written(names, cells)
+    with pytest.raises(RecordingError, match=r"nearly repeat another: sweeps .*--as stream"):
+        layout(content, tmp_path)
+    assert layout(content, tmp_path, "stream")
+    if every <= 10 and not mixed:
+        with pytest.raises(RecordingError, match="change as sweeps of a stream do"):
+            layout(content, tmp_path, "table")
+
+
+def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> None:
+    header, *lines = DEMO_TABLE.read_text().splitlines()
+    random = np.random.default_rng(2)
+    cells = np.array([line.split(",") for line in lines[:40]]).repeat(6, axis=0)
+    noise = random.normal(0.0, 3.0, (240, 72))
+    cells[:, 2:] = np.round(cells[:, 2:].astype(float) + noise).astype(int).astype(str)
+    content = written(header.split(","), cells)
+    with pytest.raises(RecordingError, match="240 of 240 rows nearly repeat another"):
+        layout(content, tmp_path)
+    assert not layout(content, tmp_path, "table")
+
+
+def test_published_grasps_are_tables(bts3_dir: Path) -> None:
+    for pose in ("down", "side", "45"):
+        assert not layout_of(bts3_dir / f"palm_{pose}.csv", FINGERS).is_stream
+
+
+def scaled(change: Callable[[int], str], separator: str = ",") -> bytes:
+    lines = PLAIN.decode().splitlines()
+    cells = [line.split(",") for line in lines[1:]]
+    rows = [[*row[:2], *(change(int(cell)) for cell in row[2:])] for row in cells]
+    return "".join(separator.join(row) + "\n" for row in [lines[0].split(","), *rows]).encode()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (scaled(lambda n: f"{n / 4095:.4f}"), "normalised? multiply by 4095"),
+        (scaled(lambda n: f"{n / 4095 * 3.3:.3f}"), "volts?"),
+        (scaled(lambda n: f"{n // 2}.5"), "means of several readings?"),
+        (scaled(lambda n: f"{n - 2000}.5"), "differences?"),
+        (scaled(lambda n: str(n * 16)), "another sensor, or another scale?"),
+        (scaled(lambda n: f'"{n // 1000},{n % 1000:03}"'), "without a separator of thousands"),
+        (scaled(lambda n: f"{n // 1000},{n % 1000:03}", ";"), "without a separator of thousands"),
+        (scaled(lambda _: "high"), "text in place of numbers?"),
+    ],
+)
+def test_values_that_are_no_counts_are_refused_once(content: bytes, said: str) -> None:
+    message = refusal(content)
+    assert "of 288 values are not counts, whole numbers in 0..4095, the first is '" in message
+    assert said in message
+
+
+def test_joints_in_degrees_are_named() -> None:
+    degrees = {"FFJ1": ["1", "2", "3", "1"], "rh_FFJ3": ["45.8", "46.1", "46.0", "3"]}
+    assert "FFJ3 = 45.8 rad is beyond every joint: degrees?" in refusal(stream(TIMES, degrees))
+
+
+def test_a_single_large_angle_is_bad() -> None:
+    angles = ["0.5", "70", *["0.5"] * 18]
+    rows = rows_of(stream([f"{n / 100}" for n in range(20)], {"FFJ3": angles}))
+    assert [math.isnan(row.position_rad[0]) for row in rows] == [False, True, *[False] * 18]
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        (["0", "1", "0", "1"], [False, True, False, True]),
+        (["0.0", "1.0", "", "1.0"], [False, True, None, True]),
+        (["False", "True", "nan", "TRUE"], [False, True, None, True]),
+        (["stable", "slip", "None", " Slip "], [False, True, None, True]),
+    ],
+)
+def test_outcomes_are_read_as_tools_write_them(
+    cells: Sequence[str], expected: Sequence[bool | None]
+) -> None:
+    content = table(4, {row: {"slipped": cell} for row, cell in enumerate(cells)})
+    rows = list(Recording(PATH, io.BytesIO(content), FINGERS, outcomes=True))
+    assert [row.annotation.slipped for row in rows] == expected
