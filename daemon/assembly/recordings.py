@@ -15,11 +15,11 @@ from graspd.daemon.assembly.sources import Source
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import GateCause
-from graspd.daemon.publish.companion import Companion
+from graspd.daemon.publish.companion import Companion, PublishedVerdict
 from graspd.daemon.publish.messages import GateMessage, OutcomeMessage
 from graspd.daemon.record.mcap_reader import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
-from graspd.daemon.record.topics import Late, Topic
+from graspd.daemon.record.topics import Late, Said, Topic
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene import scene as kinds
 from graspd.daemon.scene.drivers import Section
@@ -48,6 +48,23 @@ LOST_HEADER = (
 )
 
 
+class Same(Companion):
+    """Counts the verdicts of a replay that are not those of the run."""
+
+    def __init__(self) -> None:
+        self.said: Said | None = None
+        """Verdict of the run on the next reading. None: not recorded."""
+        self.compared = self.differ = 0
+
+    def on_verdict(self, published: PublishedVerdict) -> None:
+        if self.said is None or published.reading is None:
+            return
+        now = Said(published.verdict.verdict, published.verdict.judged)
+        self.compared += 1
+        self.differ += now != self.said
+        self.said = None
+
+
 class RecordedRun(Source):
     """One or more recordings of one run of the daemon, in the order of time."""
 
@@ -57,6 +74,9 @@ class RecordedRun(Source):
         self.header = headers[0]
         self._paths = tuple(paths)
         self._companion = Companion()
+        self.same = Same()
+        self._same_model = self._as_then = False
+        """True if the model, and session and learning, are those of the run."""
         self._same_grasps = True
         """False in another gate mode, where recorded outcomes are of other grasps."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
@@ -91,7 +111,8 @@ class RecordedRun(Source):
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
         header = self.header
-        if header.model_sha256 != model.sha256[: len(header.model_sha256)]:
+        self._same_model = header.model_sha256 == model.sha256[: len(header.model_sha256)]
+        if not self._same_model:
             log.warning("%s: was judged by %s, not by this model", self._paths[0], header.model)
         if header.file > 0:
             log.warning(BEGINS_WITHIN, self._paths[0])
@@ -104,6 +125,7 @@ class RecordedRun(Source):
 
     def restore(self, pipeline: Pipeline) -> None:
         header = self.header
+        self._as_then = True
         try:
             if pipeline.session is not None and header.session is not None:
                 pipeline.session.restore(header.session)
@@ -119,6 +141,14 @@ class RecordedRun(Source):
     def tell(self, companion: Companion) -> None:
         self._companion = companion
 
+    def companions(self) -> list[Companion]:
+        return [self.same]
+
+    def end(self) -> None:
+        if self.same.differ and self._as_then and self._same_grasps and self._same_model:
+            differ, compared = self.same.differ, self.same.compared
+            log.warning("%d of %d verdicts are not those of the run", differ, compared)
+
     def _repeat(self, pipeline: Pipeline, event: RecordedEvent) -> None:
         match event:
             case Topic.ASKED:
@@ -131,6 +161,8 @@ class RecordedRun(Source):
                 pipeline.lifts.take_back(None)
             case Late():
                 pipeline.expect_late(judged=event.judged)
+            case Said():
+                self.same.said = event
             case GateMessage(cause=GateCause.CONTACT) if self._same_grasps:
                 pipeline.hand.count_from(event.grasp - 1)
             case Exchanged():

@@ -63,6 +63,13 @@ class Source:
     def tell(self, companion: Companion) -> None:
         """Pass the recorded outcomes to `companion`, if there are any."""
 
+    def companions(self) -> list[Companion]:
+        """Return what else follows the replay."""
+        return []
+
+    def end(self) -> None:
+        """Say how the replay differs from the run, if that is known."""
+
 
 class Tables(Source):
     """Grasp tables, streams and ROS bags, which do not say how they were judged."""

@@ -207,9 +207,10 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
             if not came and stop.received is None:
                 where = f"{sockets.endpoint} within {args.wait:g} s"
                 raise PublishError(f"no subscriber of {where}")
-        companions = [*around.companions, *told, why]
+        companions = [*around.companions, *told, *source.companions(), why]
         loop = Loop(parts.drivers, pipeline, around.build_outbox(), stop, companions, timing)
         stack.callback(lambda: shown.summary(pipeline.trust))
+        stack.callback(source.end)
         stack.callback(loop.close)
         stack.callback(controller.tell)
         loop.run()

@@ -16,10 +16,12 @@ from graspd.daemon.record.topics import (
     EVENTS,
     PLAYED,
     Late,
+    Said,
     Topic,
     decode_exchanged,
     decode_gate,
     decode_late,
+    decode_said,
     joint_reading,
     tactile_reading,
 )
@@ -29,9 +31,9 @@ from graspd.drivers.recordings.player import RecordedDriver
 
 _log = logging.getLogger(__name__)
 
-RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage
+RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage | Said
 """An event of `EVENTS`, an outcome, an exchange of sensors, or what belongs to the next reading:
-that it was late, or that it changed the gate."""
+that it was late, that it changed the gate, or its verdict."""
 _Item = Reading | RecordedEvent
 LATE = b'{"judged":false}'
 """Mark of a reading that may have been late."""
@@ -99,6 +101,10 @@ class McapReplayDriver(RecordedDriver[_Item]):
         if taken is None:
             return ()
         at_ns, item = taken
+        if isinstance(item, Said):  # its reading follows at once
+            if self.on_event is not None:
+                self.on_event(item)
+            return self.read_ready()
         if isinstance(item, RecordedEvent):
             if self.on_event is not None:
                 self.on_event(item)
@@ -143,6 +149,8 @@ class McapReplayDriver(RecordedDriver[_Item]):
                     return decode_late(message.payload)
                 case Topic.GATE:
                     return decode_gate(message.payload)
+                case Topic.VERDICT:
+                    return decode_said(message.payload)
         except (ValueError, OverflowError):
             self.counters.malformed += 1
             return None
@@ -156,15 +164,18 @@ def _in_order(recording: McapReader) -> Iterator[RecordedMessage]:
     verdict the last reading before a loss counts as late.
     """
     held: list[RecordedMessage] = []
-    was_in_time = False
+    was_in_time = is_judged = False
     for message in recording:
         if message.kind in (Topic.LATE, Topic.GATE):
             yield message._replace(at_ns=held[0].at_ns) if held else message
         elif message.kind == Topic.VERDICT:
             was_in_time = STALE not in message.payload
+            if held and not is_judged:  # later ones are on silence
+                is_judged = True
+                yield message._replace(at_ns=held[0].at_ns)
         elif message.kind == Topic.TACTILE:
             yield from held
-            held, was_in_time = [message], False
+            held, was_in_time, is_judged = [message], False, False
         elif message.kind == Topic.DROPPED:
             _log.warning("%s: the disk was slow: verdicts may differ after a loss", recording.path)
             yield from held if was_in_time else _called_late(held)

@@ -91,6 +91,13 @@ class Late(msgspec.Struct, frozen=True):
     """True if the network judged it all the same."""
 
 
+class Said(msgspec.Struct, frozen=True):
+    """Part of a verdict by which a replay is held against the run."""
+
+    verdict: str
+    judged: bool = True
+
+
 class Event(msgspec.Struct, frozen=True):
     """An event; its topic tells which."""
 
@@ -148,6 +155,7 @@ EVENT: Final = b"{}"
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
 decode_late = msgspec.json.Decoder(Late).decode
 decode_gate = msgspec.json.Decoder(messages.GateMessage).decode
+decode_said = msgspec.json.Decoder(Said).decode
 _decode_joints = msgspec.json.Decoder(Joints).decode
 _decode = msgspec.json.Decoder(dict[str, Any]).decode
 

@@ -132,21 +132,37 @@ def three_seconds(folder: Path) -> Path:
     return folder / "short.csv"
 
 
-def test_a_filtered_recording_is_judged_with_a_warning(
-    lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """As `mcap filter` leaves it: no metadata."""
-    path = tmp_path / "filtered.mcap"
-    with lab.files[0].open("rb") as source, path.open("wb") as target:
-        writer = Writer(target)
+def filtered(source: Path, path: Path, *, metadata: bool = True, every: int = 1) -> Path:
+    """Write a recording again as another tool does: maybe without metadata, or readings thinned."""
+    with source.open("rb") as stream, path.open("wb") as target:
+        writer, reader = Writer(target), make_reader(stream)
         writer.start(profile="", library="another tool")
-        for schema, channel, message in make_reader(source).iter_messages():
+        for record in reader.iter_metadata() if metadata else ():
+            writer.add_metadata(record.name, record.metadata)
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic.startswith("tactile.") and message.sequence % every:
+                continue
             kind = 0
             if schema is not None:
                 kind = writer.register_schema(schema.name, schema.encoding, schema.data)
             topic = writer.register_channel(channel.topic, channel.message_encoding, kind)
             writer.add_message(topic, message.log_time, message.data, message.publish_time)
         writer.finish()
+    return path
+
+
+def test_verdicts_that_are_not_those_of_the_run_are_counted(lab: Lab, tmp_path: Path) -> None:
+    whole = filtered(lab.files[0], tmp_path / "whole.mcap")
+    assert "not those of the run" not in graspd("replay", whole).stderr
+    path = filtered(lab.files[0], tmp_path / "part.mcap", every=3)
+    assert "verdicts are not those of the run" in graspd("replay", path).stderr
+
+
+def test_a_filtered_recording_is_judged_with_a_warning(
+    lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As `mcap filter` leaves it: no metadata."""
+    path = filtered(lab.files[0], tmp_path / "filtered.mcap", metadata=False)
     verdicts = list(judge(path, model="cnn1"))
     assert "has dropped the record `graspd`" in caplog.text
     assert "was judged by" not in caplog.text
