@@ -162,7 +162,7 @@ def test_a_hand_with_two_sensors_gets_the_name_of_its_model(
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
     assert main(["replay", str(path)]) == 2
     said = capsys.readouterr().err
-    assert f"has sensors on {', '.join(fingers)}" in said
+    assert f"has {', '.join(fingers)}" in said
     assert name in said
 
 
