@@ -25,6 +25,7 @@ from graspd.daemon.judge.health import at_rail
 from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading
+from graspd.drivers.recordings.columns import time_column
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
 from graspd.drivers.recordings.layout import ReadAs
 from graspd.models import trial, zoo
@@ -93,7 +94,7 @@ class GraspModel:
     def _probabilities(
         self, counts: ArrayLike, session: str | os.PathLike[str] | ArrayLike | None
     ) -> NDArray[np.float64]:
-        judged = counts_of(counts, self.fingers)
+        judged = _grasps(counts, self.fingers)
         probabilities = np.full((len(judged), 2), np.nan)
         with self._turn:
             self._begin(session)
@@ -119,7 +120,7 @@ class GraspModel:
         if isinstance(session, str | os.PathLike):
             session_file.restore(Path(session), self.fingers, calibration)
         elif session is not None:
-            for values in counts_of(session, self.fingers):
+            for values in _grasps(session, self.fingers):
                 examined = self._examine(values)
                 self._judge.observe(examined, self._judge.judge(examined))
         if not calibration.calibrated:
@@ -130,6 +131,17 @@ class GraspModel:
                 "not needed.",
                 stacklevel=4,
             )
+
+
+def _grasps(given: ArrayLike, fingers: Sequence[Finger]) -> NDArray[np.float64]:
+    """Return the counts of grasps. Raises `ValueError`, also for a table with times, a stream."""
+    time_of_sweeps = time_column([str(name) for name in column_names(given)])
+    if time_of_sweeps is not None:
+        raise ValueError(
+            f"the table is a stream, by its column {time_of_sweeps.name}: its rows are sweeps and "
+            "not grasps; graspd.judge(table) judges it"
+        )
+    return counts_of(given, fingers)
 
 
 def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> GraspModel:

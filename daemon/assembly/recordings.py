@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from graspd.daemon.assembly.parts import Parts
-from graspd.daemon.assembly.plan import Plan
+from graspd.daemon.assembly.plan import NO_SWEEPS, Plan
 from graspd.daemon.assembly.sources import Source
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
@@ -100,6 +100,8 @@ class RecordedRun(Source):
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
         was = self._sections.get("gate", {}).get("mode")
+        if mode == "every" and was != "every":
+            raise SceneError(f"{self._paths[0]}: {NO_SWEEPS}")
         self._same_grasps = mode is None or (mode == "every") == (was == "every")
         if not self._same_grasps:
             log.warning(

@@ -89,7 +89,7 @@ class Columns:
             if joint := joint_name(name):
                 _refuse_twice(path, names, line, joints.get(joint), place)
                 joints[joint] = place
-        time = _time(names)
+        time = time_column(names)
         single = {}
         for wanted in (OBJECT, SLIPPED, *(() if time is None else (time.name,))):
             places = [place for place, name in enumerate(names) if name == wanted]
@@ -207,7 +207,7 @@ def _nearest(names: Sequence[str]) -> str:
     return f": looked for {looked}; {name[:60]!r} is nearest to {example}"
 
 
-def _time(names: Sequence[str]) -> TimeColumn | None:
+def time_column(names: Sequence[str]) -> TimeColumn | None:
     """Return the column of times: `t`, else the first with a usual name."""
     found = [(place, match) for place, name in enumerate(names) if (match := _is_time(name))]
     found.sort(key=lambda each: names[each[0]] != TIME)

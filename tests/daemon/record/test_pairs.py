@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd import read_grasps, read_recording
+from graspd import load, read_grasps, read_recording
 from graspd.drivers.base import DriverError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.drivers.recordings.layout import layout_of
@@ -63,6 +63,16 @@ def test_grasps_without_an_outcome_are_left_out_with_a_warning(tmp_path: Path) -
     with pytest.warns(UserWarning, match="2 of 200 grasps have no outcome, and are left out"):
         assert len(read_grasps(tmp_path / "grasps.csv")) == 198
     assert read_table(tmp_path / "grasps.csv").without_outcome == 2
+
+
+def test_a_stream_is_not_judged_as_grasps_by_the_library() -> None:
+    stream = read_recording(DEMO_RECORDING).iloc[:50]
+    model = load("mlp")
+    for given in (stream, stream.rename(columns={"t": "%time"})):
+        with pytest.raises(ValueError, match="the table is a stream, by its column"):
+            model.predict_proba(given)
+        with pytest.raises(ValueError, match="the table is a stream, by its column"):
+            load("small-session").predict(stream, session=stream)
 
 
 RENAMED = ("t", "time", "%time", "stamp", "secs", "number", None)
