@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graspd.models.contract import Dataset
 from graspd.models.training.data.datasets import Grasps, concatenate, read_all
 from graspd.models.training.data.protocols import (
     UNKNOWN_OBJECTS,
@@ -16,6 +17,7 @@ from graspd.models.training.data.protocols import (
     TooFewGraspsError,
     fold_seed,
     folds_of,
+    near_copies,
     object_folds,
     splits,
 )
@@ -185,3 +187,22 @@ def test_too_few_grasps_of_one_class_are_refused() -> None:
     grasps = dataclasses.replace(grasps, slipped=np.array([True] * 9 + [False] * 30))
     with pytest.raises(TooFewGraspsError, match="10 folds need 10 grasps of each class, one has 9"):
         folds_of(grasps, 10, seed=0)
+
+
+def test_readings_of_one_grasp_stay_in_one_fold() -> None:
+    one = table("lab", 40, 1)
+    noise = np.random.default_rng(3).normal(0.0, 3.0, (120, 3, 24))
+    grasps = dataclasses.replace(
+        one,
+        counts=(one.counts.repeat(3, axis=0) + noise).astype(np.uint16),
+        slipped=one.slipped.repeat(3),
+        objects=tuple(name for name in one.objects for _ in range(3)),
+        files=(Dataset("lab", one.files[0].sha256, 120),),
+    )
+    assert near_copies(one) == 0
+    assert near_copies(grasps) == 120
+    fold_of = folds_of(grasps, 5, seed=0).reshape(40, 3)
+    assert (fold_of == fold_of[:, :1]).all()
+    assert set(fold_of.ravel().tolist()) == set(range(5))
+    with pytest.raises(TooFewGraspsError, match="one has "):
+        folds_of(grasps, 40, seed=0)
