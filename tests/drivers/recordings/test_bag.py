@@ -175,6 +175,16 @@ def test_a_packed_bag_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
         read_grasps(path)
 
 
+def test_joints_in_degrees_are_named(tmp_path: Path) -> None:
+    sweeps = [
+        sweep._replace(angles={name: 57.29578 * angle for name, angle in sweep.angles.items()})
+        for sweep in sweeps_of(demo())
+    ]
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
+    with pytest.warns(UserWarning, match="rad is not a joint angle: is it in degrees"):
+        list(judge(path))
+
+
 def test_a_former_biotac_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sweeps = [
         sweep._replace(electrodes={f: counts[:19] for f, counts in sweep.electrodes.items()})
