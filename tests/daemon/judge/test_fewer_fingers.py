@@ -85,7 +85,7 @@ def test_a_table_of_these_fingers_alone_is_judged_as_the_whole_table(
 def test_a_table_without_a_finger_of_the_model_is_refused(tmp_path: Path) -> None:
     result = graspd("replay", cut(DEMO_TABLE, ("ff", "th"), tmp_path))
     assert result.returncode == 2
-    assert "mf_biotac_1" in result.stderr
+    assert "has ff, th; small-session also needs mf" in result.stderr
 
 
 @pytest.mark.parametrize("name", SOME)
