@@ -108,7 +108,7 @@ _OTHERS: Final = {
 
 def kind_of(path: Path) -> Kind:
     """Return what a file or folder holds. Raises `RecordingError` for what graspd does not read."""
-    if (path / "metadata.yaml").is_file():
+    if os.path.isfile(path / "metadata.yaml"):  # False too where it may not look
         return Kind.ROS2_BAG
     with open_recording(path) as file:
         return kind_of_open(path, file)

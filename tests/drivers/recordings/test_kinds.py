@@ -139,6 +139,11 @@ def test_any_other_file_is_named_with_the_page(
     assert str(caught.value).endswith("; deploy/RECORDING.md lists what graspd reads")
 
 
+def test_a_name_that_is_too_long_is_an_error() -> None:
+    with pytest.raises(RecordingError, match="file name too long"):
+        kind_of(Path("a" * 300))
+
+
 def test_an_empty_file_is_called_empty(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"grasps\.csv: the file is empty"):
         kind_of(write(tmp_path, b""))
