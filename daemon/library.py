@@ -59,8 +59,8 @@ class GraspModel:
         self.fingers: tuple[Finger, ...] = model.contract.fingers
         """Order of the fingers in the counts."""
         self._judge = GraspJudge.of(model, Limits.slip_threshold)
-        self._turn = threading.Lock()
-        """Held while it judges: it has one session, and the network one input."""
+        self._turns: dict[int, threading.Lock] = {}
+        """Lock of each process, held while it judges: it has one session, the network one input."""
 
     def __repr__(self) -> str:
         return f"<GraspModel {self.name} of {', '.join(self.fingers)}>"
@@ -87,7 +87,8 @@ class GraspModel:
 
         `session`, for models that need one: grasps of the same sensors on the same day, like
         `counts` and without outcomes, or the file of a session that a daemon has kept.
-        Raises `ValueError`, `ModelError` or `SessionFileError` for what does not fit.
+        Raises `ValueError`, `ModelError` or `SessionFileError` for what does not fit, and
+        `RuntimeError` in a process that was forked while a thread judged.
         """
         return self._probabilities(counts, session)
 
@@ -96,13 +97,22 @@ class GraspModel:
     ) -> NDArray[np.float64]:
         judged = _grasps(counts, self.fingers)
         probabilities = np.full((len(judged), 2), np.nan)
-        with self._turn:
+        with self._turn():
             self._begin(session)
             for row, values in enumerate(judged):
                 p_slip = self._judge.judge(self._examine(values)).p_slip
                 if p_slip is not None:
                     probabilities[row] = 1.0 - p_slip, p_slip
         return probabilities
+
+    def _turn(self) -> threading.Lock:
+        """Return what a thread holds while it judges; the thread itself is lost in a fork."""
+        own = os.getpid()
+        if any(turn.locked() for pid, turn in list(self._turns.items()) if pid != own):
+            raise RuntimeError(
+                f"a thread was judging by {self} when process {own} was forked: load it there again"
+            )
+        return self._turns.setdefault(own, threading.Lock())
 
     def _examine(self, values: NDArray[np.float64]) -> Examined:
         counts = np.where(np.isnan(values), 0.0, values).astype(np.uint16)

@@ -69,6 +69,8 @@ def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
     names, path = column_names(table), Path(folder, "table.csv")
     _refuse_twice(names, names)
     columns: list[Any] = [np.ma.array(_without_na(table[name])) for name in names]
+    for name, each in zip(names, columns, strict=True):
+        _refuse_rounded(each.dtype, f"the column {name}")
     # An outcome is 0 or 1 in a file.
     columns = [each.astype(int) if each.dtype.kind == "b" else each for each in columns]
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -115,15 +117,25 @@ def _without_na(column: Any) -> Any:  # noqa: ANN401
 def _numbers(given: Any, what: str) -> NDArray[np.float64]:  # noqa: ANN401
     """Return numbers, NaN for what is missing or masked. Raises `ValueError`."""
     try:
-        values: Any = np.ma.array(given)
+        # Of lists in lists numpy forgets the masks.
+        nested = isinstance(given, list | tuple) and any(
+            isinstance(each, list | tuple) for each in given
+        )
+        values: Any = np.ma.stack(list(map(np.ma.array, given))) if nested else np.ma.array(given)
     except ValueError as error:
         raise ValueError(f"{what}: lists of different lengths") from error
+    _refuse_rounded(values.dtype, what)
     if values.dtype.kind not in "iuf":
         odd = [each for each in values.compressed().tolist() if not _is_number(each)]
         if odd:
             raise ValueError(f"{what}: {odd[0]!r} and the like are not numbers")
     counts: NDArray[np.float64] = values.astype(np.float64).filled(np.nan)
     return counts
+
+
+def _refuse_rounded(dtype: np.dtype[Any], what: str) -> None:
+    if dtype == np.float16:
+        raise ValueError(f"{what}: float16 rounds counts above 2048: give integers or float32")
 
 
 def _is_number(value: object) -> bool:

@@ -147,6 +147,49 @@ def test_threads_share_a_model(name: str, counts: NDArray[np.float64]) -> None:
         np.testing.assert_array_equal(got, expected[order])
 
 
+FORKS = """
+import os, sys, threading, warnings
+import numpy as np
+import graspd
+
+warnings.simplefilter("ignore")
+model, counts = graspd.load("small-session"), np.full((1, 3, 24), 2000)
+judges, ends = threading.Event(), threading.Event()
+
+
+class Waits:
+    def __array__(self, dtype=None, copy=None):
+        judges.set()
+        ends.wait()
+        return counts
+
+
+def is_refused_in_a_child():
+    child = os.fork()
+    if child == 0:
+        try:
+            model.predict(counts)
+        except RuntimeError as error:
+            os._exit("load it there again" in str(error))
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+
+
+assert not is_refused_in_a_child()
+other = threading.Thread(target=lambda: model.predict(counts, session=Waits()))
+other.start()
+judges.wait()
+assert is_refused_in_a_child()
+ends.set()
+other.join()
+assert not is_refused_in_a_child()
+"""
+
+
+def test_a_fork_while_a_thread_judges_is_told_so() -> None:
+    subprocess.run([sys.executable, "-c", FORKS], check=True, timeout=60)
+
+
 @pytest.mark.parametrize("name", ["small-session", "cnn1", "svm"])
 @pytest.mark.parametrize("value", [np.nan, 0.0, 4095.0])
 @pytest.mark.filterwarnings("ignore:small-session does not know the sensors")
@@ -164,7 +207,8 @@ def with_none(values: NDArray[np.float64]) -> list[Any]:
 
 
 def masked(values: NDArray[np.float64]) -> Any:  # noqa: ANN401
-    return np.ma.array(np.nan_to_num(values).astype(np.uint16), mask=np.isnan(values))
+    """Counts, with a plausible one below each mask."""
+    return np.ma.array(np.nan_to_num(values, nan=3250).astype(np.uint16), mask=np.isnan(values))
 
 
 def columns(values: NDArray[np.float64]) -> dict[str, list[int | None]]:
@@ -203,6 +247,7 @@ GIVEN: dict[str, Callable[[NDArray[np.float64]], Any]] = {
     "lists": with_none,
     "a masked array": masked,
     "a list of masked arrays": lambda values: list(masked(values)),
+    "lists of masked arrays": lambda values: [list(grasp) for grasp in masked(values)],
     "columns by name": columns,
     "a structured array": structured,
     "pandas": lambda values: pandas(values, "float64"),
@@ -231,6 +276,7 @@ REFUSED: dict[str, tuple[Callable[[NDArray[np.float64]], Any], str]] = {
     "below 0": (lambda values: values - 4000, r"whole numbers in 0..4095.*grasp 0 .*ff_1 has -"),
     "above 12 bits": (lambda values: values + 4096, "whole numbers in 0..4095.*ff_1 has [4-8]"),
     "a half": (lambda values: values + 0.5, r"whole numbers in 0..4095.*ff_1 has \d+\.5"),
+    "rounded": (lambda values: values.astype(np.float16), "float16 rounds counts above 2048"),
     "infinite": (lambda values: values * np.inf, "whole numbers in 0..4095.*ff_1 has inf"),
     "complex": (lambda values: values.astype(complex), r"\+0j\) and the like are not numbers"),
     "a time": (lambda values: values.astype("datetime64[s]"), "are not numbers"),
