@@ -23,7 +23,7 @@ from graspd.drivers.datagrams.messages import (
 from graspd.drivers.udp import DatagramDriver
 
 CLOCK_STEP_NS: Final = 1_000_000_000
-"""Delay of the first message after a restart, ns, from which its time has another zero."""
+"""Delay of the first message after a fall of its time, ns, from which that has another zero."""
 DRIFT: Final = 1000
 """Clocks of two computers differ by less than one part in this; NTP slews by half of it."""
 LATE_NS: Final = 100_000_000
@@ -50,19 +50,19 @@ class SenderClock:
     """Bounds the age of messages by their sender's time, which may have any zero.
 
     The quickest message so far is taken to be on the way for no time. A delay that was there from
-    the first message on, or that grows by less than 1 ms a second, is not seen.
+    the first message on, or that grows by less than 1 ms a second, is not seen. Time that falls
+    has another zero.
     """
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
         """Smallest difference of reception and sender's time, ns; it grows with the drift."""
-        self._received_ns = 0
+        self._sent_ns = self._received_ns = 0
 
-    def made_ns(self, t_s: float | None, received_ns: int, *, restarted: bool = False) -> int:
+    def made_ns(self, t_s: float | None, received_ns: int) -> int:
         """Return when a message was made at the latest, monotonic ns.
 
-        `t_s`: the sender's time, s, later than in the call before unless it `restarted`; None: not
-        known.
+        `t_s`: the sender's time, s; None: not known.
         """
         if t_s is None:
             return received_ns
@@ -71,9 +71,9 @@ class SenderClock:
         if self._offset_ns is not None:
             drift_ns = (received_ns - self._received_ns) // DRIFT
             known_ns = self._offset_ns + drift_ns
-            if not restarted or offset_ns - known_ns < CLOCK_STEP_NS:
+            if sent_ns > self._sent_ns or offset_ns - known_ns < CLOCK_STEP_NS:
                 offset_ns = min(offset_ns, known_ns)
-        self._offset_ns, self._received_ns = offset_ns, received_ns
+        self._offset_ns, self._sent_ns, self._received_ns = offset_ns, sent_ns, received_ns
         return sent_ns + offset_ns
 
 
@@ -108,9 +108,8 @@ class TactileStream:
         restarts = counters.restarts
         if not self._order.admits(message.stamp):
             return None
-        restarted = counters.restarts > restarts
-        self._interrupted |= restarted
-        made_ns = self._clock.made_ns(message.stamp.t_s, t_ns, restarted=restarted)
+        self._interrupted |= counters.restarts > restarts
+        made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
         counters.late_messages += t_ns - made_ns > LATE_NS
         return [self._reading(message, made_ns)]
 
