@@ -44,6 +44,7 @@ PARTS_MAX: Final = 100_000
 """Most parts of a file; an hour at 100 Hz has 250."""
 RATIO_MAX: Final = 100
 """Largest ratio of unpacked to packed bytes; held grasps have 12, zeros 36."""
+SEVERAL: Final = "is of several recordings put together: replay each alone"
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
@@ -163,9 +164,7 @@ class McapReader:
     def __iter__(self) -> Iterator[RecordedMessage]:
         for other in self._scan:
             if other != self.header:
-                raise RecordingError(
-                    self.path, "is of several recordings put together: replay each alone"
-                )
+                raise RecordingError(self.path, SEVERAL)
         yield from self._messages(self.header.wall_minus_monotonic_ns)
 
     def _find_parts(self) -> Iterator[RecordingHeader]:

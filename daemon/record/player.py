@@ -11,13 +11,14 @@ from pathlib import Path
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish.messages import GateMessage, OutcomeMessage, decode_outcome
-from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage, header_of
+from graspd.daemon.record.mcap_reader import SEVERAL, McapReader, RecordedMessage, header_of
 from graspd.daemon.record.topics import (
     EVENTS,
     PLAYED,
     Late,
     Said,
     Topic,
+    boot_id_of,
     decode_exchanged,
     decode_gate,
     decode_late,
@@ -126,8 +127,13 @@ class McapReplayDriver(RecordedDriver[_Item]):
         for path in self.paths:
             with open_recording(path) as stream:
                 recording = McapReader(path, stream)
+                boot_id: bytes | None = None
                 for message in _in_order(recording):
                     item = self._item_of(message)
+                    if isinstance(item, TactileReading):
+                        boot_id = boot_id or boot_id_of(message.payload)
+                        if boot_id not in message.payload:
+                            raise RecordingError(path, SEVERAL)
                     if item is not None:
                         yield message.at_ns, item
                 if recording.cut_off:

@@ -195,6 +195,11 @@ def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
     return TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
 
 
+def boot_id_of(payload: bytes) -> bytes:
+    """Return the run of a `tactile` message. Raises `ValueError`."""
+    return str(_decode(payload)["boot_id"]).encode()
+
+
 def joint_reading(payload: bytes) -> JointReading:
     """Return the reading of a `joints` message. Raises `ValueError`."""
     message = _decode_joints(payload)

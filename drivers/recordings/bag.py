@@ -21,7 +21,7 @@ import apsw
 import numpy as np
 from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
-from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
@@ -39,14 +39,13 @@ from graspd.drivers.recordings.kinds import Kind, is_packed, kind_of
 from graspd.drivers.recordings.player import RecordedDriver
 
 TACTILE: Final = "sr_robot_msgs/msg/BiotacAll"
+SENSOR: Final = "sr_robot_msgs/msg/Biotac"
 JOINTS: Final = "sensor_msgs/msg/JointState"
 HANDS: Final = ("rh", "lh")
 """First part of a topic, and of the names of joints; the right hand is preferred."""
 DEFINITIONS: Final = {
     TACTILE: "std_msgs/Header header\nsr_robot_msgs/Biotac[5] tactiles\n",
-    "sr_robot_msgs/msg/Biotac": (
-        "int16 pac0\nint16 pac1\nint16 pdc\nint16 tac\nint16 tdc\nint16[] electrodes\n"
-    ),
+    SENSOR: ("int16 pac0\nint16 pac1\nint16 pdc\nint16 tac\nint16 tdc\nint16[] electrodes\n"),
 }
 """Messages as Shadow publishes them, for bags that do not hold their definitions."""
 FORMER_ELECTRODES: Final = 19
@@ -97,7 +96,7 @@ class BagDriver(RecordedDriver[Reading]):
         self.period_ns: int | None = None
         """Shortest time between two readings as played, ns; None: not known yet."""
         self._last_ns: int | None = None
-        self._last: NDArray[np.int16] | None = None
+        self._last: NDArray[np.int64] | None = None
 
     def open(self) -> None:
         """Check that each bag has these fingers, then start. Raises `RecordingError`."""
@@ -170,6 +169,9 @@ class _Bag:
             if connection.msgdef.format is MessageDefinitionFormat.MSG:
                 types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
         store.register({name: each for name, each in types.items() if name not in store.fielddefs})
+        _refuse_other_fields(
+            path, dict(store.fielddefs[TACTILE][1]), dict(store.fielddefs[SENSOR][1])
+        )
         self._decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
         self.tactile = self._choose(TACTILE)
         if self.tactile is None:
@@ -230,18 +232,41 @@ def _opened(path: Path) -> Iterator[_Bag]:
         reader.close()
 
 
-def sensors_of(path: Path, message: Any) -> NDArray[np.int16] | None:  # noqa: ANN401
+def _refuse_other_fields(path: Path, hand: dict[str, Any], sensor: dict[str, Any]) -> None:
+    """Raise `RecordingError` for definitions without the fields that are read."""
+    header = Nodetype.NAME, "std_msgs/msg/Header"
+    if hand.get("header") != header or _element(hand.get("tactiles")) != SENSOR:
+        problem = "has a sr_robot_msgs/BiotacAll without header or list of tactiles"
+        raise RecordingError(path, problem)
+    if "int" not in _element(sensor.get("electrodes")):
+        problem = "has a sr_robot_msgs/Biotac without whole numbers of electrodes"
+        raise RecordingError(path, problem)
+
+
+def _element(field: Any) -> str:  # noqa: ANN401
+    """Return the type of a list's elements; empty if the field is not a list."""
+    if field is None or field[0] not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return ""
+    _, ((kind, name), _) = field
+    return str(name[0] if kind is Nodetype.BASE else name)
+
+
+def sensors_of(path: Path, message: Any) -> NDArray[np.int64] | None:  # noqa: ANN401
     """Return the electrodes of a message, shape (5, 24), in the order of `FINGERS`.
 
-    None if it is malformed. Raises `RecordingError` for another sensor.
+    An absent sensor may have no electrodes, which are 0 here. None if the message is malformed.
+    Raises `RecordingError` for another sensor.
     """
-    electrodes = [np.asarray(each.electrodes) for each in message.tactiles]
+    electrodes = [
+        each.electrodes if len(each.electrodes) else np.zeros(ELECTRODES)
+        for each in message.tactiles
+    ]
     if any(len(each) == FORMER_ELECTRODES for each in electrodes):
         problem = f"is of a BioTac with {FORMER_ELECTRODES} electrodes; an SP has {ELECTRODES}"
         raise RecordingError(path, problem)
     if [len(each) for each in electrodes] != [ELECTRODES] * len(FINGERS):
         return None
-    return np.array(electrodes, dtype=np.int16)
+    return np.array(electrodes, dtype=np.int64)
 
 
 def fingers_of(path: Path) -> tuple[Finger, ...]:
@@ -260,7 +285,10 @@ def fingers_of(path: Path) -> tuple[Finger, ...]:
                 break
     if not number:
         raise RecordingError(path, "has no message with five sensors of 24 electrodes")
-    return tuple(compress(FINGERS, seen > number // 2))
+    fingers = tuple(compress(FINGERS, seen > number // 2))
+    if not fingers:
+        raise RecordingError(path, f"has no sensor with counts in 1..{COUNT_MAX - 1}")
+    return fingers
 
 
 def has_joints(path: Path) -> bool:

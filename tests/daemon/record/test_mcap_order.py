@@ -119,6 +119,30 @@ def test_two_recordings_in_one_file_are_refused() -> None:
         read(stream.getvalue())
 
 
+def play(driver: McapReplayDriver) -> None:
+    while not driver.exhausted:
+        driver.read_ready()
+
+
+@pytest.mark.parametrize("change", [bytes, without_metadata])
+def test_readings_of_another_run_are_refused(
+    tmp_path: Path, change: Callable[[bytes], bytes]
+) -> None:
+    def two(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+        other = [
+            message._replace(payload=message.payload.replace(BOOT.encode(), b"f" * 32))
+            for message in messages
+        ]
+        return [*messages[:20], *other[20:]]
+
+    path = tmp_path / "a.mcap"
+    path.write_bytes(change(packed_again(WHOLE, two)))
+    with McapReplayDriver([path], ("ff", "th")) as driver:
+        with pytest.raises(RecordingError, match="several recordings"):
+            play(driver)
+        assert driver.counters.readings == 10
+
+
 def lines(*kinds: str) -> list[tuple[str, bytes]]:
     """Topics and contents; `stale` and `stable` are verdicts."""
     verdicts = {

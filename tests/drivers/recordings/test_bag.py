@@ -12,15 +12,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from rosbags import rosbag1
 from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from graspd import judge, read_grasps, read_recording
 from graspd.biotac import electrode_columns
 from graspd.daemon.cli import main
 from graspd.drivers.base import DriverError, RecordingError, TactileReading
-from graspd.drivers.recordings.bag import BagDriver
+from graspd.drivers.recordings.bag import SENSOR, TACTILE, BagDriver, fingers_of
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from tests.drivers.recordings.bags import WITH_ARRAY, BagOf, Sweep
+from tests.drivers.recordings.bags import ABSENT, WITH_ARRAY, BagOf, Sweep
 
 START_NS = 1_542_585_600_000_000_000
 PERIOD_NS = 10_000_000
@@ -195,6 +197,41 @@ def test_a_former_biotac_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "BioTac with 19 electrodes; an SP has 24" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("all_fields", "fields", "said"),
+    [
+        ("Biotac[5] tactiles\nHeader header", "int32[24] electrodes", "no sensor with counts in 1"),
+        ("Biotac[5] tactiles", "int16[] electrodes", "without header or list of tactiles"),
+        ("Header header\nBiotac tactiles", "int16[] electrodes", "without header or list"),
+        ("Header header\nBiotac[5] sensors", "int16[] electrodes", "without header or list"),
+        ("Header header\nBiotac[5] tactiles", "int16[] impedance", "without whole numbers"),
+        ("Header header\nBiotac[5] tactiles", "float64[] electrodes", "without whole numbers"),
+        ("Header header\nBiotac[5] tactiles", "int16 electrodes", "without whole numbers"),
+    ],
+)
+def test_another_definition_of_the_message_is_named(
+    tmp_path: Path, all_fields: str, fields: str, said: str
+) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(fields, SENSOR) | get_types_from_msg(all_fields, TACTILE))
+    # A header at 0 and counts of 0, or a little of them; in 32 bits all are above 65535.
+    nothing = np.full(600, 1 << 16, dtype="<u4").tobytes()
+    with rosbag1.Writer(tmp_path / "hand.bag") as writer:
+        where = writer.add_connection("/rh/tactile", TACTILE, typestore=store)
+        writer.write(where, START_NS, nothing[: 5 * 24 * 4] + bytes(16))
+    with pytest.raises(RecordingError, match=said):
+        fingers_of(tmp_path / "hand.bag")
+
+
+def test_a_finger_without_electrodes_has_no_sensor(tmp_path: Path) -> None:
+    sweeps = noise(30)
+    for sweep in sweeps:
+        sweep.electrodes["lf"] = ABSENT[:0]
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
+    assert fingers_of(path) == ("ff", "mf", "th")
+    assert len(readings_of(path)) == 30
+
+
 def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps_of(demo()[:30], prefix="lh_"))
     assert "FFJ3" not in read_recording(path)
@@ -207,8 +244,6 @@ def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
 def test_a_bag_without_the_topic_names_its_topics(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from rosbags import rosbag1
-
     bag = BagOf(1)
     with rosbag1.Writer(tmp_path / "arm.bag") as writer:
         where = writer.add_connection(
