@@ -253,9 +253,20 @@ def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> N
     assert not layout(content, tmp_path, "table")
 
 
-def test_published_grasps_are_tables(bts3_dir: Path) -> None:
-    for pose in ("down", "side", "45"):
-        assert not layout_of(bts3_dir / f"palm_{pose}.csv", FINGERS).is_stream
+@pytest.mark.parametrize("pose", ["down", "side", "45"])
+def test_published_grasps_of_all_or_ten_objects_are_tables(
+    tmp_path: Path, bts3_dir: Path, pose: str
+) -> None:
+    path = bts3_dir / f"palm_{pose}.csv"
+    assert not layout_of(path, FINGERS).is_stream
+    header, *lines = path.read_text().splitlines()
+    place = header.split(",").index("object")
+    objects = np.array([line.split(",")[place] for line in lines])
+    random = np.random.default_rng(7)
+    for _ in range(10):
+        ten = np.isin(objects, random.choice(np.unique(objects), 10, replace=False))
+        rows = [line for line, is_one in zip(lines, ten, strict=True) if is_one]
+        assert not layout("\n".join([header, *rows, ""]).encode(), tmp_path)
 
 
 def scaled(change: Callable[[int], str], separator: str = ",") -> bytes:
