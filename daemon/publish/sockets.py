@@ -27,6 +27,8 @@ HIGH_WATER_MARK = 10
 
 With more a slow subscriber would read of the past.
 """
+NEVER_NS = 10**18
+"""Longest period of readings, ns: one after thirty years."""
 
 
 class Sockets(Companion):
@@ -48,7 +50,7 @@ class Sockets(Companion):
         self._clock = clock
         self._counters = Counter(dropped=0)
         tactile_hz = wanted.publish.tactile_hz
-        self._tactile_period_ns = round(1e9 / tactile_hz) if tactile_hz else None
+        self._tactile_period_ns = round(min(1e9 / tactile_hz, NEVER_NS)) if tactile_hz else None
         self._tactile_due_ns = 0
         keys = None if wanted.curve is None else _load_keys(wanted.curve)
         self._door: Door | None = None

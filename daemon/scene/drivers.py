@@ -78,7 +78,7 @@ class ReplayTactile(Section):
     """True: tell the recorded outcome of each lift that a verdict allows."""
     read_as: Literal["table", "stream"] | None = None
     """Decides for files that may be either (deploy/RECORDING.md)."""
-    rate_hz: Annotated[float, Field(gt=0, le=10_000), unit("1/s")] | None = None
+    rate_hz: Annotated[float, Field(ge=0.001, le=10_000), unit("1/s")] | None = None
     """Rows a second of a stream without times, and of a table as played."""
 
 

@@ -144,7 +144,7 @@ def test_run_names_the_process_that_has_the_port(tmp_path: Path) -> None:
 
 
 def test_check_does_not_look_for_devices(tmp_path: Path) -> None:
-    for tactile in ('"can"\nchannel = "no-such-bus"', '"spi"\nport = "nothing://there"'):
+    for tactile in ('"can"\nchannel = "no-such-bus"', '"spi"\nport = "/dev/no-such-port"'):
         assert checked(tmp_path, f"[tactile]\ndriver = {tactile}\n")
 
 

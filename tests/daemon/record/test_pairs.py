@@ -122,6 +122,8 @@ def test_a_sweep_of_an_open_hand_is_never_stable(
 def test_no_command_takes_sweeps_without_times_for_grasps(
     tmp_path: Path, words: Sequence[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if words[0] == "train":
+        pytest.importorskip("onnx", reason="needs the extra `train`")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sweeps.csv").write_bytes(sweeps(None, slice(0, 1200), None, 1.0))
     (tmp_path / "scene.toml").write_text(
