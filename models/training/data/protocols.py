@@ -86,20 +86,17 @@ def grasp_of(grasps: Grasps) -> Ints:
     Rows of lab tables that nearly repeat each other are readings of one grasp; each row of a
     published table is a grasp of its own.
     """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
     number = np.arange(len(grasps))
     rows = grasps.rows_of(lab_table_names(grasps.files))
-    if not len(rows):
-        return number
-    counts = grasps.counts[rows].reshape(len(rows), -1).astype(np.float32)
-    near = np.zeros((len(rows), len(rows)), dtype=np.bool_)
+    counts = grasps.counts[rows].astype(np.float32)
+    first = np.arange(len(rows))
     for place in range(len(rows)):
-        apart = np.square(counts[place + 1 :] - counts[place]).mean(axis=1)
-        near[place, place + 1 :] = apart <= NEAR_COUNTS**2
-    if near.any():
-        number[rows] = len(grasps) + connected_components(csr_array(near), directed=False)[1]
+        apart = np.square(counts[place + 1 :] - counts[place]).mean(axis=(1, 2))
+        near = first[place + 1 :][apart <= NEAR_COUNTS**2]
+        if len(near):
+            joined = np.union1d(near, first[place])
+            first[np.isin(first, joined)] = joined[0]
+    number[rows] = rows[first]
     return number
 
 
