@@ -68,9 +68,9 @@ _UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
 _SPACE: Final = rb"(?:[ \t]|\x1b\[[0-9;]*m)"
 """A blank, or the code of a colour."""
 _CANDUMP_LINE: Final = re.compile(
-    rb"^" + _SPACE + rb"*(?:\([^)\r\n]{1,40}\))?" + _SPACE + rb"*[!-~]{1,64}" + _SPACE + rb"+"
-    rb"(?:(?:[0-9A-F]{3}|[0-9A-F]{8})#[0-9A-FR#_. \t]*(?:[ \t]+[RT])?"
-    rb"|(?:[RT]X [-B] [-E][ \t]+)?[0-9A-F]{1,8}[ \t]+\[ ?[0-9]{1,2}\].*)[ \t]*\r?$",
+    rb"^" + _SPACE + rb"*+(?:\([^)\r\n]{1,40}\)" + _SPACE + rb"*+)?[!-~]{1,64}" + _SPACE + rb"++"
+    rb"(?:(?:[0-9A-F]{3}|[0-9A-F]{8})#[0-9A-FR#_. \t]*+T?[ \t]*+"
+    rb"|(?:[RT]X [-B] [-E][ \t]+)?[0-9A-F]{1,8}[ \t]+\[ ?[0-9]{1,2}\].*)\r?$",
     re.IGNORECASE | re.MULTILINE,
 )
 """A frame as candump writes it into a file, `can0 100#0D3A`, or shows it, `can0 100 [2] 0D 3A`."""

@@ -62,6 +62,7 @@ FILES: dict[str, tuple[bytes | Callable[[Path], None], Kind]] = {
     "UTF-16": (table(2).decode().encode("utf-16"), Kind.TEXT),
     "Latin-1": (table(2).replace(b"thing", b"K\xe4se"), Kind.TEXT),
     "comments": (b"# lab A\n#ROS\n" + table(2), Kind.TEXT),
+    "a line of blanks": (b" " * 65_535 + b"\n", Kind.TEXT),
     "Parquet": (parquet, Kind.PARQUET),
     "MCAP of graspd": (mcap(b""), Kind.MCAP),
     "MCAP of ROS 2": (mcap(b"ros2"), Kind.ROS2_BAG),
