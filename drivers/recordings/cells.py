@@ -123,7 +123,8 @@ class Cells:
         """Yield the lines of text with their ends: line feed, carriage return or both."""
         head = file.read(LINE_BYTES_MAX)
         file.seek(0)
-        if head.startswith(_UTF16) or (b"\r" in head and b"\n" not in head):
+        first = head.split(b"\n", 1)[0].removesuffix(b"\r")
+        if head.startswith(_UTF16) or b"\r" in first:
             yield from self._lines_of(file, "utf-16" if head.startswith(_UTF16) else "utf-8-sig")
             return
         encoding = "utf-8-sig"

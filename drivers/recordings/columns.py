@@ -92,7 +92,9 @@ class Columns:
         time = time_column(names)
         single = {}
         for wanted in (OBJECT, SLIPPED, *(() if time is None else (time.name,))):
-            places = [place for place, name in enumerate(names) if name == wanted]
+            is_label = wanted in (OBJECT, SLIPPED)  # of any letters, as electrodes are
+            cased = [name.lower() for name in names] if is_label else names
+            places = [place for place, name in enumerate(cased) if name == wanted]
             single[wanted] = places[0] if places else None
             for place in places[1:]:
                 _refuse_twice(path, names, line, places[0], place)
