@@ -5,6 +5,7 @@ A sweep of a stream is never judged as a grasp, so doubt is refused.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,13 +36,22 @@ NEAR_COUNTS: Final = 8.0
 """Root of the mean square by which rows differ that nearly repeat each other, counts.
 
 Sweeps of a hand at rest differ by 3 to 6. At most 5 % of the published grasps are as near to
-another one, and at most 12 % of those of any ten objects; 29 to 65 % of the sweeps of streams at 4
-to 100 Hz are.
+another one; 29 to 65 % of the sweeps of streams at 4 to 100 Hz are.
 """
 STEP_COUNTS: Final = 25.0
 """The same of rows that may be sweeps in a row: 75 to 99 % of streams, 8 to 20 % of tables."""
-NEAR_SHARE_MAX: Final = 0.2
-"""Largest share of near rows in a grasp table."""
+CLIP_COUNTS: Final = 64.0
+"""Most by which one electrode counts for a clipped step: a broken one may have any value."""
+ALIKE_SHARE_MAX: Final = 0.7
+"""Largest share of clipped steps up to `STEP_COUNTS` in a table, and of rows that have such another
+row: streams have 80 to 95 %, the published tables 13 to 30 %."""
+BETWEEN_SHARE_MAX: Final = 0.6
+"""Largest share of those up to `STEP_COUNTS` among those that are not near, in a table: streams
+have 68 to 95 %, the published tables 15 to 40 %."""
+FEW_ROWS: Final = 10
+"""Fewest rows whose shares mean something."""
+NEAR_SHARE_MAX: Final = 0.1
+"""Largest share of near rows in a grasp table; the published ones have 5 %."""
 MIDDLE_SHARE_MAX: Final = 0.25
 """Largest share of steps between near and `STEP_COUNTS` in a table; streams have 40 to 60 %."""
 JUMP_SHARE_MIN: Final = 0.02
@@ -50,6 +60,8 @@ STEP_S: Final = (0.002, 0.5)
 """Shortest and longest usual time between sweeps, s. In each unit other numbers are usual."""
 SLOWEST_S: Final = 1.0
 """Time between rows, s, above which they may be grasps."""
+BACK_SHARE_MAX: Final = 0.1
+"""Largest share of rows of a stream that go back in time; it ends at the first of them."""
 EPOCHS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Times since 1970 lie above these numbers if they are in these units, s."""
 
@@ -162,11 +174,22 @@ class _Rows:
     def is_clock(self, column: TimeColumn) -> bool:
         return is_clock(self.first[0][column.places[0]])
 
-    def blocks(self) -> Iterator[NDArray[np.float32]]:
-        """Yield the counts of all rows, shape (rows, electrodes), up to `BLOCK_ROWS` each."""
+    def likeness(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return how far each row is from its nearest of a block, and from the row before, counts.
+
+        Shapes (rows,) and (rows - 1,), of the whole file; the steps twice, the second are clipped.
+        """
+        nearest, steps, clipped = [], [], []
+        last = np.empty((0, len(self.columns.electrodes)), dtype=np.float32)
         rows: Iterable[list[str]] = chain(self.first, self._others)
-        while block := list(islice(rows, BLOCK_ROWS)):
-            yield self._counts(block)
+        while cells := list(islice(rows, BLOCK_ROWS)):
+            block = self._counts(cells)
+            nearest.append(_nearest(block))
+            block = np.concatenate((last, block))
+            steps.append(_steps(block))
+            clipped.append(_steps(block, CLIP_COUNTS))
+            last = block[-1:]
+        return np.concatenate(nearest), np.concatenate(steps), np.concatenate(clipped)
 
     def follow_each_other(self) -> bool:
         """Return True if most of the first rows are a small step from the row before."""
@@ -174,11 +197,19 @@ class _Rows:
         return 2 * int((steps <= STEP_COUNTS).sum()) > len(steps)
 
     def _counts(self, rows: Sequence[Sequence[str]]) -> NDArray[np.float32]:
-        counts = [
-            [count_of(cell, decimal_comma=self._comma) or 0 for cell in self._electrodes(row)]
-            for row in rows
-        ]
-        return np.array(counts, dtype=np.float32)
+        """Return counts, shape (rows, electrodes); a missing one is the median of its electrode."""
+        counts = np.array(
+            [
+                [count_of(cell, decimal_comma=self._comma) for cell in self._electrodes(row)]
+                for row in rows
+            ],
+            dtype=np.float32,
+        )
+        missing = np.isnan(counts)
+        if missing.any():
+            usual = np.nanmedian(np.where(missing.all(axis=0), 0.0, counts), axis=0)
+            counts = np.where(missing, usual, counts)
+        return counts
 
 
 def time_value(
@@ -215,10 +246,18 @@ def _refuse_slow(rows: _Rows, layout: Layout, read_as: ReadAs | None) -> None:
         return
     times = rows.times(column)
     step = _median_step(times)
-    if len(times) > 10 and step == 0.0:
+    is_read = len(times) >= FEW_ROWS
+    if is_read and step == 0.0:
         problem = (
-            "most rows have the time of the row before: say how many there are a second, by "
-            "--as stream --rate-hz"
+            "most rows have the time of the row before: grasps of a table (--as table), or sweeps, "
+            "of which there are how many a second (--as stream --rate-hz)?"
+        )
+        raise RecordingError(rows.path, problem, column=column.name)
+    back = sum(after < before for before, after in pairwise(times))
+    if read_as is None and is_read and back > BACK_SHARE_MAX * len(times):
+        problem = (
+            f"{back} of {len(times)} rows have a time before that of the row above: grasps of a "
+            "table (--as table)? Sweeps of a stream are in the order of time"
         )
         raise RecordingError(rows.path, problem, column=column.name)
     if read_as is not None or len(times) < 2:
@@ -235,43 +274,58 @@ def _refuse_slow(rows: _Rows, layout: Layout, read_as: ReadAs | None) -> None:
 
 def _refuse_sweeps(rows: _Rows, read_as: ReadAs | None) -> None:
     """Raise if rows of a table nearly repeat each other, as the sweeps of a stream do."""
-    number = near = middle = jumps = 0
-    last: NDArray[np.float32] | None = None
-    for block in rows.blocks():
-        number += len(block)
-        near += _near(block)
-        steps = _steps(block if last is None else np.concatenate((last, block)))
-        middle += int(((steps > NEAR_COUNTS) & (steps <= STEP_COUNTS)).sum())
-        jumps += int((steps > STEP_COUNTS).sum())
-        last = block[-1:]
-    if near <= NEAR_SHARE_MAX * number:
+    nearest, steps, clipped = rows.likeness()
+    number, near = len(nearest), int((nearest <= NEAR_COUNTS).sum())
+    if near > NEAR_SHARE_MAX * number:
+        problem = f"{near} of {number} rows nearly repeat another: "
+    elif _are_alike(clipped) or (number >= FEW_ROWS and _are_alike(nearest)):
+        problem = f"most of {number} rows are much like another: "
+    else:
         return
-    problem = f"{near} of {number} rows nearly repeat another: "
     if read_as is None:
         problem += (
             "sweeps of a stream (--as stream, and --rate-hz if it has no times), or several "
             "readings of each grasp (--as table)?"
         )
         raise RecordingError(rows.path, problem)
-    if middle > MIDDLE_SHARE_MAX * number or jumps < JUMP_SHARE_MIN * number:
+    is_repeated = near > NEAR_SHARE_MAX * number and (
+        _between(steps) > MIDDLE_SHARE_MAX * number
+        or int((steps > STEP_COUNTS).sum()) < JUMP_SHARE_MIN * number
+    )
+    if is_repeated or (number >= FEW_ROWS and (_is_continuous(nearest) or _is_continuous(clipped))):
         problem += "they change as sweeps of a stream do, and are not grasps of a table"
         raise RecordingError(rows.path, problem)
 
 
-def _near(block: NDArray[np.float32]) -> int:
-    """Return the number of rows that nearly repeat another row of the block."""
-    is_near = np.zeros(len(block), dtype=np.bool_)
+def _are_alike(apart: NDArray[np.float32]) -> bool:
+    return int((apart <= STEP_COUNTS).sum()) > ALIKE_SHARE_MAX * len(apart)
+
+
+def _between(apart: NDArray[np.float32]) -> int:
+    """Return how many rows are neither near nor far, as sweeps of a moving hand are."""
+    return int(((apart > NEAR_COUNTS) & (apart <= STEP_COUNTS)).sum())
+
+
+def _is_continuous(apart: NDArray[np.float32]) -> bool:
+    """Return True if many rows are neither near nor far, and few are far."""
+    between, far = _between(apart), int((apart > STEP_COUNTS).sum())
+    return between > max(MIDDLE_SHARE_MAX * len(apart), BETWEEN_SHARE_MAX * (between + far))
+
+
+def _nearest(block: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return by how much each row differs from the row most like it, counts; shape (rows,)."""
+    nearest = np.full(len(block), np.inf, dtype=np.float32)
     for place in range(len(block) - 1):
         apart = np.square(block[place + 1 :] - block[place]).mean(axis=1)
-        near = apart <= NEAR_COUNTS**2
-        is_near[place + 1 :] |= near
-        is_near[place] |= near.any()
-    return int(is_near.sum())
+        np.minimum(nearest[place + 1 :], apart, out=nearest[place + 1 :])
+        nearest[place] = min(nearest[place], apart.min())
+    return np.sqrt(nearest)
 
 
-def _steps(block: NDArray[np.float32]) -> NDArray[np.float32]:
+def _steps(block: NDArray[np.float32], clip: float = math.inf) -> NDArray[np.float32]:
     """Return by how much each row differs from the row before, counts; shape (rows - 1,)."""
-    squares: NDArray[np.float32] = np.square(np.diff(block, axis=0)).mean(axis=1)
+    apart = np.minimum(np.abs(np.diff(block, axis=0)), clip)
+    squares: NDArray[np.float32] = np.square(apart).mean(axis=1)
     return np.sqrt(squares)
 
 
