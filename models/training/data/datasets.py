@@ -16,7 +16,7 @@ from graspd.biotac import TABLE_FINGERS
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED
 from graspd.drivers.recordings.csv_rows import read_rows
-from graspd.drivers.recordings.layout import ReadAs, layout_of
+from graspd.drivers.recordings.layout import NEAR_COUNTS, ReadAs, layout_of
 from graspd.models.bts3 import NEW_SESSION, TABLES, WHOLE
 from graspd.models.contract import Dataset
 from graspd.models.training.arrays import Bools, Ints
@@ -212,12 +212,26 @@ def _check_name(path: Path, others: dict[str, Path]) -> None:
 
 def _read_lab_table(path: Path, read_as: ReadAs | None) -> Grasps:
     grasps = read_table(path, read_as)
-    if len(grasps) < FEWEST_GRASPS:
-        raise DatasetError(path, f"has {len(grasps)} grasps, {FEWEST_GRASPS} are the fewest")
+    number = len(np.unique(first_readings(grasps.counts)))
+    if number < FEWEST_GRASPS:
+        raise DatasetError(path, f"has {number} grasps, {FEWEST_GRASPS} are the fewest")
     if grasps.slipped.all() or not grasps.slipped.any():
         kind = "stayed" if grasps.slipped.all() else "slipped"
         raise DatasetError(path, f"has no grasp that {kind}, a session needs both kinds")
     return grasps
+
+
+def first_readings(counts: NDArray[np.uint16]) -> Ints:
+    """Return for each row the first one of its grasp, shape (N,): they nearly repeat each other."""
+    values = counts.astype(np.float32)
+    first = np.arange(len(values))
+    for row in range(len(values)):
+        apart = np.square(values[row + 1 :] - values[row]).mean(axis=(1, 2))
+        near = first[row + 1 :][apart <= NEAR_COUNTS**2]
+        if len(near):
+            joined = np.union1d(near, first[row])
+            first[np.isin(first, joined)] = joined[0]
+    return first
 
 
 def _check_once(grasps: Grasps, lab: dict[str, Path]) -> None:

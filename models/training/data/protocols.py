@@ -13,10 +13,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from graspd.drivers.recordings.layout import NEAR_COUNTS
 from graspd.models.bts3 import NEW_SESSION, WHOLE
 from graspd.models.training.arrays import Ints
-from graspd.models.training.data.datasets import Grasps, lab_table_names
+from graspd.models.training.data.datasets import Grasps, first_readings, lab_table_names
 
 EvalProtocol = Literal[
     "cv", "unknown", "objects", "objects-whole", "session", "days", "cv-palm-down", "cv-palm-side"
@@ -88,15 +87,7 @@ def grasp_of(grasps: Grasps) -> Ints:
     """
     number = np.arange(len(grasps))
     rows = grasps.rows_of(lab_table_names(grasps.files))
-    counts = grasps.counts[rows].astype(np.float32)
-    first = np.arange(len(rows))
-    for place in range(len(rows)):
-        apart = np.square(counts[place + 1 :] - counts[place]).mean(axis=(1, 2))
-        near = first[place + 1 :][apart <= NEAR_COUNTS**2]
-        if len(near):
-            joined = np.union1d(near, first[place])
-            first[np.isin(first, joined)] = joined[0]
-    number[rows] = rows[first]
+    number[rows] = rows[first_readings(grasps.counts[rows])]
     return number
 
 

@@ -237,6 +237,16 @@ def test_a_lab_table_that_would_mislead_is_refused(
     assert refusal([path]) == f"{path}: {problem}"
 
 
+def test_readings_of_one_grasp_are_not_more_grasps(tmp_path: Path) -> None:
+    counts, slipped = separable_counts(19)
+    noise = np.random.default_rng(1).normal(0.0, 3.0, (6 * 19, 3, 24))
+    readings = (counts.repeat(6, axis=0) + noise).round().astype(np.uint16)
+    path = tmp_path / "lab.csv"
+    write_table(path, readings, slipped.repeat(6))
+    with pytest.raises(DatasetError, match="has 19 grasps, 20 are the fewest"):
+        read_with_lab_tables(None, [path], "table")
+
+
 @pytest.mark.parametrize("beside", ["palm_45", "monday"])
 def test_a_grasp_that_is_in_two_tables_is_refused(beside: str, tmp_path: Path) -> None:
     data = tmp_path / "data"
