@@ -74,7 +74,8 @@ def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
     # An outcome is 0 or 1 in a file.
     columns = [each.astype(int) if each.dtype.kind == "b" else each for each in columns]
     with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([names, *zip(*(each.tolist() for each in columns), strict=True)])
+        rows = [names, *zip(*(each.tolist() for each in columns), strict=True)]
+        csv.writer(file, quoting=csv.QUOTE_NONNUMERIC).writerows(rows)  # `#1` begins no comment
     return path
 
 

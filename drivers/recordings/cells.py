@@ -97,7 +97,7 @@ class Cells:
         self.decimal_comma = separator != ","
         self._length = 0
         rows = csv.reader(
-            chain([first], self._row_lines(lines)),
+            chain([first], self._row_lines(lines, separator, first.count(separator))),
             delimiter=separator,
             skipinitialspace=True,
             strict=True,
@@ -109,10 +109,19 @@ class Cells:
         except csv.Error as error:
             raise self.error(f"this is not CSV: {error}") from error
 
-    def _row_lines(self, lines: Iterator[str]) -> Iterator[str]:
-        """Yield lines without comments; a row of several lines is as long as a line may be."""
+    def _row_lines(self, lines: Iterator[str], separator: str, number: int) -> Iterator[str]:
+        """Yield lines without comments; a row of several lines is as long as a line may be.
+
+        `number`: separators of the header.
+        """
         for line in lines:
             if self._length == 0 and line.startswith("#"):
+                is_row = separator != " " and line.count(separator) >= number
+                if is_row and not has_electrodes(_split(line.lstrip("# "))):
+                    raise self.error(
+                        "the line begins with #, as a comment does, and has the cells of a row: "
+                        "put its first cell into quotes, or delete it"
+                    )
                 continue
             self._length += len(line)
             if self._length > LINE_BYTES_MAX:

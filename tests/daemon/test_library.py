@@ -400,12 +400,14 @@ def test_a_table_is_judged_as_its_file(
 @pytest.mark.filterwarnings("ignore:of 300 grasps 177 were not judged")
 def test_what_the_readers_return_is_judged_as_its_file() -> None:
     pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    frame = graspd.read_grasps(DEMO_DAY)
+    numbered = frame.assign(object="#1")  # begins no comment
     told = [
         [(each.verdict, each.p_slip) for each in graspd.judge(given, model="mlp")]
-        for given in (DEMO_DAY, graspd.read_grasps(DEMO_DAY))
+        for given in (DEMO_DAY, frame, numbered)
     ]
     assert len(told[0]) == 300
-    assert told[0] == told[1]
+    assert told[0] == told[1] == told[2]
 
 
 @pytest.mark.parametrize(

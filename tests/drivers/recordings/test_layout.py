@@ -84,6 +84,14 @@ def test_a_name_in_quotes_may_have_line_breaks() -> None:
     assert rows_of(content)[2].annotation.line == 5
 
 
+def test_a_row_that_looks_like_a_comment_is_not_lost() -> None:
+    content = PLAIN.replace(b"thing_2", b"#2 mug")
+    assert "line 4: the line begins with #, as a comment does" in refusal(content)
+    quoted = PLAIN.replace(b"thing_2", b'"#2 mug"')
+    assert [row.annotation.object_name for row in rows_of(quoted)][2] == "#2 mug"
+    assert values(rows_of(PLAIN + b"# " + PLAIN.split(b"\n")[0] + b"\n")) == values(rows_of(PLAIN))
+
+
 def test_a_row_of_many_lines_is_bounded() -> None:
     content = PLAIN + b'"a' + b'\n","a' * 40_000
     assert "longer than 65536 characters" in refusal(content)
