@@ -163,7 +163,8 @@ class Cells:
             said = reason(error) if isinstance(error, OSError) else f"is not {encoding}"
             raise self.error(said) from error
         finally:
-            text.detach()
+            if not file.closed:
+                text.detach()
 
     def _parquet(self, file: BinaryIO) -> Iterator[list[str]]:
         try:
@@ -178,8 +179,8 @@ class Cells:
                 for values in zip(*(column.to_pylist() for column in batch.columns), strict=True):
                     self.line += 1
                     yield ["" if value is None else str(value) for value in values]
-        except (ArrowException, OSError) as error:
-            problem = f"is damaged: {str(error).splitlines()[0]}"
+        except (ArrowException, OSError, ValueError, OverflowError) as error:
+            problem = "is damaged: " + str(error).partition("\n")[0]
             raise RecordingError(self._path, problem) from error
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import math
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -105,6 +107,27 @@ def test_parquet_reads_as_its_csv(tmp_path: Path, packed: bool) -> None:
         frame = frame.astype(dict.fromkeys(ELECTRODES, float) | {"slipped": bool})
     frame.to_parquet(tmp_path / "grasps")
     assert values(list(read_rows(tmp_path / "grasps", FINGERS))) == values(rows_of(PLAIN))
+
+
+def test_a_damaged_name_in_parquet_is_refused(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs the extra pandas")
+    pandas.read_csv(io.BytesIO(PLAIN)).to_parquet(tmp_path / "grasps")
+    content = (tmp_path / "grasps").read_bytes()
+    (tmp_path / "grasps").write_bytes(content.replace(b"ff_biotac_1", b"\xe3f_biotac_1"))
+    with pytest.raises(RecordingError, match="is damaged: 'utf-8' codec can't decode"):
+        layout_of(tmp_path / "grasps", FINGERS)
+
+
+def test_a_refused_file_in_utf16_is_closed_in_silence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", seen.append)
+    path = write(tmp_path, PLAIN.replace(b",1,", b",1,,").decode().encode("utf-16"))
+    with pytest.raises(RecordingError, match="the row has 75 cells"):
+        list(read_rows(path, FINGERS))
+    gc.collect()
+    assert seen == []
 
 
 def renamed(name: Callable[[str, int], str], fingers: Sequence[str] = FINGERS) -> bytes:
