@@ -68,6 +68,29 @@ def test_a_forked_process_gets_an_error_at_once(tmp_path: Path) -> None:
         subprocess.run([sys.executable, "-c", FORKS, *places], check=True, cwd=ROOT, timeout=60)
 
 
+DROPPED = """
+import asyncio, gc, sys
+from deploy.clients.python.graspd_client import AsyncClient, Client
+
+place, loop = sys.argv[1], asyncio.new_event_loop()
+dropped, left, closed = Client(place), AsyncClient(place), AsyncClient(place)
+dropped.verdict(0.05)
+waiting = [loop.create_task(each.wait_for_grasp(1e6)) for each in (left, closed)]
+loop.call_later(0.05, loop.stop)
+loop.run_forever()
+loop.close()
+closed.close()
+del dropped, left, closed, loop, waiting
+gc.collect()
+"""
+"""Two clients that nothing closes, and one whose loop no longer runs."""
+
+
+def test_a_dropped_client_closes_its_sockets(tmp_path: Path) -> None:
+    place = f"ipc://{tmp_path}/out"
+    subprocess.run([sys.executable, "-c", DROPPED, place], check=True, cwd=ROOT, timeout=60)
+
+
 def test_a_client_is_not_pickled_and_says_so(tmp_path: Path) -> None:
     with (
         Client(f"ipc://{tmp_path}/out") as graspd,

@@ -21,6 +21,7 @@ import os
 import re
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -311,6 +312,8 @@ class _Hand:
         self._returned = "", 0
         """Grasp that `wait_for_grasp` returned last."""
         self._link = _Link(endpoint, topic, ask_endpoint, keys)
+        # A context that is collected as garbage no longer knows its sockets, and waits for them.
+        weakref.finalize(self, _close_in, os.getpid(), self._link).atexit = False
         self._compares_clocks = self._asks and not same_computer
         self._clock_asked_ns: int | None = None
         self._clock_due_ns = 0
@@ -701,9 +704,10 @@ class AsyncClient(_Hand):
         import asyncio  # only here: it takes time
 
         loop, sockets = asyncio.get_running_loop(), self._link.sockets
+        descriptors = [each.FD for each in sockets]
         self._woken = loop.create_future()
-        for each in sockets:
-            loop.add_reader(each.FD, self._wake)
+        for descriptor in descriptors:
+            loop.add_reader(descriptor, self._wake)
         timer = loop.call_later(timeout_s, self._wake)
         # A descriptor tells only of what comes later. To ask for `EVENTS` makes it tell.
         if any(int(each.EVENTS) & zmq.POLLIN for each in sockets):
@@ -712,11 +716,12 @@ class AsyncClient(_Hand):
             await self._woken
         finally:
             timer.cancel()
-            for each in sockets:
-                loop.remove_reader(each.FD)
+            for descriptor in descriptors:
+                loop.remove_reader(descriptor)
 
     def _wake(self) -> None:
-        if self._woken is not None and not self._woken.done():
+        waits = self._woken is not None and not self._woken.done()
+        if waits and not self._woken.get_loop().is_closed():
             self._woken.set_result(None)
 
     def close(self) -> None:
@@ -1059,6 +1064,12 @@ class _Link:
             made.routing_id = self._name + self._calls.to_bytes(8, "big")
         made.connect(endpoint)
         return made
+
+
+def _close_in(process: int, link: _Link) -> None:
+    """Close the sockets of a client that was dropped, in the process that made them."""
+    if os.getpid() == process:
+        link.close()
 
 
 class _Call:
