@@ -36,8 +36,8 @@ SHOWN_LENGTH_MAX: Final = 80
 """Most characters of a line in a message."""
 SET_BACK_NS: Final = 1_000_000_000
 """Fall of the time, ns, from which on the clock was set or another log begins."""
-STEPS_SHARE: Final = 0.25
-"""Share of times that are not above the one before, from which on they are steps."""
+STEPS_SHARE: Final = 0.5
+"""Falls of the time for each rise, from which on times are steps, which fall as often as rise."""
 
 _TEXTS: Final = {Kind.CANDUMP: read_candump, Kind.ASC: read_asc, Kind.TRC: read_trc}
 _ENCODINGS: Final = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb": "utf-8-sig"}
@@ -114,21 +114,24 @@ class Survey:
     @classmethod
     def of(cls, path: Path) -> Survey:
         """Read a log once. Raises `RecordingError`."""
-        survey, steps, still, last_ns = cls(), 0, 0, -1
+        survey, last_ns, rises, falls = cls(), dict[str, int](), 0, 0
         for number, text, logged in read_log(path):
             survey.lines += 1
             if logged is None:
                 survey.strange += 1
                 survey.first = survey.first or f"line {number}, {text.strip()[:SHOWN_LENGTH_MAX]!r}"
                 continue
-            if logged.may_be_step and logged.t_ns is not None:
-                steps += 1
-                still += logged.t_ns <= last_ns
-                last_ns = logged.t_ns
             key = logged.bus, None if logged.frame is None else logged.frame.arbitration_id
-            if logged.t_ns is not None and (key in survey.frames or len(survey.frames) < IDS_MAX):
-                survey.frames[key] += 1
-        survey.has_steps = still > STEPS_SHARE * steps
+            is_counted = key in survey.frames or len(survey.frames) < IDS_MAX
+            if logged.t_ns is None or not is_counted:
+                continue
+            survey.frames[key] += 1
+            if logged.may_be_step:
+                before_ns = last_ns.setdefault(logged.bus, logged.t_ns)
+                rises += logged.t_ns > before_ns
+                falls += logged.t_ns < before_ns
+                last_ns[logged.bus] = logged.t_ns
+        survey.has_steps = bool(last_ns) and falls >= rises * STEPS_SHARE - 1
         return survey
 
 
