@@ -7,17 +7,21 @@ comes at 100 Hz, the sensors' values at 71.43 Hz.
 
 from __future__ import annotations
 
+import bz2
 import logging
+import math
 import struct
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import compress
 from pathlib import Path
 from typing import Any, Final
 
 import apsw
+import lz4.frame
 import numpy as np
 from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
@@ -54,7 +58,14 @@ LOOKED_AT: Final = 20
 """Messages that say which fingers have a sensor."""
 REPEAT_NS: Final = 1_000_000_000
 """A message older than the one before by up to this is a repeat; by more, the clock was set."""
+CHUNK_MAX_BYTES: Final = 256 << 20
+"""Largest unpacked chunk, bytes; `rosbag record` ends one at 768 KiB, not within a message."""
 
+_UNPACKERS: Final[dict[Callable[[bytes], bytes], Callable[[], Any]]] = {
+    bz2.decompress: bz2.BZ2Decompressor,
+    lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+}
+"""Bounded unpackers by those of rosbags, which have no bound."""
 _DAMAGE = (
     *(rosbag1.ReaderError, rosbag2.ReaderError, SerdeError, TypesysError, apsw.Error),
     *(ValueError, LookupError, AssertionError, RuntimeError, struct.error),
@@ -122,8 +133,13 @@ class BagDriver(RecordedDriver[Reading]):
         return [self.hand_over(reading, at_ns)]
 
     def _items(self) -> Generator[tuple[int, Reading], None, None]:
+        topic: str | None = None
         for path in self.paths:
             with _opened(path) as bag:
+                topic = topic or bag.tactile.topic
+                if bag.tactile.topic != topic:
+                    problem = f"has {bag.tactile.topic}, {self.paths[0]} {topic}: replay each alone"
+                    raise RecordingError(path, problem)
                 for t_ns, message in bag.messages():
                     reading = self._reading_of(path, t_ns, message)
                     if reading is not None:
@@ -173,11 +189,12 @@ class _Bag:
             path, dict(store.fielddefs[TACTILE][1]), dict(store.fielddefs[SENSOR][1])
         )
         self._decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-        self.tactile = self._choose(TACTILE)
-        if self.tactile is None:
+        tactile = self._choose(TACTILE)
+        if tactile is None:
             topics = ", ".join(sorted({each.topic for each in reader.connections})) or "no topic"
             raise RecordingError(path, f"has no topic of sr_robot_msgs/BiotacAll, but {topics}")
-        hand = self.tactile.topic.strip("/").partition("/")[0]
+        self.tactile = tactile
+        hand = tactile.topic.strip("/").partition("/")[0]
         self._others = tuple(f"{other}_" for other in HANDS if hand in HANDS and other != hand)
         """Begin of the names of another hand's joints."""
         self.joints = self._choose(JOINTS)
@@ -219,6 +236,8 @@ def _opened(path: Path) -> Iterator[_Bag]:
     try:
         reader = rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path)
         reader.open()
+        if isinstance(reader, rosbag1.Reader):
+            _bound(reader)
     except _DAMAGE as error:
         advice = "; `rosbag reindex` may mend it" if is_ros1 else ""
         raise RecordingError(path, f"cannot be read: {error}{advice}") from error
@@ -230,6 +249,22 @@ def _opened(path: Path) -> Iterator[_Bag]:
         yield bag
     finally:
         reader.close()
+
+
+def _bound(reader: rosbag1.Reader) -> None:
+    """Let a packed chunk be an error if it unpacks to more than `CHUNK_MAX_BYTES`."""
+    for place, chunk in reader.chunks.items():
+        if chunk.decompressor in _UNPACKERS:
+            unpack = partial(_unpacked, _UNPACKERS[chunk.decompressor])
+            reader.chunks[place] = chunk._replace(decompressor=unpack)
+
+
+def _unpacked(make: Callable[[], Any], packed: bytes) -> bytes:
+    unpacker = make()
+    content: bytes = unpacker.decompress(packed, CHUNK_MAX_BYTES)
+    if not unpacker.eof:
+        raise ValueError(f"a chunk is cut off or unpacks to more than {CHUNK_MAX_BYTES} bytes")
+    return content
 
 
 def _refuse_other_fields(path: Path, hand: dict[str, Any], sensor: dict[str, Any]) -> None:
@@ -299,8 +334,11 @@ def has_joints(path: Path) -> bool:
 
 def _joints(t_ns: int, message: Any) -> JointReading | None:  # noqa: ANN401
     """Return the angles of a hand's joints; None: there is none."""
-    pairs = zip(message.name, message.position, strict=False)
-    angles = {joint: float(angle) for name, angle in pairs if (joint := joint_name(name))}
+    angles: dict[str, float] = {}
+    for name, angle in zip(message.name, message.position, strict=False):
+        if joint := joint_name(name):
+            # `rh_FFJ3` beside `lh_FFJ3` is one joint with two angles: neither is trusted.
+            angles[joint] = math.nan if joint in angles else float(angle)
     if not angles:
         return None
     position_rad = np.array(list(angles.values()))

@@ -241,6 +241,45 @@ def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
     assert (read_recording(left)["FFJ3"] == demo()["FFJ3"][:30]).all()
 
 
+def test_a_joint_of_both_hands_in_one_message_has_no_angle(tmp_path: Path) -> None:
+    angles = {"rh_FFJ3": 0.5, "lh_FFJ3": 0.6, "rh_THJ5": 0.7}
+    sweeps = [sweep._replace(angles=angles) for sweep in noise(3)]
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps, topic="/tactile")
+    frame = read_recording(path)
+    assert frame["FFJ3"].isna().all()
+    assert (frame["THJ5"] == 0.7).all()
+
+
+def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:
+    bags = [
+        BagOf(1).write(tmp_path / f"{hand}.bag", noise(5), topic=f"/{hand}/tactile")
+        for hand in ("rh", "lh")
+    ]
+    with BagDriver(bags, ("ff", "mf", "th")) as driver:
+        readings = [driver.read_ready() for _ in range(5)]
+        assert all(readings)
+        with pytest.raises(RecordingError, match=r"lh\.bag: has /lh/tactile, .* /rh/tactile"):
+            driver.read_ready()
+
+
+@pytest.mark.parametrize("packing", rosbag1.Writer.CompressionFormat)
+def test_a_packed_chunk_that_grows_too_much_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packing: rosbag1.Writer.CompressionFormat
+) -> None:
+    bag = BagOf(1)
+    writer = rosbag1.Writer(tmp_path / "hand.bag")
+    writer.set_compression(packing)
+    with writer:
+        where = writer.add_connection("/rh/tactile", TACTILE, typestore=bag.store)
+        for sweep in noise(30):
+            content = bag.store.serialize_ros1(bag.tactile(sweep), TACTILE)
+            writer.write(where, sweep.t_ns, content)
+    assert len(readings_of(tmp_path / "hand.bag")) == 30
+    monkeypatch.setattr("graspd.drivers.recordings.bag.CHUNK_MAX_BYTES", 1000)
+    with pytest.raises(RecordingError, match="unpacks to more than 1000 bytes"):
+        fingers_of(tmp_path / "hand.bag")
+
+
 def test_a_bag_without_the_topic_names_its_topics(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
