@@ -165,6 +165,8 @@ def _refuse_options(interface: str, options: Options) -> None:
     """Raise `ValueError` for options that the interface needs, lacks or has of another type."""
     constructor = _constructor(interface)
     parameters = inspect.signature(constructor).parameters
+    named = {name for name, each in parameters.items() if each.kind is not each.VAR_KEYWORD}
+    named.discard("self")
     needed = [name for name, each in parameters.items() if _is_needed(each)]
     for name in needed:
         if name not in options:
@@ -178,7 +180,7 @@ def _refuse_options(interface: str, options: Options) -> None:
         if own != value:
             raise ValueError(f"options.{name}: must be {own}, or left out")
         # Some interfaces take arguments out of a dictionary: then their code has the names.
-        if name not in parameters and name not in constructor.__code__.co_consts:
+        if name not in named and name not in constructor.__code__.co_consts:
             raise ValueError(f"options.{name}: {_named(interface)} has no such option")
         try:
             msgspec.convert(value, types.get(name, Any))

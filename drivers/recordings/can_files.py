@@ -22,8 +22,11 @@ BUS_ERROR: Final = 0x80
 """Class of an error frame of which a log keeps nothing (linux/can/error.h)."""
 HEADER_LINES_MAX: Final = 100
 """Most lines of a header; those of TRC files have 30."""
-PIECE_BYTES_MAX: Final = 1 << 22
-"""Longest piece of a BLF file, bytes; Vector's have 128 KiB before they are packed."""
+PIECE_BYTES_MAX: Final = 1 << 19
+"""Longest piece of a BLF file, bytes; Vector's have 128 KiB before they are packed.
+
+A piece unpacks to a thousand times its length at most.
+"""
 FD_FLAG: Final = 0x1000
 """Flag of a CAN FD frame in lines `CANFD` of ASC files, which have classic frames too."""
 

@@ -48,6 +48,10 @@ def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -
         (SOCKETCAND + 'port = "29536" }', "options.port: Expected `int`, got `str`"),
         (SOCKETCAND + "port = 1, tune = true }", "options.tune: python-can's interface 'socketca"),
         (SOCKETCAND + "port = 1, bitrate = 1 }", "options.bitrate: is a key of its own"),
+        (
+            'interface = "virtual"\noptions = { self = 1 }',
+            "options.self: python-can's interface 'v",
+        ),
         ('interface = "slcan"\noptions = { timeout = 1.0 }', "options.timeout: must be 0.0"),
         (
             'interface = "slcan"\nbitrate = 123456',
