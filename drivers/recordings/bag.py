@@ -212,8 +212,9 @@ class _Bag:
 
     def messages(self) -> Iterator[tuple[int, Any]]:
         """Yield times, ns, and messages of both topics. Raises `RecordingError` for damage."""
-        topics = {each.topic for each in (self.tactile, self.joints) if each is not None}
-        chosen = [each for each in self._reader.connections if each.topic in topics]
+        read = {(each.topic, each.msgtype) for each in (self.tactile, self.joints) if each}
+        everything = self._reader.connections
+        chosen = [each for each in everything if (each.topic, each.msgtype) in read]
         try:
             for connection, bag_ns, content in self._reader.messages(connections=chosen):
                 message: Any = self._decode(content, connection.msgtype)

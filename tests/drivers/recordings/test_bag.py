@@ -250,6 +250,16 @@ def test_a_joint_of_both_hands_in_one_message_has_no_angle(tmp_path: Path) -> No
     assert (frame["THJ5"] == 0.7).all()
 
 
+def test_another_message_on_the_topic_is_left_out(tmp_path: Path) -> None:
+    bag = BagOf(1)
+    with rosbag1.Writer(tmp_path / "hand.bag") as writer:
+        for kind, message in ((TACTILE, bag.tactile(noise(1)[0])), ("std_msgs/msg/String", None)):
+            where = writer.add_connection("/rh/tactile", kind, typestore=bag.store)
+            content = b"" if message is None else bag.store.serialize_ros1(message, kind)
+            writer.write(where, START_NS, content)
+    assert len(readings_of(tmp_path / "hand.bag")) == 1
+
+
 def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:
     bags = [
         BagOf(1).write(tmp_path / f"{hand}.bag", noise(5), topic=f"/{hand}/tactile")
