@@ -35,7 +35,7 @@ readings with a longer silence between them."""
 OUTAGE_NS = 1_000_000_000
 """Time without a usable reading after which tare and noise are forgotten, ns.
 
-The sensors may have been exchanged or switched off.
+The sensors may have been exchanged or switched off. The same holds where time goes back by more.
 """
 SLIDE_AFTER_NS = 20_000_000
 """Time for which a still finger must move before its state is `slide`, ns.
@@ -298,7 +298,8 @@ class HandTracker:
 
     def _follow_time(self, t_ns: int) -> None:
         """Forget what does not continue at the time of a usable reading."""
-        if self._last_ns is not None and t_ns - self._last_ns > OUTAGE_NS:
+        last_ns = self._last_ns
+        if last_ns is not None and not -OUTAGE_NS <= t_ns - last_ns <= OUTAGE_NS:
             self._contact.forget()
             self.motion.forget()
         if self._interrupted or self._is_after_gap(t_ns):

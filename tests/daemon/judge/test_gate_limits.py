@@ -368,6 +368,21 @@ def test_sensors_that_were_away_for_more_than_a_second_may_be_others(
     assert play(away).hand.tared == tared
 
 
+@pytest.mark.parametrize(("back_ns", "tared"), [(900_000_000, FINGERS), (1_100_000_000, ())])
+def test_after_time_went_back_a_second_sensors_may_be_others(
+    back_ns: int, tared: tuple[str, ...]
+) -> None:
+    """As in two recordings, of which the later one is played first."""
+    hand, none = HandTracker(FINGERS, LIMITS), Checked((), ~ALL)
+    for t_s, reading in readings(Scenario("firm", GRASPED, UP)):
+        hand.step(reading.made_ns, reading.counts, none)
+        if t_s > -0.1:
+            break
+    assert hand.tared == FINGERS
+    hand.step(reading.made_ns - back_ns, reading.counts, none)
+    assert hand.tared == tared
+
+
 def test_joints_are_lost_when_readings_go_on_without_them() -> None:
     silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=True))
     assert "joints" not in HandTracker(FINGERS, silent.limits).health(), "nothing came yet"
