@@ -77,7 +77,8 @@ def run(args: argparse.Namespace) -> int:
     learns = wanted.learn.enabled or wanted.risk is not None
     if not (learns or isinstance(model.contract.input, SessionInput)):
         raise ModelError(f"the model {model.contract.name} keeps no session")
-    if args.action != "show" and not _has_folder(wanted):
+    named = wanted.session.folder is not None and wanted.session.keep is None
+    if args.action != "show" and not (wanted.keeps_session or named):
         raise SessionFileError(
             f"{args.scene} keeps no session, and {wanted.session_path} may be that of a hand: "
             "say `[session] keep = true`"
@@ -101,12 +102,6 @@ def run(args: argparse.Namespace) -> int:
             )
             _seed(wanted, model, played)
     return 0
-
-
-def _has_folder(wanted: scene.Scene) -> bool:
-    """Return True if the scene keeps sessions, or names a folder for them and does not say no."""
-    named = wanted.session.folder is not None and wanted.session.keep is None
-    return wanted.keeps_session or named
 
 
 def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
