@@ -11,7 +11,7 @@ import struct
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -65,14 +65,19 @@ class ViewerClient:
         assert len(text) < 126
         self._socket.sendall(bytes((0x81, 0x80 | len(text), 0, 0, 0, 0)) + text)
 
-    def channels(self, wanted: set[str]) -> dict[str, dict[str, Any]]:
-        """What is advertised, by topic, until all `wanted` are there."""
+    def channels(self, wanted: set[str], send: Callable[[], None]) -> dict[str, dict[str, Any]]:
+        """What is advertised, by topic; `send` is called until all `wanted` are there.
+
+        A view that stood still for a second connects again, and has lost what waited.
+        """
         found: dict[str, dict[str, Any]] = {}
         while not wanted <= found.keys():
-            frame = self.frame()
-            if frame.startswith(b"{"):
-                told = json.loads(frame)
-                found |= {one["topic"]: one for one in told.get("channels", [])}
+            send()
+            while select.select([self._socket], [], [], 0.05)[0]:
+                frame = self.frame()
+                if frame.startswith(b"{"):
+                    told = json.loads(frame)
+                    found |= {one["topic"]: one for one in told.get("channels", [])}
         return found
 
     def message(self) -> dict[str, Any] | None:
@@ -121,12 +126,16 @@ def test_a_viewer_gets_channels_and_messages_that_their_schemas_allow(hand: Hand
         assert watching.stdout is not None
         hand.wait_for_subscriber()
         assert f"ws://127.0.0.1:{hand.port}" in watching.stdout.readline()
-        for kind, payload in sent.items():
-            hand.send(f"{kind}.right", payload)
-        hand.send("verdict.strange", b"no json")
+
+        def send() -> None:
+            for kind, payload in sent.items():
+                hand.send(f"{kind}.right", payload)
+            hand.send("verdict.strange", b"no json")
+
+        send()
         viewer = ViewerClient(hand.port)
         wanted = {f"{kind}.right" for kind in (*sent, "image", "log")}
-        channels = viewer.channels(wanted)
+        channels = viewer.channels(wanted, send)
         assert channels.keys() == wanted
         for topic, channel in channels.items():
             name, text = schemas()[topic.partition(".")[0]]
@@ -157,7 +166,7 @@ def test_no_thread_of_the_library_asks_python_to_log() -> None:
         with LiveServer(0) as server:
             server.send(b"status.right", b"{}")
             viewer = ViewerClient(server.port)
-            (channel,) = viewer.channels({"status.right"}).values()
+            (channel,) = viewer.channels({"status.right"}, lambda: None).values()
             wanted = [{"id": 7, "channelId": channel["id"]}]
             viewer.tell({"op": "subscribe", "subscriptions": wanted})
             while viewer.message() is None:
