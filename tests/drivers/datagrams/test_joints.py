@@ -30,13 +30,6 @@ LOOPBACK = "udp://127.0.0.1:0"
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> DatagramClock:
-    clock = DatagramClock()
-    clock.rule(monkeypatch)
-    return clock
-
-
-@pytest.fixture
 def driver(clock: DatagramClock) -> Iterator[JointStreamDriver]:
     with JointStreamDriver(LOOPBACK, clock=clock) as driver:
         yield driver

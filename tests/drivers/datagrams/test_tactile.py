@@ -188,13 +188,6 @@ def test_messages_that_waited_stay_old_after_many_losses() -> None:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> DatagramClock:
-    clock = DatagramClock()
-    clock.rule(monkeypatch)
-    return clock
-
-
-@pytest.fixture
 def driver(clock: DatagramClock) -> Iterator[TactileStreamDriver]:
     with TactileStreamDriver(LOOPBACK, FINGERS, "right", clock=clock) as driver:
         yield driver

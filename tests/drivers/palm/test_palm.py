@@ -35,13 +35,6 @@ EXAMPLE = ROOT / "deploy" / "calibration" / "example_hand.toml"
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> DatagramClock:
-    clock = DatagramClock()
-    clock.rule(monkeypatch)
-    return clock
-
-
-@pytest.fixture
 def driver(clock: DatagramClock) -> Iterator[PalmDriver]:
     with PalmDriver(LOOPBACK, clock=clock) as driver:
         yield driver
