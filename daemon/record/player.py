@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.reasons import Reason
@@ -28,7 +26,7 @@ from graspd.daemon.record.topics import (
 )
 from graspd.drivers.base import DriverCounters, Reading, RecordingError, TactileReading
 from graspd.drivers.recordings.kinds import open_recording
-from graspd.drivers.recordings.player import RecordedDriver
+from graspd.drivers.recordings.player import ReadingsDriver
 
 _log = logging.getLogger(__name__)
 
@@ -54,41 +52,23 @@ class McapCounters(DriverCounters):
     """Files that were cut off or are damaged."""
 
 
-class McapReplayDriver(RecordedDriver[_Item]):
+class McapReplayDriver(ReadingsDriver[_Item]):
     """Play the files of one run, at most one reading per call of `read_ready`.
 
     A damaged file is played up to the damage, and counted.
     """
 
-    def __init__(
-        self,
-        paths: Sequence[Path],
-        fingers: Sequence[str],
-        *,
-        speed: float | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        """Raises `ValueError` without `paths`, or for a `speed` of 0 or less.
+    on_event: Callable[[RecordedEvent], None] | None = None
+    """Called with each event that changes the judge's state."""
 
-        `fingers`: those to play, in this order; each file must have them. `speed`: factor of real
-        time; None: as fast as possible.
-        """
-        super().__init__(paths, speed, clock)
-        self._fingers = tuple(fingers)
-        self.on_event: Callable[[RecordedEvent], None] | None = None
-        """Called with each event that changes the judge's state."""
-        self._reset()
-
-    def _reset(self) -> None:
+    def reset(self) -> None:
+        super().reset()
         self.counters = McapCounters()
-        self.period_ns: int | None = None
-        """Shortest time between two readings as played, ns; None: not known yet."""
-        self._last_ns: int | None = None
 
     def open(self) -> None:
         """Check the header of each file, then start from the first. Raises `RecordingError`."""
         self.close()
-        self._reset()
+        self.reset()
         for path in self.paths:
             recorded = header_of(path).fingers
             missing = [finger for finger in self._fingers if finger not in recorded]
@@ -117,11 +97,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
     def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
         self.counters.faulty_readings += bool(made.faults.any())
-        step_ns = made.t_ns - self._last_ns if self._last_ns is not None else 0
-        if step_ns > 0:
-            step_ns = round(step_ns / (self.speed or 1.0))
-            self.period_ns = min(step_ns, self.period_ns or step_ns)
-        self._last_ns = made.t_ns
+        self.follow(made.t_ns)
 
     def _items(self) -> Generator[tuple[int, _Item], None, None]:
         for path in self.paths:

@@ -11,7 +11,6 @@ import bz2
 import logging
 import math
 import struct
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS, Finger
+from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS, FORMER_ELECTRODES, Finger
 from graspd.drivers.base import (
     DriverCounters,
     ElectrodeFault,
@@ -40,7 +39,7 @@ from graspd.drivers.base import (
     joint_name,
 )
 from graspd.drivers.recordings.kinds import Kind, is_packed, kind_of
-from graspd.drivers.recordings.player import RecordedDriver
+from graspd.drivers.recordings.player import ReadingsDriver
 
 TACTILE: Final = "sr_robot_msgs/msg/BiotacAll"
 SENSOR: Final = "sr_robot_msgs/msg/Biotac"
@@ -52,8 +51,6 @@ DEFINITIONS: Final = {
     SENSOR: ("int16 pac0\nint16 pac1\nint16 pdc\nint16 tac\nint16 tdc\nint16[] electrodes\n"),
 }
 """Messages as Shadow publishes them, for bags that do not hold their definitions."""
-FORMER_ELECTRODES: Final = 19
-"""Electrodes of a BioTac that is not an SP."""
 LOOKED_AT: Final = 20
 """Messages that say which fingers have a sensor."""
 REPEAT_NS: Final = 1_000_000_000
@@ -85,34 +82,19 @@ class BagCounters(DriverCounters):
     """Messages without five sensors."""
 
 
-class BagDriver(RecordedDriver[Reading]):
+class BagDriver(ReadingsDriver[Reading]):
     """Play the bags of one run, at most one reading per call of `read_ready`."""
 
-    def __init__(
-        self,
-        paths: Sequence[Path],
-        fingers: Sequence[str],
-        *,
-        speed: float | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        """`fingers`: those to play, in this order. `speed`: factor of real time; None: fast."""
-        super().__init__(paths, speed, clock)
-        self._rows = [list[str](FINGERS).index(finger) for finger in fingers]
-        self._fingers = tuple(fingers)
-        self._reset()
-
-    def _reset(self) -> None:
+    def reset(self) -> None:
+        super().reset()
         self.counters = BagCounters()
-        self.period_ns: int | None = None
-        """Shortest time between two readings as played, ns; None: not known yet."""
-        self._last_ns: int | None = None
+        self._rows = [list[str](FINGERS).index(finger) for finger in self._fingers]
         self._last: NDArray[np.int64] | None = None
 
     def open(self) -> None:
         """Check that each bag has these fingers, then start. Raises `RecordingError`."""
         self.close()
-        self._reset()
+        self.reset()
         for path in self.paths:
             found = fingers_of(path)
             missing = [finger for finger in self._fingers if finger not in found]
@@ -159,10 +141,8 @@ class BagDriver(RecordedDriver[Reading]):
         if self._last is not None and np.array_equal(values, self._last):
             self.counters.repeats += 1
             return None
-        if last_ns is not None and t_ns > last_ns:
-            step_ns = round((t_ns - last_ns) / (self.speed or 1.0))
-            self.period_ns = min(step_ns, self.period_ns or step_ns)
-        self._last_ns, self._last = t_ns, values
+        self.follow(t_ns)
+        self._last = values
         wrong = (values < 0) | (values > COUNT_MAX)
         faults = wrong * np.uint8(ElectrodeFault.NOT_A_COUNT)
         counts = np.where(wrong, 0, values).astype(np.uint16)

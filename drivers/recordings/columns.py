@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from graspd.biotac import ELECTRODES, FINGERS
+from graspd.biotac import ELECTRODES, FINGERS, FORMER_ELECTRODES
 from graspd.drivers.base import RecordingError, joint_name
 from graspd.drivers.recordings.kinds import PAGE
 
@@ -16,8 +16,6 @@ TIME: Final = "t"
 """Column of seconds, with any zero, that graspd writes."""
 OBJECT: Final = "object"
 SLIPPED: Final = "slipped"
-OTHER_ELECTRODES: Final = 19
-"""Electrodes of the BioTac, which is another sensor than the BioTac SP."""
 
 _HAND: Final = r"(?:[rl]h_)?(?P<finger>ff|mf|rf|lf|th)"
 SCHEMES: Final[Mapping[str, re.Pattern[str]]] = {
@@ -166,9 +164,9 @@ def _whole(
     for finger in fingers or found:
         numbers = found.get(finger, {})
         expected = range(base, base + ELECTRODES)
-        if set(numbers) == set(range(base, base + OTHER_ELECTRODES)):
+        if set(numbers) == set(range(base, base + FORMER_ELECTRODES)):
             problem = (
-                f"{finger} has {OTHER_ELECTRODES} electrodes: a BioTac, which is another sensor "
+                f"{finger} has {FORMER_ELECTRODES} electrodes: a BioTac, which is another sensor "
                 f"than the BioTac SP with {ELECTRODES}; no model of graspd judges it"
             )
             raise RecordingError(path, problem, line=line)

@@ -116,6 +116,39 @@ class RecordedDriver(Opened, Generic[Item]):
             self.exhausted = False
 
 
+class ReadingsDriver(RecordedDriver[Item]):
+    """Base of drivers that play readings, each with the time at which it was made."""
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        fingers: Sequence[str],
+        *,
+        speed: float | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`fingers`: those to play, in this order; each file must have them.
+
+        `speed`: factor of real time; None: as fast as possible.
+        """
+        super().__init__(paths, speed, clock)
+        self._fingers = tuple(fingers)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the readings of a former run."""
+        self.period_ns: int | None = None
+        """Shortest time between two readings as played, ns; None: not known yet."""
+        self._last_ns: int | None = None
+
+    def follow(self, t_ns: int) -> None:
+        """Take in the time at which a reading was made, ns."""
+        if self._last_ns is not None and t_ns > self._last_ns:
+            step_ns = round((t_ns - self._last_ns) / (self.speed or 1.0))
+            self.period_ns = min(step_ns, self.period_ns or step_ns)
+        self._last_ns = t_ns
+
+
 class LinkDecoder(Protocol):
     """Decoder of one link, the same as in its driver."""
 

@@ -12,6 +12,8 @@ TABLE_FINGERS: Final[tuple[Finger, ...]] = ("ff", "mf", "th")
 """Fingers of the published grasp tables, in the order of their columns; a scene's default."""
 ELECTRODES: Final = 24
 """Electrodes of one BioTac SP (manual section 5)."""
+FORMER_ELECTRODES: Final = 19
+"""Electrodes of the BioTac, which is another sensor than the BioTac SP."""
 COUNT_MAX: Final = 4095
 """Largest 12-bit reading of an electrode (manual section 5.1)."""
 
