@@ -15,7 +15,7 @@ from graspd.daemon.judge.hand import GAP_NS
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import ADVICE, OPEN, UNREADABLE, Reason
 from graspd.daemon.publish.companion import Companion, PublishedVerdict
-from graspd.drivers.base import DriverCounters, JointReading, Reading
+from graspd.drivers.base import ANGLE_MAX_RAD, DriverCounters, JointReading, Reading
 
 STEPS: Final = 20
 """Steps between readings whose median says how far apart they are."""
@@ -26,8 +26,6 @@ STEP_MIN_S: Final = 1e-4
 """Shortest step of a sensor, s: a sweep of 24 electrodes takes a hundred times as long."""
 UNITS: Final = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 """Units of a time that is read as seconds, by their number in a second."""
-ANGLE_MAX_RAD: Final = 3.5
-"""Largest angle of a joint, rad: 200 degrees."""
 CAUSES_MAX: Final = 3
 """Most reasons to write."""
 

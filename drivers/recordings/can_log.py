@@ -22,6 +22,7 @@ from graspd.drivers.recordings.kinds import (
     PAGE,
     Kind,
     kind_of,
+    marked_encoding,
     open_recording,
     reason,
 )
@@ -40,8 +41,6 @@ STEPS_SHARE: Final = 0.5
 """Falls of the time for each rise, from which on times are steps, which fall as often as rise."""
 
 _TEXTS: Final = {Kind.CANDUMP: read_candump, Kind.ASC: read_asc, Kind.TRC: read_trc}
-_ENCODINGS: Final = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb": "utf-8-sig"}
-"""Encodings by the first two bytes of a byte order mark."""
 
 _log = logging.getLogger(__name__)
 
@@ -90,7 +89,7 @@ def read_log(path: Path) -> Iterator[Line]:
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
     """Yield lines of text in any encoding; a line that is too long comes in pieces."""
-    encoding = _ENCODINGS.get(stream.read(2), "latin-1")
+    encoding = marked_encoding(stream.read(3)) or "latin-1"
     stream.seek(0)
     with io.TextIOWrapper(stream, encoding, errors="replace") as text:
         while line := text.readline(LINE_BYTES_MAX):

@@ -17,6 +17,7 @@ from graspd.drivers.recordings.kinds import (
     TABLES,
     Kind,
     kind_of_open,
+    marked_encoding,
     read_lines,
     reason,
 )
@@ -25,7 +26,6 @@ from graspd.extras import needs
 _SEPARATORS: Final = ",;\t"
 _SEPARATOR_LINE: Final = re.compile(r"sep=(.)", re.IGNORECASE)
 """First line by which a spreadsheet tells the separator."""
-_UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
 
 
 class Cells:
@@ -133,10 +133,10 @@ class Cells:
         head = file.read(LINE_BYTES_MAX)
         file.seek(0)
         first = head.split(b"\n", 1)[0].removesuffix(b"\r")
-        if head.startswith(_UTF16) or b"\r" in first:
-            yield from self._lines_of(file, "utf-16" if head.startswith(_UTF16) else "utf-8-sig")
+        encoding = marked_encoding(head) or "utf-8-sig"
+        if encoding == "utf-16" or b"\r" in first:
+            yield from self._lines_of(file, encoding)
             return
-        encoding = "utf-8-sig"
         for line in read_lines(self._path, file):
             self.line += 1
             if len(line) > LINE_BYTES_MAX:

@@ -64,7 +64,8 @@ _MAGIC: Final = {
     b";$FILEVERSION": Kind.TRC,
     b";#########": Kind.TRC,  # version 1.0
 }
-_UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
+_MARKS: Final = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
+"""Encodings by their byte order marks."""
 _SPACE: Final = rb"(?:[ \t]|\x1b\[[0-9;]*m)"
 """A blank, or the code of a colour."""
 _CANDUMP_LINE: Final = re.compile(
@@ -153,7 +154,7 @@ def _kind_of(head: bytes) -> Kind | None:
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return kind
-    if head.startswith(_UTF16):
+    if marked_encoding(head) == "utf-16":
         head = head.decode("utf-16", "replace").encode()
     if any(head.startswith(magic) for magic in _OTHERS):
         return None
@@ -167,6 +168,11 @@ def _kind_of(head: bytes) -> Kind | None:
         events = (event for event, _ in FrameParser().feed(head))
         return Kind.SERIAL if not _SERIAL_EVENTS.isdisjoint(events) else None
     return Kind.TEXT
+
+
+def marked_encoding(head: bytes) -> str | None:
+    """Return the encoding of text that begins with a byte order mark; None without one."""
+    return next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
 
 
 def open_recording(path: Path) -> BinaryIO:
