@@ -229,8 +229,10 @@ def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
 def _parts(
     paths: Sequence[Path], model: dict[str, Any], read_as: ReadAs | None, rate_hz: float | None
 ) -> Parts:
-    source: Source = Tables(paths, {}, read_as=read_as, rate_hz=rate_hz)
-    if kind_of_all(paths) is Kind.MCAP:
+    source: Source
+    if kind_of_all(paths) is not Kind.MCAP:
+        source = Tables(paths, {}, read_as=read_as, rate_hz=rate_hz)
+    else:
         require_mcap("judging MCAP")
         from graspd.daemon.assembly.recordings import RecordedRun
 

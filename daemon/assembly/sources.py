@@ -20,7 +20,7 @@ from graspd.daemon.scene.scene import Hand
 from graspd.drivers.base import Driver
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.kinds import BAGS, CAN_LOGS, Kind, kind_of, kind_of_all
-from graspd.drivers.recordings.layout import ReadAs, layout_of
+from graspd.drivers.recordings.layout import ReadAs, fingers_in_header
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 
@@ -89,7 +89,6 @@ class Tables(Source):
         `read_as`, `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags.
         """
         self._paths = [path.absolute() for path in paths]
-        self._read_as, self._rate_hz = read_as, rate_hz
         self._driver = partial(
             ReplayDriver,
             self._paths,
@@ -139,7 +138,7 @@ class Tables(Source):
             return fingers_of(path)
         if len(judged) == 1:  # a file of one finger need not name it
             return judged
-        return layout_of(path, (), self._read_as, self._rate_hz).columns.fingers
+        return fingers_in_header(path)
 
 
 class LinkLogs(Source):

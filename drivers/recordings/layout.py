@@ -98,6 +98,13 @@ def layout_of(
         return survey(path, file, fingers, read_as, rate_hz)
 
 
+def fingers_in_header(path: Path) -> tuple[str, ...]:
+    """Return the fingers of a file, by its header alone. Raises `RecordingError`."""
+    with open_recording(path) as file:
+        cells = Cells(path, file)
+        return Columns.of(path, cells.names, (), cells.header_line).fingers
+
+
 def survey(
     path: Path,
     file: BinaryIO,
