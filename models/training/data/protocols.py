@@ -93,7 +93,11 @@ def grasp_of(grasps: Grasps) -> Ints:
 
 def fewest_grasps(grasps: Grasps) -> int:
     """Return the number of grasps of the label that fewer have, each with all its readings once."""
-    first = np.unique(grasp_of(grasps), return_index=True)[1]
+    return _fewest(grasps, grasp_of(grasps))
+
+
+def _fewest(grasps: Grasps, grasp: Ints) -> int:
+    first = np.unique(grasp, return_index=True)[1]
     slips = int(grasps.slipped[first].sum())
     return min(slips, len(first) - slips)
 
@@ -107,7 +111,7 @@ def folds_of(grasps: Grasps, folds: int, seed: int) -> Ints:
     from sklearn.model_selection import StratifiedGroupKFold, StratifiedKFold
 
     slipped, grasp = grasps.slipped, grasp_of(grasps)
-    fewest = fewest_grasps(grasps)
+    fewest = _fewest(grasps, grasp)
     if fewest < folds:
         raise TooFewGraspsError(
             f"{folds} folds need {folds} grasps of each class, one has {fewest}"
