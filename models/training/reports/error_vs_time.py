@@ -7,17 +7,14 @@ noisy, so compare ratios.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import platform
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -30,7 +27,6 @@ from graspd.models.training.evaluating.style import (
     ORANGE,
     PAPER,
     QUICK,
-    QUIET,
     mark_quick,
     style,
     to_svg,
@@ -59,17 +55,18 @@ PANELS = (
 )
 """Protocols and their question; a model has at most one of a group.
 Without the first it was measured on two palm poses only, and is drawn hollow."""
+TIME = "paced_p50_us"
 COLOURS = {"model": BLUE, "peer": ORANGE}
 MARKERS = {"model": "o", "peer": "s"}
-SIZE_IN = (9.5, 9.6)
-ERROR_MAX = 104.0
-"""Upper end of an axis, %: a point at 100 is seen whole."""
+SIZE_IN = (8.6, 3.7)
+"""Size at which the pages show the picture."""
 KEY = (
-    "circles: graspd's models, squares: peers, line: the front, bars: 95 %, "
-    "hollow: two palm poses only"
+    "circle: model of graspd, square: published code, line: 95 % interval, "
+    "hollow: on two palm poses only\n"
+    "another day: the -session models have seen 50 unlabelled grasps of it"
 )
-FONT_PT = 8.5
-MARKER_PT = 8.0
+TITLE_PT, FONT_PT = 9.5, 8.5
+MARKER_PT = 6.5
 
 Report = dict[str, Any]
 """Figures in `error-vs-time.json`."""
@@ -167,108 +164,68 @@ def _processor() -> str:
     return next(names, platform.machine())
 
 
-@dataclass(frozen=True, slots=True)
-class Point:
-    """One candidate in one panel."""
-
-    name: str
-    kind: str
-    """`model` or `peer`."""
-    us: float
-    """Time of a paced reading, p50."""
-    error: float
-    """1 - F1, in %."""
-    reach: tuple[float, float]
-    """From the error down and up to the ends of its 95 % interval, in %."""
-    hollow: bool
-
-
 def error_of(row: Row, protocols: Sequence[str]) -> dict[str, float]:
     """Return the figures of the first of these protocols that a row has; empty: none."""
     return next((row["error"][name] for name in protocols if name in row["error"]), {})
 
 
-def points(rows: Sequence[Row], protocols: Sequence[str]) -> Iterator[Point]:
-    """Yield the candidates for the whole hand that have figures of one of these protocols."""
+def whole_hand(rows: Sequence[Row]) -> list[Row]:
+    """Return the candidates for the whole hand, the fastest first."""
     most = max(len(row["fingers"]) for row in rows)
-    for row in rows:
-        error = error_of(row, protocols)
-        if error and len(row["fingers"]) == most:
-            yield Point(
-                row["name"],
-                row["kind"],
-                row["time"]["paced_p50_us"],
-                100.0 * (1.0 - error["f1"]),
-                (100.0 * (error["high"] - error["f1"]), 100.0 * (error["f1"] - error["low"])),
-                row["error"].get(protocols[0]) is not error,
-            )
-
-
-def front(several: Sequence[Point]) -> list[Point]:
-    """Return the models without another that is both faster and more exact, fastest first."""
-    best: list[Point] = []
-    for point in sorted(several, key=lambda point: (point.us, point.error)):
-        if point.kind == "model" and (not best or point.error < best[-1].error):
-            best.append(point)
-    return best
+    several = [row for row in rows if len(row["fingers"]) == most]
+    return sorted(several, key=lambda row: float(row["time"][TIME]))
 
 
 def draw(report: Report, figures: Sequence[str]) -> str:
     """Return the picture, as SVG; `figures` are the report's table."""
+    rows = whole_hand(report["rows"])
     with style():
         figure = Figure(figsize=SIZE_IN, dpi=72, layout="constrained")
-        panels = figure.subplots(len(PANELS), 1, sharex=True)
-        drawn = [list(points(report["rows"], protocols)) for protocols, _ in PANELS]
-        times = [point.us for point in itertools.chain(*drawn)]
-        panels[-1].set_xscale("log")
-        panels[-1].set_xlim(min(times) / 1.5, max(times) * 1.5)
-        for axes, several, (_, asked) in zip(panels, drawn, PANELS, strict=True):
-            _draw_panel(axes, several, asked)
-        panels[-1].set_xlabel("time of a reading, input and network, paced at 100 Hz, p50, us")
-        title = f"Error against run time, on {report['machine']['processor']}"
-        figure.suptitle(f"{title}\n{KEY}", fontsize=11)
+        *panels, last = figure.subplots(1, len(PANELS) + 1, sharey=True)
+        for axes, (protocols, asked) in zip(panels, PANELS, strict=True):
+            _draw_errors(axes, rows, protocols, asked)
+        _draw_times(last, rows)
+        _name_rows(panels[0], rows)
+        title = f"Error and run time, on {report['machine']['processor']}"
+        figure.suptitle(f"{title}\n{KEY}", fontsize=TITLE_PT)
         if report["quick"]:
             mark_quick(figure)
         return to_svg(figure, title, figures)
 
 
-def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
-    for point in several:
-        colour = COLOURS[point.kind]
-        reach = [[each] for each in point.reach]
-        axes.errorbar(
-            point.us, point.error, yerr=reach, ecolor=colour, alpha=0.6, lw=1.4, capsize=3
-        )
-        marker = "*" if point.name == DEFAULT else MARKERS[point.kind]
-        axes.plot(
-            point.us, point.error, marker, color=colour,
-            markersize=MARKER_PT * (2.0 if marker == "*" else 1.0),
-            markerfacecolor=PAPER if point.hollow else colour, zorder=5,
-        )  # fmt: skip
-    best = front(several)
-    axes.plot(
-        [point.us for point in best], [point.error for point in best],
-        color=COLOURS["model"], lw=1.6, alpha=0.5, zorder=1,
-    )  # fmt: skip
-    if several:
-        low = min(point.error - point.reach[0] for point in several)
-        high = max(point.error + point.reach[1] for point in several)
-        margin = 0.08 * (high - low)
-        axes.set_ylim(max(low - margin, 0.0), min(high + margin, ERROR_MAX))
-    axes.set_ylabel(f"{asked}\n1 - F1, %")
-    name_points(axes, several)
+def _draw_errors(axes: Axes, rows: Sequence[Row], protocols: Sequence[str], asked: str) -> None:
+    for place, row in enumerate(rows):
+        error = error_of(row, protocols)
+        if not error:
+            continue
+        colour = COLOURS[row["kind"]]
+        wrong, *reach = (100.0 * (1.0 - error[name]) for name in ("f1", "high", "low"))
+        axes.plot(reach, [place, place], color=colour, lw=1.6, alpha=0.6)
+        is_other = row["error"].get(protocols[0]) is not error
+        face = PAPER if is_other else colour
+        marker = MARKERS[row["kind"]]
+        axes.plot(wrong, place, marker, color=colour, markerfacecolor=face, markersize=MARKER_PT)
+    axes.set_xlim(left=0.0)
+    axes.set_title(asked, fontsize=FONT_PT)
+    axes.set_xlabel("1 - F1, %", fontsize=FONT_PT)
+    axes.tick_params(labelsize=FONT_PT)
 
 
-def name_points(axes: Axes, several: Sequence[Point]) -> None:
-    """Put the names in a column beside the panel, in the order of the errors."""
-    ordered = sorted(several, key=lambda point: point.error)
-    heights = np.linspace(0.02, 0.98, len(ordered))
-    for point, height in zip(ordered, heights, strict=True):
-        is_default = point.name == DEFAULT
-        axes.annotate(
-            f"{point.name} (default)" if is_default else point.name, (point.us, point.error),
-            fontsize=FONT_PT, color=COLOURS[point.kind],
-            fontweight="bold" if is_default else "normal", va="center",
-            xytext=(1.02, height), textcoords="axes fraction",
-            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": QUIET, "relpos": (0.0, 0.5)},
-        )  # fmt: skip
+def _draw_times(axes: Axes, rows: Sequence[Row]) -> None:
+    for place, row in enumerate(rows):
+        colour, marker = COLOURS[row["kind"]], MARKERS[row["kind"]]
+        axes.plot(row["time"][TIME] / 1000.0, place, marker, color=colour, markersize=MARKER_PT)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_title("time of a reading", fontsize=FONT_PT)
+    axes.set_xlabel("ms, median at 100 Hz", fontsize=FONT_PT)
+    axes.tick_params(labelsize=FONT_PT)
+
+
+def _name_rows(axes: Axes, rows: Sequence[Row]) -> None:
+    names = [row["name"] for row in rows]
+    shown = [f"{name} (default)" if name == DEFAULT else name for name in names]
+    axes.set_yticks(range(len(rows)), shown)
+    for name, label in zip(names, axes.get_yticklabels(), strict=True):
+        label.set_fontweight("bold" if name == DEFAULT else "normal")
+    axes.set_ylim(len(rows) - 0.5, -0.5)
