@@ -48,7 +48,7 @@ SESSION_GRASPS = 20
 OPEN_SWEEPS = 5
 """After so many sweeps of an open hand neither a median nor a spike explains a touch."""
 STANDS_MS = 100
-COMBINATIONS, CHUNKS = 6, 4
+COMBINATIONS, CHUNKS = 5, 2
 SILENCES = tuple(itertools.product((85, 95, 101, 150, 990, 4990), ("rest", "shifted", "other")))
 """Lengths, ms, and what the hand does when the readings come again."""
 

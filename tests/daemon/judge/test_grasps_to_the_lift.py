@@ -20,7 +20,7 @@ from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import Clock, sound
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
 
-GRASPS = 40
+GRASPS = 20
 """Per rate."""
 STILL_COUNTS_PER_S = 20.0
 """A hand is still when its electrodes move no faster, in the mean. A held touch of a real sensor

@@ -162,7 +162,7 @@ def readings(draw: st.DrawFn) -> tuple[TactileReading, int]:
     sequence=st.lists(readings(), max_size=8),
     p_slip=st.one_of(st.floats(), st.floats(0, 1)),
 )
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_stable_needs_a_fresh_healthy_seen_reading_and_a_probability(
     sequence: list[tuple[TactileReading, int]], p_slip: float
 ) -> None:

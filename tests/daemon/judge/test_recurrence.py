@@ -48,9 +48,15 @@ def under_ring(rate_hz: float, sweeps: int, fingers: tuple[int, ...], live: int)
     return held(rate_hz).under(ring(sweeps, fingers, live), GateState.JUDGED, periods=periods)
 
 
-@pytest.mark.parametrize(("sweeps", "live"), [(2, 0), (64, 0), (64, 1), (64, 4)])
-@pytest.mark.parametrize("fingers", [(0, 1, 2), (0,), (2,)])
-@pytest.mark.parametrize("rate_hz", [PALM_RATE_HZ, RATE_HZ])
+@pytest.mark.parametrize(
+    ("rate_hz", "fingers", "sweeps", "live"),
+    [
+        (RATE_HZ, (0, 1, 2), 2, 0),
+        (RATE_HZ, (2,), 64, 4),
+        (PALM_RATE_HZ, (0,), 64, 0),
+        (PALM_RATE_HZ, (0, 1, 2), 64, 4),
+    ],
+)
 def test_a_ring_is_frozen_from_the_first_sweep_that_comes_again(
     rate_hz: float, fingers: tuple[int, ...], sweeps: int, live: int
 ) -> None:
@@ -157,17 +163,16 @@ def sweeps_of(
     return counts.astype(np.uint16), sound
 
 
-@pytest.mark.parametrize("flagged", [0.0, 0.02, 0.2, 0.5])
-@pytest.mark.parametrize("seed", [1])
-def test_what_recurs_is_what_the_definition_says(flagged: float, seed: int) -> None:
+@pytest.mark.parametrize("flagged", [0.02, 0.5])
+def test_what_recurs_is_what_the_definition_says(flagged: float) -> None:
     health, definition = Health(len(FINGERS)), Definition()
     number_of_frozen = 0
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     for number, (counts, read) in enumerate(zip(*sweeps_of(random, 500, flagged), strict=True)):
         faults = np.where(read, 0, ElectrodeFault.PARITY).astype(np.uint8)
         checked = health.check(TactileReading(number, number, counts, faults))
         is_frozen = Reason.FROZEN in checked.reasons
-        assert is_frozen == definition.recurs(counts, read), f"seed {seed}, sweep {number}"
+        assert is_frozen == definition.recurs(counts, read), f"sweep {number}"
         number_of_frozen += is_frozen
     assert 20 < number_of_frozen < 480
 

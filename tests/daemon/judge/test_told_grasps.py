@@ -1,4 +1,4 @@
-"""A grasp whose outcome is known is never offered again, however long it is held."""
+"""Whatever comes: a verdict has all that it needs, and no grasp is offered once its end is told."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.trust import Trust
 from graspd.models.trust.risk import RiskLimits
-from tests.daemon.judge.test_only_stable_if import HELD, Feel, Hand, begins, feels, gates, tared
-from tests.daemon.judge.test_only_stable_if import limits as gate_limits
+from tests.daemon.fakes import Clock, FakeModel, pipeline
+from tests.daemon.judge.felt_hand import HELD, Feel, Hand, begins, feels, gates, tared
+from tests.daemon.judge.felt_hand import limits as gate_limits
 
 BOOT = "b" * 32
 RISKS = {
@@ -107,8 +108,8 @@ outcomes = st.sampled_from([None, None, False, True])
     begin=begins,
     following=st.lists(st.tuples(outcomes, feels), min_size=3, max_size=12),
 )
-@settings(max_examples=100)
-def test_whatever_comes_no_told_grasp_is_offered(
+@settings(max_examples=150)
+def test_whatever_comes_a_verdict_has_all_it_needs(
     gate: HandLimits,
     limits: RiskLimits | None,
     begin: Sequence[Feel],
@@ -123,3 +124,11 @@ def test_whatever_comes_no_told_grasp_is_offered(
         for said in hand.play(feel):
             newest = said.moment.grasp
             assert newest not in told or not is_offered(said)
+    if gate.on_request:
+        assert hand.judged <= hand.asked * (2 if gate.gate.early else 1)
+
+
+def test_only_a_hand_with_a_gate_that_waits_is_asked() -> None:
+    assert not tared(gate_limits()).pipeline.on_request
+    assert tared(gate_limits(on_request=True)).pipeline.on_request
+    assert not pipeline(FakeModel(), Clock()).on_request

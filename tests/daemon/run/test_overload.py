@@ -19,7 +19,7 @@ from graspd.daemon.run.loop import DRAINS_MAX, LoopTiming
 from graspd.daemon.run.overload import YIELD_AFTER_NS, YIELD_MAX_NS, LoadShedder, mark_repeats
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from tests.daemon.fakes import MS, Clock, FakeDriver, reading
-from tests.daemon.judge.test_only_stable_if import POSES
+from tests.daemon.judge.felt_hand import POSES
 from tests.kit.loops import LoopBench
 
 START_NS = Clock().now_ns
