@@ -64,20 +64,13 @@ def data_dir() -> Path | None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Options of `.ci/run`, and of `graspd report stability`, which runs `tests/stability`."""
+    """Option of `.ci/run`."""
     parser.addoption("--left", metavar="FILE", help="leave out what passed by this `pytest -rap`")
-    parser.addoption("--model", action="append", default=[], help="a model to compare (all)")
-    parser.addoption("--data", type=Path, help="folder of the real grasps")
-    parser.addoption("--rows", choices=("markdown", "json"), help="print what was measured")
-    parser.addoption("--outcomes", type=int, default=3_000, help="that the learner is told")
 
 
 @pytest.fixture(scope="session")
-def bts3_dir(request: pytest.FixtureRequest) -> Path:
+def bts3_dir() -> Path:
     """Folder with palm_down.csv, palm_side.csv and palm_45.csv of the real data set."""
-    given: Path | None = request.config.getoption("data")
-    if given is not None:
-        return given
     folder = data_dir()
     if folder is None:
         pytest.skip("no real recordings: get them with `graspd data`, or set $GRASPD_DATA")

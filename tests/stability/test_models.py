@@ -1,9 +1,10 @@
-"""Each model of the zoo keeps its bounds on stiff, extreme, impossible and real readings."""
+"""Each row of `graspd report stability` keeps its bounds, and wrong figures break theirs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+import json
+import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,95 +15,47 @@ from numpy.typing import NDArray
 
 pytest.importorskip("onnx", reason="needs the extra `train`")
 
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
-from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.models import zoo
 from graspd.models.inputs import builder
 from graspd.models.judge.grasp_judge import Examined, GraspJudge
 from graspd.models.runtime import TactileModel
-from tests.stability.comparison import (
+from graspd.models.training.reports.stability import chain, trust
+from graspd.models.training.reports.stability.chain import (
     INPUT_RELATIVE_MAX,
     P_SLIP_ERROR_MAX,
-    CaseRow,
     Comparison,
-    comparison,
 )
-from tests.stability.exact import Reference, exact_input
-from tests.stability.readings import (
-    LIKELY,
-    NEVER_JUDGED,
-    ONE_HAND,
+from graspd.models.training.reports.stability.exact import Reference, exact_input
+from graspd.models.training.reports.stability.readings import (
     RANDOM,
     READINGS,
     Raw,
     likely_grasps,
 )
+from graspd.models.training.reports.stability.row import Row
+from tests.kit.inside import graspd
 
-Note = Callable[..., None]
-STREAM_STEP = 20
-"""Every 20th row of the demo stream is taken: its neighbours differ by noise alone."""
-SEASONED = ", session of 1e9 grasps"
-
-
-def check(note: Note, model: str, case: str, row: CaseRow) -> None:
-    """Put the row into the report, then see that it breaks no bound."""
-    note(model=model, case=case, **asdict(row))
-    assert row.readings == sum(row.verdicts.values()) > 0
-    assert not row.problems
+DEFAULT = "small-session"
 
 
-def recorded(path: Path, model: str) -> Raw:
-    fingers = comparison(model).model.contract.fingers
-    return np.array([row.counts for row in read_rows(path, fingers)])
+@pytest.mark.parametrize("name", zoo.names())
+def test_each_model_keeps_its_bounds(name: str) -> None:
+    rows = list(chain.rows(name))
+    assert {row.case for row in rows} >= {*READINGS, "next to the threshold"}
+    assert [row.case for row in rows if row.broken] == []
+    assert all(sum(row.answers.values()) == row.figures["readings"] > 0 for row in rows)
 
 
-@pytest.mark.parametrize("case", READINGS)
-def test_each_model_keeps_its_bounds(note: Note, model: str, case: str) -> None:
-    compared = comparison(model)
-    counts = READINGS[case](likely_grasps(compared.model.contract.seen))
-    row = compared.row(counts, never_judged=case in NEVER_JUDGED, one_hand=case in ONE_HAND)
-    check(note, model, case, row)
-    if case in NEVER_JUDGED:
-        assert row.verdicts == {"unknown": row.readings}
-        assert sum(row.reasons.values()) >= row.readings
+def test_real_grasps_keep_the_bounds(bts3_dir: Path) -> None:
+    rows = list(chain.rows(DEFAULT, bts3_dir))[-3:]
+    assert [row.figures["readings"] for row in rows] == [1276, 1273, 2133]  # as published
+    assert [row.case for row in rows if row.broken] == []
 
 
-@pytest.mark.parametrize(
-    ("case", "path", "step"),
-    [("demo table", DEMO_TABLE, 1), ("demo stream", DEMO_RECORDING, STREAM_STEP)],
-)
-def test_each_model_keeps_its_bounds_on_the_demo(
-    note: Note, model: str, case: str, path: Path, step: int
-) -> None:
-    counts = recorded(path, model)[::step]
-    check(note, model, case, comparison(model).row(counts, one_hand=True))
-
-
-def test_each_model_keeps_its_bounds_next_to_the_threshold(note: Note, model: str) -> None:
-    compared = comparison(model)
-    counts = compared.near_threshold(likely_grasps(compared.model.contract.seen))
-    check(note, model, "next to the threshold", compared.row(counts))
-
-
-@pytest.mark.parametrize("case", [LIKELY, RANDOM])
-def test_a_session_of_1e9_grasps_keeps_its_bounds(
-    note: Note, session_model: str, case: str
-) -> None:
-    compared = comparison(session_model, seasoned=True)
-    counts = READINGS[case](likely_grasps(compared.model.contract.seen))
-    check(note, session_model, case + SEASONED, compared.row(counts, one_hand=True))
-
-
-@pytest.mark.parametrize(
-    ("table", "rows"), [("palm_down", 1276), ("palm_side", 1273), ("palm_45", 2133)]
-)  # as published
-def test_real_grasps_keep_the_bounds(
-    note: Note, recorded_model: str, table: str, rows: int, bts3_dir: Path
-) -> None:
-    counts = recorded(bts3_dir / f"{table}.csv", recorded_model)
-    row = comparison(recorded_model).row(counts, one_hand=True)
-    assert len(counts) == rows
-    check(note, recorded_model, f"real grasps, {table}", row)
+def test_what_belongs_to_no_model_keeps_its_bounds() -> None:
+    rows = list(trust.rows(3_000))
+    assert len(rows) == 13
+    assert [row for row in rows if row.broken] == []
 
 
 # The comparison itself finds what is wrong.
@@ -111,9 +64,7 @@ def test_real_grasps_keep_the_bounds(
 def test_a_wrong_reference_breaks_the_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     right = Reference.probabilities
     monkeypatch.setattr(Reference, "probabilities", lambda *args: right(*args)[:, ::-1])
-    row = comparison("mlp").row(recorded(DEMO_TABLE, "mlp"))
-    assert any("flipped" in problem for problem in row.problems)
-    assert any(problem.startswith("p_slip") for problem in row.problems)
+    assert {"network", "p_slip", "flips"} <= set(compared("mlp").broken)
 
 
 def test_a_wrong_input_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,9 +77,62 @@ def test_a_wrong_input_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> None
         return spread
 
     monkeypatch.setattr(model.inputs, "build", wrong)
-    random = np.random.default_rng(0).integers(0, 4096, (5, 3, 24)).astype(np.uint16)
-    row = Comparison(model, Reference(model.path)).row(random)
-    assert any(problem.startswith("input") for problem in row.problems)
+    random = np.random.default_rng(0).integers(1, 4095, (5, 3, 24)).astype(np.uint16)
+    assert "input" in Comparison(model, None).row("made up", random).broken
+
+
+def test_a_judged_reading_breaks_the_bound_of_none() -> None:
+    model = TactileModel(zoo.find(DEFAULT))
+    likely = np.array(READINGS["counts like the training's"](likely_grasps(model.contract.seen)))
+    assert Comparison(model, None).row("likely", likely, never_judged=True).broken == ["judged"]
+
+
+def test_a_figure_that_is_not_a_number_is_broken() -> None:
+    row = Row(
+        "mlp", "made up", {"p_slip": float("nan"), "flips": 0.0}, {"p_slip": 1.0, "flips": 0.0}
+    )
+    assert row.broken == ["p_slip"]
+    assert row.cells()[-1] == "BROKEN p_slip: at most 1"
+    assert row.to_builtins()["figures"] == {"p_slip": None, "flips": 0.0}
+
+
+def compared(name: str) -> Row:
+    """Compare a model on random counts."""
+    (row,) = (row for row in chain.rows(name) if row.case == RANDOM)
+    return row
+
+
+# The command.
+
+
+def test_the_report_names_computer_and_broken_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = graspd("report", "stability", "small-session-mf", "--quick")
+    assert made.returncode == 0
+    assert "| small-session-mf | all 0 | readings 1," in made.stdout
+    assert "| learner | 3e+03 outcomes |" in made.stdout
+    assert "0 of 40 rows break a bound, on processor " in made.stdout
+    assert "BLAS" in made.stdout
+    monkeypatch.setattr(chain, "INPUT_RELATIVE_MAX", -1.0)
+    broken = graspd("report", "stability", "small-session-mf", "--quick", "--json")
+    assert broken.returncode == 1
+    assert json.loads(broken.stdout)["broken"] == 27
+
+
+def test_without_onnx_the_other_rows_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    made = graspd("report", "stability", "mlp", "--quick")
+    assert made.returncode == 0
+    assert "input" in made.stdout
+    assert "p_slip 0," not in made.stdout
+    assert "onnx is not installed" in made.stdout
+
+
+def test_a_missing_model_or_table_is_one_line(tmp_path: Path) -> None:
+    for words, named in ((["no-such-model"], "no-such-model"), (["--data", tmp_path], "palm_down")):
+        refused = graspd("report", "stability", *words)
+        assert (refused.returncode, refused.stdout) == (2, "")
+        (line,) = refused.stderr.splitlines()
+        assert named in line
 
 
 # Readings from the whole 12-bit space: anything at all, a few counts apart, at the rails, and one
@@ -156,13 +160,19 @@ def fingers(draw: st.DrawFn) -> list[int]:
 HAND = st.lists(fingers(), min_size=3, max_size=3).map(lambda rows: np.array(rows, dtype=np.uint16))
 
 
+@cache
+def loaded(name: str) -> tuple[TactileModel, Reference]:
+    model = TactileModel(zoo.find(name))
+    return model, Reference(model.path)
+
+
 @pytest.mark.parametrize("name", HANDS)
 @settings(max_examples=200)
 @given(counts=HAND)
 def test_inputs_and_probabilities_keep_their_bounds_over_the_12_bit_space(
     name: str, counts: Raw
 ) -> None:
-    model, reference = comparison(name).model, comparison(name).reference
+    model, reference = loaded(name)
     counts = counts[: len(model.contract.fingers)]
     inputs = builder(model.contract.input, len(counts))
     out = np.empty(inputs.shape, dtype=np.float32)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -33,9 +32,8 @@ from graspd.models.training.estimators.graphs import (
     with_probability,
 )
 from graspd.models.training.estimators.networks import IMAGE_SHAPE, build, for_inference
-from tests.stability.comparison import P_SLIP_ERROR_MAX
+from graspd.models.training.reports.stability.chain import P_SLIP_ERROR_MAX
 
-Note = Callable[..., None]
 VARIANCES = torch.tensor((0.0, 1e-38, 1e-12, 1.0, 1e12, 1e38))
 """Running statistics of batch norm, in turn; the last is near float32's largest number."""
 LARGEST_LOGIT = 1e4
@@ -43,7 +41,7 @@ LOGITS = (0.0, 1e-3, 1.0, 17.0, 60.0, 87.0, 88.0, 103.0, 104.0, 200.0, LARGEST_L
 """Softmax in float32 gives denormal numbers from a difference of 87 on, and zero from 104 on."""
 
 
-def test_batch_norm_is_folded_whatever_its_variances(note: Note) -> None:
+def test_batch_norm_is_folded_whatever_its_variances() -> None:
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(0)
         network = build(NetworkConfig(filters=12, hidden=24)).eval()
@@ -60,17 +58,10 @@ def test_batch_norm_is_folded_whatever_its_variances(note: Note) -> None:
         wide = nn.Sequential(*copy.deepcopy(network).double(), nn.Softmax(dim=1)).eval()
         difference = for_inference(network, 1.0)(images).double() - wide(images.double())
     error = float(difference.abs().max())
-    note(
-        step="batch norm, variances from 0 to 1e38, folded",
-        expected=f"p_slip to {P_SLIP_ERROR_MAX:.0e}",
-        found=f"{error:.1e}",
-    )
     assert error < P_SLIP_ERROR_MAX
 
 
-def test_extreme_logits_give_a_probability_and_the_verdict_of_their_sign(
-    note: Note, tmp_path: Path
-) -> None:
+def test_extreme_logits_give_a_probability_and_the_verdict_of_their_sign(tmp_path: Path) -> None:
     path = tmp_path / "logits.onnx"
     path.write_bytes(logit_model(TactileModel(zoo.find("mlp")).contract))
     model, limits = TactileModel(path), Limits(max_age_ns=0)
@@ -86,11 +77,6 @@ def test_extreme_logits_give_a_probability_and_the_verdict_of_their_sign(
         decision, _ = decide(p_slip, (), HELD, 0, limits)
         right = decision is (Decision.SLIP if logit >= 0.0 else Decision.STABLE)
         judged += right and 0.0 <= p_slip <= 1.0
-    note(
-        step="logits to +-1e4 and softmax underflow",
-        expected=f"p_slip to {P_SLIP_ERROR_MAX:.0e}, verdict by the sign",
-        found=f"{max(errors):.1e}, {judged} of {len(logits)} judged, sum off 1 by {max(sums):.0e}",
-    )
     assert max(errors) < P_SLIP_ERROR_MAX
     assert judged == len(logits)
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +30,7 @@ from graspd.models.training.evaluating.style import (
     to_svg,
 )
 from graspd.models.training.reports.candidates import Row, candidates, measure
+from graspd.models.training.reports.machine import described, machine
 
 READINGS, PACED = 2000, 300
 QUICK_READINGS, QUICK_PACED = 100, 5
@@ -97,8 +96,7 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> R
     times = measure({row["name"]: step for row, step in several}, readings, paced)
     rows = [{**row, "time": times[row["name"]]} for row, _ in several]
     return {
-        "machine": {"processor": _processor(), "python": platform.python_version()}
-        | {package: version(package) for package in ("numpy", "onnxruntime")},
+        "machine": machine(),
         "quick": quick,
         "readings": {"hot": readings, "paced": paced},
         "rows": sorted(rows, key=_rank),
@@ -112,7 +110,7 @@ def _rank(row: Row) -> tuple[str, float]:
 
 def table(measured: Report) -> list[str]:
     """Return the lines of a Markdown table of all rows, with a line on how it was made."""
-    machine = ", ".join(f"{name} {value}" for name, value in measured["machine"].items())
+    machine = described(measured["machine"])
     made = (
         f"{machine}; {measured['readings']['hot']} readings hot, {measured['readings']['paced']} "
         f"paced; `graspd report error-vs-time`"
@@ -152,16 +150,6 @@ def _interval(error: dict[str, float]) -> str:
 
 def _score(error: dict[str, float], name: str) -> str:
     return f"{error[name]:.3f}" if error else "-"
-
-
-def _processor() -> str:
-    """Return the name of the processor, or its architecture where the kernel does not tell."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.machine())
 
 
 def error_of(row: Row, protocols: Sequence[str]) -> dict[str, float]:

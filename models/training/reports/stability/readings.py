@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import COUNT_MAX, ELECTRODES
 from graspd.models.contract import SeenCounts
 
-ELECTRODES, COUNT_MAX = 24, 4095
 RANDOM_READINGS = 300
-"""Of each random kind. A model and its reference take up to 1 ms for one."""
+"""Readings of each random kind. A model and its reference take up to 1 ms for one."""
 DENORMAL = 5e-310
 """Below the smallest normal double, 2.2e-308."""
 
@@ -32,6 +32,7 @@ def likely_grasps(seen: SeenCounts, seed: int = 0) -> Raw:
 
 
 def equal(likely: Raw) -> Counts:
+    """All electrodes equal, at four levels."""
     return np.stack([np.full_like(likely[0], level) for level in (1, 2, 2000, COUNT_MAX - 1)])
 
 
@@ -67,22 +68,26 @@ def unequal(factor: float) -> Callable[[Raw], Counts]:
 
 
 def one_finger_dead(likely: Raw) -> Counts:
+    """The first finger reads the same at all electrodes."""
     dead = likely[:20].copy()
     dead[:, 0] = 2000
     return dead
 
 
 def all_at(level: int) -> Callable[[Raw], Counts]:
+    """All electrodes at this level."""
     return lambda likely: np.full_like(likely[:1], level)
 
 
 def alternating(likely: Raw) -> Counts:
+    """Every other electrode at the other rail."""
     counts = np.zeros_like(likely[:2])
     counts[0, :, ::2] = counts[1, :, 1::2] = COUNT_MAX
     return counts
 
 
 def one_at_a_rail(likely: Raw) -> Counts:
+    """An electrode in turn at each rail."""
     counts = likely[: 2 * ELECTRODES].copy()
     for electrode in range(ELECTRODES):
         counts[2 * electrode : 2 * electrode + 2, 0, electrode] = (0, COUNT_MAX)
@@ -90,6 +95,8 @@ def one_at_a_rail(likely: Raw) -> Counts:
 
 
 def one_reads(value: float) -> Callable[[Raw], Counts]:
+    """An electrode in turn reads this value, which no sensor sends."""
+
     def make(likely: Raw) -> Counts:
         counts = likely[:ELECTRODES].astype(np.float64)
         for reading in range(ELECTRODES):
@@ -100,17 +107,17 @@ def one_reads(value: float) -> Callable[[Raw], Counts]:
 
 
 def all_read(value: float) -> Callable[[Raw], Counts]:
+    """All electrodes read this value."""
     return lambda likely: np.full(likely[:1].shape, value)
 
 
 def random_counts(likely: Raw) -> Counts:
+    """Any counts of 12 bits."""
     random = np.random.default_rng(0)
     return random.integers(0, COUNT_MAX + 1, likely.shape).astype(np.uint16)
 
 
 LIKELY, RANDOM = "counts like the training's", "random 12-bit counts"
-ONE_HAND = frozenset({LIKELY, RANDOM})
-"""Cases whose readings one hand feels, one after the other."""
 NEVER_JUDGED: dict[str, Callable[[Raw], Counts]] = {
     "all electrodes equal": equal,
     "sigma of 1 count": two_levels((1, 2000, 4090), 2),
@@ -130,7 +137,7 @@ NEVER_JUDGED: dict[str, Callable[[Raw], Counts]] = {
     "all electrodes read denormal": all_read(DENORMAL),
     "all electrodes read negative zero": all_read(-0.0),
 }
-"""Cases of which every verdict must be `unknown`."""
+"""Cases of which no reading may be judged."""
 READINGS: dict[str, Callable[[Raw], Counts]] = NEVER_JUDGED | {
     "one electrode far off": one_far_off,
     "fingers' spreads 1e6 apart": unequal(1e3),
@@ -140,4 +147,4 @@ READINGS: dict[str, Callable[[Raw], Counts]] = NEVER_JUDGED | {
     RANDOM: random_counts,
     LIKELY: np.copy,
 }
-"""What makes the readings of a case from likely grasps of a hand."""
+"""Cases by name: each makes its readings from likely grasps of a hand."""

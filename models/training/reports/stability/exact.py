@@ -1,19 +1,17 @@
-"""What a model should be fed with, and should answer, if nothing were rounded.
+"""Input and answer of a model if nothing were rounded.
 
 Inputs are made in extended precision and by definition, step for step: pixels are filled one by one
-in passes, moments are taken in two passes. None of the shortcuts of `graspd.models.tactile_image`
-and `graspd.models.inputs` is taken here.
+in passes, moments are taken in two passes. No shortcut of `graspd.models.tactile_image` and
+`graspd.models.inputs` is used.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
-from onnx import numpy_helper
-from onnx.reference import ReferenceEvaluator
 
 from graspd.models.contract import (
     OUTPUT_NAME,
@@ -28,12 +26,14 @@ from graspd.models.layout import LAYOUTS, Layout
 from graspd.models.session_statistics import SessionState
 from graspd.models.tactile_image import Composition, Fill, Normalisation
 
+if TYPE_CHECKING:
+    import onnx
+
 Exact = NDArray[np.longdouble]
 Standard = tuple[Exact, Exact]
 """Mean and spread by which features are standardised, shape (features,) each."""
 CHUNK = 128
 """Readings at a time: the products of a convolution of these take 30 MB."""
-NARROW = (onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16)
 STEPPED = frozenset({"TreeEnsembleClassifier", "TreeEnsembleRegressor"})
 """Operators that jump: the least change of an input may change the answer by a whole step."""
 
@@ -46,6 +46,9 @@ class Reference:
     """
 
     def __init__(self, path: Path) -> None:
+        import onnx
+        from onnx.reference import ReferenceEvaluator
+
         model = onnx.load(path)
         operators = frozenset(node.op_type for node in model.graph.node)
         self.is_stepped = bool(operators & STEPPED)
@@ -68,15 +71,18 @@ class Reference:
 
 def _widen(model: onnx.ModelProto) -> None:
     """Turn all that is a narrower float into float64, in place."""
+    from onnx import TensorProto, numpy_helper
+
+    narrow = TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.BFLOAT16
     tensors = list(model.graph.initializer)
     for node in model.graph.node:
         for attribute in node.attribute:
             if attribute.HasField("t"):
                 tensors.append(attribute.t)
-            elif node.op_type == "Cast" and attribute.i in NARROW:
-                attribute.i = onnx.TensorProto.DOUBLE
+            elif node.op_type == "Cast" and attribute.i in narrow:
+                attribute.i = TensorProto.DOUBLE
     for tensor in tensors:
-        if tensor.data_type in NARROW:
+        if tensor.data_type in narrow:
             values = numpy_helper.to_array(tensor).astype(np.float64)
             tensor.CopyFrom(numpy_helper.from_array(values, tensor.name))
 
@@ -86,10 +92,10 @@ def exact_input(
     counts: NDArray[np.generic],
     standard: Standard | None = None,
 ) -> tuple[Exact, Exact]:
-    """Inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24).
+    """Return inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24).
 
     Features are standardised by `standard`, mean and spread (features,), or by the training's.
-    Where a finger is flat its part of the input is zero.
+    The part of a flat finger is zero.
     """
     values = counts.astype(np.longdouble)
     match contract.input:
@@ -105,7 +111,7 @@ def exact_input(
 
 
 def exact_standard(session: SessionInput, state: SessionState) -> Standard:
-    """Mean and spread of the features of a session: its own, blended with the training's."""
+    """Return mean and spread of the features of a session: its own, blended with the training's."""
     features = len(session.mean)
     own, prior = np.longdouble(state.weight), np.longdouble(session.prior_grasps)
     mean = np.array(state.mean[:features], dtype=np.longdouble)
@@ -124,9 +130,9 @@ def exact_softening(
     temperature: float,
     threshold: float,
 ) -> NDArray[np.float64]:
-    """What a young session publishes for these: the margin over the temperature.
+    """Return the probability of a young session: the margin over the temperature.
 
-    Counted from the threshold, and probabilities taken for `TINY` at least, by definition.
+    Counted from the threshold; probabilities are `TINY` at least, by definition.
     """
     slip = np.maximum(p_slip, TINY).astype(np.longdouble)
     stable = np.maximum(p_stable, TINY).astype(np.longdouble)
