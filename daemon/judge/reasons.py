@@ -8,7 +8,7 @@ them makes the verdict `unknown`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -105,6 +105,38 @@ OF_THE_HAND = frozenset(
     {Reason.NO_CONTACT, Reason.MOVING, Reason.SETTLING, Reason.NOT_TARED, Reason.NOT_ASKED}
 )
 """Reasons of an open hand, or of a grasp that settles."""
+
+
+class Need(StrEnum):
+    """Whether a person has to do something about a reason."""
+
+    NORMAL = "normal"
+    """Ordinary work."""
+    WAIT = "wait"
+    """It passes by itself, or with the next ordinary steps."""
+    ACT = "act"
+
+
+NEEDS = {
+    Reason.NO_CONTACT: Need.NORMAL,
+    Reason.NOT_ASKED: Need.NORMAL,
+    Reason.LOW_CONFIDENCE: Need.NORMAL,
+    Reason.OUTCOME_TOLD: Need.NORMAL,
+    Reason.MOVING: Need.WAIT,
+    Reason.SETTLING: Need.WAIT,
+    Reason.NOT_TARED: Need.WAIT,
+    Reason.NOT_CALIBRATED: Need.WAIT,
+    Reason.UNPROVEN: Need.WAIT,
+}
+"""Reasons that are not `Need.ACT`."""
+
+
+def need_of(reasons: Iterable[Reason]) -> Need:
+    """Return the most urgent need of several reasons."""
+    needs = {NEEDS.get(reason, Need.ACT) for reason in reasons}
+    return next((need for need in reversed(Need) if need in needs), Need.NORMAL)
+
+
 UNREADABLE = frozenset(
     {
         Reason.STALE,

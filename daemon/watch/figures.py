@@ -5,12 +5,16 @@ from __future__ import annotations
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.judge.windows import LONG_NS
 from graspd.daemon.publish.messages import Status, Verdict
+from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.watch.snapshot import Line
 
 SURE_MS = LONG_NS / 1e6
 """Time without motion, ms, after which a slow slide is excluded."""
 LIKELY = 0.25
 """Largest `p_slip` with which `stable` is shown as a promise."""
+SHARE_MIN = 0.01
+"""Smallest share that is shown as a number."""
+REFUSED = OutcomeStatus.CONTRADICTS, OutcomeStatus.UNKNOWN
 UNCOVERED = Line("risk", "covers only announced lifts, and none was announced")
 NO_OUTCOME = "no outcome reported yet"
 SUPERVISED = Line(
@@ -18,28 +22,31 @@ SUPERVISED = Line(
 )
 
 
-def doubt(verdict: Verdict) -> str | None:
-    """Return why outcomes do not support this `stable` verdict yet; None: they do."""
+def doubt(verdict: Verdict) -> Line | None:
+    """Return in a word and a line why outcomes do not support this `stable`; None: they do."""
     risk, p_slip = verdict.risk, verdict.p_slip
     if verdict.early:
-        return "judged early: it may still slide slowly, and is judged once more"
+        return Line("early", "it may still slide slowly, and is judged once more")
     if p_slip is None or p_slip > LIKELY:
-        return "a slip is too likely for a promise: grasp again, or watch the lift"
+        return Line("risky", "a slip is too likely for a promise: grasp again, or watch the lift")
     if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
-        return f"{NO_OUTCOME}, so what `stable` is worth here is not known"
+        return Line("unproven", f"{NO_OUTCOME}, so what `stable` is worth here is not known")
     if risk.target is None:
-        return "no target is set that would keep slips among `stable` few: [risk]"
+        return Line(
+            "unlimited", "no target is set that would keep slips among `stable` few: [risk]"
+        )
     if risk.lifts * risk.target < 1.0:
-        return f"too few `stable` lifts are reported yet to show the target, {percent(risk.target)}"
+        few = "too few `stable` lifts are reported yet to show the target"
+        return Line("unproven", f"{few}, {percent(risk.target)}")
     if risk.slips > risk.lifts * risk.target:
-        return "more `stable` lifts slipped than the target so far"
+        return Line("disproven", "more `stable` lifts slipped than the target so far")
     return None
 
 
 def rests_on(verdict: Verdict) -> str:
     """Return one line on the outcomes and the risk behind the verdict."""
     network, risk = verdict.p_slip_model, verdict.risk
-    said = "" if network is None else f"slip probability by the network alone {percent(network)}, "
+    said = "" if network is None else f"slip probability by the network alone {likely(network)}, "
     if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
         return said + NO_OUTCOME
     said += f"rests on {counted(verdict.outcomes, 'lift')}; "
@@ -69,8 +76,15 @@ def lift(verdict: Verdict, ended: str | None) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share, 0..1, as a text in percent: "9.2 %", "0.31 %", "42 %"."""
-    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+    """Return a share that a user set, 0..1, in percent."""
+    return f"{100 * share:g} %"
+
+
+def likely(p_slip: float) -> str:
+    """Return a probability in percent; the first and the last percent are not told apart."""
+    if p_slip < SHARE_MIN:
+        return "< 1 %"
+    return "> 99 %" if p_slip > 1.0 - SHARE_MIN else f"{100 * p_slip:.0f} %"
 
 
 def counted(count: int, what: str) -> str:
@@ -79,79 +93,46 @@ def counted(count: int, what: str) -> str:
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Return how learning goes, what matters most first."""
-    risk = None if verdict is None else verdict.risk
+    """Return how session and learning go, what matters most first."""
+    if status is None:
+        return []
     lines = []
-    if status is not None and status.lifts is not None:
+    if status.lifts is not None:
         lines.append(Line("never reported", counted(status.lifts.unreported, "lift")))
         if status.lifts.covered is False:
             lines.append(UNCOVERED)
+    risk = None if verdict is None else verdict.risk
     if risk is not None:
+        lines.append(Line("awaited", counted(risk.outstanding, "outcome")))
+        announced = f"{counted(risk.announced, 'lift')}, {risk.awaited} awaited"
+        lines.append(Line("announced", announced))
         lines.append(Line("warm-up left", counted(risk.warm_up_left, "outcome")))
-        lines.append(Line("outstanding", counted(risk.outstanding, "lift")))
-        lines.append(Line("announced", f"{counted(risk.announced, 'lift')}, {risk.awaited} out"))
-    learner = None if status is None else status.learner
+        if risk.bound is not None:
+            slips = f"{risk.slips} of {counted(risk.lifts, 'lift')}, {int(risk.bound)} allowed"
+            lines.append(Line("slips", slips))
+    learner = status.learner
     if learner is not None:
-        lines.append(Line("learner", "on" if learner.enabled else "off"))
-        lines.append(Line("learned from", counted(learner.outcomes, "outcome")))
-        lines.append(Line("uncertainty", percent(learner.uncertainty)))
-    if risk is not None and risk.target is not None:
-        bound = "no bound" if risk.bound is None else f"at most {risk.bound:.1f}"
-        lifts = counted(risk.lifts, "lift")
-        lines.append(Line("slips of `stable`", f"{risk.slips} of {lifts}, {bound}"))
-    if learner is not None:
-        lines += [Line(f"outcomes {kind.value}", str(n)) for kind, n in learner.told.items()]
+        learned = counted(learner.outcomes, "outcome") if learner.enabled else "nothing: it is off"
+        lines.append(Line("learned from", learned))
+        refused = sum(learner.told.get(kind, 0) for kind in REFUSED)
+        lines.append(Line("refused", counted(refused, "outcome")))
+    if status.session_grasps is not None:
+        missing = "" if status.session_calibrated else "not yet "
+        lines.append(Line("session", f"{status.session_grasps} grasps, {missing}calibrated"))
     return lines
 
 
-def timing(
-    verdict: Verdict | None, status: Status | None, verdicts_hz: float, lost: int, unreadable: int
-) -> list[Line]:
-    """Return rates, delays and losses; `lost` counts gaps of `seq`."""
-    lines = [
-        Line("readings", "-" if status is None else f"{status.readings_hz:.0f} /s"),
-        Line("verdicts", f"{verdicts_hz:.0f} /s"),
-        Line("age", "-" if verdict is None else f"{verdict.age_ms:.1f} ms"),
-    ]
+def timing(verdict: Verdict | None, status: Status | None, lost: int) -> list[Line]:
+    """Return rates, delays and losses; `lost`: messages that did not come here or were odd."""
+    lines = [] if verdict is None else [Line("age", f"{verdict.age_ms:.1f} ms")]
     if status is not None:
-        delays, jitter = status.latency_us, status.jitter_us
+        delays = status.latency_us
         lines += [
-            Line("latency p50, p99", f"{_us(delays.get('p50'))}, {_us(delays.get('p99'))}"),
-            Line("longest latency", _us(delays.get("max"))),
-            Line("jitter p99", _us(jitter.get("p99"))),
+            Line("readings", f"{status.readings_hz:.0f} /s"),
+            Line("latency", f"{_us(delays.get('p50'))}, 99 % below {_us(delays.get('p99'))}"),
             Line("late", f"{status.late_readings} readings"),
-            Line("worst age", f"{status.worst_age_ms:.0f} ms"),
         ]
-    return [
-        *lines,
-        Line("lost here", f"{lost} messages"),
-        Line("not understood", f"{unreadable} messages"),
-    ]
-
-
-def session(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Return whether the session is calibrated, and which electrodes are repaired."""
-    said = "this model needs none"
-    if status is None:
-        said = "-"
-    elif status.session_grasps is not None:
-        missing = "" if status.session_calibrated else "not yet "
-        said = f"{status.session_grasps} grasps, {missing}calibrated"
-    repaired = [] if verdict is None else verdict.repaired
-    return [Line("session", said), Line("repaired now", ", ".join(repaired) or "nothing")]
-
-
-def drivers(status: Status | None) -> list[Line]:
-    """Return the counters of the drivers that are not 0, and versions."""
-    if status is None:
-        return []
-    lines = [
-        Line(f"{driver} {name}", str(count))
-        for driver, counters in status.drivers.items()
-        for name, count in counters.items()
-        if count
-    ]
-    return lines + [Line(name, version) for name, version in status.versions.items()]
+    return [*lines, Line("lost here", counted(lost, "message"))]
 
 
 def _us(value: float | None) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from graspd.biotac import ELECTRODES, Finger
+from graspd.biotac import ELECTRODES, Finger, electrode_name
 from graspd.daemon.judge.reasons import Decision, GateState
-from graspd.daemon.publish.messages import OutcomeMessage, Tactile, Verdict
+from graspd.daemon.publish.messages import OutcomeMessage, Status, Tactile, Verdict
 from graspd.daemon.watch.figures import lift
 from graspd.daemon.watch.snapshot import FingerImage, FingerMotion, JudgedGrasp
 from graspd.models.levels import PIXELS, RestCounts, fall_of, levels_of
@@ -49,19 +49,24 @@ class Fingers:
                 self._rest.learn(finger, counts, sound)
         return True
 
-    def images(self, verdict: Verdict, now_ns: int) -> list[FingerImage]:
+    def images(self, verdict: Verdict, status: Status | None, now_ns: int) -> list[FingerImage]:
         """Return the image of each finger in the newest reading; none if it is too old."""
+        broken = set() if status is None else status.health.keys()
         tactile = self._tactile
         if tactile is None or now_ns - self._tactile_ns > OLD_NS:
             return []
-        return [self._image(tactile, index, verdict) for index in range(len(tactile.fingers))]
+        indices = range(len(tactile.fingers))
+        return [self._image(tactile, index, verdict, broken) for index in indices]
 
-    def _image(self, tactile: Tactile, index: int, verdict: Verdict) -> FingerImage:
+    def _image(
+        self, tactile: Tactile, index: int, verdict: Verdict, broken: Collection[str]
+    ) -> FingerImage:
         name = tactile.fingers[index]
         counts = np.array(tactile.counts[index], dtype=np.float64)
-        sound = np.array(tactile.faults[index]) == 0
-        electrodes = range(1, ELECTRODES + 1)
-        repaired = [f"{name}_{number}" in verdict.repaired for number in electrodes]
+        electrodes = [electrode_name(name, place) for place in range(ELECTRODES)]
+        repaired = [electrode in verdict.repaired for electrode in electrodes]
+        faulty = np.array(tactile.faults[index]) != 0
+        sound = ~(faulty | repaired | [electrode in broken for electrode in electrodes])
         rest = self._rest.of(name)
         fall = fall_of(counts, sound, rest)
         return FingerImage(
@@ -70,7 +75,8 @@ class Fingers:
             from_rest=rest is not None,
             levels=levels_of(fall, from_rest=rest is not None).tolist(),
             deepest=round(float(fall.max())),
-            marked=sorted(PIXELS[electrode] for electrode in np.flatnonzero(~sound | repaired)),
+            marked=sorted(PIXELS[electrode] for electrode in np.flatnonzero(~sound)),
+            broken=_broken(np.flatnonzero(~sound).tolist(), repaired),
             motion=_motion(verdict, name),
             state=(verdict.fingers or {}).get(name),
         )
@@ -78,6 +84,14 @@ class Fingers:
     @property
     def joints(self) -> dict[str, float]:
         return {} if self._tactile is None else self._tactile.joints
+
+
+def _broken(places: Sequence[int], repaired: Sequence[bool]) -> str:
+    """Return places, from 0, as numbers from 1: "7 repaired; 8, 9 broken"."""
+    kinds: dict[str, list[str]] = {"repaired": [], "broken": []}
+    for place in places:
+        kinds["repaired" if repaired[place] else "broken"].append(str(place + 1))
+    return "; ".join(f"{', '.join(found)} {kind}" for kind, found in kinds.items() if found)
 
 
 def _motion(verdict: Verdict, finger: Finger) -> FingerMotion | None:

@@ -16,7 +16,7 @@ let came = now(), looked = now();
 let fastest = Infinity;  // way of a snapshot on this connection, with the difference of the clocks, ms
 
 function text(node, value) { if (node.textContent !== value) node.textContent = value; }
-function percent(share) { return `${(100 * share).toFixed(0)} %`; }
+function percent(share) { return share < .01 ? "< 1 %" : share > .99 ? "> 99 %" : `${(100 * share).toFixed(0)} %`; }
 function clock(seconds) { return new Date(1000 * seconds).toTimeString().slice(0, 8); }
 function likely(grasp) { return grasp.p_slip === null ? "" : `slip probability ${percent(grasp.p_slip)}`; }
 function called(grasp) { return grasp.verdict + (grasp.p_slip === null ? "" : `, ${likely(grasp)}`); }
@@ -63,6 +63,10 @@ function lines(parent, items) {
     text(node.children[0], line.what); text(node.children[1], ": " + line.advice);
   });
 }
+function problems(parent, items) {
+  lines(parent, items);
+  items.forEach((line, at) => { parent.children[at].dataset.need = line.need; });
+}
 function rows(table, items) {
   children(table, items, () => element("tr", element("td"), element("td")), (node, line) => {
     text(node.children[0], line.what); text(node.children[1], line.advice);
@@ -95,8 +99,8 @@ function drawMotion(bar, words, motion, state) {
   bar.dataset.motion = now === null ? "unknown" : now > limit ? "moving" : "still";
   bar.style.setProperty("--share", `${now === null ? 0 : Math.min(50 * now / limit, 100)}%`);
   words.dataset.state = state ?? "unknown";
-  const figures = now === null ? "" : ` ${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`;
-  text(words, (state ?? (now === null ? "motion unknown" : "moves")) + figures);
+  const figures = now === null ? "not known" : `${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`;
+  text(words, `${state === null ? "" : `${state}, `}motion ${figures}`);
 }
 
 // A second of the timeline in words; `ago` counts from the end of the history.
@@ -105,7 +109,7 @@ function momentOf(minutes, ago) {
   if (at < 0) return "no second here: watch began later";
   const codes = minutes.history[at], names = LANES.filter(([code]) => codes.includes(code)).map(([, name]) => name);
   const share = minutes.probability[at];
-  const probability = share < 0 ? "no slip probability" : `highest slip probability ${share} %`;
+  const probability = share < 0 ? "no slip probability" : `highest slip probability ${percent(share / 100)}`;
   return `${clock(minutes.t - ago)}: ${names.join(", ")}; ${probability}`;
 }
 
@@ -238,8 +242,8 @@ class Hand {
     children(this.part("joints"), joints, () => element("div", element("span"), element("b")), (node, [name, angle]) => {
       text(node.children[0], name); text(node.children[1], `${(angle * 180 / Math.PI).toFixed(1)}\u00b0`);
     });
-    lines(this.part("health"), seen.health.length ? seen.health :
-      [{what: seen.state === null ? "not known" : "well", advice: seen.state === null ? "no status comes" : "nothing to be done"}]);
+    problems(this.part("health"), seen.health.length ? seen.health :
+      [{need: "normal", what: seen.state === null ? "not known" : "well", advice: seen.state === null ? "no status comes" : "nothing to do"}]);
     this.drawTables();
   }
   drawMinutes(quiet) {
@@ -247,7 +251,7 @@ class Hand {
     drawTimeline(this.part("timeline"), minutes, paused ? clock(minutes.t) : "now", this.pointed);
     this.part("time").classList.toggle("paused", paused);
     this.say("minutes", paused ? `Paused: five minutes until ${clock(minutes.t)}` : "Last five minutes: verdicts of each second");
-    this.say("pause", paused ? "go on" : "pause");
+    this.say("pause", paused ? "resume" : "pause");
     this.say("at", this.pointed === null ? "" : momentOf(minutes, this.pointed));
     this.part("at").hidden = this.pointed === null;
     this.part("key").hidden = this.pointed !== null;
@@ -264,6 +268,7 @@ class Hand {
     this.drawFingers(images);
   }
   tone() { return gone || this.seen === null ? "silent" : this.seen.tone; }
+  word() { return gone || this.seen === null ? "no connection" : this.seen.why[0]?.what ?? ""; }
   headline() {
     if (this.seen === null || this.seen.last_t === null) return "no verdict yet";
     return gone ? "unknown" : this.seen.headline;
@@ -284,9 +289,9 @@ class Hand {
 
   drawFingers(fingers) {
     children(this.part("fingers"), fingers,
-      () => element("figure", element("figcaption", element("b"), element("span"), element("span")), element("canvas"), element("div"), element("span")),
+      () => element("figure", element("figcaption", element("b"), element("span"), element("span")), element("canvas"), element("div"), element("span"), element("b")),
       (node, finger) => {
-        const [name, touch, depth] = node.children[0].children, [, canvas, bar, words] = node.children;
+        const [name, touch, depth] = node.children[0].children, [, canvas, bar, words, broken] = node.children;
         text(name, finger.name);
         text(touch, finger.touches === null ? "" : finger.touches ? "touches" : "free");
         touch.className = finger.touches ? "touch" : "faint";
@@ -295,6 +300,7 @@ class Hand {
         drawFinger(canvas, finger);
         bar.className = "moves"; words.className = "faint";
         drawMotion(bar, words, finger.motion, finger.state);
+        text(broken, finger.broken && `\u2715 ${finger.broken}`); broken.hidden = finger.broken === "";
       });
     const canvas = this.part("legend").querySelector("canvas"), context = sized(canvas);
     for (let x = 0; x < canvas.width; x++) {
@@ -303,7 +309,7 @@ class Hand {
     }
     const rest = fingers.length === 0 || fingers[0].from_rest;
     this.say("scale", fingers.length === 0 ? "no readings to see" :
-      `pressed, ${rest ? "to 1600 counts below rest" : "below the finger's own median"}; \u2715 faulty or repaired`);
+      `pressed, ${rest ? "to 1600 counts below rest" : "below the finger's own median"}; \u2715 broken`);
   }
 
   drawTables() {
@@ -317,11 +323,11 @@ class Hand {
         const [mark, word] = node.children[1].children;
         mark.dataset.verdict = grasp.verdict; text(mark, MARKS[grasp.verdict]);
         text(word, grasp.verdict);
-        text(node.children[2], likely(grasp)); node.children[2].className = "likely";
+        text(node.children[2], grasp.p_slip === null ? "" : percent(grasp.p_slip));
         text(node.children[3], grasp.lift + (grasp.supervised ? ", supervised" : ""));
         node.children[3].className = !["held", "slipped"].includes(grasp.lift) ? "faint" : grasp.verdict === "stable" && grasp.lift === "slipped" ? "bad" : "";
       });
-    for (const name of ["learning", "timing", "session", "drivers"]) rows(this.part(name), this.seen[name]);
+    for (const name of ["learning", "timing"]) rows(this.part(name), this.seen[name]);
   }
 }
 
@@ -347,10 +353,11 @@ function drawStrip() {
   const strip = document.getElementById("strip");
   strip.hidden = hands.length < 2;
   document.getElementById("hands").classList.toggle("several", hands.length > 1);
-  children(strip, hands, () => element("a", element("span"), element("b")), (node, hand) => {
+  children(strip, hands, () => element("a", element("span"), element("b"), element("span"), element("span")), (node, hand) => {
     const id = `hand-${hands.indexOf(hand)}`;
     hand.root.id = id; node.href = `#${id}`; node.dataset.tone = hand.tone();
     text(node.children[0], hand.seen?.hand ?? "?"); text(node.children[1], hand.headline());
+    text(node.children[2], hand.word()); text(node.children[3], gone ? "" : hand.seen?.not_well ?? "");
   });
 }
 

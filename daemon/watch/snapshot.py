@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import msgspec
 
-from graspd.daemon.judge.reasons import FingerState
+from graspd.daemon.judge.reasons import FingerState, Need
 
 
 class Tone(StrEnum):
@@ -54,6 +54,8 @@ class Line(msgspec.Struct, frozen=True):
 
     what: str
     advice: str
+    need: Need = Need.ACT
+    """Whether a person has to do something, if the line says what is not well."""
 
 
 class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,7 +80,9 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     deepest: int
     """Largest fall of an electrode, counts."""
     marked: list[int]
-    """Pixels of electrodes that are faulty or repaired."""
+    """Pixels of electrodes that are broken or repaired."""
+    broken: str
+    """Numbers of these electrodes, in words; empty: none."""
     motion: FingerMotion | None
     """Motion; None: the daemon has no gate."""
     state: FingerState | None = None
@@ -117,6 +121,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Result of `figures.rests_on`; empty before the first message."""
     p_slip: float | None
     why: list[Line]
+    """Why the verdict is as it is; the first has one word to stand beside it."""
     grasp: int | None
     gate: str | None
     contact: list[str] | None
@@ -131,16 +136,14 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     joints: dict[str, float]
     """Angle of each joint, rad."""
     health: list[Line]
-    """Problems, and what to do about each."""
+    """Parts that are not as they should be, first those to act on."""
     not_well: str
-    """Problems in a few words; empty: no problem, or not known."""
+    """Those to act on in a few words; empty: none, or not known."""
     state: str | None
     """`running`, `no readings` or `stopping`; None: not known."""
     model: str | None
     learning: list[Line]
     timing: list[Line]
-    session: list[Line]
-    drivers: list[Line]
     history: list[str]
     """Tones of the last 300 seconds, the oldest first; see `TONE_CODE`."""
     history_p: list[int]

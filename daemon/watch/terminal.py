@@ -21,8 +21,10 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from graspd.daemon.judge.reasons import Need
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import printable
+from graspd.daemon.watch.figures import likely
 from graspd.daemon.watch.snapshot import (
     FingerImage,
     FingerMotion,
@@ -166,17 +168,13 @@ def draw(hands: Sequence[Snapshot], width: int, chosen: int, page: int) -> Rende
 
     `page`: how many pages of the lines that do not fit are skipped.
     """
-    if len(hands) == 1:
-        return _hand(hands[0], page, "q ends")
-    if width // len(hands) >= HAND_COLUMNS:
+    if len(hands) > 1 and width // len(hands) >= HAND_COLUMNS:
         beside = Table.grid(expand=True, padding=(0, 2))
         for _ in hands:
             beside.add_column(ratio=1)
-        beside.add_row(*[_hand(hand, page, "q ends") for hand in hands])
+        beside.add_row(*[_hand([hand], 0, page) for hand in hands])
         return beside
-    shown = hands[chosen]
-    others = [_verdict(hand, wraps=True) for hand in hands if hand is not shown]
-    return _hand(shown, page, "q ends, tab shows the next hand", others)
+    return _hand(hands, chosen, page)
 
 
 class Fitted:
@@ -211,7 +209,9 @@ def _cut(lines: int, troubles: int) -> Text:
     return Text(f"{lines} more lines{wrong}: space shows them", style="reverse", no_wrap=True)
 
 
-def _hand(seen: Snapshot, page: int, keys: str, others: Sequence[Text] = ()) -> RenderableType:
+def _hand(hands: Sequence[Snapshot], chosen: int, page: int) -> RenderableType:
+    """Return the verdicts of all hands, and the details of the chosen one."""
+    seen = hands[chosen]
     wrong, figures = _table(), _table()
     for label, text in [*_labelled("why", seen.why), *_health(seen)]:
         wrong.add_row(label, Text(text))
@@ -222,8 +222,11 @@ def _hand(seen: Snapshot, page: int, keys: str, others: Sequence[Text] = ()) -> 
     # An operator sees this clock stand still when nothing is drawn any more.
     clock = time.strftime("%H:%M:%S", time.localtime(seen.t))
     model = printable(seen.model or "no model yet", NAME_MAX)
-    header = Text(f"graspd {clock} ({keys})  {seen.state or '-'}  {model}")
-    return Fitted(Group(*others, _verdict(seen), header), wrong, figures, page)
+    keys = "q ends" if len(hands) == 1 else "q ends, tab: next hand"
+    name = printable(seen.hand or "-", NAME_MAX)
+    header = Text(f"{clock} details of {name}: {seen.state or '-'}, {model} ({keys})")
+    verdicts = [_verdict(hand, wraps=len(hands) > 1) for hand in hands]
+    return Fitted(Group(*verdicts, header), wrong, figures, page)
 
 
 def _table() -> Table:
@@ -233,13 +236,13 @@ def _table() -> Table:
 
 
 def _verdict(seen: Snapshot, *, wraps: bool = False) -> Text:
-    """Return the verdict and what is not well. `wraps`: no other line says it."""
+    """Return the verdict, the word that says why, and what is not well."""
     name = printable(seen.hand or "-", NAME_MAX)
     why = seen.why[0].what if seen.why else ""
     if seen.not_well:
         why += f"; {printable(seen.not_well, 2 * NAME_MAX)}"
     word = f" {seen.headline.upper()} "
-    probability = "" if seen.p_slip is None else f" slip probability {100 * seen.p_slip:.0f} %,"
+    probability = "" if seen.p_slip is None else f" slip probability {likely(seen.p_slip)},"
     return Text.assemble(
         (f"{name} ", "bold"), (word, STYLES[seen.tone]), f"{probability} {why}", no_wrap=not wraps
     )
@@ -258,7 +261,8 @@ def _verdict_rows(seen: Snapshot) -> Iterator[Row]:
 def _health(seen: Snapshot) -> list[Row]:
     if not seen.health:
         return [("health", "all is well" if seen.state else "not known")]
-    return _labelled("health", seen.health)
+    needs = [[line for line in seen.health if line.need is need] for need in reversed(Need)]
+    return [row for lines in needs if lines for row in _labelled(lines[0].need.value, lines)]
 
 
 def _labelled(label: str, lines: Sequence[Line]) -> list[Row]:
@@ -271,7 +275,8 @@ def _labelled(label: str, lines: Sequence[Line]) -> list[Row]:
 def _finger(finger: FingerImage) -> str:
     depth = f", fall {finger.deepest} counts" if finger.from_rest else ""
     state = "" if finger.state is None else f", {finger.state}"
-    return ("-" if finger.motion is None else _motion(finger.motion)) + state + depth
+    broken = finger.broken and f", {finger.broken}"
+    return ("-" if finger.motion is None else _motion(finger.motion)) + state + depth + broken
 
 
 def _motion(motion: FingerMotion) -> str:
@@ -282,7 +287,7 @@ def _motion(motion: FingerMotion) -> str:
     still = min(round(share * HALF_BAR), HALF_BAR)
     moving = math.ceil(max(share - 1.0, 0.0) * HALF_BAR)
     bar = f"{'#' * still:-<{HALF_BAR}}|{'#' * moving:-<{HALF_BAR}}"
-    return f"{bar} moves {motion.now:.3g} of {motion.limit:.3g}"
+    return f"{bar} motion {motion.now:.3g} of {motion.limit:.3g}"
 
 
 def _figures(seen: Snapshot) -> Iterator[Row]:
@@ -293,17 +298,15 @@ def _figures(seen: Snapshot) -> Iterator[Row]:
     yield "grasps seen", ", ".join(f"{count} {what}" for what, count in seen.counts.items())
     yield "last grasps", "; ".join(map(_past, seen.grasps)) or "-"
     yield "learning", _flow(seen.learning)
-    for line in seen.session:
-        yield line.what, printable(line.advice, NAME_MAX)
     yield "timing", _flow(seen.timing)
     angles = sorted(seen.joints.items())
     joints = [f"{printable(name, 5)} {math.degrees(rad):.1f}°" for name, rad in angles]
-    yield "joints", ", ".join(joints) or "none"
+    yield "joints", ", ".join(joints) or "no angles come"
     yield "endpoint", f"{printable(seen.endpoint, 2 * NAME_MAX)} {seen.link}"
 
 
 def _past(grasp: JudgedGrasp) -> str:
-    probability = "" if grasp.p_slip is None else f" {100 * grasp.p_slip:.0f} %"
+    probability = "" if grasp.p_slip is None else f" {likely(grasp.p_slip)}"
     supervised = ", supervised" if grasp.supervised else ""
     lift = "" if grasp.lift == "-" else f", {grasp.lift}"
     return f"{grasp.grasp} {grasp.verdict}{probability}{lift}{supervised}"

@@ -8,14 +8,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import msgspec
+from msgspec import structs
 
 from graspd.daemon.judge.reasons import (
     ADVICE,
-    OF_THE_HAND,
     WATCHED_LIFT,
     Decision,
     GateState,
+    Need,
     Reason,
+    need_of,
     to_act_on,
 )
 from graspd.daemon.process.sleep import boottime_ns
@@ -30,7 +32,7 @@ from graspd.daemon.publish.messages import (
 )
 from graspd.daemon.watch import figures
 from graspd.daemon.watch.feed import Feed
-from graspd.daemon.watch.figures import SUPERVISED, doubt, rests_on, stillness
+from graspd.daemon.watch.figures import SUPERVISED, counted, doubt, rests_on, stillness
 from graspd.daemon.watch.hand import OPEN, Fingers, GraspLog
 from graspd.daemon.watch.snapshot import Line, Link, Snapshot, Tone
 
@@ -38,12 +40,14 @@ TICK_S = 0.02
 """Time between two looks at the feeds, s: silence is timed this exactly."""
 SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
-OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
-HALF = 0.5
-"""Smallest `p_slip` at which a slip is likelier than not."""
-HELD_NS = 1_000_000_000
-"""Time for which `slip` stands after its probability has fallen, ns; as `Limits.steady_ns`."""
-HELD = Line("slip, held", "for a second: a moment ago its probability was 50 % or more")
+OVERLOADED = Line(
+    "overloaded",
+    "the PC is too busy to judge each reading: end other programs, or use a smaller model",
+)
+LATE_SHARE = 0.05
+"""Share of the readings of a second from which late ones are not well."""
+FOLLOW = frozenset({Reason.SEQUENCE_GAP, Reason.STALE, Reason.HELD})
+"""Reasons that an overload brings about."""
 NO_VERDICT, LEANS = "no verdict yet", "leans to stable"
 """Headlines beside the verdicts."""
 NO_READINGS = "no readings"
@@ -130,14 +134,12 @@ class View:
         """When the last verdict came."""
         self._clocks_ns: int | None = None
         """Least time from the sending of a verdict, on the daemon's clock, to its arrival."""
-        self._likely: tuple[str, int, int] | None = None
-        """Start, grasp and time, ns, of the last verdict by which a slip was likely."""
         self._gate: GateState | None = None
         self._status: Status | None = None
         self._grasps = GraspLog()
         self._fingers = Fingers()
-        self._received = self._lost = self._unreadable = 0
-        self._rate_marks: deque[tuple[int, int]] = deque(maxlen=SNAPSHOTS_HZ + 1)
+        self._lost = self._late = 0
+        """Messages that are missing or odd; late readings of the last second."""
         self._history = History()
 
     def take(
@@ -154,7 +156,7 @@ class View:
         try:
             message = msgspec.json.decode(payload, type=MESSAGES[kind])
         except (msgspec.DecodeError, UnicodeDecodeError):
-            self._unreadable += 1
+            self._lost += 1
             return
         self._hand = hand
         match message:
@@ -164,10 +166,11 @@ class View:
                 self._gate = message.state
             case Tactile():
                 fits = self._fingers.take(message, now_ns, self._resting())
-                self._unreadable += not fits
+                self._lost += not fits
             case OutcomeMessage():
                 self._grasps.end(message)
             case Status():
+                self._late = _late(self._status, message)
                 self._status = message
 
     def _take_verdict(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> None:
@@ -178,11 +181,8 @@ class View:
             self._lost += verdict.seq - last.seq - 1
         elif last is not None:
             self._clocks_ns = None
-        self._received += 1
         now_ns = self._arrival_ns(verdict, earliest_ns, latest_ns)
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
-        if verdict.p_slip is not None and verdict.p_slip >= HALF:
-            self._likely = verdict.boot_id, verdict.grasp, now_ns
         self._grasps.take(verdict, now_ns)
 
     def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
@@ -208,10 +208,8 @@ class View:
         word = "unknown" if judged is None else judged.verdict.value
         if not (silent and self._is_catching_up(now_ns)):
             self._history.add(now_ns, tone, p_slip)
-        if not silent:
-            self._rate_marks.append((now_ns, self._received))
         wall_t = self._wall()
-        health = [] if status is None or silent else _health(status)
+        health = [] if status is None or silent else _health(status, self._late)
         return Snapshot(
             endpoint=self._endpoint,
             link=self.link,
@@ -229,16 +227,14 @@ class View:
             still=stillness(None if verdict is None else verdict.still_ms),
             grasps=self._grasps.last(now_ns, None if silent else self._held()),
             counts=self._grasps.counts(),
-            fingers=[] if verdict is None else self._fingers.images(verdict, now_ns),
+            fingers=[] if verdict is None else self._fingers.images(verdict, status, now_ns),
             joints={} if silent else self._fingers.joints,
             health=health,
             not_well=_not_well(health),
             state=None if status is None or silent else _state(status),
             model=None if last is None else f"{last.model} {last.model_sha}",
             learning=figures.learning(last, status),
-            timing=figures.timing(last, status, self._rate_hz(), self._lost, self._unreadable),
-            session=figures.session(verdict, status),
-            drivers=figures.drivers(status),
+            timing=figures.timing(last, status, self._lost),
             history=[codes for codes, _ in self._history.seconds],
             history_p=[share for _, share in self._history.seconds],
         )
@@ -253,32 +249,29 @@ class View:
         ):
             return Tone.SILENT, [self._silence(now_ns), *self._where_to_look()]
         if verdict.verdict is Decision.UNKNOWN:
-            why = [Line(reason.value, ADVICE[reason]) for reason in to_act_on(verdict.reasons)]
-            if Reason.STALE in verdict.reasons:
-                why.append(Line("look", self._doctor))
-            if verdict.supervised and WATCHED_LIFT.issuperset(verdict.reasons):
-                return Tone.LEARNING, [SUPERVISED, *why]
-            is_expected = OF_THE_HAND.issuperset(verdict.reasons)
-            return Tone.WAITING if is_expected else Tone.TROUBLE, why
+            return self._unknown(verdict)
         also = [SUPERVISED] if verdict.supervised else []
         if verdict.session_calibrated is False:
             also.append(Line("less sure", ADVICE[Reason.NOT_CALIBRATED]))
         if verdict.verdict is Decision.SLIP:
             what = "do not lift unwatched" if verdict.supervised else "do not lift"
-            held = [HELD] if self._is_held_slip(verdict, now_ns) else []
-            return Tone.SLIP, [Line(what, "it is judged to slip; grasp again"), *held, *also]
+            return Tone.SLIP, [Line(what, "it is judged to slip; grasp again"), *also]
         why_not = doubt(verdict)
         if why_not is not None or verdict.supervised:
-            return Tone.LEANS, [Line("leans to stable", why_not or "supervised"), *also]
+            return Tone.LEANS, [*([] if why_not is None else [why_not]), *also]
         return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
 
-    def _is_held_slip(self, verdict: Verdict, now_ns: int) -> bool:
-        """Return True if a slip was likely a moment ago and is not now."""
-        if self._likely is None or verdict.p_slip is None or verdict.p_slip >= HALF:
-            return False
-        boot_id, grasp, likely_ns = self._likely
-        is_same = (boot_id, grasp) == (verdict.boot_id, verdict.grasp)
-        return is_same and now_ns - likely_ns <= HELD_NS
+    def _unknown(self, verdict: Verdict) -> tuple[Tone, list[Line]]:
+        reasons = to_act_on(verdict.reasons)
+        if self._status is not None and self._status.overloaded and FOLLOW.intersection(reasons):
+            rest = [reason for reason in reasons if reason not in FOLLOW]
+            return Tone.TROUBLE, [OVERLOADED, *map(_line, rest)]
+        why = [_line(reason) for reason in reasons]
+        if Reason.STALE in reasons:
+            why.append(Line("look", self._doctor))
+        if verdict.supervised and WATCHED_LIFT.issuperset(reasons):
+            return Tone.LEARNING, [SUPERVISED, *why]
+        return Tone.TROUBLE if need_of(reasons) is Need.ACT else Tone.WAITING, why
 
     def _silence(self, now_ns: int) -> Line:
         stopped_ns, went_on_ns = self.stood_still
@@ -312,37 +305,44 @@ class View:
         verdict = self._verdict
         return None if verdict is None or self._gate in OPEN else (verdict.boot_id, verdict.grasp)
 
-    def _rate_hz(self) -> float:
-        if not self._rate_marks:
-            return 0.0
-        (first_ns, before), (last_ns, received) = self._rate_marks[0], self._rate_marks[-1]
-        elapsed_s = (last_ns - first_ns) / 1e9
-        return (received - before) / elapsed_s if elapsed_s > 0.0 else 0.0
-
 
 def _state(status: Status) -> str:
     return NO_READINGS if status.state is State.SILENT else status.state.value
 
 
-def _health(status: Status) -> list[Line]:
-    """Return a line for each reason, with all its parts."""
-    lines = [Line("overloaded", OVERLOADED)] if status.overloaded else []
+def _line(reason: Reason) -> Line:
+    return Line(reason.value, ADVICE[reason], need_of([reason]))
+
+
+def _late(former: Status | None, status: Status) -> int:
+    """Return the readings that were late between two statuses, if they are too many; else 0."""
+    if former is None or former.boot_id != status.boot_id:
+        return 0
+    late = status.late_readings - former.late_readings
+    elapsed_s = (status.t_mono_ns - former.t_mono_ns) / 1e9
+    return late if late > LATE_SHARE * status.readings_hz * elapsed_s else 0
+
+
+def _health(status: Status, late: int) -> list[Line]:
+    """Return a line for each reason, with all its parts; first those to act on."""
+    lines = [OVERLOADED] if status.overloaded else []
+    if late and not status.overloaded:
+        lines.append(
+            Line("late", f"the PC is too busy: {counted(late, 'late verdict')} in a second")
+        )
     parts: dict[Reason, list[str]] = {}
     for part, reason in status.health.items():
         parts.setdefault(reason, []).append(part)
-    if Reason.NOT_CALIBRATED in parts:  # which each session begins with
-        parts[Reason.NOT_CALIBRATED] = parts.pop(Reason.NOT_CALIBRATED)
-    return lines + [
-        Line(f"{', '.join(names)} {reason.value}", ADVICE[reason])
-        for reason, names in parts.items()
-    ]
+    for reason, names in parts.items():
+        line = _line(reason)
+        lines.append(structs.replace(line, what=f"{', '.join(names)} {line.what}"))
+    return sorted(lines, key=lambda line: line.need is not Need.ACT)
 
 
 def _not_well(health: Sequence[Line]) -> str:
-    if not health:
-        return ""
-    more = f" and {len(health) - 1} more" if len(health) > 1 else ""
-    return f"not well: {health[0].what}{more}"
+    acts = [line.what for line in health if line.need is Need.ACT]
+    more = f" and {len(acts) - 1} more" if len(acts) > 1 else ""
+    return f"not well: {acts[0]}{more}" if acts else ""
 
 
 def _duration(span_ns: int) -> str:

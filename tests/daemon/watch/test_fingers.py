@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.watch.snapshot import FingerImage
 from graspd.daemon.watch.view import View
 from graspd.models.layout import D1
@@ -21,7 +21,7 @@ WIDTH = 11
 
 def rested(readings: int = 30) -> View:
     """A view that has seen an open hand at rest."""
-    view = after((b"status.right", status(0)))
+    view = after((b"status.right", status(0, health={})))
     for seq in range(readings):
         view.take(b"verdict.right", verdict(seq), 0)
         view.take(b"tactile.right", tactile(seq, RESTING, RESTING), 0)
@@ -95,11 +95,22 @@ def test_faulty_and_repaired_electrodes_are_marked_and_no_touch() -> None:
     view.take(b"tactile.right", tactile(99, counts, RESTING, faulty=(6,)), 0)
     view.take(b"verdict.right", verdict(99, Decision.STABLE, repaired=["ff_1", "th_24"]), 0)
     first, second = view.snapshot(0).fingers
-    assert first.levels == [0] * 132
+    assert (first.levels, first.deepest) == ([0] * 132, 0)
+    assert (first.broken, second.broken) == ("1 repaired; 7 broken", "24 repaired")
     assert first.marked == [1, 8 * WIDTH + 1]  # E1 stands in row 0, column 1
     assert second.marked == [5 * WIDTH + 5]  # E24 in row 5, column 5
     nothing, _ = images(a_view(), [0] * 24, RESTING, faulty=tuple(range(24)))
     assert (nothing.levels, len(nothing.marked)) == ([0] * 132, 24)
+
+
+def test_a_broken_electrode_is_crossed_in_an_open_hand_too() -> None:
+    """Electrode 7 stands still at 0 counts, and no word of it is faulty."""
+    view = rested()
+    view.take(b"status.right", status(1, health={"ff_7": Reason.ELECTRODE_DEAD}), 0)
+    view.take(b"tactile.right", tactile(99, [3000] * 6 + [0] + [3000] * 17, RESTING), 0)
+    first, second = view.snapshot(0).fingers
+    assert (first.levels, first.deepest) == ([0] * 132, 0)
+    assert (first.marked, first.broken, second.broken) == ([8 * WIDTH + 1], "7 broken", "")
 
 
 @pytest.mark.parametrize("counts", [[], [1] * 23])

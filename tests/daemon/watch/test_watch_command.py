@@ -134,7 +134,7 @@ def test_it_shows_verdicts_then_silence_and_verdicts_again(endpoint: str) -> Non
         terminal.resize(200, 60)
         terminal.read_until(rb"latency")
         terminal.resize(20, 5)
-        terminal.read_until(rb"graspd")
+        terminal.read_until(rb"details")
         terminal.type(b"q")
         assert terminal.end() == 0
 
