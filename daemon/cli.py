@@ -67,7 +67,7 @@ LINUX = {"run", "doctor", "keys"}
 """Commands that need Linux, also for their help."""
 LIBRARIES = ("onnxruntime", "numpy", "pyzmq", "python-can", "pyserial")
 """Libraries whose versions `--version` prints."""
-WRONG = 2
+FAILED, WRONG = 1, 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -100,6 +100,11 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
             problem = needs(args.command, EXTRAS[args.command], error)
         except _input_errors() as error:
             problem = str(error)
+        except OSError as error:
+            if error.filename is None:  # not of the file system
+                raise
+            complain(f"{error.filename}: {error.strerror}")
+            return FAILED
         else:
             return code
         sys.stdout.flush()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import os
 from collections.abc import Iterator, Mapping
 from ipaddress import ip_address
 from pathlib import Path
@@ -135,7 +136,7 @@ def _absent(tactile: scene_drivers.Tactile) -> str | None:
             path, what = NETWORK / port, "CAN interface"
         case _:
             return None
-    if path.exists():
+    if os.path.exists(path):
         return None
     return (
         f"the {what} {port} is not there yet; graspd run waits for it, graspd doctor lists others"

@@ -166,7 +166,7 @@ def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
 
 
 def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
-    findings = [model_finding(wanted), *_listen(wanted, report, listen_s)]
+    findings = [*_listen(wanted, report, listen_s), model_finding(wanted)]
     advised = {finding.advice for finding in findings if finding.advice}
     # The graspd that holds the port holds the sockets as well: that is said once.
     sockets = [finding for finding in socket_findings(wanted) if finding.advice not in advised]

@@ -17,7 +17,10 @@ class Level(StrEnum):
 
 
 class Cause(StrEnum):
-    """Cause of a fault. Programs may rely on these names; deploy/CONNECT.md lists them."""
+    """Cause of a fault, in the order in which to act on them.
+
+    Programs may rely on these names; deploy/CONNECT.md lists them.
+    """
 
     PORT_MISSING = "port-missing"
     PORT_DENIED = "port-denied"
@@ -123,15 +126,20 @@ def fine(what: str) -> Finding:
 
 
 def roots(findings: Iterable[Finding]) -> list[Finding]:
-    """Drop findings that another cause explains. A cause is as bad as what follows from it."""
+    """Drop findings that another cause explains, and put the others in the order of `Cause`.
+
+    A cause is as bad as what follows from it.
+    """
     findings = list(findings)
     causes = {finding.cause for finding in findings}
     follows = {effect for cause in causes for effect in EXPLAINS.get(cause, ())}
     errors = {finding.cause for finding in findings if finding.level is Level.ERROR}
-    return [
+    kept = [
         replace(finding, level=Level.ERROR)
         if errors & EXPLAINS.get(finding.cause, frozenset())
         else finding
         for finding in findings
         if finding.cause not in follows
     ]
+    order = [None, *Cause]
+    return sorted(kept, key=lambda finding: order.index(finding.cause))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import socket
-import stat
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +45,7 @@ def model_finding(wanted: Scene) -> Finding:
     except ModelError as problem:
         advice = "See graspd models for those that exist."
         return Finding(Level.ERROR, str(problem), Cause.MODEL_MISSING, advice)
-    if not path.exists():
+    if not os.path.exists(path):
         advice = "[model] path is relative to the scene. See graspd models for those of the zoo."
         return Finding(Level.ERROR, f"no model at {path}", Cause.MODEL_MISSING, advice)
     try:
@@ -177,23 +177,37 @@ def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
 
 def _of_socket(name: str, path: Path) -> Iterator[Finding]:
     folder = path.parent
-    if not folder.is_dir():
+    holders = computer.file_holders(f"{path}.lock")
+    if not _is_reached(folder):
+        what, advice = f"{name}: you may not enter {folder.parent}", "Choose a folder of your own."
+        yield Finding(Level.WARNING, what, Cause.SOCKET_DENIED, advice)
+    elif not os.path.isdir(folder):
         what = f"{name}: there is no folder {folder}"
         advice = f"The service makes it. Without a service: sudo install -d -o $USER {folder}"
         level = Level.WARNING if folder == SERVICE_FOLDER else Level.ERROR
         yield Finding(level, what, Cause.SOCKET_FOLDER, advice)
-        return
-    holders = computer.file_holders(f"{path}.lock")
-    if holders:
+    elif holders:
         what = f"{name}: {path} is in use: {'; '.join(map(str, holders))}"
         yield Finding(Level.WARNING, what, Cause.SOCKET_HELD, HELD_BY_GRASPD)
-    elif path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+    elif os.path.exists(path) and not path.is_socket():
         advice = f"Name another one, or move it away: mv {path} {path}.old"
         yield Finding(Level.ERROR, f"{name}: {path} is not a socket", Cause.SOCKET_HELD, advice)
     elif not os.access(folder, os.W_OK | os.X_OK):
-        what = f"{name}: you may not make {path}"
-        advice = f"as its owner: sudo -u {folder.owner()} graspd"
+        what, advice = f"{name}: you may not make {path}", "Choose a folder of your own."
+        with suppress(KeyError):  # a user without a name
+            advice = f"as its owner: sudo -u {folder.owner()} graspd"
         yield Finding(Level.WARNING, what, Cause.SOCKET_DENIED, advice)
+
+
+def _is_reached(path: Path) -> bool:
+    """Return False if a folder on the way may not be entered."""
+    try:
+        path.stat()
+    except PermissionError:
+        return False
+    except OSError:  # not there, which is another finding
+        return True
+    return True
 
 
 def _of_port(name: str, address: str) -> Iterator[Finding]:

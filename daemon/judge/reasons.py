@@ -8,12 +8,12 @@ them makes the verdict `unknown`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from graspd.biotac import Finger
+from graspd.biotac import ELECTRODES, Finger
 
 
 class Decision(StrEnum):
@@ -153,18 +153,46 @@ UNREADABLE = frozenset(
     }
 )
 """Reasons for which the sensors cannot be read, so that the state of the hand is not known."""
+FOLLOWING = {*NEEDS, Reason.JOINTS_LATE}
+"""Reasons that last until readings come: without any, there is nothing to do about them."""
+_ORDER = {reason: (reason in NEEDS, place) for place, reason in enumerate(Reason)}
+"""Link, sensors, electrodes, the rest; last what is not `Need.ACT`."""
 WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
 """Reasons that still permit a supervised lift; any other reason forbids it."""
 
 
-def to_act_on(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return the reasons to show to a person: without `OF_THE_HAND` if any is `UNREADABLE`.
+def to_act_on(reasons: Iterable[Reason]) -> list[Reason]:
+    """Return the reasons to show to a person, in the order in which to act on them.
 
-    While the sensors cannot be read, to close the hand does not help.
+    While the sensors cannot be read, to close the hand does not help: `OF_THE_HAND` is left out.
     """
-    if UNREADABLE.isdisjoint(reasons):
-        return list(reasons)
-    return [reason for reason in reasons if reason not in OF_THE_HAND]
+    shown = set(reasons)
+    if not UNREADABLE.isdisjoint(shown):
+        shown -= OF_THE_HAND
+    return sorted(shown, key=_ORDER.__getitem__)
+
+
+def parts_to_act_on(health: Mapping[str, Reason]) -> dict[Reason, list[str]]:
+    """Return the parts that are not well by their reason, in the order in which to act on them.
+
+    A finger stands for its 24 electrodes. Parts that only follow from the link or from such a
+    finger are left out.
+    """
+    fingers: dict[str, list[Reason]] = {}
+    for part, reason in health.items():
+        finger, _, electrode = part.partition("_")
+        if electrode:
+            fingers.setdefault(finger, []).append(reason)
+    unread = {finger for finger, reasons in fingers.items() if len(reasons) == ELECTRODES}
+    is_silent = Reason.STALE in health.values()
+    parts: dict[Reason, dict[str, None]] = {}
+    for part, reason in health.items():
+        finger, _, electrode = part.partition("_")
+        follows = FOLLOWING if is_silent else OF_THE_HAND if finger in unread else ()
+        if reason not in follows:
+            name = finger if finger in unread else part
+            parts.setdefault(reason, {})[name] = None
+    return {reason: list(parts[reason]) for reason in sorted(parts, key=_ORDER.__getitem__)}
 
 
 class GateState(StrEnum):

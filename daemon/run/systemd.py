@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 
+from graspd.daemon.judge.reasons import parts_to_act_on
 from graspd.daemon.publish.companion import Companion, Requests
 from graspd.daemon.publish.messages import Status
 
@@ -90,8 +91,6 @@ def in_a_line(status: Status) -> str:
         parts.append(f"overloaded, {status.skipped_readings} readings left out")
     if status.late_readings:
         parts.append(f"{status.late_readings} late")
-    parts += [f"{part} {reason}" for part, reason in list(status.health.items())[:4]]
-    if len(status.health) > 4:
-        more = len(status.health) - 4
-        parts.append(f"{more} more {'part is' if more == 1 else 'parts are'} not well")
+    not_well = parts_to_act_on(status.health)
+    parts += [f"{' and '.join(names)} {reason}" for reason, names in not_well.items()]
     return ", ".join(parts)

@@ -18,6 +18,7 @@ from graspd.daemon.judge.reasons import (
     Need,
     Reason,
     need_of,
+    parts_to_act_on,
     to_act_on,
 )
 from graspd.daemon.process.sleep import boottime_ns
@@ -324,19 +325,16 @@ def _late(former: Status | None, status: Status) -> int:
 
 
 def _health(status: Status, late: int) -> list[Line]:
-    """Return a line for each reason, with all its parts; first those to act on."""
+    """Return a line for each reason, with all its parts, in the order in which to act."""
     lines = [OVERLOADED] if status.overloaded else []
     if late and not status.overloaded:
         lines.append(
             Line("late", f"the PC is too busy: {counted(late, 'late verdict')} in a second")
         )
-    parts: dict[Reason, list[str]] = {}
-    for part, reason in status.health.items():
-        parts.setdefault(reason, []).append(part)
-    for reason, names in parts.items():
+    for reason, names in parts_to_act_on(status.health).items():
         line = _line(reason)
         lines.append(structs.replace(line, what=f"{', '.join(names)} {line.what}"))
-    return sorted(lines, key=lambda line: line.need is not Need.ACT)
+    return lines
 
 
 def _not_well(health: Sequence[Line]) -> str:

@@ -133,3 +133,25 @@ def test_the_status_line_says_state_rate_verdicts_and_what_is_not_well() -> None
     assert "1 unknown, gate idle, overloaded, 4 readings left out, 3 late" in in_a_line(
         msgspec.structs.replace(status, overloaded=True)
     )
+
+
+UNPLUGGED = dict.fromkeys((f"mf_{n}" for n in range(1, 25)), Reason.SENSOR_MISSING)
+NOT_TARED = dict.fromkeys(("ff", "mf", "th"), Reason.NOT_TARED)
+
+
+@pytest.mark.parametrize(
+    ("health", "shown"),
+    [
+        ({**NOT_TARED, "link": Reason.STALE}, "link stale"),
+        ({**NOT_TARED, **UNPLUGGED}, "mf sensor-missing, ff and th not-tared"),
+        (
+            {"session": Reason.NOT_CALIBRATED, "ff": Reason.NOT_TARED, "ff_7": Reason.SATURATED},
+            "ff_7 saturated, ff not-tared, session not-calibrated",
+        ),
+    ],
+)
+def test_what_to_do_comes_first_and_what_follows_never(
+    health: dict[str, Reason], shown: str
+) -> None:
+    line = in_a_line(msgspec.structs.replace(GOLDEN_STATUS, health=health))
+    assert line.endswith(f", 3 late, {shown}")
