@@ -1,9 +1,9 @@
 "use strict";
 const STATES = ["idle", "closing", "settled", "judged", "released"];
 const TONES = {s: "stable", l: "leans", x: "slip", u: "learning", w: "waiting", t: "trouble", ".": "silent"};
-const LANES = [["x", "slip"], ["s", "stable"], ["l", "leans"], ["u", "watched"], ["t", "wrong"], ["w", "waiting"], [".", "silent"]];
+const LANES = [["x", "slip"], ["s", "stable"], ["l", "leans"], ["u", "supervised"], ["t", "act"], ["w", "wait"], [".", "silent"]];
 const MARKS = {slip: "\u2715", stable: "\u25cf", unknown: "?"};
-const LEFT = 62, RIGHT = 4;  // of the timeline, px
+const LEFT = 70, RIGHT = 4;  // of the timeline, px
 const ROWS = 12, COLUMNS = 11, FULL = 100, MOMENTS = 300, MINUTES = 5;
 const QUIET_MS = 1000;  // the server sends ten times a second
 const FRESH_S = .2;  // an image is of the judged grasp if the verdict is not older

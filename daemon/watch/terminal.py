@@ -1,4 +1,4 @@
-"""The terminal view: tables, drawn until `q`, Ctrl-C or SIGTERM; Ctrl-Z stops it."""
+"""The terminal view: tables, drawn until `q`, Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import contextlib
 import math
 import os
 import select
-import signal
 import sys
 import termios
 import time
 import tty
 from collections.abc import Iterator, Sequence
-from types import FrameType
-from typing import Self
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
@@ -57,6 +54,8 @@ NAMES_MAX = 1000
 LABEL_COLUMNS = 12
 """Width of the longest label, `grasps seen` or `last message`, columns."""
 SIGNALS_MAX = 64
+CHARACTERS = 6
+"""Place of the control characters in the settings of a terminal."""
 
 Row = tuple[str, str]
 """Label and text."""
@@ -71,49 +70,12 @@ def can_draw() -> bool:
 def show(hands: Sequence[HandFeed]) -> None:
     """Draw on the terminal until `q`, Ctrl-C or SIGTERM."""
     console = Console(highlight=False)
-    with StopSignal() as stop, Suspension() as suspension:
+    with StopSignal() as stop:
         keyboard = Keyboard(stop)
-        while True:
-            with (
-                keyboard.unbuffered(),
-                Live(console=console, screen=True, auto_refresh=False) as live,
-            ):
-                for seen in snapshots(hands, lambda: keyboard.wait() or suspension.asked):
-                    chosen = keyboard.tabs % len(hands)
-                    picture = draw(seen, console.width, chosen, keyboard.spaces)
-                    live.update(picture, refresh=True)
-            if stop.received is not None or not suspension.asked:
-                return
-            now = time.strftime("%H:%M:%S")
-            console.print(f"graspd watch stopped at {now}: unknown until it goes on (fg)")
-            suspension.stop()
-
-
-class Suspension:
-    """Ctrl-Z: the last verdict must not stay on the screen while nothing is drawn."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __enter__(self) -> Self:
-        """Take over SIGTSTP, unless it is ignored."""
-        self._former = signal.getsignal(signal.SIGTSTP)
-        if self._former is not signal.SIG_IGN:
-            signal.signal(signal.SIGTSTP, self._ask)
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        signal.signal(signal.SIGTSTP, self._former)
-
-    def stop(self) -> None:
-        """Stop the process; return when it is continued."""
-        self.asked = False
-        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGTSTP)
-        signal.signal(signal.SIGTSTP, self._ask)
-
-    def _ask(self, _number: int, _frame: FrameType | None) -> None:
-        self.asked = True
+        with keyboard.unbuffered(), Live(console=console, screen=True, auto_refresh=False) as live:
+            for seen in snapshots(hands, keyboard.wait):
+                chosen = keyboard.tabs % len(hands)
+                live.update(draw(seen, console.width, chosen, keyboard.spaces), refresh=True)
 
 
 class Keyboard:
@@ -148,7 +110,10 @@ class Keyboard:
 
     @contextlib.contextmanager
     def unbuffered(self) -> Iterator[None]:
-        """Read keys at once and without echo, if there is a terminal."""
+        """Read keys at once and without echo, if there is a terminal.
+
+        Ctrl-Z has no effect: the last verdict would stay on the screen.
+        """
         if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
             yield
             return
@@ -157,6 +122,9 @@ class Keyboard:
         self._waited.register(keyboard, select.POLLIN)
         try:
             tty.setcbreak(keyboard)
+            settings = termios.tcgetattr(keyboard)
+            settings[CHARACTERS][termios.VSUSP] = b"\0"  # _POSIX_VDISABLE
+            termios.tcsetattr(keyboard, termios.TCSANOW, settings)
             yield
         finally:
             self._waited.unregister(keyboard)
@@ -221,10 +189,9 @@ def _hand(hands: Sequence[Snapshot], chosen: int, page: int) -> RenderableType:
         figures.add_row(label, Text(text), style=OLD if seen.tone is Tone.SILENT else None)
     # An operator sees this clock stand still when nothing is drawn any more.
     clock = time.strftime("%H:%M:%S", time.localtime(seen.t))
-    model = printable(seen.model or "no model yet", NAME_MAX)
     keys = "q ends" if len(hands) == 1 else "q ends, tab: next hand"
     name = printable(seen.hand or "-", NAME_MAX)
-    header = Text(f"{clock} details of {name}: {seen.state or '-'}, {model} ({keys})")
+    header = Text(f"{clock} details of {name}: {seen.state or '-'} ({keys})")
     verdicts = [_verdict(hand, wraps=len(hands) > 1) for hand in hands]
     return Fitted(Group(*verdicts, header), wrong, figures, page)
 
@@ -303,6 +270,7 @@ def _figures(seen: Snapshot) -> Iterator[Row]:
     joints = [f"{printable(name, 5)} {math.degrees(rad):.1f}°" for name, rad in angles]
     yield "joints", ", ".join(joints) or "no angles come"
     yield "endpoint", f"{printable(seen.endpoint, 2 * NAME_MAX)} {seen.link}"
+    yield "model", printable(seen.model or "not known yet", NAME_MAX)
 
 
 def _past(grasp: JudgedGrasp) -> str:

@@ -231,7 +231,7 @@ class View:
             fingers=[] if verdict is None else self._fingers.images(verdict, status, now_ns),
             joints={} if silent else self._fingers.joints,
             health=health,
-            not_well=_not_well(health),
+            not_well=_not_well(health, why),
             state=None if status is None or silent else _state(status),
             model=None if last is None else f"{last.model} {last.model_sha}",
             learning=figures.learning(last, status),
@@ -337,8 +337,10 @@ def _health(status: Status, late: int) -> list[Line]:
     return lines
 
 
-def _not_well(health: Sequence[Line]) -> str:
-    acts = [line.what for line in health if line.need is Need.ACT]
+def _not_well(health: Sequence[Line], why: Sequence[Line]) -> str:
+    """Return in a few words what to act on, without what the verdict itself says."""
+    said = {line.advice for line in why}
+    acts = [line.what for line in health if line.need is Need.ACT and line.advice not in said]
     more = f" and {len(acts) - 1} more" if len(acts) > 1 else ""
     return f"not well: {acts[0]}{more}" if acts else ""
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import logging
 import re
 import socket
 import sys
 import threading
-from collections import deque
 from collections.abc import Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -31,8 +29,6 @@ SITES: Final = {None, "none", "same-origin"}
 """Accepted values of `Sec-Fetch-Site`: the request comes from no other site."""
 CONNECTIONS_MAX: Final = 32
 """Most connections, each with a thread; an open page keeps one."""
-PAGES_MAX: Final = 16
-"""Most open pages; a new one ends the oldest."""
 PATIENCE_S: Final = 5.0
 """Longest silence of a browser within a request, and longest wait until it reads on, s."""
 SEND_BUFFER_BYTES: Final = 32 * 1024
@@ -84,7 +80,6 @@ class Server(ThreadingHTTPServer):
         self.newest = newest
         self.page, self.policy = load_page()
         self._places = threading.BoundedSemaphore(CONNECTIONS_MAX)
-        self._pages: deque[Any] = deque()
         super().__init__((ADDRESS, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
@@ -98,16 +93,7 @@ class Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            with contextlib.suppress(ValueError):
-                self._pages.remove(request)
             self._places.release()
-
-    def add_page(self, request: Any) -> None:  # noqa: ANN401
-        """Note an open page; the oldest of too many ends."""
-        self._pages.append(request)
-        if len(self._pages) > PAGES_MAX:
-            with contextlib.suppress(OSError):  # it has just ended
-                self._pages.popleft().shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         failure = sys.exception()
@@ -169,7 +155,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _stream(self) -> None:
-        self.server.add_page(self.request)
         newest = self.server.newest
         number = newest.number  # the next one is sent first: this may be old
         self._begin("text/event-stream")

@@ -124,7 +124,7 @@ def test_the_header_has_the_wall_clock_of_the_picture(monkeypatch: pytest.Monkey
     monkeypatch.undo()
     time.tzset()
     # date -u -d @1790000000: 14:13:20
-    assert header.startswith("15:13:20 details of right: running, ")
+    assert header.startswith("15:13:20 details of right: running (q ends)")
 
 
 @pytest.mark.parametrize("width", [1, 10, 40])

@@ -132,7 +132,9 @@ def test_an_overload_is_the_cause_and_a_cable_is_not() -> None:
     seen = view.snapshot(0)
     assert [line.what for line in seen.why] == ["overloaded", "moving"]
     assert "cable" not in " ".join(line.advice for line in seen.why)
-    assert (seen.tone, seen.not_well) == (Tone.TROUBLE, "not well: overloaded")
+    assert (seen.tone, seen.not_well) == (Tone.TROUBLE, "")  # the verdict says it
+    view.take(b"verdict.right", verdict(1, reasons=[Reason.MOVING]), 0)
+    assert view.snapshot(0).not_well == "not well: overloaded"
 
 
 @pytest.mark.parametrize(("late", "not_well"), [(5, ""), (6, "not well: late")])

@@ -11,7 +11,7 @@ from contextlib import ExitStack, closing
 
 import pytest
 
-from graspd.daemon.watch.web import ADDRESS, PAGES_MAX, Server, load_page
+from graspd.daemon.watch.web import ADDRESS, Server, load_page
 from tests.daemon.watch.browser import serving
 
 
@@ -183,17 +183,6 @@ def test_a_browser_that_does_not_read_misses_snapshots_and_holds_up_nobody(serve
                 break
             seen += 1
         assert seen < 1900  # what the sockets of both sides hold, 8 MB would be all
-
-
-def test_open_pages_do_not_hold_the_page(server: Server) -> None:
-    with ExitStack() as stack:
-        pages = [opened(server, stack) for _ in range(PAGES_MAX)]
-        assert ask(server)[0] == 200
-        newest = opened(server, stack)
-        with pages[0].makefile("rb") as oldest:
-            assert oldest.read() is not None  # it ends: the oldest gives way
-        server.newest.put(b'{"a": 1}')
-        assert next(events(pages[1])) == next(events(newest)) == {"a": 1}
 
 
 @pytest.mark.parametrize("begin", [b"", b"GET / HTTP/1.0\r\nHost: localhost\r\nX: "])
