@@ -1,4 +1,4 @@
-"""State of a link, its retries with a capped backoff, and whether its descriptor is ready."""
+"""State of a link, its retries with a capped backoff, and the clock of its sender."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ OUTAGE_NS: Final = 2_000_000_000
 WARNINGS_MAX = 8
 """Most warnings in one outage, each for another reason; the log cannot fill up."""
 
+CLOCK_STEP_NS: Final = 1_000_000_000
+"""Delay of the first message after a fall of its time, ns, from which that has another zero."""
+DRIFT: Final = 1000
+"""Clocks of two computers differ by less than one part in this; NTP slews by half of it."""
 READABLE: Final = 1
 """POLLIN of poll(2), which Python has not on all systems."""
 
@@ -133,3 +137,34 @@ class Link:
         if self.reason is not None:
             facts["why"] = Fact(self.reason)
         return facts
+
+
+class SenderClock:
+    """Bounds the age of messages by their sender's time, which may have any zero.
+
+    The quickest message so far is taken to be on the way for no time. A delay that was there from
+    the first message on, or that grows by less than 1 ms a second, is not seen. Time that falls
+    has another zero.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns: int | None = None
+        """Smallest difference of reception and sender's time, ns; it grows with the drift."""
+        self._sent_ns = self._received_ns = 0
+
+    def made_ns(self, t_s: float | None, received_ns: int) -> int:
+        """Return when a message was made at the latest, monotonic ns.
+
+        `t_s`: the sender's time, s; None: not known.
+        """
+        if t_s is None:
+            return received_ns
+        sent_ns = round(t_s * 1e9)
+        offset_ns = received_ns - sent_ns
+        if self._offset_ns is not None:
+            drift_ns = (received_ns - self._received_ns) // DRIFT
+            known_ns = self._offset_ns + drift_ns
+            if sent_ns > self._sent_ns or offset_ns - known_ns < CLOCK_STEP_NS:
+                offset_ns = min(offset_ns, known_ns)
+        self._offset_ns, self._sent_ns, self._received_ns = offset_ns, sent_ns, received_ns
+        return sent_ns + offset_ns

@@ -4,7 +4,8 @@ The sockets of `socketcan` and `udp_multicast` are read directly, because python
 several times slower, and fails for descriptors of 1024 and more. Stamps are wall time, which can
 step. The difference of the two clocks when a frame is read turns them into monotonic time, so only
 a step between arrival and reading makes them wrong.
-A frame without a stamp arrived after the last time at which the bus was empty.
+A frame without a stamp arrived after the last time at which the bus was empty. The server of
+socketcand stamps by its own clock, which tells how old a frame is.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from graspd.drivers.can.frames import (
 )
 from graspd.drivers.can.interfaces import OWN_OPTIONS, Options, open_bus, refuse_unusable
 from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
-from graspd.drivers.link import is_ready
+from graspd.drivers.link import SenderClock, is_ready
 
 FRAMES_PER_DRAIN: Final = 512
 """Most frames of one call: about 100 ms of a full bus. The loop must get its turn."""
@@ -77,7 +78,7 @@ class CanBus:
         if bitrate is not None:
             self._options["bitrate"] = bitrate
         self._stamped = interface in STAMPED_INTERFACES
-        self._may_hang = interface == "socketcand"
+        self._is_remote = interface == "socketcand"
         self._clock = clock
         self._wall_clock = wall_clock
         self._bus: can.BusABC | None = None
@@ -89,6 +90,7 @@ class CanBus:
         self.close()
         self.failure = None
         self._idle_ns = self._received_ns = self._clock()
+        self._server, self._stamp_s = SenderClock(), 0.0
         self._bus = bus = open_bus(self._interface, self._channel, **self._options)
         self.descriptor = _fileno(bus)
         if self.descriptor is not None:
@@ -175,7 +177,7 @@ class CanBus:
                 # slcan returns no frame for an adapter's answer, although frames wait behind it.
                 if self.descriptor is None or not is_ready(self.descriptor):
                     self._idle_ns = before_ns
-                    if self._may_hang:
+                    if self._is_remote:
                         self._notice_quiet(before_ns, bool(frames))
                     return
                 continue
@@ -186,7 +188,20 @@ class CanBus:
                 t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
                 frames.append((frame, t_ns, t_ns))
             else:
-                frames.append((frame, since_ns, self._clock()))
+                frames.append((frame, *self._arrived(message.timestamp, since_ns)))
+
+    def _arrived(self, stamp_s: float, since_ns: int) -> tuple[int, int]:
+        """Return the earliest and latest time at which a frame arrived, ns."""
+        now_ns, before_s = self._clock(), self._stamp_s
+        if not self._is_remote:
+            return since_ns, now_ns
+        self._stamp_s = stamp_s
+        if stamp_s < before_s:
+            self._server = SenderClock()
+        if stamp_s <= before_s:  # the clock was set, or is too coarse to tell
+            return since_ns, now_ns
+        t_ns = self._server.made_ns(stamp_s, now_ns)
+        return t_ns, t_ns
 
     def _notice_quiet(self, now_ns: int, received: bool) -> None:
         """Have a connection that may be lost opened again."""

@@ -15,7 +15,7 @@ import socket
 from collections.abc import Mapping
 from ctypes.util import find_library
 from importlib.util import find_spec
-from typing import Any, Final, get_type_hints
+from typing import Annotated, Any, Final, get_type_hints
 
 import can
 import msgspec
@@ -62,8 +62,9 @@ _BITRATES: Final = {
 }
 """Rates that an adapter knows, kbit/s; others take any."""
 _OWN_KEYS: Final = frozenset({"interface", "channel", "bitrate"})
-_TYPES: Final[dict[str, dict[str, type]]] = {
-    "socketcand": {"host": str, "port": int, "tcp_tune": bool},
+_PORT: Final = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+_TYPES: Final[dict[str, dict[str, Any]]] = {
+    "socketcand": {"host": str, "port": _PORT, "tcp_tune": bool},
 }
 """Types of options that python-can does not declare."""
 _WRONG_ARGUMENT: Final = (TypeError, ValueError, OverflowError)

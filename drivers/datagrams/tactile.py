@@ -20,12 +20,9 @@ from graspd.drivers.datagrams.messages import (
     Order,
     read_message,
 )
+from graspd.drivers.link import SenderClock
 from graspd.drivers.udp import DatagramDriver
 
-CLOCK_STEP_NS: Final = 1_000_000_000
-"""Delay of the first message after a fall of its time, ns, from which that has another zero."""
-DRIFT: Final = 1000
-"""Clocks of two computers differ by less than one part in this; NTP slews by half of it."""
 LATE_NS: Final = 100_000_000
 """Delay of a message, ns, from which it is counted as late: the usual age limit."""
 
@@ -44,37 +41,6 @@ class TactileCounters(MessageCounters):
     """Fingers without 24 counts: of another sensor."""
     bad_counts: int = 0
     """Values that are not a whole number in 0..4095."""
-
-
-class SenderClock:
-    """Bounds the age of messages by their sender's time, which may have any zero.
-
-    The quickest message so far is taken to be on the way for no time. A delay that was there from
-    the first message on, or that grows by less than 1 ms a second, is not seen. Time that falls
-    has another zero.
-    """
-
-    def __init__(self) -> None:
-        self._offset_ns: int | None = None
-        """Smallest difference of reception and sender's time, ns; it grows with the drift."""
-        self._sent_ns = self._received_ns = 0
-
-    def made_ns(self, t_s: float | None, received_ns: int) -> int:
-        """Return when a message was made at the latest, monotonic ns.
-
-        `t_s`: the sender's time, s; None: not known.
-        """
-        if t_s is None:
-            return received_ns
-        sent_ns = round(t_s * 1e9)
-        offset_ns = received_ns - sent_ns
-        if self._offset_ns is not None:
-            drift_ns = (received_ns - self._received_ns) // DRIFT
-            known_ns = self._offset_ns + drift_ns
-            if sent_ns > self._sent_ns or offset_ns - known_ns < CLOCK_STEP_NS:
-                offset_ns = min(offset_ns, known_ns)
-        self._offset_ns, self._sent_ns, self._received_ns = offset_ns, sent_ns, received_ns
-        return sent_ns + offset_ns
 
 
 class TactileStream:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import compress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import apsw
@@ -38,7 +39,7 @@ from graspd.drivers.base import (
     TactileReading,
     joint_name,
 )
-from graspd.drivers.recordings.kinds import Kind, is_packed, kind_of
+from graspd.drivers.recordings.kinds import SQLITE, Kind, Unpacked, is_packed, kind_of
 from graspd.drivers.recordings.player import ReadingsDriver
 
 TACTILE: Final = "sr_robot_msgs/msg/BiotacAll"
@@ -63,8 +64,16 @@ _UNPACKERS: Final[dict[Callable[[bytes], bytes], Callable[[], Any]]] = {
     lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
 }
 """Bounded unpackers by those of rosbags, which have no bound."""
+_zstd: Final[Any] = vars(rosbag2.reader)["zstd"]
 _DAMAGE = (
-    *(rosbag1.ReaderError, rosbag2.ReaderError, SerdeError, TypesysError, apsw.Error),
+    *(
+        _zstd.ZstdError,
+        rosbag1.ReaderError,
+        rosbag2.ReaderError,
+        SerdeError,
+        TypesysError,
+        apsw.Error,
+    ),
     *(ValueError, LookupError, AssertionError, RuntimeError, struct.error),
     *(OSError, EOFError, MemoryError, OverflowError),
 )
@@ -153,9 +162,7 @@ class BagDriver(ReadingsDriver[Reading]):
 class _Bag:
     """An open bag."""
 
-    def __init__(
-        self, path: Path, reader: rosbag1.Reader | rosbag2.Reader, *, is_ros1: bool
-    ) -> None:
+    def __init__(self, path: Path, reader: Any, *, is_ros1: bool) -> None:  # noqa: ANN401
         self._path, self._reader = path, reader
         store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
         types = dict[str, Any]()
@@ -215,7 +222,7 @@ def _opened(path: Path) -> Iterator[_Bag]:
     if is_packed(path):
         raise RecordingError(path, "is a packed bag: `gunzip` it first")
     try:
-        reader = rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path)
+        reader = rosbag1.Reader(path) if is_ros1 else _reader_of(path)
         reader.open()
         if isinstance(reader, rosbag1.Reader):
             _bound(reader)
@@ -232,6 +239,15 @@ def _opened(path: Path) -> Iterator[_Bag]:
         reader.close()
 
 
+def _reader_of(path: Path) -> Any:  # noqa: ANN401
+    """Return a reader of ROS 2; rosbags knows a file by its suffix alone."""
+    if path.is_dir():
+        return rosbag2.Reader(path)
+    with path.open("rb") as file:
+        suffix = ".db3" if file.read(len(SQLITE)) == SQLITE else ".mcap"
+    return rosbag2.Reader.STORAGE_PLUGINS[suffix](path)
+
+
 def _bound(reader: rosbag1.Reader) -> None:
     """Let a packed chunk be an error if it unpacks to more than `CHUNK_MAX_BYTES`."""
     for place, chunk in reader.chunks.items():
@@ -246,6 +262,19 @@ def _unpacked(make: Callable[[], Any], packed: bytes) -> bytes:
     if not unpacker.eof:
         raise ValueError(f"a chunk is cut off or unpacks to more than {CHUNK_MAX_BYTES} bytes")
     return content
+
+
+def _bound_ros2() -> None:
+    """Let rosbags unpack ROS 2 bags by bounded functions; its own have no bound."""
+    bounded = SimpleNamespace(**vars(_zstd))
+    bounded.decompress = partial(_unpacked, _zstd.ZstdDecompressor)
+    bounded.open = lambda file, _mode: Unpacked(file, _zstd.open(file))
+    vars(rosbag2.reader)["zstd"] = vars(rosbag2.storage_mcap)["zstd"] = bounded
+    lz4_unpack = partial(_unpacked, lz4.frame.LZ4FrameDecompressor)
+    vars(rosbag2.storage_mcap)["lz4_decompress"] = lz4_unpack
+
+
+_bound_ros2()
 
 
 def _refuse_other_fields(path: Path, hand: dict[str, Any], sensor: dict[str, Any]) -> None:

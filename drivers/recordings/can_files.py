@@ -16,7 +16,7 @@ from typing import BinaryIO, Final, TextIO, cast
 import can
 
 from graspd.drivers.can.frames import CLASSIC_DATA_MAX, ERR_FLAG, EXTENDED_ID_MAX
-from graspd.drivers.recordings.candump import NS_PER_S, Line, Logged, frame_of
+from graspd.drivers.recordings.candump import NO_BUS, NS_PER_S, Line, Logged, frame_of
 
 BUS_ERROR: Final = 0x80
 """Class of an error frame of which a log keeps nothing (linux/can/error.h)."""
@@ -51,20 +51,27 @@ _TRC_OTHERS: Final = re.compile(
 
 def read_asc(lines: Iterable[str]) -> Iterator[Line]:
     """Yield frames of an ASC file, and lines that were not understood."""
-    base, is_relative, t_s = "hex", False, 0.0
+    base, is_relative = "hex", False
     for number, text in enumerate(lines, 1):
         if head := _ASC_BASE.match(text.strip()):
             base, is_relative = head[1].lower(), (head[2] or "").lower() == "relative"
-        if (time := _ASC_TIME.match(text)) and is_relative:
-            t_s += float(time[1])
-        if _ASC_OTHERS.match(text):
+        is_other = _ASC_OTHERS.match(text) is not None
+        logged = None if is_other else _frame_of_asc(base, text)
+        if logged is not None:
+            yield number, text, logged._replace(may_be_step=is_relative)
             continue
-        message = _message(can.ASCReader, [f"base {base}", "no internal events logged", text])
-        if message is not None and message.is_fd and _is_classic(text, len(message.data)):
-            message.is_fd = False
-        if message is not None and is_relative:
-            message.timestamp = t_s
-        yield number, text, _logged(message, text if base == "hex" else "")
+        if is_relative and (time := _ASC_TIME.match(text)):
+            t_ns = round(float(time[1]) * NS_PER_S)
+            yield number, text, Logged(t_ns, NO_BUS, None, may_be_step=True)
+        if not is_other:
+            yield number, text, None
+
+
+def _frame_of_asc(base: str, text: str) -> Logged | None:
+    message = _message(can.ASCReader, [f"base {base}", "no internal events logged", text])
+    if message is not None and message.is_fd and _is_classic(text, len(message.data)):
+        message.is_fd = False
+    return _logged(message, text if base == "hex" else "")
 
 
 def read_trc(lines: Iterable[str]) -> Iterator[Line]:

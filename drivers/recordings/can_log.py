@@ -16,7 +16,7 @@ from graspd.drivers.can.frames import ERR_FLAG, ERROR, EXTENDED, LOST, REMOTE, C
 from graspd.drivers.can.stream import BoardOptions, CanStream
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.can_files import read_asc, read_blf, read_trc
-from graspd.drivers.recordings.candump import ANY_BUS, NS_PER_S, Line, read_candump
+from graspd.drivers.recordings.candump import ANY_BUS, NO_BUS, NS_PER_S, Line, read_candump
 from graspd.drivers.recordings.kinds import (
     LINE_BYTES_MAX,
     PAGE,
@@ -108,13 +108,15 @@ class Survey:
     frames: Counter[tuple[str, int | None]] = field(default_factory=Counter)
     """Frames of a bus and arbitration id; None: CAN FD."""
     has_steps: bool = False
-    """True if times are since the frame before (`candump -td`)."""
+    """True if times are since the line before (`candump -td`, ASC with relative times)."""
 
     @classmethod
     def of(cls, path: Path) -> Survey:
         """Read a log once. Raises `RecordingError`."""
         survey, last_ns, rises, falls = cls(), dict[str, int](), 0, 0
         for number, text, logged in read_log(path):
+            if logged is not None and logged.bus == NO_BUS:
+                continue
             survey.lines += 1
             if logged is None:
                 survey.strange += 1

@@ -55,6 +55,8 @@ _DROPS: Final = re.compile(
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 ANY_BUS: Final = "any"
 """Bus of a loss that is of all of them."""
+NO_BUS: Final = ""
+"""Bus of a line that is not a frame, and whose time counts."""
 
 
 class Logged(NamedTuple):

@@ -23,7 +23,7 @@ from graspd.drivers.recordings.kinds import (
 )
 from graspd.extras import needs
 
-_SEPARATORS: Final = ",;\t"
+_SEPARATORS: Final = ",;\t|"
 _SEPARATOR_LINE: Final = re.compile(r"sep=(.)", re.IGNORECASE)
 """First line by which a spreadsheet tells the separator."""
 

@@ -11,6 +11,7 @@ from typing import Final
 from graspd.biotac import ELECTRODES, FINGERS, FORMER_ELECTRODES
 from graspd.drivers.base import RecordingError, joint_name
 from graspd.drivers.recordings.kinds import PAGE
+from graspd.drivers.recordings.values import are_numbers
 
 TIME: Final = "t"
 """Column of seconds, with any zero, that graspd writes."""
@@ -42,7 +43,7 @@ _UNIT_S: Final = {
 }
 _UNITS: Final = "|".join(sorted(_UNIT_S, key=len, reverse=True))
 _TIME_NAME: Final = re.compile(
-    rf"(?P<before>(?:.*[./])?%?(?:rosbag|log_?)?(?:t|times?|time_?stamp|stamp|date_?time)"
+    rf"(?P<before>(?:.*[./])?[%_]*(?:rosbag|log_?)?(?:t|times?|time_?stamp|stamp|date_?time)"
     rf"[ _./(\[]*)?(?P<unit>{_UNITS})?[)\]]?",
     re.IGNORECASE,
 )
@@ -133,6 +134,10 @@ def _electrodes(
                 numbers[number] = place
         if found:
             return _whole(path, example, found, fingers, line)
+    if are_numbers(names):
+        raise RecordingError(
+            path, "has numbers in place of names: the header is missing", line=line
+        )
     problem = f"no column of electrodes is known{_nearest(names)}; {PAGE} has the table of names"
     raise RecordingError(path, problem, line=line)
 

@@ -24,6 +24,7 @@ from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.layout import Layout, ReadAs, survey, time_value
 from graspd.drivers.recordings.values import (
     COUNT_OF_TEXT,
+    are_texts,
     count_of,
     number_of,
     outcome_of,
@@ -121,6 +122,8 @@ class Recording:
             for place, count in enumerate(counts):
                 if count is None:
                     counts[place] = self._unusual(texts[place], place, faults)
+            if faults.all() and are_texts(texts):
+                raise self._cells.error("has text in place of counts: another header, or units?")
         return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
     def _unusual(self, text: str, place: int, faults: NDArray[np.uint8]) -> int:

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, cast
 
 from graspd.drivers.base import RecordingError
 
@@ -75,8 +75,13 @@ _CANDUMP_LINE: Final = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 """A frame as candump writes it into a file, `can0 100#0D3A`, or shows it, `can0 100 [2] 0D 3A`."""
-_ASC_LINE: Final = re.compile(rb"^base\s+(?:hex|dec)\b", re.IGNORECASE | re.MULTILINE)
-_SQLITE: Final = b"SQLite format 3\0"
+_ASC_LINE: Final = re.compile(
+    rb"^(?:base[ \t]+(?:hex|dec)\b"
+    rb"|[ \t]*\d+\.\d+[ \t]+\d+[ \t]+[0-9A-F]+x?[ \t]+[RT]x[ \t]+[dr]\b)",
+    re.IGNORECASE | re.MULTILINE,
+)
+"""The header of an ASC file, or a frame, `0.000200 1 5A1 Rx d 7 A4 CB`."""
+SQLITE: Final = b"SQLite format 3\0"
 _SERIAL_EVENTS: Final = frozenset((1, 2, 3))
 """Types of the records of `graspd.drivers.recordings.serial_log`."""
 _OTHERS: Final = {
@@ -101,7 +106,10 @@ _OTHERS: Final = {
     b"\x7fELF": "a program",
     b"\xd4\xc3\xb2\xa1": "a network capture (pcap)",
     b"\x0a\x0d\x0d\x0a": "a network capture (pcapng)",
-    _SQLITE: "an SQLite database without the tables of a ROS 2 bag",
+    SQLITE: "an SQLite database without the tables of a ROS 2 bag",
+    b"{": "JSON: write the table as CSV",
+    b"[{": "JSON: write the table as CSV",
+    b"header:": "what `rostopic echo` shows: take `rostopic echo -p`, or a bag",
     _GZIP: "packed twice: unpack it first",
 }
 """Other files, by their first bytes."""
@@ -149,7 +157,7 @@ def kind_of_all(paths: Sequence[Path]) -> Kind:
 def _kind_of(head: bytes) -> Kind | None:
     if head.startswith(_MCAP_ROS2[0]) and head[17:].startswith(_MCAP_ROS2[1]):
         return Kind.ROS2_BAG
-    if head.startswith(_SQLITE) and b"messages" in head and b"topics" in head:
+    if head.startswith(SQLITE) and b"messages" in head and b"topics" in head:
         return Kind.ROS2_BAG
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
@@ -186,7 +194,11 @@ def open_recording(path: Path) -> BinaryIO:
             file = path.open("rb")
             packed = file.read(len(_GZIP)) == _GZIP
             file.seek(0)
-            return io.BufferedReader(_Unpacked(file)) if packed else file
+            if packed:
+                return io.BufferedReader(
+                    Unpacked(file, cast(BinaryIO, gzip.GzipFile(fileobj=file)))
+                )
+            return file
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise RecordingError(path, reason(error)) from error
     raise RecordingError(path, "is a directory" if stat.S_ISDIR(mode) else "is not a regular file")
@@ -200,12 +212,12 @@ def is_packed(path: Path) -> bool:
         return file.read(len(_GZIP)) == _GZIP
 
 
-class _Unpacked(io.RawIOBase):
-    """The content of a gzip file. A damaged file, or one that grows too much, is an `OSError`."""
+class Unpacked(io.RawIOBase):
+    """The content of a packed file. A damaged one, or one that grows too much, is an `OSError`."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._packed = gzip.GzipFile(fileobj=file)
+    def __init__(self, file: BinaryIO, packed: BinaryIO) -> None:
+        """`packed`: what unpacks `file`."""
+        self._file, self._packed = file, packed
 
     def readable(self) -> bool:
         return True

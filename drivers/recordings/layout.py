@@ -60,7 +60,7 @@ JUMP_SHARE_MIN: Final = 0.02
 STEP_S: Final = (0.002, 0.5)
 """Shortest and longest usual time between sweeps, s. In each unit other numbers are usual."""
 SLOWEST_S: Final = 1.0
-"""Time between rows, s, above which they may be grasps."""
+"""Time between rows, s, from which on they may be grasps."""
 BACK_SHARE_MAX: Final = 0.1
 """Largest share of rows of a stream that go back in time; it ends at the first of them."""
 EPOCHS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
@@ -118,6 +118,9 @@ def survey(
     rows = _Rows(path, columns, cells)
     rows.refuse_values()
     if rows.is_timed(read_as, rate_hz):
+        if rate_hz is not None and read_as is None and columns.time is not None:
+            problem = "the rows have times: --rate-hz is for --as stream, which leaves them out"
+            raise RecordingError(path, problem, column=columns.time.name)
         rows.refuse_degrees()
         layout = _stream(rows, rate_hz if read_as == "stream" else None)
         if layout.rate_hz is None:
@@ -272,7 +275,7 @@ def _refuse_slow(rows: _Rows, layout: Layout, read_as: ReadAs | None) -> None:
         return
     is_known = layout.unit_s == 1.0 or column.unit_s is not None or abs(times[0]) > EPOCHS[-1][0]
     step_s = step * layout.unit_s
-    if step_s > SLOWEST_S or not (is_known or rows.follow_each_other()):
+    if step_s >= SLOWEST_S or not (is_known or rows.follow_each_other()):
         problem = (
             f"rows are {step:g} apart: grasps of a table (--as table), or sweeps of a stream "
             f"{step_s:g} s apart (--as stream)?"

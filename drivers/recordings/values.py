@@ -96,17 +96,32 @@ def outcome_of(cell: str) -> bool | None:
 def problem_with(cells: Sequence[str], *, decimal_comma: bool) -> str | None:
     """Return why values of electrodes are no counts, as a whole; None: most of them are.
 
-    A broken electrode has values that are missing or out of range; none has fractions.
+    A broken electrode has values that are missing or out of range; none has fractions, or
+    negative values other than the -1 of a missing one.
     """
     given = [cell for cell in cells if cell.strip().lower() not in BLANK]
     wrong = [cell for cell in given if count_of(cell, decimal_comma=decimal_comma) is None]
-    fractions = [cell for cell in wrong if "." in cell or "," in cell]
-    if 2 * len(wrong) <= len(given) and 20 * len(fractions) <= len(given):
+    scaled = [cell for cell in wrong if "." in cell or "," in cell or _is_negative(cell)]
+    if 2 * len(wrong) <= len(given) and 20 * len(scaled) <= len(given):
         return None
     return (
         f"{len(wrong)} of {len(given)} values are not counts, whole numbers in 0..{COUNT_MAX}, the "
         f"first is {shown(wrong[0])}: {_looks_like(wrong, decimal_comma=decimal_comma)}"
     )
+
+
+def _is_negative(cell: str) -> bool:
+    return cell.strip().startswith("-") and number_of(cell) not in (None, -1.0)
+
+
+def are_numbers(cells: Sequence[str]) -> bool:
+    """Return True if most cells are numbers, as those of a header never are."""
+    return 2 * sum(number_of(cell) is not None for cell in cells) > len(cells)
+
+
+def are_texts(cells: Sequence[str]) -> bool:
+    """Return True if no cell is a number or blank, as in a header or a row of units."""
+    return all(number_of(cell) is None and cell.strip().lower() not in BLANK for cell in cells)
 
 
 def _looks_like(wrong: Sequence[str], *, decimal_comma: bool) -> str:

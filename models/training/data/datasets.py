@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import TABLE_FINGERS
+from graspd.biotac import ELECTRODES, TABLE_FINGERS
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED
 from graspd.drivers.recordings.csv_rows import read_rows
@@ -222,15 +223,34 @@ def _read_lab_table(path: Path, read_as: ReadAs | None) -> Grasps:
 
 
 def first_readings(counts: NDArray[np.uint16]) -> Ints:
-    """Return for each row the first one of its grasp, shape (N,): they nearly repeat each other."""
-    values = counts.astype(np.float32)
-    first = np.arange(len(values))
+    """Return for each row the first one of its grasp, shape (N,): they nearly repeat each other.
+
+    Near rows have near means of each finger, so only those of near means are compared.
+    """
+    values = counts.reshape(len(counts), -1).astype(np.float32)
+    means = values.reshape(len(counts), -1, ELECTRODES).mean(axis=2)
+    apart_max = NEAR_COUNTS * math.sqrt(means.shape[1])
+    sorted_by = means[:, int(means.std(axis=0).argmax())]
+    left = np.argsort(sorted_by)
+    places = sorted_by[left]
+    first = np.full(len(values), -1)
+    number = 0
     for row in range(len(values)):
-        apart = np.square(values[row + 1 :] - values[row]).mean(axis=(1, 2))
-        near = first[row + 1 :][apart <= NEAR_COUNTS**2]
-        if len(near):
-            joined = np.union1d(near, first[row])
-            first[np.isin(first, joined)] = joined[0]
+        reached = [row] if first[row] < 0 else []
+        while reached:
+            at = reached.pop()
+            first[at] = row
+            number += 1
+            if 2 * number > len(left):  # those that are known need not be looked at
+                left = left[first[left] < 0]
+                places, number = sorted_by[left], 0
+            begin, end = sorted_by[at] - apart_max, sorted_by[at] + apart_max
+            others = left[slice(*np.searchsorted(places, (begin, end)))]
+            others = others[first[others] < 0]
+            others = others[(np.abs(means[others] - means[at]) <= apart_max).all(axis=1)]
+            near = np.square(values[others] - values[at]).mean(axis=1) <= NEAR_COUNTS**2
+            first[others[near]] = row
+            reached += others[near].tolist()
     return first
 
 

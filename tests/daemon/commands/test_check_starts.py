@@ -46,6 +46,7 @@ def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -
         ('interface = "pcan"', "interface: python-can's interface 'pcan' needs the library"),
         ('interface = "socketcand"', "options: python-can's interface 'socketcand' needs options"),
         (SOCKETCAND + 'port = "29536" }', "options.port: Expected `int`, got `str`"),
+        (SOCKETCAND + "port = 99999 }", "options.port: Expected `int` <= 65535"),
         (SOCKETCAND + "port = 1, tune = true }", "options.tune: python-can's interface 'socketca"),
         (SOCKETCAND + "port = 1, bitrate = 1 }", "options.bitrate: is a key of its own"),
         (

@@ -94,10 +94,12 @@ def driver_of(options: Options, clock: Clock) -> CanBridgeDriver:
     )
 
 
-def sweep_text(sweep: int) -> str:
+def sweep_text(sweep: int, t_s: float = 23.424242, step_s: float = 0.0) -> str:
     """The frames of a sweep as the server sends them: id, its own time, data without spaces."""
-    frames = sweep_of_frames(sweep)
-    return "".join(f"< frame {SAMPLE_ID:03X} 23.424242 {each.data.hex()} >" for each in frames)
+    return "".join(
+        f"< frame {SAMPLE_ID:03X} {t_s + number * step_s:.6f} {each.data.hex()} >"
+        for number, each in enumerate(sweep_of_frames(sweep))
+    )
 
 
 def readings_of(driver: CanBridgeDriver, clock: Clock) -> list[TactileReading]:
@@ -120,6 +122,19 @@ def test_the_samples_and_errors_of_a_server_are_read(server: Server) -> None:
         assert not reading.faults.any()
         assert (driver.counters.error_frames, driver.counters.foreign_frames) == (1, 1)
         assert driver.stream.link.state is LinkState.UP
+
+
+def test_a_board_may_pause_between_sweeps(server: Server) -> None:
+    clock = Clock()
+    with driver_of(server.options, clock) as driver:
+        for sweep in range(9):
+            server.send(sweep_text(sweep, 5.0 + sweep / 100, 0.0002))
+            (reading,) = readings_of(driver, clock)
+            assert (reading.counts == truth(sweep)).all()
+            assert not reading.faults.any()
+            clock.now_ns += 10_000_000
+        assert driver.period_ns == pytest.approx(10_000_000, abs=50_000)
+        assert driver.counters.untimed_frames == 0
 
 
 def test_a_server_that_ends_is_connected_to_again(server: Server) -> None:

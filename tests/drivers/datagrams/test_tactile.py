@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
-from graspd.drivers.datagrams.tactile import SenderClock, TactileStream, TactileStreamDriver
+from graspd.drivers.datagrams.tactile import TactileStream, TactileStreamDriver
+from graspd.drivers.link import SenderClock
 from graspd.drivers.twins.datagrams import TactileTwin
 from graspd.drivers.twins.faults import LinkFaults
 from tests.drivers.datagrams.network import FINGERS, Plan, arrivals, links, message

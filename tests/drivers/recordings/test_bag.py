@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from rosbags import rosbag1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from graspd import judge, read_grasps, read_recording
@@ -96,10 +96,33 @@ def test_a_bag_is_judged_as_its_stream(
     assert np.allclose(frame["t"] - frame["t"][0], wanted["t"], atol=1e-6)
 
 
-def test_a_single_file_of_a_bag_is_read(tmp_path: Path) -> None:
-    folder = BagOf(2).write(tmp_path / "hand", noise(30))
-    (storage,) = folder.glob("*.db3")
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_single_file_of_a_bag_is_read_whatever_its_name(
+    tmp_path: Path, plugin: StoragePlugin
+) -> None:
+    folder = BagOf(2).write(tmp_path / "hand", noise(30), storage_plugin=plugin)
+    (storage,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
     assert len(readings_of(storage)) == 30
+    assert len(readings_of(storage.rename(tmp_path / "hand.bin"))) == 30
+
+
+@pytest.mark.parametrize(
+    ("plugin", "packing"),
+    [
+        (StoragePlugin.SQLITE3, CompressionMode.FILE),
+        (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+        (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    ],
+)
+def test_a_packed_bag_of_ros_2_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugin: StoragePlugin, packing: CompressionMode
+) -> None:
+    path = BagOf(2).write(tmp_path / "hand", noise(30), storage_plugin=plugin, packing=packing)
+    assert len(readings_of(path)) == 30
+    monkeypatch.setattr("graspd.drivers.recordings.bag.CHUNK_MAX_BYTES", 100)
+    monkeypatch.setattr("graspd.drivers.recordings.kinds.COPIED_BYTES_MAX", 1000)
+    with pytest.raises(RecordingError, match=r"unpacks to more than 100"):
+        fingers_of(path)
 
 
 @pytest.mark.parametrize(

@@ -136,6 +136,11 @@ BAD_FILES = {
         GOOD.replace(b"thing_1", b'"thing"_1'),
         "line 3: this is not CSV: ',' expe",
     ),
+    "no header": (GOOD.split(b"\n", 1)[1], "line 1: has numbers in place of names: the header is"),
+    "another header": (
+        GOOD + GOOD,
+        "line 4: has text in place of counts: another header, or units?",
+    ),
     "time not a number": (
         stream(["0", "later"]),
         "line 3, column t: 'later' is not a time",

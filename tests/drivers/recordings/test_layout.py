@@ -51,6 +51,7 @@ DIALECTS = {
     "UTF-16, big end": b"\xfe\xff" + PLAIN.decode().encode("utf-16-be"),
     "semicolons": PLAIN.replace(b",", b";"),
     "tabs": PLAIN.replace(b",", b"\t"),
+    "bars": PLAIN.replace(b",", b"|"),
     "spaces": PLAIN.replace(b",", b" "),
     "sep line": b"sep=;\r\n" + PLAIN.replace(b",", b";"),
     "sep line after a mark": b"\xef\xbb\xbfsep=|\n" + PLAIN.replace(b",", b"|"),
@@ -191,7 +192,8 @@ def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
     ("name", "cells"),
     [
         ("t", TIMES), ("time", TIMES), ("Timestamp", TIMES), ("stamp", TIMES), ("secs", TIMES),
-        ("Time (s)", TIMES), ("field.header.stamp", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
+        ("Time (s)", TIMES), ("__time", TIMES),
+        ("field.header.stamp", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
         ("%time", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
         ("time_ms", ["5", "15", "25", "35"]), ("t_ns", ["0", "10000000", "20000000", "30000000"]),
         ("timestamp", [f"{1.7e15 + n * 1e4:.0f}" for n in range(4)]),
@@ -224,7 +226,8 @@ def written(names: Sequence[str], cells: NDArray[np.str_]) -> bytes:
 
 
 def layout(content: bytes, folder: Path, read_as: ReadAs | None = None) -> bool:
-    return layout_of(write(folder, content), FINGERS, read_as, 100.0).is_stream
+    rate_hz = 100.0 if read_as == "stream" else None
+    return layout_of(write(folder, content), FINGERS, read_as, rate_hz).is_stream
 
 
 @pytest.mark.parametrize(("scale", "unit"), [(1e3, 1e-3), (1e6, 1e-6), (1e9, 1e-9)])
@@ -247,6 +250,13 @@ def test_grasps_with_times_a_minute_apart_are_doubted(tmp_path: Path) -> None:
         layout_of(path, FINGERS)
     assert not layout_of(path, FINGERS, "table").is_stream
     assert layout_of(path, FINGERS, "stream").is_stream
+
+
+def test_a_rate_is_never_ignored(tmp_path: Path) -> None:
+    path = write(tmp_path, stream(TIMES))
+    assert layout_of(path, FINGERS, "stream", 50.0).rate_hz == 50.0
+    with pytest.raises(RecordingError, match="column t: the rows have times: --rate-hz is for"):
+        layout_of(path, FINGERS, None, 50.0)
 
 
 def test_times_that_stand_still_are_refused(tmp_path: Path) -> None:
@@ -355,6 +365,7 @@ def scaled(change: Callable[[int], str], separator: str = ",") -> bytes:
         (scaled(lambda n: f"{n / 4095 * 3.3:.3f}"), "volts?"),
         (scaled(lambda n: f"{n // 2}.5"), "means of several readings?"),
         (scaled(lambda n: f"{n - 2000}.5"), "differences?"),
+        (scaled(lambda n: str(n - 1100)), "differences?"),
         (scaled(lambda n: str(n * 16)), "another sensor, or another scale?"),
         (scaled(lambda n: f'"{n // 1000},{n % 1000:03}"'), "without a separator of thousands"),
         (scaled(lambda n: f"{n // 1000},{n % 1000:03}", ";"), "without a separator of thousands"),
