@@ -194,6 +194,8 @@ class DeviceFault(Enum):
     """Words from a sensor reached the device damaged."""
     SWEEP_TOO_LONG = auto()
     BUS_ERROR = auto()
+    SEQUENCE = auto()
+    """It samples other channels than the scene says."""
 
 
 class Fact(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -20,7 +21,7 @@ from graspd.daemon.assembly.plan import Plan, require_mcap
 from graspd.daemon.commands.models import f1_percent
 from graspd.daemon.doctor.computer import NETWORK
 from graspd.daemon.doctor.finding import Level
-from graspd.daemon.doctor.surroundings import socket_findings
+from graspd.daemon.doctor.surroundings import key_findings, socket_findings
 from graspd.daemon.judge.joint_motion import RAD_PER_S
 from graspd.daemon.judge.motion_limits import MotionLimits, SlowNoise, Tails
 from graspd.daemon.judge.stillness import centred
@@ -34,6 +35,7 @@ from graspd.daemon.process.text import (
     write_lines,
 )
 from graspd.daemon.scene import drivers as scene_drivers
+from graspd.daemon.scene.endpoints import clash
 from graspd.daemon.scene.scene import Realtime, Record, RiskSection
 from graspd.drivers.base import DriverError
 from graspd.drivers.udp import Endpoint
@@ -62,13 +64,52 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the scenes, their models and files; 0 if all are right.
+    """Check the scenes, their models and files, and whether they can run together; 0 if they can.
     Whether sockets can be had and devices work is for `graspd doctor`."""
-    return max([_check(path, as_json=args.json) for path in args.scene])
+    checked = {path: _check(path, as_json=args.json) for path in args.scene}
+    right = [(path, wanted) for path, wanted in checked.items() if wanted is not None]
+    clashes = [
+        f"{path} and {other}: the same {what}"
+        for (path, first), (other, second) in itertools.combinations(right, 2)
+        for what in _shared(first, second)
+    ]
+    for text in clashes:
+        complain(text)
+    return WRONG if clashes or len(right) < len(checked) else 0
 
 
-def _check(path: Path, *, as_json: bool) -> int:
-    """Check one scene and print the result. Return the exit code."""
+def _shared(first: scene.Scene, second: scene.Scene) -> Iterator[str]:
+    """Yield what two scenes both name and only one of them can have."""
+    taken = dict(_taken(second))
+    for what, name in _taken(first):
+        if taken.get(what) == name:
+            yield f"{what}, {name}"
+    for ends in itertools.product(_endpoints(first), _endpoints(second)):
+        if clash(*ends):
+            yield f"endpoint, {ends[0]}"
+
+
+def _endpoints(wanted: scene.Scene) -> list[str]:
+    return [end for end in (wanted.endpoint, wanted.ask_endpoint) if end is not None]
+
+
+def _taken(wanted: scene.Scene) -> Iterator[tuple[str, object]]:
+    """Yield what a scene takes for itself, with the key that names it."""
+    yield "hand.name", wanted.hand.name
+    if wanted.keeps_session:
+        yield "session.folder", os.path.realpath(wanted.session_path)
+    for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
+        match section:
+            case scene_drivers.SpiTactile(port=port):
+                yield "tactile.port", os.path.realpath(port)
+            case scene_drivers.CanTactile(channel=channel, arbitration_id=identifier):
+                yield "tactile.channel and arbitration_id", (channel, identifier)
+            case scene_drivers.UdpSection(source=source):
+                yield f"{name}.source", source
+
+
+def _check(path: Path, *, as_json: bool) -> scene.Scene | None:
+    """Check one scene and print the result. Return it if it is right."""
     try:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
@@ -76,15 +117,14 @@ def _check(path: Path, *, as_json: bool) -> int:
         plan = Plan.of(wanted)
         assembly.build_pipeline(plan, model)
         period_ns = _try_drivers(plan)
-        _try_keys(wanted)
-        for finding in socket_findings(wanted):
-            if finding.level is Level.ERROR:
-                raise scene.SceneError(finding.what)
+        findings = (*key_findings(wanted), *socket_findings(wanted))
+        if wrong := [finding.what for finding in findings if finding.level is Level.ERROR]:
+            raise scene.SceneError("\n".join(wrong))
         if wanted.record is not None:
             require_mcap("[record]")
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
-        return WRONG
+        return None
     document: dict[str, Any] = {
         "scene": str(path),
         "in": _what_is_in(wanted, model, plan.hand, period_ns),
@@ -97,7 +137,7 @@ def _check(path: Path, *, as_json: bool) -> int:
         write_json(document)
     else:
         write_lines(*_lines(document))
-    return 0
+    return wanted
 
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:
@@ -149,17 +189,6 @@ def _try_drivers(plan: Plan) -> int | None:
     with contextlib.closing(driver):
         assembly.open_file(plan.scene, driver)
         return driver.period_ns
-
-
-def _try_keys(wanted: scene.Scene) -> None:
-    if wanted.curve is None:
-        return
-    from graspd.daemon.publish.keys import KeysError, load_clients, load_own
-
-    load_own(wanted.curve.secret_key)
-    refused = load_clients(wanted.curve.clients).refused
-    if refused:
-        raise KeysError("\n".join(refused))
 
 
 def _what_is_in(

@@ -25,6 +25,7 @@ from graspd.daemon.doctor.link import counter_findings, device_findings, rate_fi
 from graspd.daemon.doctor.surroundings import (
     can_finding,
     explained,
+    key_findings,
     model_finding,
     realtime_findings,
     shared_findings,
@@ -46,7 +47,7 @@ COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
 NARROWEST = 40
 """Lines are not wrapped to fewer columns."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
-"""Faults of a device that explain why no finger is felt."""
+"""Faults of a device that explain why no finger is felt; so does `FRAMES_LOST` as an error."""
 FINGER_COLUMNS = 25
 """Width of a finger in the table of electrodes."""
 USUAL_COLUMNS = 80
@@ -170,7 +171,7 @@ def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list
     advised = {finding.advice for finding in findings if finding.advice}
     # The graspd that holds the port holds the sockets as well: that is said once.
     sockets = [finding for finding in socket_findings(wanted) if finding.advice not in advised]
-    return [*findings, *sockets, *realtime_findings(wanted)]
+    return [*findings, *key_findings(wanted), *sockets, *realtime_findings(wanted)]
 
 
 def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
@@ -239,7 +240,12 @@ def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> li
     """Add what electrodes say. A fault of the whole device replaces all absent fingers."""
     electrodes = statistics.findings()
     absent = [finding for finding in electrodes if finding.cause is Cause.SENSOR_ABSENT]
-    whole = [finding for finding in told if finding.cause in WHOLE_DEVICE]
+    whole = [
+        finding
+        for finding in told
+        if finding.cause in WHOLE_DEVICE
+        or (finding.cause is Cause.FRAMES_LOST and finding.level is Level.ERROR)
+    ]
     if not whole or len(absent) < len(statistics.fingers):
         return told + electrodes
     raised = [

@@ -65,6 +65,7 @@ class Cause(StrEnum):
     ELECTRODE_RESTLESS = "electrode-restless"
     ELECTRODE_RAIL = "electrode-rail"
     ELECTRODE_UNREAD = "electrode-unread"
+    KEYS = "keys"
     MODEL_MISSING = "model-missing"
     MODEL_MISFIT = "model-misfit"
     SOCKET_FOLDER = "socket-folder"

@@ -98,7 +98,7 @@ ADVICE = {
     Cause.CLOCK: f"The board's clock stands, was reset, or is wrong. {FLASH}",
     Cause.REPEATED: "Data comes twice. Check for a second sender, and whether the board hangs.",
     Cause.FOREIGN_SENDER: "Two programs send to one port, and one is read. Name it with only_from.",
-    Cause.SETTINGS: "The board samples electrodes that the scene's sequence lacks. Align them.",
+    Cause.SETTINGS: "The board samples channels that the scene's sequence lacks. Align them.",
     Cause.FRAMES_LOST: f"Data is lost or late. {AGAIN} the load of bus, hub and this computer.",
     Cause.OUT_OF_ORDER: f"Frames overtake each other. {AGAIN} the relay or hub on the way.",
     Cause.PALM_MODE: "The palm is in a service mode, or late. Let the hand's own driver start it.",
@@ -173,6 +173,10 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     DeviceFault.SENSOR_WORDS: Trouble(
         Cause.SENSOR_WORDS,
         "Counted by chip select since its reset. If one grows, check the wires of that sensor.",
+    ),
+    DeviceFault.SEQUENCE: Trouble(
+        Cause.SETTINGS,
+        "Set tactile.sequence to that of the board: electrodes, all or interleaved.",
     ),
     DeviceFault.SWEEP_TOO_LONG: Trouble(
         Cause.SETTINGS, "Set a longer period or a shorter sequence, and flash it."

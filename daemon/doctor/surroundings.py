@@ -123,6 +123,21 @@ def socket_findings(wanted: Scene) -> list[Finding]:
     return list(by_cause.values())
 
 
+def key_findings(wanted: Scene) -> list[Finding]:
+    """Judge the keys of `[curve]`."""
+    if wanted.curve is None:
+        return []
+    from graspd.daemon.publish import keys  # only where there are any
+
+    try:
+        keys.load_own(wanted.curve.secret_key)
+        refused = keys.load_clients(wanted.curve.clients).refused
+    except keys.KeysError as problem:
+        refused = [str(problem)]
+    advice = f"graspd keys list --dir {wanted.curve.secret_key.parent} shows all keys."
+    return [Finding(Level.ERROR, what, Cause.KEYS, advice) for what in refused]
+
+
 def realtime_findings(wanted: Scene) -> list[Finding]:
     """Try `[realtime]` for a moment; return what this user may not have."""
     if wanted.realtime is None:

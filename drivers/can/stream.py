@@ -7,6 +7,7 @@ from typing import Final, TypedDict
 
 import numpy as np
 
+from graspd.biotac import ELECTRODES
 from graspd.drivers.base import (
     DeviceFault,
     ElectrodeFault,
@@ -37,6 +38,10 @@ from graspd.drivers.link import Link, LinkState, longest_silence_ns
 
 NAME: Final = "can"
 _SPECIAL: Final = ERROR | REMOTE | LOST
+
+
+READINGS_MIN: Final = 20
+"""Fewest readings by which the board's sequence is known."""
 
 
 class BoardOptions(TypedDict, total=False):
@@ -76,7 +81,7 @@ class CanStream:
         self.link = Link(NAME)
         self.last_error: str | None = None
         """Last failure of the bus or error frame, for people; silence does not count."""
-        self._where = bus
+        self._where, self._sequence = bus, sequence
         self._accepted = 0
         self._silent_at_ns = 0
         rows = sensor_rows(fingers, sensors)
@@ -106,9 +111,21 @@ class CanStream:
         facts = {"bus": Fact(self._where), **self.link.describe()}
         if self.last_error is not None:
             facts["last error"] = Fact(self.last_error, DeviceFault.BUS_ERROR)
+        if not self._has_sequence():
+            text = f"is not {self._sequence}, as the scene says"
+            facts["sequence"] = Fact(text, DeviceFault.SEQUENCE)
         if self.arbitration_id is not None:
             facts["arbitration id"] = Fact(f"{self.arbitration_id:#x}")
         return facts
+
+    def _has_sequence(self) -> bool:
+        """Return False if far more or fewer samples than expected are not of electrodes."""
+        counters, expected = self.counters, len(SEQUENCES[self._sequence]) - ELECTRODES
+        readings = counters.readings
+        others = counters.accepted_frames - ELECTRODES * readings + counters.lost_frames
+        if readings < READINGS_MIN or not expected:  # others are `unexpected_channels` then
+            return True
+        return 0.25 < others / (expected * readings) < 4.0
 
     def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], LinkError | None]:
         """Return the readings that are complete, oldest first, and why the bus is lost."""

@@ -143,6 +143,34 @@ def test_run_names_the_process_that_has_the_port(tmp_path: Path) -> None:
             assert f"Address already in use: PID {os.getpid()}, " in result.stderr
 
 
+TWO = '[hand]\nname = "{}"\n[tactile]\ndriver = {}\n[publish]\nendpoint = "{}"\n'
+
+
+@pytest.mark.parametrize(
+    ("hand", "tactile", "endpoint", "shared"),
+    [
+        ("left", '"spi"\nport = "/dev/b"', "tcp://127.0.0.1:6001", []),
+        (
+            "right",
+            '"spi"\nport = "/dev/b"',
+            "tcp://127.0.0.1:6001",
+            ["hand.name", "session.folder"],
+        ),
+        ("left", '"spi"\nport = "/dev/../dev/a"', "tcp://127.0.0.1:6001", ["tactile.port"]),
+        ("left", '"can"', "tcp://[::ffff:127.0.0.1]:6000", ["endpoint"]),
+    ],
+)
+def test_check_says_what_two_scenes_cannot_share(
+    tmp_path: Path, hand: str, tactile: str, endpoint: str, shared: list[str]
+) -> None:
+    right = written(tmp_path, TWO.format("right", '"spi"\nport = "/dev/a"', "tcp://127.0.0.1:6000"))
+    other = tmp_path / "other.toml"
+    other.write_text(TWO.format(hand, tactile, endpoint))
+    result = graspd("check", right, other)
+    assert re.findall(r"the same ([a-z.]+),", result.stderr) == shared
+    assert result.returncode == (2 if shared else 0)
+
+
 def test_check_does_not_look_for_devices(tmp_path: Path) -> None:
     for tactile in ('"can"\nchannel = "no-such-bus"', '"spi"\nport = "/dev/no-such-port"'):
         assert checked(tmp_path, f"[tactile]\ndriver = {tactile}\n")

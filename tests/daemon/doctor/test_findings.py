@@ -193,6 +193,7 @@ def test_joining_in_the_middle_of_a_sweep_is_no_trouble(number: int, findings: i
         (DeviceFault.NO_SENSOR, Level.ERROR, Cause.SENSOR_ABSENT, "MISO"),
         (DeviceFault.SENSOR_WORDS, Level.WARNING, Cause.SENSOR_WORDS, "by chip select"),
         (DeviceFault.SWEEP_TOO_LONG, Level.WARNING, Cause.SETTINGS, "longer period"),
+        (DeviceFault.SEQUENCE, Level.WARNING, Cause.SETTINGS, "electrodes, all or interleaved"),
         (DeviceFault.BUS_ERROR, Level.WARNING, Cause.BUS_ERRORS, "terminators"),
     ],
 )

@@ -12,9 +12,13 @@ import pytest
 from graspd.daemon.commands.doctor import examine
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Level
+from graspd.daemon.doctor.link import counter_findings, device_findings
+from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.frames import ERROR, CanFrame
+from graspd.drivers.can.stream import CanStream
 from graspd.drivers.spi.messages import FIRMWARE
 from graspd.drivers.twins import spi as spi_twin
+from graspd.drivers.twins.can import CanTwin
 from graspd.drivers.twins.faults import LinkFaults
 from tests.daemon.doctor.emulated import (
     CAN,
@@ -48,6 +52,7 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
         },
     ),
     "lost frames": (LinkFaults(drop_probability=0.05), dict.fromkeys(LINKS, Cause.FRAMES_LOST)),
+    "frames in bursts": (LinkFaults(burst_frames=30), {"can": Cause.FRAMES_LOST}),
     "repeated frames": (
         LinkFaults(duplicate_probability=0.05),
         dict.fromkeys(LINKS, Cause.REPEATED),
@@ -114,6 +119,24 @@ def test_a_fault_of_a_bridge_is_told(
         listen(driver, step, 2000 if cause is Cause.CLOCK else 300, statistics)
         told = faults_told(driver, statistics, statistics.readings / 100.0)
     assert [finding.cause for finding in told] == [cause], told
+
+
+@pytest.mark.parametrize("scene", SEQUENCES)
+@pytest.mark.parametrize("board", SEQUENCES)
+def test_a_board_of_another_sequence_is_told(scene: str, board: str) -> None:
+    stream = CanStream("bus", FINGERS, sequence=scene)
+    stream.link.greeting()
+    twin = CanTwin("virtual", "bus", iter(Hand(100.0)), sequence=board)
+    for sweep in range(100):
+        frames = twin.next_frames()
+        for place, (identifier, data) in enumerate(frames):
+            t_ns = 10_000_000 * sweep + 10_000_000 * place // len(frames)
+            stream.receive([(CanFrame(identifier, data), t_ns, t_ns)])
+            stream.watch(t_ns)
+    told = [*device_findings("can", stream.describe())]
+    told += counter_findings("can", stream.counters.as_dict())
+    causes = {finding.cause for finding in told} - {None}
+    assert causes == ({Cause.SETTINGS} if scene != board else set())
 
 
 def test_a_bus_that_is_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
