@@ -230,7 +230,7 @@ def first_readings(counts: NDArray[np.uint16]) -> Ints:
     values = counts.reshape(len(counts), -1).astype(np.float32)
     means = values.reshape(len(counts), -1, ELECTRODES).mean(axis=2)
     apart_max = NEAR_COUNTS * math.sqrt(means.shape[1])
-    sorted_by = means[:, int(means.std(axis=0).argmax())]
+    sorted_by = means[:, -1]
     left = np.argsort(sorted_by)
     places = sorted_by[left]
     first = np.full(len(values), -1)
