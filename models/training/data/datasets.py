@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import ELECTRODES, TABLE_FINGERS
+from graspd.biotac import TABLE_FINGERS
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED
 from graspd.drivers.recordings.csv_rows import read_rows
@@ -227,23 +227,24 @@ def first_readings(counts: NDArray[np.uint16]) -> Ints:
 
     Near rows have near means of each finger, so only those of near means are compared.
     """
-    values = counts.reshape(len(counts), -1).astype(np.float32)
-    means = values.reshape(len(counts), -1, ELECTRODES).mean(axis=2)
-    apart_max = NEAR_COUNTS * math.sqrt(means.shape[1])
+    number, fingers, electrodes = counts.shape
+    values = counts.astype(np.float32).reshape(number, fingers * electrodes)
+    means = counts.mean(axis=2)
+    apart_max = NEAR_COUNTS * math.sqrt(fingers)
     sorted_by = means[:, -1]
     left = np.argsort(sorted_by)
     places = sorted_by[left]
-    first = np.full(len(values), -1)
-    number = 0
-    for row in range(len(values)):
+    first = np.full(number, -1)
+    known = 0
+    for row in range(number):
         reached = [row] if first[row] < 0 else []
         while reached:
             at = reached.pop()
             first[at] = row
-            number += 1
-            if 2 * number > len(left):  # those that are known need not be looked at
+            known += 1
+            if 2 * known > len(left):  # those that are known need not be looked at
                 left = left[first[left] < 0]
-                places, number = sorted_by[left], 0
+                places, known = sorted_by[left], 0
             begin, end = sorted_by[at] - apart_max, sorted_by[at] + apart_max
             others = left[slice(*np.searchsorted(places, (begin, end)))]
             others = others[first[others] < 0]
