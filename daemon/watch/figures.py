@@ -93,33 +93,36 @@ def counted(count: int, what: str) -> str:
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Return how session and learning go, what matters most first."""
+    """Return how session and learning go, what matters most first; counts of 0 are left out."""
     if status is None:
         return []
     lines = []
+    risk, learner = None if verdict is None else verdict.risk, status.learner
     if status.lifts is not None:
-        lines.append(Line("never reported", counted(status.lifts.unreported, "lift")))
+        lines += _count("never reported", status.lifts.unreported, "lift")
         if status.lifts.covered is False:
             lines.append(UNCOVERED)
-    risk = None if verdict is None else verdict.risk
     if risk is not None:
-        lines.append(Line("awaited", counted(risk.outstanding, "outcome")))
-        announced = f"{counted(risk.announced, 'lift')}, {risk.awaited} awaited"
-        lines.append(Line("announced", announced))
-        lines.append(Line("warm-up left", counted(risk.warm_up_left, "outcome")))
+        lines += _count("awaited", risk.outstanding, "outcome")
+        lines += _count("announced", risk.announced, "lift", f", {risk.awaited} awaited")
+        lines += _count("warm-up left", risk.warm_up_left, "outcome")
         if risk.bound is not None:
             slips = f"{risk.slips} of {counted(risk.lifts, 'lift')}, {int(risk.bound)} allowed"
             lines.append(Line("slips", slips))
-    learner = status.learner
     if learner is not None:
         learned = counted(learner.outcomes, "outcome") if learner.enabled else "nothing: it is off"
         lines.append(Line("learned from", learned))
         refused = sum(learner.told.get(kind, 0) for kind in REFUSED)
-        lines.append(Line("refused", counted(refused, "outcome")))
+        lines += _count("refused", refused, "outcome")
     if status.session_grasps is not None:
         missing = "" if status.session_calibrated else "not yet "
-        lines.append(Line("session", f"{status.session_grasps} grasps, {missing}calibrated"))
+        grasps = counted(status.session_grasps, "grasp")
+        lines.append(Line("session", f"{grasps}, {missing}calibrated"))
     return lines
+
+
+def _count(what: str, count: int, noun: str, more: str = "") -> list[Line]:
+    return [Line(what, counted(count, noun) + more)] if count else []
 
 
 def timing(verdict: Verdict | None, status: Status | None, lost: int) -> list[Line]:

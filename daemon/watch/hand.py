@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from graspd.biotac import ELECTRODES, Finger, electrode_name
-from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.daemon.judge.reasons import Decision, FingerState, GateState
 from graspd.daemon.publish.messages import OutcomeMessage, Status, Tactile, Verdict
 from graspd.daemon.watch.figures import lift
 from graspd.daemon.watch.snapshot import FingerImage, FingerMotion, JudgedGrasp
@@ -71,14 +71,13 @@ class Fingers:
         fall = fall_of(counts, sound, rest)
         return FingerImage(
             name=name,
-            touches=None if verdict.contact is None else name in verdict.contact,
             from_rest=rest is not None,
             levels=levels_of(fall, from_rest=rest is not None).tolist(),
             deepest=round(float(fall.max())),
             marked=sorted(PIXELS[electrode] for electrode in np.flatnonzero(~sound)),
             broken=_broken(np.flatnonzero(~sound).tolist(), repaired),
             motion=_motion(verdict, name),
-            state=(verdict.fingers or {}).get(name),
+            state=_state(verdict, name),
         )
 
     @property
@@ -94,8 +93,13 @@ def _broken(places: Sequence[int], repaired: Sequence[bool]) -> str:
     return "; ".join(f"{', '.join(found)} {kind}" for kind, found in kinds.items() if found)
 
 
+def _state(verdict: Verdict, finger: Finger) -> FingerState | None:
+    return None if verdict.fingers is None else verdict.fingers.get(finger)
+
+
 def _motion(verdict: Verdict, finger: Finger) -> FingerMotion | None:
-    if verdict.motion is None:
+    """Return the motion of a finger; None for one that is free, which has none."""
+    if verdict.motion is None or _state(verdict, finger) is FingerState.FREE:
         return None
     limit = (verdict.motion_limits or {}).get(finger, 0.0)
     return FingerMotion(now=verdict.motion.get(finger) if limit > 0.0 else None, limit=limit)

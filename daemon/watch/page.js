@@ -92,15 +92,13 @@ function drawFinger(canvas, finger) {
 }
 
 // Up to the mark in the middle a finger is still; at the right end it moves twice as much.
-function drawMotion(bar, words, motion, state) {
+function drawMotion(bar, words, motion) {
   bar.hidden = words.hidden = motion === null;
   if (motion === null) return;
   const {now, limit} = motion;
   bar.dataset.motion = now === null ? "unknown" : now > limit ? "moving" : "still";
   bar.style.setProperty("--share", `${now === null ? 0 : Math.min(50 * now / limit, 100)}%`);
-  words.dataset.state = state ?? "unknown";
-  const figures = now === null ? "not known" : `${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`;
-  text(words, `${state === null ? "" : `${state}, `}motion ${figures}`);
+  text(words, now === null ? "motion not known" : `motion ${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`);
 }
 
 // A second of the timeline in words; `ago` counts from the end of the history.
@@ -293,13 +291,13 @@ class Hand {
       (node, finger) => {
         const [name, touch, depth] = node.children[0].children, [, canvas, bar, words, broken] = node.children;
         text(name, finger.name);
-        text(touch, finger.touches === null ? "" : finger.touches ? "touches" : "free");
-        touch.className = finger.touches ? "touch" : "faint";
+        text(touch, finger.state ?? "");
+        touch.className = finger.state === "free" ? "faint" : "touch"; touch.dataset.state = finger.state;
         text(depth, finger.from_rest ? `${finger.deepest} counts` : "");
         canvas.role = "img"; canvas.ariaLabel = `tactile image of ${finger.name}: ${touch.textContent} ${depth.textContent}`;
         drawFinger(canvas, finger);
         bar.className = "moves"; words.className = "faint";
-        drawMotion(bar, words, finger.motion, finger.state);
+        drawMotion(bar, words, finger.motion);
         text(broken, finger.broken && `\u2715 ${finger.broken}`); broken.hidden = finger.broken === "";
       });
     const canvas = this.part("legend").querySelector("canvas"), context = sized(canvas);

@@ -71,8 +71,6 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     """Picture of one finger."""
 
     name: str
-    touches: bool | None
-    """True if it touches; None: not known."""
     from_rest: bool
     """True if levels are relative to the resting counts, False: to the finger's median."""
     levels: list[int]
@@ -84,8 +82,8 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     broken: str
     """Numbers of these electrodes, in words; empty: none."""
     motion: FingerMotion | None
-    """Motion; None: the daemon has no gate."""
-    state: FingerState | None = None
+    """Motion; None: the finger is free, or the daemon has no gate."""
+    state: FingerState | None
     """State; None: not known."""
 
 

@@ -281,5 +281,5 @@ def _past(grasp: JudgedGrasp) -> str:
 
 
 def _flow(lines: Sequence[Line]) -> str:
-    texts = [f"{line.what} {printable(line.advice, NAME_MAX)}" for line in lines]
+    texts = [f"{line.what} {printable(line.advice, NAMES_MAX)}" for line in lines]
     return "; ".join(texts) or "-"

@@ -255,7 +255,7 @@ class View:
         if verdict.session_calibrated is False:
             also.append(Line("less sure", ADVICE[Reason.NOT_CALIBRATED]))
         if verdict.verdict is Decision.SLIP:
-            what = "do not lift unwatched" if verdict.supervised else "do not lift"
+            what = "do not lift unsupervised" if verdict.supervised else "do not lift"
             return Tone.SLIP, [Line(what, "it is judged to slip; grasp again"), *also]
         why_not = doubt(verdict)
         if why_not is not None or verdict.supervised:

@@ -235,7 +235,6 @@ def test_learning_shows_untold_lifts_first() -> None:
         Line("risk", "covers only announced lifts, and none was announced"),
         Line("awaited", "1 outcome"),
         Line("announced", "40 lifts, 1 awaited"),
-        Line("warm-up left", "0 outcomes"),
         Line("slips", "2 of 41 lifts, 9 allowed"),
         Line("learned from", "57 outcomes"),
         Line("refused", "1 outcome"),

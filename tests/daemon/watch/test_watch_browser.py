@@ -139,8 +139,13 @@ def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
         parts = ["bar.nextSibling.innerText"]
         if wanted and len(wanted[0]) > 1:
             parts = ["bar.dataset.motion", "bar.style.getPropertyValue('--share')", *parts]
-        found = f"[...document.querySelectorAll('.moves')].map(bar => [{', '.join(parts)}])"
+        shown = "[...document.querySelectorAll('.moves:not([hidden])')]"
+        found = f"{shown}.map(bar => [{', '.join(parts)}])"
         return f"JSON.stringify({found}) == JSON.stringify({json.dumps(wanted)})"
+
+    def words(expected: list[str]) -> str:
+        found = "[...document.querySelectorAll('figcaption')].map(e => e.children[1].innerText)"
+        return f"JSON.stringify({found}) == JSON.stringify({json.dumps(expected)})"
 
     shown = "[...document.querySelectorAll('.moves')].every(bar => !bar.hidden)"
     show(browser, page, talker, Decision.STABLE)
@@ -170,9 +175,14 @@ def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
         ),
     )
     talker.more |= {"fingers": {"ff": "slide", "th": None}}
-    see(browser, "stable", bars(["slide, motion 2.0 / 1.3 \u03c3"], ["motion 9.0 / 1.0 \u03c3"]))
+    see(
+        browser,
+        "stable",
+        words(["slide", ""]),
+        bars(["motion 2.0 / 1.3 \u03c3"], ["motion 9.0 / 1.0 \u03c3"]),
+    )
     talker.more |= {"motion": {"ff": None, "th": 0.5}, "fingers": {"ff": "free", "th": "touch"}}
-    see(browser, "stable", bars(["free, motion not known"], ["touch, motion 0.5 / 1.0 \u03c3"]))
+    see(browser, "stable", words(["free", "touch"]), bars(["motion 0.5 / 1.0 \u03c3"]))
     talker.decision = None
     see(browser, "silent", reads("still", "-"), bars())
 
@@ -206,10 +216,10 @@ def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
     plain = f"{figure}.fontStyle == 'normal'"
     see(browser, "stable", says("timing", "250 us"), reads("old", ""), plain)
     talker.decision = None
-    see(browser, "silent")
+    # For more than a second: a busy computer is silent for less.
+    see(browser, "silent", r"/silent: no message for \d{4}/.test(document.body.innerText)")
     silent_s = int(time.time())
     assert text(browser, "verdict") == "UNKNOWN"
-    assert "silent: no message for " in text(browser, "why")
     assert browser.value(f"{figure}.fontStyle") == "italic"
     assert browser.value(f"{figure}.color") == "rgb(91, 101, 112)"  # --faint
     assert "250 us" in text(browser, "timing")
