@@ -61,11 +61,8 @@ function element(name, ...inside) { const made = document.createElement(name); m
 function lines(parent, items) {
   children(parent, items, () => element("li", element("b"), element("span")), (node, line) => {
     text(node.children[0], line.what); text(node.children[1], ": " + line.advice);
+    node.dataset.need = line.need;
   });
-}
-function problems(parent, items) {
-  lines(parent, items);
-  items.forEach((line, at) => { parent.children[at].dataset.need = line.need; });
 }
 function rows(table, items) {
   children(table, items, () => element("tr", element("td"), element("td")), (node, line) => {
@@ -240,8 +237,9 @@ class Hand {
     children(this.part("joints"), joints, () => element("div", element("span"), element("b")), (node, [name, angle]) => {
       text(node.children[0], name); text(node.children[1], `${(angle * 180 / Math.PI).toFixed(1)}\u00b0`);
     });
-    problems(this.part("health"), seen.health.length ? seen.health :
-      [{need: "normal", what: seen.state === null ? "not known" : "well", advice: seen.state === null ? "no status comes" : "nothing to do"}]);
+    const well = {need: "normal", what: "well", advice: "nothing to do"};
+    const unknown = {need: "normal", what: "not known", advice: "no status comes"};
+    lines(this.part("health"), none || seen.state === null ? [unknown] : seen.health.length ? seen.health : [well]);
     this.drawTables();
   }
   drawMinutes(quiet) {
@@ -311,8 +309,6 @@ class Hand {
   }
 
   drawTables() {
-    const {counts} = this.seen;
-    this.say("counts", Object.entries(counts).map(([name, count]) => `${count} ${name}`).join(", "));
     children(this.part("grasps"), this.seen.grasps,
       () => element("tr", element("td", element("button")), element("td", element("i"), element("span")), element("td"), element("td")),
       (node, grasp) => {

@@ -128,8 +128,6 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Time without motion, as text; `-`: not known."""
     grasps: list[JudgedGrasp]
     """Latest judged grasps, the newest first."""
-    counts: dict[str, int]
-    """Number of grasps since watch began, by their last verdict."""
     fingers: list[FingerImage]
     joints: dict[str, float]
     """Angle of each joint, rad."""

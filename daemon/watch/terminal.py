@@ -52,7 +52,7 @@ NAME_MAX = 40
 NAMES_MAX = 1000
 """Most characters shown of several received names: a hand's 120 electrodes have 840."""
 LABEL_COLUMNS = 12
-"""Width of the longest label, `grasps seen` or `last message`, columns."""
+"""Width of the longest label, `last message`, columns."""
 SIGNALS_MAX = 64
 CHARACTERS = 6
 """Place of the control characters in the settings of a terminal."""
@@ -262,7 +262,6 @@ def _figures(seen: Snapshot) -> Iterator[Row]:
         then = time.strftime("%H:%M:%S", time.localtime(seen.last_t))
         ago_s = seen.t - seen.last_t
         yield "last message", f"{then}, {ago_s:.0f} s ago; figures of then"
-    yield "grasps seen", ", ".join(f"{count} {what}" for what, count in seen.counts.items())
     yield "last grasps", "; ".join(map(_past, seen.grasps)) or "-"
     yield "learning", _flow(seen.learning)
     yield "timing", _flow(seen.timing)

@@ -227,7 +227,6 @@ class View:
             contact=None if verdict is None or verdict.contact is None else list(verdict.contact),
             still=stillness(None if verdict is None else verdict.still_ms),
             grasps=self._grasps.last(now_ns, None if silent else self._held()),
-            counts=self._grasps.counts(),
             fingers=[] if verdict is None else self._fingers.images(verdict, status, now_ns),
             joints={} if silent else self._fingers.joints,
             health=health,

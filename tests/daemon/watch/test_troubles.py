@@ -112,37 +112,31 @@ def test_health_names_all_parts_of_a_reason_at_once() -> None:
     assert seen.not_well == "not well: ff_7, mf_24 electrode-dead and 1 more"
 
 
+SERVICE = "systemctl status graspd@{0}; journalctl -u graspd@{0}"
+START, THERE = "is it started? graspd run {0}", "on the daemon's computer: "
+
+
 @pytest.mark.parametrize(
-    ("endpoint", "scene", "look"),
+    ("endpoint", "scene", "look", "examined"),
     [
-        ("ipc:///tmp/x.ipc", "/etc/graspd/left.toml", "systemctl status graspd@left; "),
-        ("ipc:///run/graspd/right.ipc", None, "systemctl status graspd@right; "),
-        ("ipc:///tmp/x.ipc", "deploy/scenes/demo.toml", "is it started? graspd run deploy/"),
-        ("tcp://10.0.0.2:5556", None, "on the daemon's computer: systemctl status 'graspd@*'"),
-        ("ipc:///tmp/x.ipc", None, "is it started? graspd run SCENE"),
+        (
+            "ipc:///tmp/x.ipc",
+            "/etc/graspd/left.toml",
+            SERVICE.format("left"),
+            "/etc/graspd/left.toml",
+        ),
+        ("ipc:///run/graspd/right.ipc", None, SERVICE.format("right"), "/etc/graspd/right.toml"),
+        ("ipc:///tmp/x.ipc", "my/demo.toml", START.format("my/demo.toml"), "my/demo.toml"),
+        ("tcp://10.0.0.2:5556", None, THERE + "systemctl status 'graspd@*'", "SCENE"),
+        ("ipc:///tmp/x.ipc", None, START.format("SCENE"), "SCENE"),
     ],
 )
 def test_where_to_look_is_a_command_of_this_daemon(
-    endpoint: str, scene: str | None, look: str
+    endpoint: str, scene: str | None, look: str, examined: str
 ) -> None:
-    said, _ = where_to_look(endpoint, None if scene is None else Path(scene))
-    assert said.startswith(look)
-    if "graspd@" in look:
-        assert "graspd@*" in said or f"journalctl -u {look.split()[2].rstrip(';')}" in said
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "scene", "command"),
-    [
-        ("ipc:///tmp/x.ipc", "deploy/scenes/demo.toml", "graspd doctor deploy/scenes/demo.toml;"),
-        ("ipc:///run/graspd/left.ipc", None, "graspd doctor /etc/graspd/left.toml;"),
-        ("tcp://10.0.0.2:5556", None, "on the daemon's computer: graspd doctor SCENE;"),
-        ("ipc:///tmp/x.ipc", None, "graspd doctor SCENE;"),
-    ],
-)
-def test_where_to_examine_names_the_scene(endpoint: str, scene: str | None, command: str) -> None:
-    _, said = where_to_look(endpoint, None if scene is None else Path(scene))
-    assert said.startswith(command)
+    there = THERE * endpoint.startswith("tcp")
+    doctor = f"{there}graspd doctor {examined}; the daemon's log says why"
+    assert where_to_look(endpoint, None if scene is None else Path(scene)) == (look, doctor)
 
 
 @pytest.mark.parametrize(

@@ -302,28 +302,6 @@ def test_a_judged_grasp_is_past_once_it_is_released(gate: GateState, held: bool)
     assert (last.verdict, last.held) == ("stable", held)
 
 
-def test_grasps_are_counted_once_by_their_last_verdict() -> None:
-    view, seq = after((b"verdict.right", verdict(0, grasp=41, gate=GateState.IDLE))), 1  # over
-    # As the gate numbers them: 1 slips, 2 turns from stable to slip, 3 is let go unjudged, 4 holds.
-    said = {1: [Decision.SLIP], 2: [Decision.STABLE, Decision.SLIP], 3: [], 4: [Decision.STABLE]}
-    for grasp, decisions in said.items():
-        steps = [(GateState.CLOSING, Decision.UNKNOWN)] * 9
-        steps += [(GateState.JUDGED, decision) for decision in decisions for _ in range(20)]
-        steps += [(GateState.RELEASED, Decision.UNKNOWN), (GateState.IDLE, Decision.UNKNOWN)] * 5
-        for gate, decision in steps:
-            view.take(b"verdict.right", verdict(seq, decision, grasp=grasp, gate=gate), 0)
-            seq += 1
-        if grasp == 3:
-            assert view.snapshot(0).counts == {"stable": 0, "slip": 2, "unknown": 1}
-    seen = view.snapshot(0)
-    assert seen.counts == {"stable": 1, "slip": 2, "unknown": 1}
-    view.take(b"verdict.right", verdict(seq, grasp=5, gate=GateState.CLOSING), 0)
-    assert view.snapshot(0).counts == seen.counts  # not known yet
-    restarted = verdict(0, Decision.STABLE, grasp=1, boot_id="another")
-    view.take(b"verdict.right", restarted, 0)
-    assert view.snapshot(0).counts == {"stable": 2, "slip": 2, "unknown": 2}
-
-
 @pytest.mark.parametrize(
     ("moments", "seconds"),
     [
