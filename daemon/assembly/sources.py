@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,8 @@ from graspd.models.runtime import TactileModel
 if TYPE_CHECKING:
     from graspd.drivers.recordings.player import LinkLogDriver
 
+DRAWS = "replay"
+"""Id of the start whose draws say which lifts of a table are supervised: each time the same."""
 LINK_LOGS = {Kind.SERIAL: "spi", **dict.fromkeys(CAN_LOGS, "can")}
 """Kinds of link logs, and the driver of such a link."""
 LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session")
@@ -110,9 +113,9 @@ class Tables(Source):
         for path in self._paths:
             self._refuse_other_fingers(path, model)
         plan = Plan.of(replayed.model_copy(update={"hand": hand}))
-        if kind_of_all(self._paths) in BAGS:
-            return Parts.of(plan, model, self._bags(hand.fingers, speed))
-        return Parts.of(plan, model, self._driver(hand.fingers, speed=speed))
+        play = self._bags if kind_of_all(self._paths) in BAGS else self._driver
+        parts = Parts.of(plan, model, play(hand.fingers, speed=speed))
+        return replace(parts, boot_id=DRAWS)
 
     def _bags(self, fingers: Sequence[Finger], speed: float | None) -> Driver:
         from graspd.drivers.recordings.bag import BagDriver

@@ -64,18 +64,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the scenes, their models and files, and whether they can run together; 0 if they can.
+    """Check the scenes, their models and files; 0 if all are right. Warn of what they share.
     Whether sockets can be had and devices work is for `graspd doctor`."""
     checked = {path: _check(path, as_json=args.json) for path in args.scene}
     right = [(path, wanted) for path, wanted in checked.items() if wanted is not None]
-    clashes = [
-        f"{path} and {other}: the same {what}"
-        for (path, first), (other, second) in itertools.combinations(right, 2)
-        for what in _shared(first, second)
-    ]
-    for text in clashes:
-        complain(text)
-    return WRONG if clashes or len(right) < len(checked) else 0
+    for (path, first), (other, second) in itertools.combinations(right, 2):
+        if shared := list(_shared(first, second)):
+            complain(f"{path} and {other} cannot run together: the same {', '.join(shared)}")
+    return WRONG if len(right) < len(checked) else 0
 
 
 def _shared(first: scene.Scene, second: scene.Scene) -> Iterator[str]:
@@ -83,17 +79,17 @@ def _shared(first: scene.Scene, second: scene.Scene) -> Iterator[str]:
     taken = dict(_taken(second))
     for what, name in _taken(first):
         if taken.get(what) == name:
-            yield f"{what}, {name}"
+            yield f"{what} {name}"
     for ends in itertools.product(_endpoints(first), _endpoints(second)):
         if clash(*ends):
-            yield f"endpoint, {ends[0]}"
+            yield f"endpoint {ends[0]}"
 
 
 def _endpoints(wanted: scene.Scene) -> list[str]:
     return [end for end in (wanted.endpoint, wanted.ask_endpoint) if end is not None]
 
 
-def _taken(wanted: scene.Scene) -> Iterator[tuple[str, object]]:
+def _taken(wanted: scene.Scene) -> Iterator[tuple[str, str]]:
     """Yield what a scene takes for itself, with the key that names it."""
     yield "hand.name", wanted.hand.name
     if wanted.keeps_session:
@@ -103,7 +99,7 @@ def _taken(wanted: scene.Scene) -> Iterator[tuple[str, object]]:
             case scene_drivers.SpiTactile(port=port):
                 yield "tactile.port", os.path.realpath(port)
             case scene_drivers.CanTactile(channel=channel, arbitration_id=identifier):
-                yield "tactile.channel and arbitration_id", (channel, identifier)
+                yield "tactile.channel and arbitration_id", f"{channel} {identifier}"
             case scene_drivers.UdpSection(source=source):
                 yield f"{name}.source", source
 

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="grasp tables or streams (CSV, Parquet); what `graspd run` has recorded (MCAP); ROS "
         "bags; what came over a link (a CAN log, serial bytes); each packed by gzip or not, "
         "known by its content; - is standard input; without any, the demo: a synthetic day, with "
-        "--outcomes and --max-slip-when-stable 0.05",
+        "--outcomes, --only-lifted and --max-slip-when-stable 0.05",
     )
     parser.add_argument(
         "--scene", type=Path, help="of a link log: the scene that says how to decode it"
@@ -173,7 +173,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     if not args.recordings:
-        args.recordings, args.outcomes = [DEMO_DAY], True
+        args.recordings = [DEMO_DAY]
+        args.outcomes = args.only_lifted = True
         args.max_slip_when_stable = args.max_slip_when_stable or DEMO_RISK
     source = _source(args)
     parts = _parts(args, source)

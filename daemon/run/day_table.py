@@ -17,7 +17,7 @@ GRASPS = 25
 """Grasps of one line."""
 PUBLISHED = "cnn1"
 """Name of the published network in the zoo."""
-COLUMNS = f"{'stable':>8}{'slipped':>15}{'good lifts kept':>18}"
+COLUMNS = f"{'stable':>7}{'slipped':>11}{'good lifts kept':>17}"
 
 
 class DayTable(Companion):
@@ -39,8 +39,8 @@ class DayTable(Companion):
         self._write(
             title,
             "",
-            coloured(f"{'':10}{heads}", Colour.BOLD),
-            coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", Colour.BOLD),
+            coloured(f"{'':9}{heads}", Colour.BOLD),
+            coloured(f"{'grasps':9}{COLUMNS}{COLUMNS}", Colour.BOLD),
         )
 
     def on_verdict(self, published: PublishedVerdict) -> None:
@@ -75,38 +75,37 @@ class DayTable(Companion):
         self._line("all", self._whole, allowed)
         self._write("", *self._figures())
         if trust is not None and trust.lifts.told:
-            learned = f"graspd learned from {trust.learner.outcomes} outcomes of lifts."
+            self._write(f"graspd learned from {trust.learner.outcomes} outcomes of lifts.")
             if report is not None and report.target is not None and report.bound is not None:
                 share = f"{100 * report.target:g} % of its `stable`"
                 most = int(report.bound)
-                learned += f" At most {most} can slip: {share}, and {report.beyond_share:.2f} more."
-            self._write(learned)
+                self._write(
+                    f"At most {most} can slip: {share}, and {report.beyond_share:.2f} more."
+                )
         self._write(*self._warnings, "Each verdict and all scores: --verbose.")
 
     def _figures(self) -> list[str]:
-        """Return the three figures that matter, each with what it means."""
+        """Return the three figures that matter."""
         published, graspd = self._whole
         return [
-            f"slips of `stable`  {_slips(graspd)}, published {_slips(published)}: "
-            "the risk of a lift on `stable`",
-            f"good lifts kept    {_kept(graspd)}, published {_kept(published)}: "
-            "`stable` of those that hold",
-            f"unknown            {graspd.decisions[Decision.UNKNOWN]} of {graspd.labelled} grasps, "
-            f"published {published.decisions[Decision.UNKNOWN]}: no answer, so grasp again",
+            f"`stable` that slipped  {_slips(graspd)}, published {_slips(published)}",
+            f"good lifts kept        {_kept(graspd)}, published {_kept(published)}",
+            f"unknown, grasp again   {graspd.decisions[Decision.UNKNOWN]} of {graspd.labelled}, "
+            f"published {published.decisions[Decision.UNKNOWN]}",
         ]
 
     def _line(self, grasps: str, tallies: tuple[Tally, Tally], allowed: float | None) -> None:
-        self._write(f"{grasps:10}{''.join(self._cells(tally, allowed) for tally in tallies)}")
+        self._write(f"{grasps:9}{''.join(self._cells(tally, allowed) for tally in tallies)}")
 
     def _cells(self, tally: Tally, allowed: float | None) -> str:
         stable, slips = tally.stable
         worth = tally.worth() or {}
         share, kept = worth.get("slips_among_stable"), worth.get("coverage")
-        slipped = f"{slips:9}" + (f"{100 * share:4.0f} %" if share is not None else f"{'-':>6}")
+        slipped = f"{slips:6}" + (f"{100 * share:3.0f} %" if share is not None else f"{'-':>5}")
         if share is not None and allowed is not None:
             slipped = coloured(slipped, Colour.RED if share > allowed else Colour.GREEN)
         good = f"{100 * kept:.0f} %" if kept is not None else "-"
-        return f"{stable:8}{slipped}{good:>18}"
+        return f"{stable:7}{slipped}{good:>17}"
 
     def _write(self, *lines: str) -> None:
         write_lines(*lines)

@@ -32,17 +32,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for kind in KINDS.values():
         for name in kind.NAMES:
             path, now = kind.path_of(name), kind.made(name)
-            if args.renew:
+            before = path.read_text() if path.is_file() else ""
+            found = kind.differences(before, now)
+            if args.renew and found:
                 path.parent.mkdir(exist_ok=True)
-                path.write_text(now)
-                sys.stdout.write(f"{path.name}: {now.count(chr(10))} lines\n")
-                continue
-            found = kind.differences(path.read_text() if path.is_file() else "", now)
+                path.write_text("".join(renewed(kind, before, now)))
             sys.stdout.writelines(f"{path.name}: {line}\n" for line in found[:SHOWN_MAX])
             if found:
                 sys.stdout.write(f"{path.name}: {len(found)} differences\n")
-            code = code or int(bool(found))
+            code = code or int(bool(found) and not args.renew)
     return code
+
+
+def renewed(kind: ModuleType, before: str, now: str) -> list[str]:
+    """Return the lines of `now`, as they were where only last digits differ."""
+    was, lines = before.splitlines(keepends=True), now.splitlines(keepends=True)
+    if len(was) != len(lines):
+        return lines
+    return [
+        kept if not kind.differences(kept, line) else line
+        for kept, line in zip(was, lines, strict=True)
+    ]
 
 
 if __name__ == "__main__":

@@ -65,9 +65,9 @@ def test_the_demo_shows_what_stable_is_worth_by_both_methods_on_a_day_of_drift()
     # The three figures, counted here from the messages and the table.
     held = slipped.count(False)
     unknown = sum(verdict.verdict == "unknown" for verdict in verdicts)
-    assert f"slips of `stable`  {slips} of {stable} (" in text
-    assert f"good lifts kept    {stable - slips} of {held} (" in text
-    assert f"unknown            {unknown} of 300 grasps, published 0:" in text
+    assert f"`stable` that slipped  {slips} of {stable} (" in text
+    assert f"good lifts kept        {stable - slips} of {held} (" in text
+    assert f"unknown, grasp again   {unknown} of 300, published 0" in text
 
 
 def test_a_table_with_outcomes_is_counted_by_25_grasps(tmp_path: Path) -> None:
