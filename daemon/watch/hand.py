@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from graspd.biotac import ELECTRODES, Finger, electrode_name
-from graspd.daemon.judge.reasons import FingerState, GateState
+from graspd.daemon.judge.reasons import FingerState
 from graspd.daemon.publish.messages import OutcomeMessage, Status, Tactile, Verdict
 from graspd.daemon.watch.figures import lift
 from graspd.daemon.watch.snapshot import FingerImage, FingerMotion, JudgedGrasp
@@ -16,8 +16,6 @@ from graspd.models.levels import PIXELS, RestCounts, fall_of, levels_of
 OLD_NS = 1_000_000_000
 """Largest age of a reading whose image is shown, ns."""
 GRASPS_MAX = 8
-OPEN = {GateState.IDLE, GateState.RELEASED}
-"""States of the gate without a grasp."""
 
 Key = tuple[str, int]
 """`boot_id` and number of a grasp."""

@@ -12,6 +12,7 @@ from msgspec import structs
 
 from graspd.daemon.judge.reasons import (
     ADVICE,
+    OPEN,
     WATCHED_LIFT,
     Decision,
     GateState,
@@ -34,7 +35,7 @@ from graspd.daemon.publish.messages import (
 from graspd.daemon.watch import figures
 from graspd.daemon.watch.feed import Feed
 from graspd.daemon.watch.figures import SUPERVISED, counted, doubt, rests_on, stillness
-from graspd.daemon.watch.hand import OPEN, Fingers, GraspLog
+from graspd.daemon.watch.hand import Fingers, GraspLog
 from graspd.daemon.watch.snapshot import Line, Link, Snapshot, Tone
 
 TICK_S = 0.02
@@ -263,7 +264,7 @@ class View:
 
     def _unknown(self, verdict: Verdict) -> tuple[Tone, list[Line]]:
         reasons = to_act_on(verdict.reasons)
-        if self._status is not None and self._status.overloaded and FOLLOW.intersection(reasons):
+        if self._is_overloaded() and FOLLOW.intersection(reasons):
             rest = [reason for reason in reasons if reason not in FOLLOW]
             return Tone.TROUBLE, [OVERLOADED, *map(_line, rest)]
         why = [_line(reason) for reason in reasons]
@@ -272,6 +273,10 @@ class View:
         if verdict.supervised and WATCHED_LIFT.issuperset(reasons):
             return Tone.LEARNING, [SUPERVISED, *why]
         return Tone.TROUBLE if need_of(reasons) is Need.ACT else Tone.WAITING, why
+
+    def _is_overloaded(self) -> bool:
+        status = self._status
+        return status is not None and status.overloaded and status.state is State.RUNNING
 
     def _silence(self, now_ns: int) -> Line:
         stopped_ns, went_on_ns = self.stood_still

@@ -240,26 +240,6 @@ def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
     browser.complaints.clear()  # the browser says that there was no server
 
 
-def test_the_timeline_is_there_again_on_a_page_that_is_reloaded(
-    page: Page, talker: Talker, browser: Browser
-) -> None:
-    slipped = "/slip [1-9]/.test(document.querySelector('.timeline').ariaLabel)"
-    show(browser, page, talker, Decision.SLIP)
-    see(browser, "slip", slipped)  # a second of it is over
-    talker.decision = Decision.STABLE
-    see(browser, "stable")
-    browser.go("about:blank")
-    browser.go(page.address)
-    see(browser, "stable", slipped)
-    # It is drawn: below the first lane's name and the minutes there is something of its colour.
-    assert browser.value(
-        "(c => { const all = c.getContext('2d').getImageData(0, 0, c.width, 12).data; let n = 0;"
-        " for (let i = 0; i < all.length; i += 4)"
-        " n += all[i] === 207 && all[i + 1] === 34 && all[i + 2] === 46; return n; })"
-        "(document.querySelector('.timeline'))"
-    )
-
-
 @pytest.mark.parametrize(
     ("names", "width", "fits", "theme"),
     [
