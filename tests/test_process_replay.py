@@ -28,7 +28,7 @@ def test_every_reference_is_compared() -> None:
 
 
 @pytest.mark.parametrize("name", ["demo", "twin_faults", "request_risk", "mcap", "serial_log"])
-def test_a_reference_has_grasps_that_were_judged_and_some_that_were_not(name: str) -> None:
+def test_a_reference_has_judged_and_unjudged_grasps(name: str) -> None:
     known = reference(name)
     assert sum(entry["n"] for entry in known) > 2500  # readings of the demo recording: 2836
     assert {entry["verdict"] for entry in known} >= {"stable", "slip", "unknown"}
@@ -40,7 +40,7 @@ def test_every_reference_judges_some_grasp(name: str) -> None:
     assert any(entry["judged"] and entry["valid"] for entry in reference(name))
 
 
-def test_a_recording_is_judged_as_it_was_when_it_was_made() -> None:
+def test_a_replayed_recording_is_judged_as_before() -> None:
     assert verdicts.path_of("mcap").read_text() == verdicts.path_of("request_risk").read_text()
 
 
@@ -63,12 +63,12 @@ def test_outcomes_are_taken_and_refused_in_the_references() -> None:
 
 
 @pytest.mark.parametrize("code", [0, 1, 2])
-def test_each_exit_code_of_the_command_line_is_in_the_references(code: int) -> None:
+def test_the_references_have_each_exit_code(code: int) -> None:
     texts = [commands.path_of(name).read_text() for name in commands.NAMES]
     assert any(f"\nexit code {code}\n" in text for text in texts)
 
 
-def test_no_reference_is_so_near_to_the_threshold_that_another_processor_could_turn_it() -> None:
+def test_no_reference_is_near_the_threshold() -> None:
     for name in verdicts.NAMES:
         for entry in reference(name):
             assert entry.get("near", False) == is_near(entry)
@@ -134,8 +134,6 @@ def test_a_reference_reads_as_it_was_written() -> None:
         ('1 verdict {"seq":3,"p_slip":null,"gate":null}', True),
     ],
 )
-def test_of_a_message_only_numbers_with_a_point_may_differ_a_little(
-    now: str, *, differs: bool
-) -> None:
+def test_only_numbers_with_a_point_may_differ_slightly(now: str, *, differs: bool) -> None:
     was = '1 verdict {"seq":3,"p_slip":0.25,"gate":null}'
     assert bool(lines_apart([was], [now], 2e-4)) == differs

@@ -21,7 +21,7 @@ SILENCE_S = 0.1
 """`silence_ms` of a daemon at 100 Hz with the default age limit."""
 
 
-def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_path: Path) -> None:
+def test_a_python_client_lifts_a_settled_grasp_either_way(tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, whole_grasps=True) as daemon,
         Client(daemon.endpoint) as listening,
@@ -145,7 +145,7 @@ def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -
     assert (bool(answer), answer.verdict.reasons) == (False, ("silent",))
 
 
-def test_a_daemon_that_was_killed_is_unknown_until_it_is_heard_again(tmp_path: Path) -> None:
+def test_a_killed_daemon_is_unknown_until_heard_again(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Client(daemon.endpoint, max_age_ms=1e6) as graspd:
         wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
         former = graspd.verdict().boot_id

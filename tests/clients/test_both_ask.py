@@ -14,7 +14,14 @@ from typing import Any
 import pytest
 import zmq
 
-from deploy.clients.python.graspd_client import Client, Decision, Outcome, OutcomeAnswer, Verdict
+from deploy.clients.python.graspd_client import (
+    Client,
+    Decision,
+    LiftAnswer,
+    Outcome,
+    OutcomeAnswer,
+    Verdict,
+)
 from tests.clients.building import Probe, asked, cpp_lifts
 from tests.clients.messages import TEACHES, TOPIC, verdict
 from tests.kit.waiting import wait_until
@@ -85,6 +92,24 @@ def _serve(
                 questions.send_multipart([who, *(TAKEN_FRAMES if told_of else answer(message))])
 
 
+def says_no(ask: Callable[[], LiftAnswer], *reasons: str) -> None:
+    """Ask until the reasons are these: on a busy machine a message may be old."""
+
+    def is_so() -> bool:
+        answer = ask()
+        assert not answer
+        return answer.verdict.reasons == reasons
+
+    wait_until(is_so)
+
+
+def cpp_reasons(lift_gate: Path, *words: object) -> list[str]:
+    """Why the C++ example does not lift: what stands in its brackets."""
+    result = asked(lift_gate, *words)
+    assert result.returncode == 1
+    return result.stdout.partition("[")[2].partition("]")[0].split()
+
+
 ANSWERS: dict[str, tuple[Answer, str]] = {
     "the same": (told(), "stable"),
     "with a later field": (told(later="field"), "stable"),
@@ -128,7 +153,7 @@ SUPERVISED: dict[str, tuple[Answer, bool]] = {
 
 
 @pytest.mark.parametrize(("answer", "may"), SUPERVISED.values(), ids=SUPERVISED)
-def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
+def test_supervised_clients_lift_only_what_is_unproven(
     lift_gate: Path, tmp_path: Path, answer: Answer, may: bool
 ) -> None:
     places = [f"ipc://{tmp_path}/out", "30.0" if may else str(DEADLINE_S), f"ipc://{tmp_path}/ask"]
@@ -144,14 +169,11 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
         assert not graspd.may_i_lift(DEADLINE_S)
 
 
-def test_a_supervised_lift_waits_until_the_newest_message_is_not_early(
-    lift_gate: Path, tmp_path: Path
-) -> None:
+def test_a_supervised_lift_waits_while_messages_are_early(lift_gate: Path, tmp_path: Path) -> None:
     places = [f"ipc://{tmp_path}/out", str(DEADLINE_S)]
     with false_daemon(tmp_path, told(), "unknown", **TEACHES | {"early": True}):
         with Client(places[0]) as graspd:
-            answer = graspd.may_i_lift(DEADLINE_S, supervised=True)
-            assert (bool(answer), answer.verdict.reasons) == (False, ("not-still",))
+            says_no(lambda: graspd.may_i_lift(DEADLINE_S, supervised=True), "not-still")
         assert not cpp_lifts(lift_gate, "--supervised", *places)
 
 
@@ -170,17 +192,16 @@ STILL: dict[str, tuple[dict[str, Any], bool, bool]] = {
 
 
 @pytest.mark.parametrize(("says", "may", "may_at_once"), STILL.values(), ids=STILL)
-def test_who_wants_the_hand_to_have_been_still_lifts_only_when_the_daemon_says_so(
+def test_a_lift_waits_for_the_stillness_that_is_asked_for(
     lift_gate: Path, tmp_path: Path, says: dict[str, Any], may: bool, may_at_once: bool
 ) -> None:
     out = f"ipc://{tmp_path}/out"
     with false_daemon(tmp_path, told(), **says), Client(out) as graspd:
         for still_ms, allowed in ((240.0, may), (None, may_at_once)):
             deadline_s = 100.0 if allowed else DEADLINE_S
-            answer = graspd.may_i_lift(deadline_s, still_ms=still_ms)
-            assert bool(answer) is allowed
+            assert bool(graspd.may_i_lift(deadline_s, still_ms=still_ms)) is allowed
             if may_at_once and not allowed:
-                assert answer.verdict.reasons == ("not-still",)
+                says_no(partial(graspd.may_i_lift, DEADLINE_S, still_ms=240.0), "not-still")
             still = [] if still_ms is None else ["--still", still_ms]
             assert cpp_lifts(lift_gate, *still, out, deadline_s) is allowed
 
@@ -228,7 +249,7 @@ def test_an_answer_alone_allows_no_lift(lift_gate: Path, tmp_path: Path, outcome
 
 @pytest.mark.parametrize("reasons", [["moving"], ["settling", "joints-late"]])
 @pytest.mark.parametrize("answers", [True, False])
-def test_where_nobody_answers_a_restless_hand_is_not_all_that_is_told(
+def test_a_missing_answer_is_told_beside_motion(
     lift_gate: Path, tmp_path: Path, reasons: list[str], answers: bool
 ) -> None:
     out, ask = f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/{'ask' if answers else 'nobody'}"
@@ -238,11 +259,8 @@ def test_where_nobody_answers_a_restless_hand_is_not_all_that_is_told(
         false_daemon(tmp_path, told(), "unknown", reasons=reasons),
         Client(out, ask_endpoint=ask) as graspd,
     ):
-        answer = graspd.may_i_lift(deadline_s)
-        result = asked(lift_gate, out, deadline_s, ask)
-    assert (bool(answer), list(answer.verdict.reasons)) == (False, expected)
-    assert result.returncode == 1
-    assert [word for word in result.stdout.split() if word in (*reasons, "no-answer")] == expected
+        says_no(lambda: graspd.may_i_lift(deadline_s), *expected)
+        wait_until(lambda: cpp_reasons(lift_gate, out, deadline_s, ask) == expected)
 
 
 @pytest.mark.parametrize(
@@ -357,9 +375,7 @@ def test_an_outcome_has_the_object_as_it_was_given(
 
 
 @pytest.mark.parametrize("name", ["a mug", "mug,cup", "müg", "mug\n", "x" * 65, "=1", "a/b"])
-def test_a_name_that_is_no_word_of_an_outcome_is_not_sent(
-    lift_gate: Path, tmp_path: Path, name: str
-) -> None:
+def test_a_malformed_object_name_is_not_sent(lift_gate: Path, tmp_path: Path, name: str) -> None:
     with heard(tmp_path, [b'{"v":1,"ok":true}']) as found:
         with pytest.raises(ValueError, match="no name of an object: 1 to 64 ASCII letters, "):
             told_in_python(tmp_path, name)
@@ -368,7 +384,7 @@ def test_a_name_that_is_no_word_of_an_outcome_is_not_sent(
     assert found == []
 
 
-def test_an_outcome_needs_a_grasp_somebody_to_tell_and_an_open_client(tmp_path: Path) -> None:
+def test_an_outcome_needs_a_grasp_an_endpoint_and_a_client(tmp_path: Path) -> None:
     asking = Client(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask")
     with asking as graspd, pytest.raises(ValueError, match="of no grasp"):
         graspd.tell(graspd.verdict(), Outcome.SLIPPED)
@@ -381,17 +397,14 @@ def test_a_told_grasp_is_offered_no_more_in_either_language(probe: Probe, tmp_pa
     places = [f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask"]
     with false_daemon(tmp_path, told()), Client(places[0], ask_endpoint=places[1]) as graspd:
         assert graspd.tell(graspd.may_i_lift(30.0).verdict, Outcome.SLIPPED, wait_s=30.0)
-        again = graspd.may_i_lift(DEADLINE_S, supervised=True)
-        assert (bool(again), again.verdict.reasons) == (False, ("outcome-told",))
+        says_no(lambda: graspd.may_i_lift(DEADLINE_S, supervised=True), "outcome-told")
         probe.tell("client", *places)
         assert probe.ask("lift").startswith("1 1 ")
         assert probe.ask("slipped") == "told"
         assert probe.ask("watch", DEADLINE_S).startswith("0 ")
 
 
-def test_in_cpp_a_lift_that_was_never_told_is_counted_and_warned_of(
-    probe: Probe, tmp_path: Path
-) -> None:
+def test_cpp_counts_and_warns_of_lifts_never_told(probe: Probe, tmp_path: Path) -> None:
     grasps: dict[str, bool] = {}
     warned = []
     with false_daemon(tmp_path, told(), messages_each=10):

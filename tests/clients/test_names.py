@@ -54,7 +54,7 @@ def minus(names: Names, left_out: set[tuple[str, str]]) -> Names:
     }
 
 
-def test_the_cpp_client_has_the_public_names_of_the_python_client() -> None:
+def test_the_cpp_client_has_the_python_clients_names() -> None:
     python = in_python()
     assert python.pop(FOR_ASYNCIO) == python["Client"]
     for kind, names in minus(python, ONLY_PYTHON).items():

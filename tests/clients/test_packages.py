@@ -74,9 +74,7 @@ def test_pkg_config_finds_the_installed_client(prefix: Path, project: Path) -> N
     works(project / PROGRAM, project)
 
 
-def test_the_program_of_the_readme_says_not_to_lift_where_nobody_answers(
-    prefix: Path, project: Path
-) -> None:
+def test_the_readmes_program_lifts_nothing_without_an_answer(prefix: Path, project: Path) -> None:
     """In both languages."""
     said = {}
     endpoint = f"ipc://{project}/nobody"

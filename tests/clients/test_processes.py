@@ -119,7 +119,7 @@ def test_a_second_thread_is_refused_and_may_close(
         assert graspd.verdict().reasons == ("closed",)
 
 
-def test_in_cpp_signals_end_no_call_and_a_fork_is_told_so() -> None:
+def test_cpp_survives_signals_and_refuses_after_a_fork() -> None:
     result = asked(compiled_probe("signals"), 100)
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout.splitlines() == [

@@ -88,18 +88,23 @@ def told_to(probe: Probe, messages: list[list[bytes]], ended: Grasps = ()) -> st
     return probe.ask("at", NOW_NS)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: str(case["name"]))
-def test_python_does_not_lift_on_it(case: dict[str, Any]) -> None:
-    found = told(came(case, START_NS), ended=case.get("told", ())).at(NOW_NS)
-    assert (bool(found), found.supervised) == (False, False)
+def test_python_lifts_on_no_refused_case() -> None:
+    lifts = []
+    for case in CASES:
+        found = told(came(case, START_NS), ended=case.get("told", ())).at(NOW_NS)
+        if found or found.supervised:
+            lifts.append(case["name"])
+    assert not lifts
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: str(case["name"]))
-def test_cpp_says_of_it_what_python_says(probe: Probe, case: dict[str, Any]) -> None:
-    messages, ended = came(case, START_NS), case.get("told", ())
-    answer = told_to(probe, messages, ended)
-    assert not answer.startswith("stable")
-    assert answer == said(told(messages, ended=ended), NOW_NS)
+def test_cpp_says_of_each_case_what_python_says(probe: Probe) -> None:
+    differs = []
+    for case in CASES:
+        messages, ended = came(case, START_NS), case.get("told", ())
+        answer = told_to(probe, messages, ended)
+        if answer.startswith("stable") or answer != said(told(messages, ended=ended), NOW_NS):
+            differs.append(case["name"])
+    assert not differs
 
 
 def test_what_the_cases_begin_with_is_lifted_on_in_both(probe: Probe) -> None:
@@ -122,7 +127,7 @@ def test_told_grasps_are_remembered_in_bounded_memory(probe: Probe) -> None:
         assert told_to(probe, [PADDED], ended) == expected
 
 
-def test_a_daemon_with_a_higher_threshold_is_believed_as_far_as_the_client_is_told() -> None:
+def test_a_client_believes_a_higher_threshold_only_if_told() -> None:
     unsure = [[TOPIC, json.dumps(well(START_NS) | {"p_slip": 0.6}).encode()]]
     assert told(unsure).at(NOW_NS).reasons == ("p-slip",)
     assert told(unsure, max_p_slip=0.7).at(NOW_NS)

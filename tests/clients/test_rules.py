@@ -35,7 +35,7 @@ def local() -> Newest:
     return Newest(TOPIC, MAX_AGE_NS, True)
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(events())
 def test_it_says_stable_exactly_when_all_that_came_says_so(sequence: Sequence[Event]) -> None:
     newest, now_ns, came = local(), START_NS, []
@@ -136,9 +136,9 @@ OFFSET_NS = 77_000 * MS
 """By which the other computer's clock is ahead."""
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(st.lists(st.integers(0, 400), max_size=60), st.sampled_from([0.0, 5e-4, -5e-4]))
-def test_from_another_computer_nothing_that_the_network_held_up_is_stable(
+def test_another_computers_delayed_messages_are_never_stable(
     delays_ms: list[int], drift: float
 ) -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
@@ -156,7 +156,7 @@ def test_from_another_computer_nothing_that_the_network_held_up_is_stable(
         empty_ns = arrived_ns
 
 
-def test_from_another_computer_the_first_message_may_be_an_old_one() -> None:
+def test_another_computers_first_message_may_be_old() -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     newest.take(frames(verdict(7, OFFSET_NS)), START_NS, START_NS)
     assert newest.at(START_NS).reasons == ("joining",)
@@ -173,7 +173,7 @@ def test_another_computer_that_was_rebooted_is_heard_again() -> None:
         assert bool(newest.at(now_ns)) == (number in (1, 3))
 
 
-def test_a_delay_that_creeps_as_slowly_as_a_clock_may_is_at_most_20_ms() -> None:
+def test_a_creeping_delay_is_at_most_20_ms() -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     newest.take(frames(verdict(0, OFFSET_NS)), START_NS, START_NS)
     for seq, delay_us in enumerate([*range(0, 30_000, 900), 19_000], 1):
@@ -184,7 +184,7 @@ def test_a_delay_that_creeps_as_slowly_as_a_clock_may_is_at_most_20_ms() -> None
         assert newest.at(now_ns).reasons == expected, f"delayed by {delay_us} us"
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(
     st.lists(st.tuples(st.integers(0, 300), st.integers(0, 300)), max_size=40),
     st.sampled_from([0.0, 5e-4, -5e-4]),
@@ -271,7 +271,7 @@ def test_only_endpoints_of_this_computer_share_its_clock(endpoint: str, same: bo
 
 
 @pytest.mark.parametrize("word", ["stable", "slip", "unknown"])
-def test_a_decision_is_the_word_of_the_wire_and_printed_as_it(word: str) -> None:
+def test_a_decision_prints_as_its_word_on_the_wire(word: str) -> None:
     decision = Decision(word)
     assert (decision == word, str(decision), f"{decision}", json.dumps(decision)) == (
         True,

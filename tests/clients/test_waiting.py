@@ -27,7 +27,7 @@ def world(*messages: tuple[str, dict[str, Any]]) -> World:
     return World(coming(*messages), acknowledged=[(MS, TAKEN)] * 9)
 
 
-def test_each_grasp_is_returned_once_as_soon_as_it_is_judged() -> None:
+def test_a_grasp_is_returned_once_when_judged() -> None:
     first, second = {"grasp": 1}, {"grasp": 2}
     made = world(
         *[("unknown", first)] * 3,
@@ -65,7 +65,7 @@ def test_what_is_early_is_not_sure(outcome: str, more: dict[str, Any], watch: bo
 
 
 @pytest.mark.parametrize("watch", [False, True])
-def test_what_is_to_be_watched_is_returned_where_a_person_watches(watch: bool) -> None:
+def test_a_supervised_grasp_is_returned_under_supervision_alone(watch: bool) -> None:
     with client(world(("unknown", TEACHES))) as graspd:
         found = graspd.wait_for_grasp(0.05, supervised=watch)
         assert (found is not None and found.supervised) is watch
@@ -131,7 +131,7 @@ def test_a_slide_stops_the_lift_at_once() -> None:
     assert answer.waited_s == pytest.approx(0.05, abs=0.002)
 
 
-def test_a_lift_that_holds_is_not_stopped_before_the_time_is_over() -> None:
+def test_a_lift_that_holds_runs_its_time() -> None:
     answer = watched(lift(*[HELD] * 40))
     assert (bool(answer), answer.sliding, answer.held) == (False, (), True)
     assert answer.waited_s == pytest.approx(0.3, abs=0.002)
@@ -263,17 +263,17 @@ def asked_at_ms(world: World, *, same: bool = False) -> list[int]:
     return times
 
 
-def test_a_client_asks_for_the_clock_once_a_second_while_it_is_answered() -> None:
+def test_an_answered_client_asks_the_clock_once_a_second() -> None:
     world = heard()
     world.timing.answers.extend([(5 * MS, TOLD)] * 20)
     assert asked_at_ms(world) == pytest.approx(list(range(0, 12_000, 1000)), abs=200)
 
 
-def test_a_client_that_is_not_answered_asks_again_after_ten_seconds() -> None:
+def test_an_unanswered_client_asks_again_after_ten_seconds() -> None:
     assert asked_at_ms(heard()) == [0, 10_000]
 
 
-def test_a_client_on_the_same_computer_does_not_ask_for_the_clock() -> None:
+def test_a_client_beside_the_daemon_asks_no_clock() -> None:
     assert asked_at_ms(heard(), same=True) == []
 
 

@@ -91,7 +91,7 @@ def test_faults_keep_the_bits_that_recordings_hold() -> None:
     }
 
 
-def test_a_recorded_reading_was_made_when_it_was_recorded_a_live_one_when_it_came() -> None:
+def test_recorded_and_live_readings_bear_their_own_times() -> None:
     arrays = np.zeros((1, 24), np.uint16), np.zeros((1, 24), np.uint8)
     assert TactileReading(5, 0, *arrays).made_ns == 5
     assert TactileReading(5, 0, *arrays, recorded_ns=0).made_ns == 0
@@ -122,7 +122,7 @@ def test_a_link_that_is_closed_says_so_and_reads_nothing(
     driver.close()
 
 
-def test_patience_grows_up_to_a_second_and_begins_anew_when_the_link_is_up() -> None:
+def test_patience_grows_to_a_second_until_the_link_is_up() -> None:
     clock = Clock()
     link = Link("spi")
     link.start(clock.now_ns)
@@ -233,7 +233,7 @@ def test_a_channel_has_the_command_of_the_manual(channel: int, command: int) -> 
     assert channel_of(command) == channel
 
 
-def test_there_are_the_28_channels_of_the_manual_and_no_more() -> None:
+def test_the_manuals_28_channels_are_all() -> None:
     assert set(CHANNELS) == set(COMMANDS)
     assert {command for command in range(256) if channel_of(command) is not None} == set(
         COMMANDS.values()
@@ -285,7 +285,7 @@ def test_a_line_that_nothing_drives_is_a_missing_sensor(word: int) -> None:
     assert counts.tolist() == [0]
 
 
-def test_one_random_word_in_16_passes_and_never_with_a_flipped_bit() -> None:
+def test_one_random_word_in_16_passes() -> None:
     _, faults = decode_words(np.arange(1 << 16, dtype=np.uint16))
     assert (faults == 0).mean() == 0.0625
     good = words(*(encode_word(count) for count in range(4096)))

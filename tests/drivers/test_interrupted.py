@@ -60,7 +60,7 @@ def test_joint_messages_of_a_new_start_interrupt() -> None:
     assert interrupted(list(readings)) == [10, 20]
 
 
-def test_counts_of_a_new_start_and_after_a_lost_link_interrupt() -> None:
+def test_counts_after_a_new_start_or_loss_interrupt() -> None:
     stream, readings = TactileStream(("ff",), "right"), list[Reading]()
     for place, seq in enumerate((*range(50, 60), *range(20), 5000, 5001)):
         if place == 31:

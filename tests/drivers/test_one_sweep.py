@@ -155,6 +155,7 @@ class Assembler:
     silent: int
     """Units that a board is silent after a start."""
     late_max: int = 3
+    examples: int = 80
     steady_sweeps: int = 1
     """Undisturbed sweeps at the beginning."""
 
@@ -169,11 +170,16 @@ ASSEMBLERS = {
         24,
         silent=SILENT_NS // SLOT_NS + 1,
         steady_sweeps=3,
+        examples=20,  # its stream is that of samples
     ),
     # A board without a pause, of which two sweeps in a row have come.
     **{
         f"samples, {sequence}": Assembler(
-            samples(sequence), len(channels), silent=len(channels), steady_sweeps=3
+            samples(sequence),
+            len(channels),
+            silent=len(channels),
+            steady_sweeps=3,
+            examples=40,
         )
         for sequence, channels in SEQUENCES.items()
     },
@@ -184,7 +190,7 @@ ASSEMBLERS = {
 def test_no_reading_mixes_two_sweeps(name: str) -> None:
     assembler = ASSEMBLERS[name]
 
-    @settings(max_examples=150)
+    @settings(max_examples=assembler.examples)
     @given(
         plans(assembler.units, assembler.steady_sweeps),
         st.sampled_from([0, 5 * ROUND + 3, (1 << 16) - 9]),
@@ -198,9 +204,9 @@ def test_no_reading_mixes_two_sweeps(name: str) -> None:
     holds()
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(plans(1))
-def test_of_joints_a_message_is_a_reading_and_none_comes_after_a_later_one(
+def test_joint_messages_are_whole_and_never_go_back(
     plan: list[Step],
 ) -> None:
     stream = JointStream()

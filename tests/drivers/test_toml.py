@@ -64,7 +64,7 @@ def test_what_is_shipped_is_read(path: Path) -> None:
         'a = """..........\\"""..........""""" # ok',
     ],
 )
-def test_dots_and_brackets_in_strings_comments_and_numbers_do_not_nest(text: str) -> None:
+def test_dots_and_brackets_in_values_do_not_nest(text: str) -> None:
     assert toml.loads(text) == tomllib.loads(text)
 
 

@@ -90,9 +90,7 @@ def linked(image: Image, board: Board, tmp_path: Path) -> Iterator[LockStep]:
     link.close()
 
 
-def test_twenty_seconds_are_read_and_judged_as_those_of_a_twin(
-    image: Image, board: Board, tmp_path: Path
-) -> None:
+def test_twenty_seconds_are_judged_as_a_twins(image: Image, board: Board, tmp_path: Path) -> None:
     rows = grasps()
     board.power(image(), write_counts(tmp_path / "counts", rows))
     link = LockStep(board, tmp_path / "port")
@@ -130,9 +128,7 @@ def grasp_verdicts(readings: Sequence[TactileReading]) -> list[tuple[int, str, f
 
 
 @pytest.mark.parametrize("loss", ["unplug", "detach", "stick"])
-def test_a_link_that_is_lost_comes_back_and_no_reading_mixes_both(
-    linked: LockStep, loss: str
-) -> None:
+def test_a_link_that_comes_back_mixes_no_reading(linked: LockStep, loss: str) -> None:
     """Power that goes, a cable that is pulled, a firmware that hangs until its watchdog bites."""
     board = linked.board
     linked.serve(500.0)

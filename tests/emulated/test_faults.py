@@ -53,7 +53,7 @@ def sweep_on(board: Board, count: int) -> list[bytes]:
     return board.until(SWEEP, count, PERIOD_MS * (count + 2))
 
 
-def test_an_error_word_and_a_dead_electrode_are_told_as_they_are(sweeping: Board) -> None:
+def test_error_words_and_dead_electrodes_are_reported(sweeping: Board) -> None:
     board = sweeping
     before = board.status()
     sweep_on(board, 2)
@@ -74,7 +74,7 @@ def test_an_error_word_and_a_dead_electrode_are_told_as_they_are(sweeping: Board
     assert (after.overruns, after.tx_dropped) == (before.overruns, before.tx_dropped)
 
 
-def test_a_sensor_that_answers_late_gives_error_words_and_then_readings_again(
+def test_a_late_sensor_gives_error_words_and_recovers(
     sweeping: Board,
 ) -> None:
     board = sweeping
@@ -113,7 +113,7 @@ def test_a_sensor_that_is_unplugged_is_missed_and_found_again(sweeping: Board) -
     assert after.overruns - before.overruns <= 1
 
 
-def test_100000_damaged_bytes_are_counted_frame_by_frame_while_sweeps_go_on(
+def test_100000_damaged_bytes_are_counted_while_sweeps_come(
     sweeping: Board,
 ) -> None:
     board, seed = sweeping, 20251122
@@ -145,7 +145,7 @@ def test_100000_damaged_bytes_are_counted_frame_by_frame_while_sweeps_go_on(
     assert answered == [*found, "81 5"]
 
 
-def test_a_port_that_nobody_reads_costs_whole_frames_and_no_sweep(sweeping: Board) -> None:
+def test_an_unread_port_costs_frames_and_no_sweep(sweeping: Board) -> None:
     board = sweeping
     before = board.status()
     first = seq_of(sweep_on(board, 1)[0])
@@ -164,7 +164,7 @@ def test_a_port_that_nobody_reads_costs_whole_frames_and_no_sweep(sweeping: Boar
         assert (counts_of(sweep) == pattern(seq_of(sweep))).all()
 
 
-def test_a_port_that_is_closed_and_opened_again_is_greeted_as_ever(sweeping: Board) -> None:
+def test_a_reopened_port_is_greeted_again(sweeping: Board) -> None:
     board = sweeping
     sweep_on(board, 3)
     board.do("close")
@@ -179,7 +179,7 @@ def test_a_port_that_is_closed_and_opened_again_is_greeted_as_ever(sweeping: Boa
         assert (counts_of(sweep) == pattern(row)).all()
 
 
-def test_an_spi_that_never_finishes_ends_in_a_reset_by_the_watchdog(sweeping: Board) -> None:
+def test_a_stuck_spi_ends_in_a_watchdog_reset(sweeping: Board) -> None:
     board = sweeping
     sweep_on(board, 2)
     board.run(PERIOD_MS - 1.0)  # in the middle of the next

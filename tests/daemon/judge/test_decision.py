@@ -105,12 +105,12 @@ def test_every_combination_is_judged_by_the_rule() -> None:
     assert len(CASES) == 16 * 6 * 3 * 3 * 2 * 2 * 2 * 3
 
 
-@pytest.mark.parametrize("reason", Reason)
 @pytest.mark.parametrize("where", ["health", "gate"])
-def test_any_reason_makes_the_verdict_unknown(reason: Reason, where: str) -> None:
-    health, gate = ((reason,), ()) if where == "health" else ((), (reason,))
-    moment = Moment(1, in_contact=where == "health", reasons=gate)
-    assert decide(0.0, health, moment, 0, LIMITS) == (Decision.UNKNOWN, (reason,))
+def test_any_reason_makes_the_verdict_unknown(where: str) -> None:
+    for reason in Reason:
+        health, gate = ((reason,), ()) if where == "health" else ((), (reason,))
+        moment = Moment(1, in_contact=where == "health", reasons=gate)
+        assert decide(0.0, health, moment, 0, LIMITS) == (Decision.UNKNOWN, (reason,))
 
 
 def test_the_defaults_ask_for_no_confidence() -> None:
@@ -120,7 +120,7 @@ def test_the_defaults_ask_for_no_confidence() -> None:
 
 
 @pytest.mark.parametrize(("age_ns", "stale"), [(100_000_000, False), (100_000_001, True)])
-def test_by_default_a_reading_is_stale_after_a_tenth_of_a_second(age_ns: int, stale: bool) -> None:
+def test_a_reading_is_stale_after_100_ms_by_default(age_ns: int, stale: bool) -> None:
     """Ten periods at 100 Hz: no message for so long means unknown, too."""
     assert decide(0.1, (), HELD, age_ns, Limits())[1] == ((Reason.STALE,) if stale else ())
 

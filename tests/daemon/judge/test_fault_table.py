@@ -109,11 +109,7 @@ def test_no_fault_makes_a_verdict_more_certain(name: str) -> None:
             assert finding.decision in {Decision.UNKNOWN, finding.sound.decision}
             assert (finding.decision is Decision.UNKNOWN) is bool(finding.reasons)
             assert state is GateState.JUDGED or finding.decision is Decision.UNKNOWN
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_judged_grasp_under_a_fault_says_why_not(name: str) -> None:
-    found, expected = findings(name, GateState.JUDGED), EXPECTED[name]
+    expected = EXPECTED[name]
     refused = [finding for finding in found if finding.decision is Decision.UNKNOWN]
     if expected == "=":
         assert [each.decision for each in found] == [each.sound.decision for each in found]
@@ -152,14 +148,14 @@ def test_a_verdict_stands_under_a_fault_for_so_many_readings(name: str, readings
     )
 
 
-def test_after_a_jump_of_time_a_grasp_settles_anew_for_the_long_window() -> None:
+def test_a_grasp_settles_again_after_a_jump_of_time() -> None:
     decisions = [finding.decision for finding in findings("time back by 50 ms", GateState.JUDGED)]
     assert decisions[:24] == [Decision.UNKNOWN] * 24
     assert decisions[-3:] == [Decision.STABLE] * 3
 
 
 @pytest.mark.parametrize("name", SINGLE)
-def test_one_electrode_that_fails_before_the_grasp_is_repaired_and_changes_nothing(
+def test_one_electrode_that_fails_early_changes_nothing(
     name: str,
 ) -> None:
     hand = grasp(of_a_palm=False, on_request=False)

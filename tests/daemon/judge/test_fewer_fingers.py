@@ -50,7 +50,7 @@ def verdicts_of(text: str) -> list[Verdict]:
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_a_network_has_inputs_for_its_own_fingers_and_no_others(name: str) -> None:
+def test_a_network_has_inputs_for_its_own_fingers(name: str) -> None:
     session = ort.InferenceSession(zoo.find(name), providers=["CPUExecutionProvider"])
     (given,) = session.get_inputs()
     # 24 electrodes, mean and spread of each finger.
@@ -67,9 +67,7 @@ def test_a_network_has_inputs_for_its_own_fingers_and_no_others(name: str) -> No
 
 
 @pytest.mark.parametrize("name", SOME)
-def test_a_table_of_these_fingers_alone_is_judged_as_the_whole_table(
-    name: str, tmp_path: Path
-) -> None:
+def test_a_table_of_fewer_fingers_gets_the_same_verdicts(name: str, tmp_path: Path) -> None:
     part = graspd("replay", cut(DEMO_TABLE, HANDS[name], tmp_path), "--model", name, "--json")
     whole = graspd("replay", DEMO_TABLE, "--model", name, "--json")
     assert part.returncode == whole.returncode == 0, part.stderr
@@ -88,7 +86,7 @@ def test_a_table_without_a_finger_of_the_model_is_refused(tmp_path: Path) -> Non
     assert "has ff, th; small-session also needs mf" in result.stderr
 
 
-def test_a_scene_of_one_finger_judges_each_grasp_by_its_model(tmp_path: Path) -> None:
+def test_a_one_finger_scene_judges_by_its_own_model(tmp_path: Path) -> None:
     name = "small-session-th"
     recording = cut(DEMO_RECORDING, HANDS[name], tmp_path)
     scene = tmp_path / "scene.toml"

@@ -64,7 +64,7 @@ def test_the_words_follow_a_grasp_from_rest_to_release() -> None:
     assert {state for t_s, state, _ in told if 1.15 < t_s < 1.3} == {GateState.JUDGED}
 
 
-def test_motion_of_a_still_finger_is_a_slide_once_it_lasts() -> None:
+def test_motion_of_a_still_finger_must_last() -> None:
     finger = FingerWord()
     moves = [True, True, False, True, True, True, False, True, None, True]
     told = [finger.touch(place * 10 * MS, each) for place, each in enumerate(moves)]
@@ -109,7 +109,7 @@ def test_a_reading_that_cannot_be_used_tells_nothing(reason: Reason) -> None:
     assert hand.silent().fingers == UNKNOWN, "and nothing is told without a reading"
 
 
-def test_a_finger_with_too_few_electrodes_is_not_known_and_hides_no_other() -> None:
+def test_a_finger_of_few_electrodes_hides_no_other() -> None:
     hand = HandTracker(FINGERS, LIMITS)
     lost = ~ALL
     lost[1, :13] = True
@@ -141,7 +141,7 @@ def test_an_old_reading_tells_nothing(late_ms: int, is_known: bool) -> None:
     assert judge.silence(reading.t_ns).moment.fingers == UNKNOWN
 
 
-def test_where_each_reading_is_a_grasp_no_finger_has_a_word() -> None:
+def test_without_a_gate_no_finger_has_a_word() -> None:
     judge = Pipeline(TactileModel(zoo.find("cnn1")), FINGERS, Limits(), lambda: 0)
     assert judge.judge(sound(np.full(ALL.shape, 2000))).moment.fingers is None
 

@@ -111,7 +111,7 @@ def test_a_touch_must_last_as_long_as_the_window(
     assert [c.t_ns for c in steps.take_changes()] == [touched_ns, steps.t_ns, steps.t_ns]
 
 
-def test_what_was_judged_early_is_judged_once_more_when_no_slow_slide_is_left() -> None:
+def test_an_early_verdict_is_judged_again_after_the_long_window() -> None:
     steps = Steps(limits=replace(GATE, early=True))
     steps.rest()
     for _ in range(60):
@@ -124,7 +124,7 @@ def test_what_was_judged_early_is_judged_once_more_when_no_slow_slide_is_left() 
     assert judged.t_ns - touched.t_ns == 240 * MS
 
 
-def test_a_judged_grasp_that_moves_on_for_two_windows_is_judged_again() -> None:
+def test_a_judged_grasp_moving_for_two_windows_settles_again() -> None:
     steps = Steps()
     steps.grasp()
     steps.story()
@@ -137,9 +137,7 @@ def test_a_judged_grasp_that_moves_on_for_two_windows_is_judged_again() -> None:
 
 
 @pytest.mark.parametrize(("fresh", "first"), [(True, 5), (False, 11)])
-def test_a_verdict_is_refreshed_after_50_ms_or_by_old_values_after_100(
-    fresh: bool, first: int
-) -> None:
+def test_fresh_verdicts_last_50_ms_and_old_ones_100(fresh: bool, first: int) -> None:
     steps, sweep = Steps(), np.full(SHAPE, 3000, dtype=np.uint16)
     steps.grasp()
     judged = []
@@ -221,7 +219,7 @@ def test_what_others_say_against_it_keeps_a_grasp_from_settling(reason: Reason) 
     assert steps.now.settled, "the same grasp, so its verdict stands"
 
 
-def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> None:
+def test_unusable_electrodes_neither_move_nor_change_a_grasp() -> None:
     steps = Steps()
     steps.grasp()
     usable, median = ALL.copy(), np.full(SHAPE, 3000, dtype=np.uint16)
@@ -275,7 +273,7 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
     assert {change.state for change in changes} == set(GateState), "the walk saw all of it"
 
 
-def test_after_a_gap_three_fresh_sweeps_are_judged_and_none_from_before() -> None:
+def test_after_a_gap_three_fresh_sweeps_are_judged() -> None:
     hasty = replace(GATE, early=True)
     firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, gate=hasty))
     hand, none = HandTracker(FINGERS, firm.limits), Checked((), ~ALL)
@@ -345,7 +343,7 @@ def test_a_request_expires_though_time_went_back() -> None:
     assert steps.now.state is GateState.SETTLED
 
 
-def test_an_electrode_that_comes_back_as_the_grasp_settles_is_not_judged_by_old_values() -> None:
+def test_an_electrode_back_at_settling_is_judged_by_new_values() -> None:
     firm = Scenario("firm", GRASPED, UP)
     moment_s = play(firm).first_s(GateState.SETTLED)
     hand, lost = HandTracker(FINGERS, LIMITS), ~ALL
@@ -361,7 +359,7 @@ def test_an_electrode_that_comes_back_as_the_grasp_settles_is_not_judged_by_old_
 
 
 @pytest.mark.parametrize(("missing", "tared"), [((0.5, 1.4), FINGERS), ((0.3, 1.45), ())])
-def test_sensors_that_were_away_for_more_than_a_second_may_be_others(
+def test_sensors_away_for_a_second_may_be_others(
     missing: tuple[float, float], tared: tuple[str, ...]
 ) -> None:
     away = Scenario("away for 0.9 s, or 1.2", GRASPED, "", missing=missing)
@@ -407,7 +405,7 @@ def test_after_readings_were_left_out_a_grasp_settles_again() -> None:
     assert since == 1 + 24
 
 
-def test_of_both_windows_the_one_nearer_to_its_limit_is_told() -> None:
+def test_the_window_nearer_its_limit_is_reported() -> None:
     hand, alone, told = HandTracker(FINGERS, LIMITS), Motion(3, GATE.false_alarms), set()
     for _, reading in readings(Scenario("firm", GRASPED, UP)):
         felt, _ = hand.step(reading.made_ns, reading.counts, Checked((), ~ALL))

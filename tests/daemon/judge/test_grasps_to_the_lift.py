@@ -106,12 +106,12 @@ def test_the_verdict_comes_after_everything_is_still(found: Study) -> None:
         assert t_s - crept_s(seen.truth, STILL_COUNTS_PER_S) < WAITED_MAX_S
 
 
-def test_nothing_is_judged_before_the_hand_has_closed_or_while_it_opens(found: Study) -> None:
+def test_nothing_is_judged_before_closing_or_while_opening(found: Study) -> None:
     assert not found.too_early
     assert found.outlived_s <= STANDS_S
 
 
-def test_the_verdict_is_that_of_the_row_unless_the_row_is_a_toss_up(found: Study) -> None:
+def test_a_clear_row_keeps_its_verdict(found: Study) -> None:
     others = [seen for seen in found.grasps if seen.judged[0][1].decision is not seen.row.decision]
     unlike = [seen for seen in others if seen.judged[0][1].decision is Decision.UNKNOWN]
     # A row at the edge of what was ever seen may fall over it, to the safe side.

@@ -95,7 +95,7 @@ def test_every_electrode_is_broken_when_the_definition_says_so(seed: int) -> Non
     assert {Reason.ELECTRODE_DEAD, Reason.ELECTRODE_JUMPS, Reason.SATURATED} <= named
 
 
-def test_a_first_reading_of_low_counts_is_no_jump_from_anywhere() -> None:
+def test_first_low_counts_are_no_jump() -> None:
     health = Health(FINGERS)
     counts = np.full((FINGERS, 24), 5)
     for place in range(3):  # two jumps more would be enough
@@ -139,7 +139,7 @@ def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -
         ({0: 151, 1: -151, 8: 151}, False),  # 1.91
     ],
 )
-def test_an_electrode_jumps_by_more_than_a_spike_and_more_than_twice(
+def test_an_electrode_jumps_above_a_spike_more_than_twice(
     jumps: dict[int, int], jumpy: bool
 ) -> None:
     _, found = watched(steps_of(max(jumps) + 1, jumps))
@@ -159,7 +159,7 @@ def test_it_jumps_while_the_others_keep_still(movers: int, by: int, jumpy: bool,
     assert ((1, 0) in found[-1]) == jumpy
 
 
-def test_an_electrode_is_dead_that_keeps_its_count_in_16_readings() -> None:
+def test_an_electrode_unchanged_for_16_readings_is_dead() -> None:
     steps = steps_of(40, {})
     steps[:16, 0] = 0
     steps[17:, 5] = 0  # from 17 on
@@ -183,7 +183,7 @@ def test_an_electrode_is_dead_that_keeps_its_count_in_16_readings() -> None:
         ((0, 0, 0), False),
     ],
 )
-def test_twelve_broken_electrodes_of_a_hand_and_eight_of_a_finger_can_be_repaired(
+def test_more_than_twelve_or_eight_broken_electrodes_are_too_many(
     broken: tuple[int, ...], found: bool
 ) -> None:
     mask = np.array([np.arange(24) < number for number in broken])
@@ -223,7 +223,7 @@ def test_one_finger_that_repeats_itself_is_enough(finger: int, flagged: bool) ->
 
 
 @pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF])
-def test_a_sweep_that_comes_again_was_seen_in_a_reading_that_could_not_be_used(flag: int) -> None:
+def test_an_unusable_reading_is_remembered_as_an_old_sweep(flag: int) -> None:
     health, reasons = Health(FINGERS), []
     for count, bits in [(2000, flag), (2001, 0), (2002, 0), (2000, 0)]:
         reading = flat(count)
@@ -232,7 +232,7 @@ def test_a_sweep_that_comes_again_was_seen_in_a_reading_that_could_not_be_used(f
     assert reasons[1:] == [(), (), (Reason.FROZEN,)]
 
 
-def test_electrodes_of_all_fingers_that_repeat_themselves_are_no_held_finger() -> None:
+def test_a_few_repeats_of_all_fingers_hold_none() -> None:
     """Ten of each finger, as a palm at 71.43 Hz read at 100 Hz: 2 of 7, and quiet ones."""
     health = Health(FINGERS)
     for place in range(5):
@@ -251,7 +251,7 @@ def test_of_two_faults_of_an_electrode_the_first_is_named() -> None:
 
 
 @pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF, 64])
-def test_a_fault_that_is_not_of_one_electrode_speaks_against_the_reading(flag: int) -> None:
+def test_a_fault_of_more_than_electrodes_refuses_the_reading(flag: int) -> None:
     reading = flat(2000)
     reading.faults[2, 23] = flag
     reading.faults[0, 1] = ElectrodeFault.PARITY

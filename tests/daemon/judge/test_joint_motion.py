@@ -59,9 +59,7 @@ def test_speed_is_angle_over_time_at_every_rate(
 
 
 @pytest.mark.parametrize(("rate_hz", "still_after_ms"), [(10.0, 100), (100.0, 80), (1000.0, 85)])
-def test_a_step_counts_as_motion_for_a_window_and_no_longer(
-    rate_hz: float, still_after_ms: int
-) -> None:
+def test_a_step_is_motion_for_one_window(rate_hz: float, still_after_ms: int) -> None:
     # By hand: 0.02 rad within 80 ms are 0.25 rad/s. At 1 kHz an angle in 5 ms is remembered.
     motion, now_ns = turning(rate_hz, 0.0)
     seen: dict[int, Reason | None] = {}
@@ -115,7 +113,7 @@ def test_joints_are_late_and_then_lost(age_ms: int, reason: Reason | None, lost:
     assert motion.is_lost(now_ns + age_ms * MS) is lost
 
 
-def test_joints_that_never_come_are_waited_for_once_from_the_first_sweep_on() -> None:
+def test_joints_that_never_come_are_waited_for_once() -> None:
     motion = JointMotion()
     assert not motion.is_lost(START_NS)
     assert motion.objection(START_NS) is Reason.JOINTS_LATE
@@ -200,7 +198,7 @@ def test_joints_that_swing_in_step_with_the_window_are_moving(
             assert motion.objection(START_NS + round(t_s * 1e9)) is Reason.MOVING
 
 
-def test_a_joint_that_loses_its_angle_is_late_and_then_lost() -> None:
+def test_a_joint_without_an_angle_is_late_then_lost() -> None:
     motion, now_ns = turning(100.0, 0.0)
     for ms in range(10, 1500, 10):
         send(motion, now_ns + ms * MS, 0.3, np.nan, -0.1)
@@ -232,7 +230,7 @@ def test_eighteen_angles_a_sixteenth_of_a_window_apart_are_kept(every_ms: float,
     assert steps == {round({5: 5, 4: 8, 2.5: 5, 10: 10}[every_ms] * MS)}
 
 
-def test_a_window_is_compared_with_its_first_angle_and_nothing_older() -> None:
+def test_a_window_compares_with_its_first_angle() -> None:
     """By hand: 0.0079 rad in 80 ms are 0.099 rad/s, 0.0081 rad 0.101 rad/s."""
     for moved, reason in ((0.0079, None), (0.0081, Reason.MOVING)):
         motion, now_ns = turning(100.0, 0.0)
@@ -257,7 +255,7 @@ def test_eight_senders_are_told_apart_and_a_ninth_begins_anew() -> None:
     assert set(motion.past) == set(motion.latest_ns) == {("J8",)}
 
 
-def test_no_more_than_64_lost_joints_are_remembered_and_each_once() -> None:
+def test_64_lost_joints_are_remembered_once_each() -> None:
     motion = JointMotion()
     for place in range(70):
         t_ns = START_NS + place * 2000 * MS
@@ -285,7 +283,7 @@ def held(rates_hz: Mapping[tuple[str, ...], float], seconds: float) -> JointMoti
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 71.43, 100.0, 1000.0])
-def test_angles_that_do_not_change_by_a_bit_for_a_second_are_frozen(rate_hz: float) -> None:
+def test_angles_unchanged_for_a_second_are_frozen(rate_hz: float) -> None:
     assert held({NAMES: rate_hz}, 0.95).objection(START_NS + 950 * MS) is None
     motion = held({NAMES: rate_hz}, 1.1)
     now_ns = START_NS + 1100 * MS

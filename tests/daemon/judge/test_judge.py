@@ -17,7 +17,7 @@ from graspd.models.contract import ModelError
 from tests.daemon.fakes import FINGERS, HIGH, LOW, MARGIN, MS, Clock, FakeModel, pipeline, reading
 
 
-def test_every_reason_says_what_to_do_and_every_fault_has_a_reason() -> None:
+def test_every_reason_has_advice_and_every_fault_a_reason() -> None:
     assert set(ADVICE) == set(Reason)
     assert set(REASON_OF_FAULT) == {fault for fault in ElectrodeFault if fault}
 
@@ -194,7 +194,7 @@ def test_stable_needs_a_fresh_healthy_seen_reading_and_a_probability(
         before = given_reading
 
 
-def test_a_finger_that_is_flagged_as_a_whole_is_missing_and_not_frozen() -> None:
+def test_a_wholly_flagged_finger_is_missing_not_frozen() -> None:
     clock = Clock()
     judge = pipeline(FakeModel(), clock)
     for number in range(3):

@@ -42,9 +42,7 @@ def learnt(monkeypatch: pytest.MonkeyPatch) -> Learnt:
     return taken
 
 
-def test_a_verdict_does_not_wait_for_its_grasp_to_be_learnt(
-    pipeline: Pipeline, learnt: Learnt
-) -> None:
+def test_a_verdict_waits_for_no_learning(pipeline: Pipeline, learnt: Learnt) -> None:
     judge(pipeline, grasps(3))
     assert len(learnt) == 2, "the third waits for the next reading"
 
@@ -60,14 +58,14 @@ def test_a_look_at_session_or_health_learns_nothing(pipeline: Pipeline, learnt: 
     assert len(learnt) == 3, "once"
 
 
-def test_a_grasp_of_a_sensor_that_was_exchanged_is_not_learnt(pipeline: Pipeline) -> None:
+def test_a_grasp_of_exchanged_sensors_is_not_learnt(pipeline: Pipeline) -> None:
     judge(pipeline, grasps(3))
     pipeline.sensors_exchanged()
     assert pipeline.session is not None
     assert pipeline.session.grasps == 0
 
 
-def test_a_grasp_is_learnt_as_what_it_was_judged_to_be(
+def test_a_grasp_is_learnt_as_it_was_judged(
     pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slips: list[bool | None] = []
@@ -80,7 +78,7 @@ def test_a_grasp_is_learnt_as_what_it_was_judged_to_be(
     assert set(told) == {False, True}
 
 
-def test_who_needs_a_calibrated_session_has_no_verdict_before_it_is_one() -> None:
+def test_without_a_calibrated_session_a_careful_judge_says_unknown() -> None:
     model = TactileModel(zoo.find("small-session"))
     careful, bold = (
         Pipeline(model, model.contract.fingers, Limits(10**9), lambda: 0, needs_session=needs)

@@ -85,7 +85,7 @@ def test_unusable_values_never_enter_and_those_before_them_are_forgotten() -> No
                 assert fresh.counts[place] == sorted(last)[1]
 
 
-def test_a_value_that_repeats_the_last_usable_one_is_held_whatever_came_between() -> None:
+def test_a_repeat_of_the_last_usable_value_is_held() -> None:
     fresh, unusable = FreshMedian(SHAPE), ~ALL
     for value, usable in ((10, ALL), (20, ALL), (0, unusable), (20, ALL), (0, unusable)):
         fresh.push(np.full(SHAPE, value, dtype=np.uint16), usable)
@@ -93,7 +93,7 @@ def test_a_value_that_repeats_the_last_usable_one_is_held_whatever_came_between(
     assert (fresh.counts == 10).all(), "10, 10 and 20"
 
 
-def test_an_electrode_that_never_was_usable_reads_zero_and_is_waited_for_only_if_usable() -> None:
+def test_a_never_usable_electrode_reads_zero_and_holds_up_nothing() -> None:
     fresh, usable = FreshMedian(SHAPE), ALL.copy()
     usable[1, 5] = False
     medians = play(fresh, never_repeating(5), usable)

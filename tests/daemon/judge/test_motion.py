@@ -79,7 +79,7 @@ def test_held_hands_are_still_and_slides_are_not(late: bool) -> None:
     assert sure < 0.1
 
 
-def test_of_too_many_sweeps_at_one_time_nothing_is_known_until_their_step_is_over() -> None:
+def test_too_many_sweeps_at_once_leave_motion_unknown() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(3.0, 100.0, 3.5, 4)
     t_ns = fed(motion, counts, 100.0)
     known = []
@@ -93,7 +93,7 @@ def test_of_too_many_sweeps_at_one_time_nothing_is_known_until_their_step_is_ove
         assert motion.known is is_known
 
 
-def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_a_gap() -> None:
+def test_motion_is_unknown_before_noise_and_after_a_gap() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(3.0, 100.0, 3.5, 4)
     known = []
     for index, sweep in enumerate(np.rint(counts).astype(np.uint16)):
@@ -116,7 +116,7 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
     assert not np.isfinite(moves(motion)).any()
 
 
-def test_fast_motion_is_no_noise_and_is_excluded_soon_after_it_ends() -> None:
+def test_fast_motion_is_no_noise_and_soon_over() -> None:
     motion, rate_hz = Motion(1, 0.05, early=True), 100.0
     begin_ns = fed(motion, wavering(2.0, rate_hz, 3.5, 5), rate_hz)
     before = motion.strict.fast, motion.strict.slow
@@ -151,7 +151,7 @@ def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
     assert (moves(motion) > 5.0).all()
 
 
-def test_a_value_that_is_held_is_believed_in_its_fourth_sweep() -> None:
+def test_a_held_value_is_believed_in_its_fourth_sweep() -> None:
     motion, sweep = Motion(1, 0.05), np.full((1, 24), 2000, dtype=np.uint16)
     motion.add(0, sweep, None)
     fallen, believed = sweep.copy(), []
@@ -165,7 +165,7 @@ def test_a_value_that_is_held_is_believed_in_its_fourth_sweep() -> None:
 @pytest.mark.parametrize(
     ("electrodes", "counts", "believed"), [(4, 20, True), (4, 21, False), (5, 21, True)]
 )
-def test_four_electrodes_that_jump_by_more_than_twenty_counts_are_spikes(
+def test_four_electrodes_jumping_above_20_counts_are_spikes(
     electrodes: int, counts: int, believed: bool
 ) -> None:
     motion = Motion(2, 0.05)
@@ -177,7 +177,7 @@ def test_four_electrodes_that_jump_by_more_than_twenty_counts_are_spikes(
     assert (motion.spikes.clean == (jumped if believed else sweep)).all()
 
 
-def test_an_electrode_that_jumps_and_stays_has_moved_however_constant_it_is() -> None:
+def test_an_electrode_that_jumps_and_stays_has_moved() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(2.5, 100.0, 3.5, 11)
     counts[-8:, 0, 0] = counts[-9, 0, 0] - 1000.0
     fed(motion, counts, 100.0)
@@ -185,7 +185,7 @@ def test_an_electrode_that_jumps_and_stays_has_moved_however_constant_it_is() ->
     assert not motion.strict.sure
 
 
-def test_electrodes_that_are_lost_for_longer_tell_nothing_until_a_window_has_passed() -> None:
+def test_long_lost_electrodes_stay_unknown_for_a_window() -> None:
     motion = Motion(1, 0.05, early=True)
     counts = np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
     known = []
@@ -221,7 +221,7 @@ def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
     assert motion.blocks.sums[0, 0] > 0.0
 
 
-def test_a_finger_that_is_lost_as_a_whole_is_not_known_and_no_error() -> None:
+def test_a_wholly_lost_finger_is_unknown() -> None:
     motion, counts = Motion(1, 0.05), np.rint(wavering(2.0, 100.0, 3.5, 15)).astype(np.uint16)
     for index, sweep in enumerate(counts):
         motion.add(index * 10_000_000, sweep, FINGER if index < 150 else ~FINGER)
@@ -240,7 +240,7 @@ def test_nearly_half_of_the_sweeps_may_be_false_alarms() -> None:
     assert (strict.fast, strict.early, strict.sure) == ([1.0] * 3, False, False), "nothing is known"
 
 
-def test_no_finger_may_waver_so_much_that_motion_passes_for_noise() -> None:
+def test_a_wavering_finger_is_noise_up_to_a_limit() -> None:
     motion = Motion(1, 0.05)
     fed(motion, wavering(4.0, 100.0, 20.0, 16), 100.0)
     # Twice the 10 counts that are believed to be noise.
@@ -248,7 +248,7 @@ def test_no_finger_may_waver_so_much_that_motion_passes_for_noise() -> None:
     assert not motion.strict.sure
 
 
-def test_where_sweeps_come_slowly_a_line_has_three_of_them_and_one_lies_before() -> None:
+def test_a_slow_line_has_three_sweeps_and_one_before() -> None:
     motion, counts = Motion(1, 0.05), np.rint(wavering(12.0, 10.0, 3.5, 17)).astype(np.uint16)
     known = []
     for index in range(115):
@@ -279,9 +279,7 @@ def test_who_looks_late_sees_what_who_always_looked_sees(rate_hz: float) -> None
 
 
 @pytest.mark.parametrize(("sweeps", "counts_per_s"), [(8, 83.0), (12, 53.0), (24, 25.0)])
-def test_the_limit_of_slopes_is_what_19_of_20_real_touches_kept_to(
-    sweeps: int, counts_per_s: float
-) -> None:
+def test_the_slope_limit_fits_19_of_20_real_touches(sweeps: int, counts_per_s: float) -> None:
     """Of 44 held touches at 100 Hz, in windows of 80, 120 and 240 ms."""
     times_s = 0.01 * (np.arange(sweeps) - (sweeps - 1) / 2)
     variance = np.array([SIGMA_COUNTS**2 / (1.0 - CORRELATION)])

@@ -57,7 +57,7 @@ def under_ring(rate_hz: float, sweeps: int, fingers: tuple[int, ...], live: int)
         (PALM_RATE_HZ, (0, 1, 2), 64, 4),
     ],
 )
-def test_a_ring_is_frozen_from_the_first_sweep_that_comes_again(
+def test_a_ring_is_frozen_from_its_first_repeat(
     rate_hz: float, fingers: tuple[int, ...], sweeps: int, live: int
 ) -> None:
     found = under_ring(rate_hz, sweeps, fingers, live)
@@ -80,7 +80,7 @@ def test_a_ring_between_palm_and_host_is_frozen_too(sweeps: int) -> None:
 
 
 @pytest.mark.parametrize("packets", [15, 64, 896])
-def test_a_ring_of_palm_packets_that_is_no_whole_number_of_rounds_is_never_stable(
+def test_a_ring_of_odd_palm_packets_is_never_stable(
     packets: int,
 ) -> None:
     """Where it begins anew a packet is lost, or two contradict each other: a round lacks those."""
@@ -209,7 +209,7 @@ def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
     assert all(Reason.FROZEN in reasons for reasons in said[9:])
 
 
-def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
+def test_an_unread_finger_does_not_recur() -> None:
     health, random = Health(3), np.random.default_rng(3)
     for _ in range(300):
         reading = sound(random.integers(500, 3500, (3, 24)))

@@ -109,7 +109,7 @@ def test_a_grasp_stays_judged_and_is_one() -> None:
     assert hand.model.runs > 10 * 4.5
 
 
-def test_what_was_slip_is_stable_only_when_it_was_not_for_a_second() -> None:
+def test_slip_becomes_stable_only_after_a_second_without() -> None:
     hand = tared(limits())
     assert hand.play(HELD)[-1].decision is Decision.STABLE
     slips = hand.play(Feel(times=10, answer=0.6))
@@ -139,7 +139,7 @@ def test_a_network_that_fails_now_is_told_now() -> None:
     assert hand.play(Feel(times=6))[-1].decision is Decision.STABLE
 
 
-def test_where_values_are_missing_all_the_time_the_newest_are_judged() -> None:
+def test_values_that_keep_missing_leave_the_newest_judged() -> None:
     hand = tared(limits())
     assert hand.play(HELD)[-1].decision is Decision.STABLE
     missing = (Flaw(0, 3, 2, int(ElectrodeFault.MISSING), 0),)
@@ -158,7 +158,7 @@ def risky(limit: RiskLimits) -> tuple[Hand, Trust]:
     return hand, trust
 
 
-def test_under_a_risk_a_grasp_that_is_judged_on_and_on_is_one_lift() -> None:
+def test_a_grasp_judged_again_under_risk_is_one_lift() -> None:
     hand, trust = risky(RiskLimits(0.05))
     said = hand.play(Feel(times=300, answer=0.001))
     assert said[-1].decision is Decision.STABLE
@@ -188,7 +188,7 @@ def test_under_a_risk_nobody_gets_a_lucky_draw_by_waiting() -> None:
     assert trust.report().outstanding <= 1
 
 
-def test_a_grasp_is_judged_without_what_it_taught_the_session_until_it_is_over(
+def test_a_grasp_teaches_the_session_only_when_over(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     taken: list[NDArray[np.generic]] = []

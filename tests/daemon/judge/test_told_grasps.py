@@ -89,7 +89,7 @@ def test_the_grasp_after_a_told_one_is_offered() -> None:
     assert (said.moment.grasp, said.decision) == (2, Decision.STABLE)
 
 
-def test_an_answer_to_a_question_says_that_the_outcome_is_told() -> None:
+def test_an_answer_says_that_its_outcome_is_told() -> None:
     hand = trusting(gate_limits(on_request=True), RISKS["in the warm-up"])
     hand.play(HELD)
     tell(hand, 1, slipped=True)

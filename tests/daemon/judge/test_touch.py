@@ -53,7 +53,7 @@ def test_a_finger_lets_go_below_its_share(
     ("deep", "relative", "touches"),
     [(20.0, 20.0, True), (19.99, 99.0, False), (99.0, 19.99, False)],
 )
-def test_a_touch_takes_a_fall_below_the_baseline_and_below_the_finger(
+def test_a_touch_falls_below_baseline_and_finger(
     deep: float, relative: float, touches: bool
 ) -> None:
     touch = Touch(THRESHOLD)
@@ -62,7 +62,7 @@ def test_a_touch_takes_a_fall_below_the_baseline_and_below_the_finger(
     assert touch.since_ns == (0 if touches else None)
 
 
-def test_the_depth_of_a_hold_fades_by_five_counts_a_second_down_to_the_fall() -> None:
+def test_a_hold_fades_five_counts_a_second_to_its_fall() -> None:
     touch = held(100.0)
     depths = []
     for elapsed_s, fall in ((1.0, 60.0), (0.1, 60.0), (99.0, 60.0), (0.0, 70.0)):
@@ -73,7 +73,7 @@ def test_the_depth_of_a_hold_fades_by_five_counts_a_second_down_to_the_fall() ->
     assert (touch.touching, touch.depth, touch.since_ns) == (False, 0.0, None)
 
 
-def test_the_depth_of_a_hold_fades_by_the_time_between_sweeps() -> None:
+def test_a_holds_depth_fades_by_time() -> None:
     contact, rest = Contact(1), np.full((1, 24), 3000, dtype=np.uint16)
     for place in range(100):
         contact.observe(place * 10 * MS, rest, rest, None)
@@ -108,9 +108,7 @@ def test_a_finger_that_let_go_touches_again_after_fifty_milliseconds(
         ((10.0, -3.0), 20.0),  # never less than a touch
     ],
 )
-def test_a_new_touch_falls_from_the_smallest_fall_since_it_let_go(
-    falls: tuple[float, ...], again: float
-) -> None:
+def test_a_new_touch_falls_from_its_smallest_fall(falls: tuple[float, ...], again: float) -> None:
     for fall, touches in ((again - 0.01, False), (again, True)):
         touch = held(40.0)
         for place, rest in enumerate(falls):
@@ -124,9 +122,7 @@ def test_a_new_touch_falls_from_the_smallest_fall_since_it_let_go(
     ("after_ns", "anew"),
     [(0, False), (30 * S, False), (30 * S + 1, True)],
 )
-def test_a_finger_that_touches_alone_for_half_a_minute_is_tared_anew(
-    after_ns: int, anew: bool
-) -> None:
+def test_a_finger_alone_for_half_a_minute_is_tared(after_ns: int, anew: bool) -> None:
     touch = held(100.0)
     assert not touch.has_lost_rest(S, 0.0)
     assert touch.has_lost_rest(S + after_ns, 0.0) == anew
@@ -172,7 +168,7 @@ def rest_of(sweeps: Sweeps, usable: int = 24) -> Rest | None:
     return rest
 
 
-def test_a_window_is_looked_at_after_a_hundred_sweeps_and_every_25_more() -> None:
+def test_a_window_is_checked_after_100_sweeps_then_every_25() -> None:
     contact = Contact(1)
     rest = np.full((1, 24), 3000, dtype=np.uint16)
     looks = []
@@ -185,7 +181,7 @@ def test_a_window_is_looked_at_after_a_hundred_sweeps_and_every_25_more() -> Non
     assert looks == [100, 125, 150, 260, 285, 310], "a hundred sweeps after what looked as a touch"
 
 
-def test_a_finger_that_touches_with_all_others_at_times_is_not_alone() -> None:
+def test_a_finger_that_touches_with_others_is_not_alone() -> None:
     contact = Contact(2)
     rest = np.full((2, 24), 3000, dtype=np.uint16)
     for place in range(100):
@@ -200,7 +196,7 @@ def test_a_finger_that_touches_with_all_others_at_times_is_not_alone() -> None:
     assert contact.tared.tolist() == [False, True], "half a minute since it was left alone"
 
 
-def test_the_baseline_is_the_median_of_the_last_hundred_sweeps_only() -> None:
+def test_the_baseline_is_the_median_of_100_sweeps() -> None:
     old, new = [np.full(24, 9, dtype=np.uint16)] * 50, wavering(0)
     rest = rest_of([*old, *new])
     assert rest is not None
@@ -249,9 +245,7 @@ def test_an_electrode_at_a_rail_has_no_rest(place: int, value: int, known: bool)
 
 
 @pytest.mark.parametrize(("step", "known"), [(20, True), (21, False)])
-def test_an_electrode_that_wavers_three_times_as_much_as_a_finger_may_has_no_rest(
-    step: int, known: bool
-) -> None:
+def test_an_electrode_far_noisier_than_its_finger_has_no_rest(step: int, known: bool) -> None:
     sweeps = wavering(2)
     for place, sweep in enumerate(sweeps):
         sweep[5] = 3000 + step * (-1) ** place  # sigma 29.7 or 31.1, the limit is 30
@@ -278,9 +272,7 @@ def test_a_touch_takes_five_sigmas_or_twenty_counts(step: int, threshold: float)
     [(1.0, 1.0), (9.0, 1.25), (-0.3, -0.3), (-9.0, -0.375)],
     ids=["rises slowly", "rises", "sinks slowly", "sinks"],
 )
-def test_a_baseline_rises_five_and_sinks_one_and_a_half_counts_a_second(
-    step: float, followed: float
-) -> None:
+def test_a_baseline_rises_faster_than_it_sinks(step: float, followed: float) -> None:
     contact = Contact(1)
     for place in range(100):
         counts = np.full((1, 24), 3000, dtype=np.uint16)

@@ -48,7 +48,7 @@ def test_outcomes_move_the_probability_and_not_what_the_network_says() -> None:
     assert found[-1].p_slip > 0.6
 
 
-def test_in_the_warm_up_grasps_are_to_be_lifted_under_supervision() -> None:
+def test_a_warm_up_lifts_under_supervision() -> None:
     clock = Clock()
     judge = trusting(FakeModel(0.3), clock, RiskLimits(0.05, warm_up=3))
     found = [lift(judge, clock, seed, slipped=False) for seed in range(4)]
@@ -63,7 +63,7 @@ def test_in_the_warm_up_grasps_are_to_be_lifted_under_supervision() -> None:
     assert not found[3].supervised
 
 
-def test_what_cannot_be_judged_is_never_to_be_lifted_under_supervision() -> None:
+def test_what_cannot_be_judged_is_never_supervised() -> None:
     clock = Clock()
     judge = trusting(FakeModel(0.3), clock, RiskLimits(0.05, warm_up=50))
     bad = reading(clock())

@@ -47,7 +47,7 @@ def test_a_settled_grasp_goes_on_where_it_would_not_settle() -> None:
     assert steps.now.motion_limits["ff"] in np.round((strict.fast[0], strict.slow[0]), 2)
 
 
-def test_a_grasp_that_has_become_another_settles_by_the_strict_limit() -> None:
+def test_a_changed_grasp_settles_by_the_strict_limit() -> None:
     steps = Steps()
     steps.grasp()
     trembling(steps, 4.0)

@@ -106,9 +106,7 @@ def test_messages_that_its_process_is_too_slow_for_are_dropped(tmp_path: Path) -
     assert not all(sent)
 
 
-def test_a_subscriber_that_does_not_read_loses_messages_and_nothing_else(
-    tmp_path: Path, peers: Peers
-) -> None:
+def test_a_subscriber_that_does_not_read_loses_only_messages(tmp_path: Path, peers: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
     with Publisher(endpoint, high_water_mark=10) as publisher:
         subscriber = peers.subscribe(endpoint, high_water_mark=10)
@@ -123,9 +121,7 @@ def test_a_subscriber_that_does_not_read_loses_messages_and_nothing_else(
     assert numbers == sorted(set(numbers))
 
 
-def test_all_messages_before_the_last_status_are_heard_when_the_door_closes(
-    tmp_path: Path, peers: Peers
-) -> None:
+def test_all_messages_before_the_last_status_are_heard(tmp_path: Path, peers: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
     with Publisher(endpoint) as publisher:
         subscriber = peers.subscribe(endpoint)
@@ -166,7 +162,7 @@ def test_the_socket_file_keeps_its_mode_and_survives_opening_again(
 
 
 @pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
-def test_a_question_comes_with_its_routing_id_and_gets_its_answer(
+def test_a_question_gets_its_answer_by_routing_id(
     asked: tuple[Door, str], peers: Peers, kind: int
 ) -> None:
     door, endpoint = asked
@@ -211,9 +207,7 @@ def test_a_flood_of_questions_is_read_a_few_a_round(asked: tuple[Door, str], pee
     assert max(rounds) <= QUESTIONS_MAX
 
 
-def test_a_peer_that_sends_too_much_is_disconnected_and_others_are_not(
-    asked: tuple[Door, str], peers: Peers
-) -> None:
+def test_only_a_peer_that_floods_is_disconnected(asked: tuple[Door, str], peers: Peers) -> None:
     door, endpoint = asked
     loud, polite = (peers.connect(zmq.DEALER, endpoint, name=name) for name in (b"loud", b"polite"))
     loud.send(b"x" * 100_000)

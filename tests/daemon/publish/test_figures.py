@@ -58,7 +58,7 @@ def test_jitter_is_of_readings_in_a_row(
     assert deadlines.jitter.max_us == pytest.approx(longest_us)
 
 
-def test_a_verdict_more_than_a_period_after_its_reading_is_late() -> None:
+def test_a_verdict_a_period_after_its_reading_is_late() -> None:
     deadlines = Deadlines()
     for seq, age_ms in enumerate((0.5, 10.0, 10.5, 2.0)):
         deadlines.add(reading(seq * PERIOD_NS, seq=seq), age_ms, PERIOD_NS)
@@ -143,7 +143,7 @@ def test_what_stable_is_worth_counts_each_lift_of_known_outcome() -> None:
     )
 
 
-def test_an_outcome_that_comes_later_counts_as_if_it_had_been_recorded() -> None:
+def test_a_late_outcome_counts_as_if_recorded() -> None:
     early, late = RunSummary(), RunSummary()
     for grasp, slipped in enumerate((True, False, True, False), 1):
         said = verdict(Decision.STABLE if grasp < 3 else Decision.SLIP)

@@ -48,9 +48,7 @@ def test_a_key_on_the_list_hears_messages_and_may_ask(door: KeyedDoor) -> None:
     assert door.said().count("admitted a peer with the key of controller") == 2
 
 
-def test_a_key_that_is_not_on_the_list_is_turned_away_and_named(
-    door: KeyedDoor, tmp_path: Path
-) -> None:
+def test_an_unlisted_key_is_refused_and_named(door: KeyedDoor, tmp_path: Path) -> None:
     keys = door.client("stranger", tmp_path / "elsewhere")
     assert not door.hears(door.connect(keys), QUIET_S)
     told = f"turned away a peer: its key {keys[0].decode()} is not on the list"
@@ -67,9 +65,7 @@ def test_a_peer_without_a_key_is_warned_of(door: KeyedDoor) -> None:
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
-def test_a_key_that_is_put_on_the_list_is_admitted_and_connections_stay(
-    door: KeyedDoor, tmp_path: Path
-) -> None:
+def test_a_listed_key_is_admitted_and_connections_stay(door: KeyedDoor, tmp_path: Path) -> None:
     friend = door.connect(door.known)
     assert door.hears(friend, PATIENCE_S)
     assert door.hears(door.connect(door.admitted("new", tmp_path / "new")), PATIENCE_S)
@@ -107,9 +103,7 @@ def leads_over_a_folder_that_is_open(clients: Path) -> None:
 
 
 @pytest.mark.parametrize("spoil", [is_open_to_the_group, leads_over_a_folder_that_is_open])
-def test_a_folder_that_cannot_be_trusted_lets_nobody_in_until_it_can(
-    door: KeyedDoor, spoil: Callable[[Path], None]
-) -> None:
+def test_an_untrusted_folder_admits_no_key(door: KeyedDoor, spoil: Callable[[Path], None]) -> None:
     former = door.connect(door.known)
     assert door.hears(former, PATIENCE_S)
     spoil(door.clients)
@@ -137,7 +131,7 @@ NO_KEYS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", NO_KEYS)
-def test_a_file_that_is_no_key_is_named_and_others_count(tmp_path: Path, kind: str) -> None:
+def test_a_file_without_a_key_is_named(tmp_path: Path, kind: str) -> None:
     NO_KEYS[kind](tmp_path / "broken.key")
     make(tmp_path, "laptop")
     admitted, refused = load_clients(tmp_path)
@@ -157,7 +151,7 @@ def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> No
         load_own(secret)
 
 
-def test_below_a_folder_in_which_all_may_put_files_of_their_own_keys_are_safe(
+def test_own_keys_below_a_shared_folder_are_safe(
     tmp_path: Path,
 ) -> None:
     """As below /tmp, where nobody may replace what is somebody else's."""
@@ -193,7 +187,7 @@ def test_links_that_lead_round_and_round_are_followed_no_further(tmp_path: Path)
         load_clients(tmp_path / "one" / "clients")
 
 
-def test_a_public_key_is_no_secret_one_and_keys_are_never_overwritten(tmp_path: Path) -> None:
+def test_keys_are_told_apart_and_never_overwritten(tmp_path: Path) -> None:
     public, secret = make(tmp_path, "daemon")
     with pytest.raises(KeysError, match="has no secret key"):
         load_pair(public)
@@ -221,9 +215,7 @@ def test_the_command_makes_lists_and_complains(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_folder_that_others_may_write_is_refused_before_anything_starts(
-    tmp_path: Path, command: str
-) -> None:
+def test_a_folder_that_others_write_is_refused_at_start(tmp_path: Path, command: str) -> None:
     make(tmp_path / "keys", "daemon")
     make(tmp_path / "keys" / "clients", "laptop")
     curve = '[curve]\nsecret_key = "keys/daemon.key_secret"\nclients = "keys/clients"\n'

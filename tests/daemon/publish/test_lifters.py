@@ -243,7 +243,7 @@ def test_before_the_first_reading_silence_is_the_answer(bench: Bench) -> None:
     assert bench.book.silences == 1
 
 
-def test_a_lift_that_waits_too_long_for_the_disk_ends_unknown(bench: Bench) -> None:
+def test_a_lift_too_late_on_the_disk_is_unknown(bench: Bench) -> None:
     bench.say(b"lift")
     bench.verdict(keep=bench.book.disk.append)
     bench.questions.serve([], S, bench.book)

@@ -113,7 +113,7 @@ LOCKS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", LOCKS)
-def test_a_lock_file_that_is_not_ours_is_left_as_it_is(tmp_path: Path, kind: str) -> None:
+def test_a_lock_file_of_others_is_kept(tmp_path: Path, kind: str) -> None:
     lock = tmp_path / "v.lock"
     LOCKS[kind](lock)
     with pytest.raises(PublishError, match="cannot publish on ipc://") as error:

@@ -130,7 +130,7 @@ def outages(folder: Path) -> Iterator[tuple[str, int]]:
             verdict = subscriber.verdict(verdict.silence_ms / 1e3)
 
 
-def test_heartbeats_of_peers_that_hang_up_do_not_end_the_daemon(tmp_path: Path) -> None:
+def test_peers_that_hang_up_end_no_daemon(tmp_path: Path) -> None:
     with hand(tmp_path) as daemon:
         for door in daemon.doors:
             for says in HANG_UPS:

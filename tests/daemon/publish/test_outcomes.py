@@ -49,7 +49,7 @@ def test_outcomes_are_published_as_the_schema_says() -> None:
         jsonschema.validate(json.loads(payload), schema() | {"$ref": "#/$defs/OutcomeMessage"})
 
 
-def test_an_outcome_of_a_grasp_that_an_earlier_start_judged_says_which() -> None:
+def test_an_outcome_of_an_earlier_start_names_it() -> None:
     output = SentMessages()
     sender = outbox(output)
     for boot_id, judged_by in ((BOOT, None), ("f" * 32, "f" * 32)):
@@ -105,7 +105,7 @@ def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
     assert asked.questions.counters["malformed"] == 0
 
 
-def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(asked: Asked) -> None:
+def test_an_outcome_to_be_kept_is_answered_when_kept(asked: Asked) -> None:
     requests = Requests(takes_the_seventh)
     waiting: list[Answer] = []
     requests.waiting = waiting

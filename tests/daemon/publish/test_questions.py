@@ -86,7 +86,7 @@ def test_what_is_no_question_is_counted_and_not_answered(
     assert questions.counters["malformed"] == 1
 
 
-def test_a_flood_of_questions_is_bounded_and_each_peers_newest_is_answered(
+def test_a_flood_of_questions_keeps_each_peers_newest(
     questions: Questions, sent: list[Frames]
 ) -> None:
     for _ in range(5):
@@ -107,7 +107,7 @@ def test_the_oldest_question_makes_place_for_a_newer_one(
     assert sent[0] == [b"20", b"{}"]
 
 
-def test_when_time_is_up_only_the_peers_that_waited_that_long_are_answered(
+def test_only_peers_that_waited_long_enough_are_answered(
     questions: Questions, sent: list[Frames]
 ) -> None:
     questions.take([[b"first", USER, b"judge"]], 0, Asked())
@@ -144,9 +144,7 @@ def ask(asker: zmq.Socket[bytes]) -> Verdict:
     return decode_verdict(asker.recv())
 
 
-def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown(
-    tmp_path: Path, peers: Peers
-) -> None:
+def test_a_controller_that_asks_gets_its_verdict_or_unknown(tmp_path: Path, peers: Peers) -> None:
     with start("run", scene(tmp_path, "request", 200.0)) as daemon:
         wait_for(tmp_path / "ask")
         asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")
@@ -168,9 +166,7 @@ def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown(
             assert answer.verdict is Decision.UNKNOWN
 
 
-def test_in_other_modes_the_answer_is_the_verdict_of_the_next_reading(
-    tmp_path: Path, peers: Peers
-) -> None:
+def test_without_a_gate_the_next_verdict_answers(tmp_path: Path, peers: Peers) -> None:
     with start("run", scene(tmp_path, "settled", 10_000.0)) as daemon:
         wait_for(tmp_path / "ask")
         asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")

@@ -52,7 +52,7 @@ def test_readings_are_published_at_the_rate_of_the_scene(
     assert times == pytest.approx(10 * published, abs=1)
 
 
-def test_readings_go_on_after_a_pause_and_do_not_catch_up(tmp_path: Path) -> None:
+def test_readings_after_a_pause_catch_up_nothing(tmp_path: Path) -> None:
     clock = Clock()
     with Sockets(wanted(tmp_path, tactile_hz=10.0), clock) as sockets:
         assert sockets.wanted(b"tactile.right")
@@ -123,7 +123,7 @@ def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_of_sockets_have_the_mode_and_the_group_of_the_scene(tmp_path: Path) -> None:
+def test_socket_files_have_the_scenes_mode_and_group(tmp_path: Path) -> None:
     group = grp.getgrgid(os.getgroups()[0] if os.getgroups() else os.getgid()).gr_name
     with Sockets(wanted(tmp_path, file_mode="0620", group=group)):
         for name in ("v", "ask"):

@@ -90,7 +90,7 @@ class ScriptedDriver(FakeDriver):
         return []
 
 
-def test_silence_is_reported_once_per_limit_and_ends_with_the_next_reading() -> None:
+def test_silence_is_reported_once_per_limit() -> None:
     clock = Clock()
     start_ns = clock()
     bench = LoopBench(ScriptedDriver([10, 400], clock, 450), clock)
@@ -107,7 +107,7 @@ def test_silence_is_reported_once_per_limit_and_ends_with_the_next_reading() -> 
     assert [verdict.valid for verdict in bench.verdicts] == [True, False, False, False, True]
 
 
-def test_a_slow_driver_may_be_silent_for_ten_of_its_periods() -> None:
+def test_a_slow_driver_may_miss_ten_periods() -> None:
     clock = Clock()
     start_ns = clock()
     driver = ScriptedDriver([10, 400], clock, 1000)
@@ -120,7 +120,7 @@ def test_a_slow_driver_may_be_silent_for_ten_of_its_periods() -> None:
     assert round(bench.verdicts[-1].age_ms) == 500
 
 
-def test_latency_counts_the_wait_behind_other_readings_of_the_same_moment() -> None:
+def test_latency_includes_the_wait_behind_other_readings() -> None:
     clock = Clock()
 
     class SlowModel(FakeModel):
@@ -152,7 +152,7 @@ def test_status_comes_every_second_even_when_idle() -> None:
 
 
 @pytest.mark.parametrize("error", [LinkError(LinkCause.UNKNOWN, "gone"), DriverError("broken")])
-def test_a_driver_that_gives_up_ends_the_loop_and_no_round(error: DriverError) -> None:
+def test_a_driver_that_gives_up_ends_the_loop(error: DriverError) -> None:
     """The last status is sent; the watchdog is not fed for the round that failed."""
     clock, watchdog = Clock(), Watchdog()
     driver = FakeDriver([reading(clock(), 1), reading(clock(), 2), error], clock)
@@ -199,7 +199,7 @@ class Watchdog(Companion):
         self.fed += 1
 
 
-def test_a_reading_is_sent_before_its_verdict_only_while_somebody_wants_it() -> None:
+def test_a_reading_is_sent_only_while_wanted() -> None:
     clock = Clock()
     angles = JointReading(clock(), 0, ("FFJ3", "MFJ3"), np.array([0.5, np.nan]))
     first, second, third = (reading(clock(), seed) for seed in (1, 2, 3))
@@ -248,7 +248,7 @@ class Peer(Companion):
         return {"peer": {"outcomes": self.refused.count(KEPT)}}
 
 
-def test_a_companion_asks_and_tells_and_hears_what_comes_of_it() -> None:
+def test_a_companion_asks_tells_and_hears_answers() -> None:
     clock = Clock()
     driver = FakeDriver([reading(clock(), seed) for seed in (1, 2)], clock)
     peer = Peer("b" * 32)
@@ -272,7 +272,7 @@ def told(bench: LoopBench, outcome: Literal["stable", "slip"]) -> list[Reply]:
     return answers
 
 
-def test_an_outcome_is_answered_when_it_is_kept_and_repeated_only_then() -> None:
+def test_a_kept_outcome_is_answered_and_then_repeated() -> None:
     clock, waiting = Clock(), list[Answer]()
     driver = FakeDriver([reading(clock())], clock)
     bench = LoopBench(driver, clock, boot_id=BOOT, keep=waiting.append)
@@ -290,7 +290,7 @@ def test_an_outcome_is_answered_when_it_is_kept_and_repeated_only_then() -> None
     assert [topic for topic, _ in bench.output.sent].count(b"outcome.right") == 1
 
 
-def test_a_replay_takes_outcomes_by_its_own_name_of_the_start() -> None:
+def test_a_replay_takes_outcomes_by_its_own_start() -> None:
     """It enters its grasps in the book by the start that was recorded."""
     clock = Clock()
     bench = LoopBench(FakeDriver([reading(clock())], clock), clock, boot_id=BOOT)
@@ -300,7 +300,7 @@ def test_a_replay_takes_outcomes_by_its_own_name_of_the_start() -> None:
     assert bench.pipeline.lifts.is_told(GraspId("e" * 32, 1))
 
 
-def test_an_outcome_teaches_before_the_next_verdict_and_is_in_the_status() -> None:
+def test_an_outcome_teaches_before_the_next_verdict() -> None:
     clock, trust = Clock(), Trust("fake", 0)
     driver = FakeDriver([reading(clock(), seed) for seed in (1, 2, 3)], clock)
     peer = Peer("b" * 32)
@@ -323,7 +323,7 @@ def test_an_outcome_teaches_before_the_next_verdict_and_is_in_the_status() -> No
     assert 0.0 < status.learner.uncertainty < 1.0
 
 
-def test_an_outcome_of_a_grasp_of_an_earlier_start_is_taken_once_it_is_known() -> None:
+def test_an_outcome_of_an_earlier_start_waits_until_known() -> None:
     clock, earlier = Clock(), GraspId("e" * 32, 1)
     known = Trust("fake", 0)
     known.note(earlier, known.judge(earlier, 0.1, -2.0, np.empty(0)), stable=True)
@@ -346,7 +346,7 @@ class Exchanging(FakeDriver):
         return {"ff": "A" if self.counters.readings < 3 else "B"}
 
 
-def test_an_exchanged_sensor_is_noticed_before_its_first_reading_is_published_or_judged() -> None:
+def test_an_exchanged_sensor_is_noticed_before_its_first_reading() -> None:
     clock = Clock()
     driver = Exchanging([reading(clock(), seed) for seed in range(4)], clock)
     published_at_exchange: list[int] = []
@@ -357,7 +357,7 @@ def test_an_exchanged_sensor_is_noticed_before_its_first_reading_is_published_or
     assert published_at_exchange == [4]  # two readings and their verdicts
 
 
-def test_companions_are_called_in_their_order_and_only_for_hooks_of_their_own() -> None:
+def test_companions_are_called_in_order_for_their_own_hooks() -> None:
     first, second = Watchdog(), Watchdog()
     bound = hooks([first, Companion(), second], Companion.after_round)
     assert bound == (first.after_round, second.after_round)

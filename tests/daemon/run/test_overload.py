@@ -84,7 +84,7 @@ def flood(cost_ns: int, seconds: float = 3.0, at_once: int = 1000) -> Overloaded
 
 
 @pytest.mark.parametrize("times", [1.5, 10.0])
-def test_at_any_overload_the_newest_is_judged_and_all_are_accounted_for(times: float) -> None:
+def test_an_overload_judges_the_newest_and_counts_all(times: float) -> None:
     cost_ns = round(times * PERIOD_NS)
     bench = flood(cost_ns, 4.0)
     status = bench.statuses[-1]
@@ -118,7 +118,7 @@ def test_a_stall_that_can_be_caught_up_costs_no_reading() -> None:
     assert bench.statuses[-1].skipped_readings == 0
 
 
-def test_a_recording_is_judged_row_by_row_however_long_that_takes() -> None:
+def test_a_recording_is_judged_row_by_row() -> None:
     clock = Clock()
     driver = LiveDriver(stream(1.0), clock)
     driver.live = False
@@ -129,7 +129,7 @@ def test_a_recording_is_judged_row_by_row_however_long_that_takes() -> None:
     assert bench.rests_s  # all the same: in realtime it would be ended
 
 
-def test_the_loop_sleeps_feeds_the_watchdog_and_tells_its_status_in_every_overload() -> None:
+def test_an_overloaded_loop_sleeps_feeds_the_watchdog_and_reports() -> None:
     bench = flood(30 * MS, 10.0)
     worked_ns = 10 * SECOND_NS
     assert sum(bench.rests_s) * 1e9 == pytest.approx(worked_ns / 11, rel=0.2)
@@ -140,7 +140,7 @@ def test_the_loop_sleeps_feeds_the_watchdog_and_tells_its_status_in_every_overlo
     assert max(np.diff([status.t_mono_ns for status in bench.statuses])) < 1.1 * SECOND_NS
 
 
-def test_it_is_said_once_when_it_begins_and_once_when_it_is_over(
+def test_an_overload_is_logged_at_its_begin_and_end(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     clock = Clock()
@@ -187,7 +187,7 @@ def test_the_newest_is_that_of_all_that_the_driver_has() -> None:
     assert max(ages_ms) < 10.0
 
 
-def test_a_driver_that_always_has_more_does_not_hold_the_loop() -> None:
+def test_a_driver_with_endless_readings_does_not_hold_the_loop() -> None:
     clock = Clock()
     driver = LiveDriver(stream(2.0, PERIOD_NS // 200), clock, at_once=20)
     bench = OverloadedLoop(driver, clock, lambda: 30 * MS)
@@ -197,7 +197,7 @@ def test_a_driver_that_always_has_more_does_not_hold_the_loop() -> None:
     assert bench.statuses[-1].skipped_readings + len(bench.judged) == driver.counters.readings
 
 
-def test_a_loop_at_work_sleeps_now_and_then_and_an_idle_one_is_left_alone() -> None:
+def test_a_busy_loop_sleeps_and_an_idle_one_does_not() -> None:
     slept: list[float] = []
     shedder = LoadShedder(0, live=True, sleep=slept.append)
     for now_ns in range(0, SECOND_NS, MS):
@@ -208,7 +208,7 @@ def test_a_loop_at_work_sleeps_now_and_then_and_an_idle_one_is_left_alone() -> N
     assert slept == [pytest.approx(YIELD_AFTER_NS / 10 / 1e9, rel=0.2)]
 
 
-def test_a_sensor_that_freezes_among_what_is_left_out_is_never_stable() -> None:
+def test_a_sensor_frozen_among_skipped_readings_is_never_stable() -> None:
     """Each reading is a grasp: the judge sees but the newest, and that differs from its last."""
     clock = Clock()
     came = stream(2.0)
@@ -315,7 +315,7 @@ def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
     assert said[249].verdict is Decision.STABLE
 
 
-def test_a_finger_that_repeats_itself_is_held_whatever_is_read_of_its_flagged_electrodes() -> None:
+def test_a_repeated_finger_is_held_despite_flagged_electrodes() -> None:
     """As without the gap, where health takes no flagged electrode for a difference."""
     former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
     counts = newest.counts.copy()
@@ -331,7 +331,7 @@ def test_a_finger_that_repeats_itself_is_held_whatever_is_read_of_its_flagged_el
     assert found.faults[0, 5] == ElectrodeFault.PARITY
 
 
-def test_a_finger_of_which_nothing_is_read_is_missing_and_not_held() -> None:
+def test_an_unread_finger_is_missing_not_held() -> None:
     former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
     counts, faults = newest.counts.copy(), np.zeros((3, 24), np.uint8)
     counts[2], faults[2] = 0, ElectrodeFault.MISSING
@@ -353,7 +353,7 @@ class BusySelector(selectors.SelectSelector):
         return super().select(0.0)
 
 
-def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> None:
+def test_a_slow_busy_processor_rests_too() -> None:
     rests_s: list[float] = []
     clock = Clock()
     driver = FakeDriver([], clock)
@@ -372,7 +372,7 @@ def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> N
     assert time.monotonic_ns() - began_ns >= YIELD_AFTER_NS
 
 
-def test_a_reading_that_does_not_follow_makes_the_grasp_settle_again() -> None:
+def test_a_reading_that_does_not_follow_unsettles_the_grasp() -> None:
     """The counts go on as before; only the sender says that it began again."""
     clock = Clock()
     came = [item for item in grasps(3) if item.seq < 150]

@@ -161,7 +161,7 @@ RTTIME_US = 500_000
 """As `LimitRTTIME` of the unit, but a tenth: longest computing without a sleep."""
 
 
-def test_the_kernel_takes_the_rests_of_an_overloaded_loop_for_sleep(tmp_path: Path) -> None:
+def test_the_kernel_sees_an_overloaded_loops_rests_as_sleep(tmp_path: Path) -> None:
     """Who computes in realtime for longer than its limit without sleeping is ended."""
     if not fifo_may_be_had():
         pytest.skip("SCHED_FIFO is refused here")

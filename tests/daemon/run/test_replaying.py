@@ -19,7 +19,7 @@ from tests.kit.messages import GOLDEN_VERDICT
     ("in_the_table", "told"),
     [("mug", "mug"), ('a "red" pen', None), ("=HYPERLINK(0)", None), ("mug\n", None), (None, None)],
 )
-def test_an_object_is_told_by_a_name_that_outcomes_may_have(
+def test_an_object_has_a_name_that_outcomes_take(
     in_the_table: str | None, told: str | None
 ) -> None:
     controller, requests = Controller(only_lifted=False), Asked()

@@ -108,7 +108,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
         yield running
 
 
-def test_ready_comes_when_it_runs_and_the_watchdog_is_fed_from_then_on(running: Running) -> None:
+def test_ready_comes_first_and_then_the_watchdog_is_fed(running: Running) -> None:
     assert running.verdict().model == "small-session"
     for _ in range(3):
         assert running.told("WATCHDOG=1") == ["WATCHDOG=1"]
@@ -130,7 +130,7 @@ def test_a_signal_ends_the_daemon_and_is_logged(running: Running, number: signal
     assert int(ended[1]) > seen.seq
 
 
-def test_a_table_that_ends_is_logged_with_a_judgement_a_row(
+def test_an_ended_table_logs_a_judgement_a_row(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = len(DEMO_TABLE.read_text().splitlines()) - 1
@@ -143,7 +143,7 @@ def test_a_table_that_ends_is_logged_with_a_judgement_a_row(
     assert sum(map(int, counts)) == rows
 
 
-def test_a_run_that_fails_is_logged_and_a_scene_that_never_ran_is_not(
+def test_only_a_scene_that_ran_logs_its_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(_loop: object) -> None:

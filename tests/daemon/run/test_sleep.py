@@ -27,7 +27,7 @@ class Sleeper(FakeModel):
         return super().run()
 
 
-def test_a_reading_of_before_a_sleep_gives_no_verdict_however_fresh_it_looks() -> None:
+def test_a_reading_from_before_a_sleep_gives_no_verdict() -> None:
     clock, boot = Clock(), Clock()
     driver = FakeDriver([reading(clock(), seed) for seed in range(9)], clock)
     bench = LoopBench(driver, clock, model=Sleeper(boot), sleep=Sleep(clock, boot))
@@ -38,7 +38,7 @@ def test_a_reading_of_before_a_sleep_gives_no_verdict_however_fresh_it_looks() -
     assert bench.statuses[-1].state is State.STOPPING
 
 
-def test_who_comes_late_after_a_sleep_is_told_nothing_of_before_it() -> None:
+def test_a_late_client_after_a_sleep_hears_nothing_old() -> None:
     clock, boot = Clock(), Clock()
     sleep = Sleep(clock, boot)
     boot.now_ns += HOUR_NS

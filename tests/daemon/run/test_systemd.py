@@ -93,7 +93,7 @@ def test_only_a_sound_watchdog_of_this_process_counts(
 
 
 @pytest.mark.parametrize("address", ["", "relative", "vsock:2:1234"])
-def test_an_address_that_is_no_socket_of_this_kind_is_no_manager(address: str) -> None:
+def test_an_address_of_another_kind_is_no_manager(address: str) -> None:
     assert Systemd.of({"NOTIFY_SOCKET": address}) is None
 
 
@@ -120,7 +120,7 @@ def test_a_manager_that_is_gone_costs_one_warning(
     manager.close()
 
 
-def test_the_status_line_says_state_rate_verdicts_and_what_is_not_well() -> None:
+def test_the_status_line_names_state_rate_verdicts_and_troubles() -> None:
     status = GOLDEN_STATUS
     assert status.state is State.RUNNING
     assert status.verdicts[Decision.SLIP] == 1

@@ -87,7 +87,7 @@ def test_a_lift_that_is_taken_back_is_not_awaited() -> None:
 
 
 @pytest.mark.parametrize("stable", [True, False])
-def test_a_grasp_that_was_not_assessed_is_told_and_teaches_nothing(stable: bool) -> None:
+def test_an_unassessed_grasp_is_told_and_teaches_nothing(stable: bool) -> None:
     lifts = LiftBook()
     lifts.note(named(1), NOT_ASSESSED, stable=stable)
     assert lifts.outstanding == stable
@@ -131,7 +131,7 @@ def test_a_restored_outcome_is_kept() -> None:
     assert other.tell(named(1), slipped=True)[0] is OutcomeStatus.CONTRADICTS
 
 
-def test_a_lift_is_announced_once_and_awaited_until_it_is_told() -> None:
+def test_a_lift_is_announced_once_and_awaited_until_told() -> None:
     lifts = LiftBook()
     lifts.announce()  # of no grasp
     lifts.note(named(1), bytes(8), stable=False)

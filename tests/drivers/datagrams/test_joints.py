@@ -102,7 +102,7 @@ def test_what_is_no_message_is_counted_and_dropped(data: bytes) -> None:
     ["NaN", "Infinity", "-Infinity", "1e999", "true", "false", "null", '"0.5"', "[0.5]", "{}",
      "3.6", "-3.6", "90", "1" + "0" * 400],
 )  # fmt: skip
-def test_what_is_no_angle_in_radians_is_nan_and_costs_no_other(angle: str) -> None:
+def test_an_impossible_angle_is_nan_and_costs_no_other(angle: str) -> None:
     found, counters = parse('{"joints": {"FFJ3": 0.5, "FFJ4": ' + angle + ', "THJ5": 0}}')
     assert found is not None
     assert found.names == ("FFJ3", "FFJ4", "THJ5")
@@ -138,7 +138,7 @@ def test_whatever_is_fed_nothing_is_raised(data: bytes) -> None:
     st.integers(0, 60),
     st.binary(max_size=2),
 )
-def test_damage_of_a_message_leaves_no_number_that_is_no_angle(
+def test_a_damaged_message_gives_no_impossible_angle(
     angles: dict[str, float], at: int, damage: bytes
 ) -> None:
     data = json.dumps({"seq": 1, "joints": angles}).encode()
@@ -175,9 +175,7 @@ def test_a_number_fits_into_a_signed_integer_of_64_bits(seq: int, taken: bool) -
 
 
 @pytest.mark.parametrize(("step", "missed", "restarts"), [(1001, 1000, 0), (1002, 0, 1)])
-def test_a_jump_by_more_than_a_thousand_is_a_new_start(
-    step: int, missed: int, restarts: int
-) -> None:
+def test_a_jump_above_a_thousand_is_a_new_start(step: int, missed: int, restarts: int) -> None:
     counters = JointCounters()
     order = Order(counters)
     for seq in (5, 5 + step):
@@ -201,7 +199,7 @@ def taken(driver: JointStreamDriver, *data: bytes) -> list[JointReading]:
         return joints(driver.read_ready())
 
 
-def test_each_message_is_a_reading_and_a_gap_is_a_loss(driver: JointStreamDriver) -> None:
+def test_a_message_is_a_reading_and_a_gap_a_loss(driver: JointStreamDriver) -> None:
     readings = taken(driver, *(message(seq, FFJ3=seq / 100) for seq in (3, 4, 7, 8)))
     assert [reading.seq for reading in readings] == [0, 1, 4, 5]
     assert [reading.position_rad[0] for reading in readings] == [0.03, 0.04, 0.07, 0.08]
@@ -221,7 +219,7 @@ def test_without_number_and_time_every_message_counts(driver: JointStreamDriver)
     assert len(taken(driver, *[message()] * 5)) == 5
 
 
-def test_a_sender_that_begins_anew_is_taken_at_its_eleventh_message(
+def test_a_restarted_sender_is_heard_at_its_eleventh_message(
     driver: JointStreamDriver,
 ) -> None:
     stream = [message(seq) for seq in (*range(500, 510), *range(20))]

@@ -83,9 +83,7 @@ def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver) -> None:
     assert driver.stream.counters.other_palms == 2 * ROUND
 
 
-def test_the_loop_is_not_woken_in_the_middle_of_a_round(
-    driver: PalmDriver, clock: DatagramClock
-) -> None:
+def test_a_round_wakes_the_loop_once(driver: PalmDriver, clock: DatagramClock) -> None:
     with Sender(driver) as sender:
         assert driver.fileno() is not None
         sender.send(datagrams(1)[0])
@@ -96,7 +94,7 @@ def test_the_loop_is_not_woken_in_the_middle_of_a_round(
         assert driver.fileno() is not None
 
 
-def test_without_a_calibration_there_are_no_joints_and_no_joint_code() -> None:
+def test_without_a_calibration_no_joint_code_is_loaded() -> None:
     program = (
         "import sys\n"
         "from graspd.drivers.palm.stream import PalmDriver\n"
@@ -106,7 +104,7 @@ def test_without_a_calibration_there_are_no_joints_and_no_joint_code() -> None:
     assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0
 
 
-def test_joints_come_at_their_own_rate_with_the_angles_of_the_calibration(
+def test_joints_come_calibrated_at_their_own_rate(
     clock: DatagramClock,
 ) -> None:
     with (
@@ -131,7 +129,7 @@ def test_joints_come_at_their_own_rate_with_the_angles_of_the_calibration(
     assert np.isnan(angles["MFJ1"])
 
 
-def test_a_raw_value_that_is_no_count_gives_no_angle_and_is_counted() -> None:
+def test_a_raw_value_that_is_no_count_gives_no_angle() -> None:
     packet = next(iter(PalmTwin(rows(1)).packets()))
     broken = dataclasses.replace(packet, sensors=(5000, *packet.sensors[1:]))
     with PalmDriver(LOOPBACK, calibration=EXAMPLE) as driver, Sender(driver) as sender:

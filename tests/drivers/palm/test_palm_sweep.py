@@ -134,7 +134,7 @@ def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
 
 
 @pytest.mark.parametrize("position", [0, 1])
-def test_garbage_for_a_pressure_or_temperature_is_an_absent_sensor_whatever_the_electrodes_say(
+def test_an_impossible_pressure_or_temperature_is_an_absent_sensor(
     position: int,
 ) -> None:
     """As recorded from a hand without this sensor: -22072 is 43464 unsigned."""
@@ -165,7 +165,7 @@ def test_a_finger_of_nothing_but_zeros_is_absent() -> None:
     assert not played.readings[1].faults.any()
 
 
-def test_a_damaged_type_never_puts_a_value_in_another_place_unseen() -> None:
+def test_a_damaged_type_moves_no_value_unseen() -> None:
     stream = packets(4)
     for position, wrong in itertools.product(range(ROUND), range(1, 29, 2)):
         damaged = list(stream)
@@ -197,9 +197,7 @@ def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str
     ("after_ns", "lost"),
     [(MS, 0), (11 * MS - 1, 0), (11 * MS, 1), (25 * MS - 1, 1), (25 * MS, 2)],
 )
-def test_a_packet_ten_cycles_after_it_was_due_tells_of_a_lost_round(
-    after_ns: int, lost: int
-) -> None:
+def test_a_packet_ten_cycles_overdue_means_a_lost_round(after_ns: int, lost: int) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(2)
     readings = [reading for at in range(ROUND) for reading in sweeps.push(stream[at], at * MS)]
@@ -214,9 +212,7 @@ def test_a_packet_ten_cycles_after_it_was_due_tells_of_a_lost_round(
     ("after_ns", "missed"),
     [(13 * MS, 0), (14 * MS, 1), (2_000 * MS, 142), (2_000 * MS + 1, 1)],
 )
-def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
-    after_ns: int, missed: int
-) -> None:
+def test_interrupted_rounds_are_counted_for_two_seconds(after_ns: int, missed: int) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(2)
     sweeps.interrupt()
@@ -241,9 +237,7 @@ def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
         (7, 0, False),  # half a round ahead
     ],
 )
-def test_a_packet_is_late_that_comes_in_half_the_time_of_its_step_ahead(
-    step: int, after_ns: int, late: bool
-) -> None:
+def test_a_packet_is_late_within_half_its_steps_time(step: int, after_ns: int, late: bool) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(1)
     for at in range(ROUND):

@@ -210,7 +210,7 @@ def test_a_stream_of_counts_ends_the_bridge_when_it_ends(start_bridge: StartBrid
     assert host.process.wait(100) == 0
 
 
-def test_a_link_leads_to_the_terminal_and_goes_with_the_process(
+def test_a_link_to_the_terminal_ends_with_its_process(
     start_bridge: StartBridge, tmp_path: Path
 ) -> None:
     link = tmp_path / "bridge"

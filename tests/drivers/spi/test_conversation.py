@@ -42,7 +42,7 @@ def state(conversation: Conversation) -> LinkState:
     return conversation.link.state
 
 
-def test_a_bridge_is_asked_four_times_half_a_second_apart_and_given_up() -> None:
+def test_a_silent_bridge_is_asked_four_times() -> None:
     conversation, now_ns = opened(), T0
     for number in range(4):
         assert conversation.due_ns == now_ns
@@ -76,9 +76,7 @@ def test_a_ping_is_sent_every_247_milliseconds() -> None:
 @pytest.mark.parametrize(
     ("period_ms", "silence_ms"), [(1, 100), (10, 100), (20, 200), (1000, 10_000)]
 )
-def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
-    period_ms: int, silence_ms: int
-) -> None:
+def test_silence_is_ten_missing_sweeps_and_100_ms(period_ms: int, silence_ms: int) -> None:
     conversation = greeted(hello(0, period_ms=period_ms))
     assert said(conversation, T0) == [Start()]
     heard_ns = T0 + 7 * MS
@@ -92,7 +90,7 @@ def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
     assert conversation.link.cause is LinkCause.TIMEOUT
 
 
-def test_a_bridge_that_sweeps_less_than_once_a_second_is_refused() -> None:
+def test_a_bridge_slower_than_once_a_second_is_refused() -> None:
     conversation = greeted(hello(0, period_ms=1001))
     assert conversation.link.reason == "port: the bridge sweeps once in 1.001 s only"
     assert conversation.link.cause is LinkCause.SETTINGS
@@ -105,7 +103,7 @@ def test_a_bridge_with_too_few_sensors_is_refused() -> None:
     assert (conversation.link.reason, conversation.counters.refused_bridges) == (why, 1)
 
 
-def test_a_board_that_was_reset_by_opening_it_is_asked_again_at_once() -> None:
+def test_a_board_reset_by_opening_is_asked_again() -> None:
     conversation = opened()
     assert said(conversation, T0) == [Stop(), Ping(42)]
     assert said(conversation, T0) == []
@@ -113,7 +111,7 @@ def test_a_board_that_was_reset_by_opening_it_is_asked_again_at_once() -> None:
     assert said(conversation, T0) == [Stop(), Ping(43)]
 
 
-def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again() -> None:
+def test_a_bridge_reset_in_the_middle_is_greeted_again() -> None:
     conversation = greeted()
     sent = [encode(message) for message in (sweep(0, 10_000), hello(0), sweep(1, 20_000))]
     assert len(conversation.receive(b"".join(sent), T0 + S)) == 1
@@ -241,7 +239,7 @@ def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None
     assert conversation.describe().get("newer firmware") == fact
 
 
-def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words() -> None:
+def test_a_bridges_counters_are_shown_and_echoes_are_unknown() -> None:
     conversation = greeted()
     hear(conversation, BridgeStatus(1, 2, 3, 4, 5, (6,)), T0)
     hear(conversation, Ping(7), T0)
@@ -305,7 +303,7 @@ BY_FINGER = {"ff": "A", "mf": "B", "th": "C"}
         ([MISREAD, SERIALS, MISREAD, SERIALS], None),
     ],
 )
-def test_nothing_is_handed_over_before_two_hellos_in_a_row_tell_the_same_sensors(
+def test_readings_wait_for_two_hellos_of_the_same_sensors(
     hellos: list[tuple[str, ...]], believed: str | None
 ) -> None:
     conversation = opened()
@@ -317,7 +315,7 @@ def test_nothing_is_handed_over_before_two_hellos_in_a_row_tell_the_same_sensors
     assert conversation.serials.get("mf") == believed
 
 
-def test_a_bridge_that_never_names_the_same_sensors_twice_is_given_up() -> None:
+def test_a_bridge_of_changing_sensors_is_given_up() -> None:
     conversation = opened()
     for number in range(5):
         told(conversation, (f"A{number}", "B", "C"), T0)
@@ -354,7 +352,7 @@ def test_another_serial_number_stops_readings_until_it_is_told_again(
     assert tuple(conversation.serials.values()) == serials
 
 
-def test_a_sensor_that_does_not_answer_is_none_that_was_exchanged() -> None:
+def test_a_silent_sensor_was_not_exchanged() -> None:
     conversation = opened()
     for _ in range(2):
         told(conversation, SERIALS, T0)

@@ -112,7 +112,7 @@ def test_no_room_is_no_failure(
     ("waiting", "sleeps", "discarded"),
     [((), 0, False), ((9, 9), 2, False), ((9,) * 9, 9, False), ((9,) * 10, 10, True)],
 )
-def test_closing_waits_20_ms_for_the_last_bytes_and_no_longer(
+def test_closing_waits_20_ms_for_last_bytes(
     monkeypatch: pytest.MonkeyPatch, waiting: tuple[int, ...], sleeps: int, discarded: bool
 ) -> None:
     slept: list[float] = []
@@ -178,7 +178,7 @@ def test_who_taps_a_line_gets_all_that_comes_and_goes(monkeypatch: pytest.Monkey
     assert [int(event) for event in LineEvent] == [1, 2, 3], "as serial link logs hold them"
 
 
-def test_a_terminal_hands_over_all_there_is_and_says_that_it_has_gone(
+def test_a_terminal_gives_everything_before_it_ends(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     master, slave = pty.openpty()

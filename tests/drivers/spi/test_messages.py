@@ -79,7 +79,7 @@ def test_frames_come_out_however_the_bytes_are_cut(size: int) -> None:
     assert counters.bad_cobs == counters.bad_crc == counters.too_long == 0
 
 
-def test_a_frame_of_another_layout_fails_unless_its_type_has_none() -> None:
+def test_a_frame_of_another_layout_fails() -> None:
     parser = FrameParser(0x1234)
     assert parser.feed(encode_frame(0x02, b"abc", 0x1235)) == []
     assert parser.feed(encode_frame(0x02, b"abc")) == []
@@ -117,7 +117,7 @@ def test_an_overlong_frame_is_dropped_and_never_held() -> None:
     assert parser.counters.too_long == 2
 
 
-def test_the_longest_frame_is_taken_and_one_byte_more_is_not() -> None:
+def test_a_frame_one_byte_too_long_is_dropped() -> None:
     parser = FrameParser()
     parser.feed(b"\xff" * ENCODED_MAX_BYTES + b"\0")
     assert parser.counters.too_long == 0
@@ -249,7 +249,7 @@ def test_the_layout_of_a_later_version_can_be_read() -> None:
     assert layout_of(later[:4]) is None
 
 
-def test_a_serial_number_of_odd_bytes_does_not_break_the_hello() -> None:
+def test_an_odd_serial_number_breaks_no_hello() -> None:
     payload = bytearray(HELLO.to_bytes())
     start = payload.index(b"BTSP")
     payload[start : start + 5] = b"B\xff\n\x80P"

@@ -55,7 +55,7 @@ def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:
     assert rig.driver.period_ns == 10 * MS
 
 
-def test_the_first_nonce_is_of_the_time_so_that_an_old_answer_is_told_from_a_new_one(
+def test_first_nonces_follow_the_time(
     rig: Rig,
 ) -> None:
     rig.clock.now_ns = (7 << 32) + 12345
@@ -143,7 +143,7 @@ def test_a_port_without_descriptor_is_polled(rig: Rig) -> None:
         assert driver.counters.unknown_frames == 2
 
 
-def test_a_socket_has_a_descriptor_and_its_end_is_a_lost_link() -> None:
+def test_a_socket_has_a_descriptor_until_it_is_lost() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = f"socket://127.0.0.1:{server.getsockname()[1]}"
         clock = Clock()
@@ -244,7 +244,7 @@ LOSING = {"bit_flip_probability", "drop_probability", "reorder_probability"}
     ],
     ids=lambda faults: "+".join(faults) or "none",
 )
-def test_faults_are_counted_one_by_one_and_no_reading_is_invented(
+def test_faults_are_counted_and_no_reading_is_invented(
     tmp_path: Path, faults: dict[str, float]
 ) -> None:
     rows = generated()
@@ -270,7 +270,7 @@ def test_faults_are_counted_one_by_one_and_no_reading_is_invented(
         assert counters.clock_faults == 0
 
 
-def test_a_link_that_breaks_in_the_middle_of_a_frame_comes_back(tmp_path: Path) -> None:
+def test_a_link_broken_within_a_frame_comes_back(tmp_path: Path) -> None:
     faults = LinkFaults(disconnect_every_frames=40)
     rows = generated(100_000 // 24)
     twin = SpiTwin(tmp_path / "b", rows, rate_hz=1000.0, faults=faults)
@@ -285,7 +285,7 @@ def test_a_link_that_breaks_in_the_middle_of_a_frame_comes_back(tmp_path: Path) 
     assert seqs == sorted(set(seqs))
 
 
-def test_a_link_that_leads_somewhere_is_left_alone_and_one_that_leads_nowhere_is_not(
+def test_only_a_dead_link_is_replaced(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "bridge"
@@ -302,7 +302,7 @@ def test_a_link_that_leads_somewhere_is_left_alone_and_one_that_leads_nowhere_is
     assert not path.is_symlink()
 
 
-def test_a_source_without_counts_and_a_rate_of_nothing_are_refused(tmp_path: Path) -> None:
+def test_a_source_without_counts_or_rate_is_refused(tmp_path: Path) -> None:
     empty: Iterator[Counts] = iter(())
     with pytest.raises(ValueError, match="no counts"):
         SpiTwin(tmp_path / "b", empty)

@@ -28,9 +28,7 @@ def test_a_sweep_becomes_a_reading_by_slot_and_sensor(channels: tuple[int, ...])
     ("sensors", "columns"),
     [(("th", "mf", "ff"), [2, 1, 0]), (("mf", "th", "ff"), [2, 0, 1])],
 )
-def test_the_order_of_the_wiring_does_not_matter_to_the_reading(
-    sensors: tuple[str, ...], columns: list[int]
-) -> None:
+def test_the_wiring_order_changes_no_reading(sensors: tuple[str, ...], columns: list[int]) -> None:
     conversation = greeted(sensors=sensors)
     present = 7 & ~(1 << columns[2])
     (reading,) = hear(conversation, sweep(0, 100, present), T0)
@@ -78,7 +76,7 @@ def test_a_board_may_have_more_sensors_than_fingers_are_named() -> None:
     assert not reading.faults.any()
 
 
-def test_the_sweep_that_was_under_way_at_stop_is_not_taken_for_a_new_one() -> None:
+def test_a_sweep_from_before_stop_is_stale() -> None:
     conversation = greeted(hello(0, tick=50_000))
     sent = (sweep(4711, 49_000), sweep(0, 51_000), sweep(1, 61_000))
     made = [reading.seq for each in sent for reading in hear(conversation, each, T0)]
@@ -87,7 +85,7 @@ def test_the_sweep_that_was_under_way_at_stop_is_not_taken_for_a_new_one() -> No
     assert (counters.stale_sweeps, counters.missed_readings) == (1, 0)
 
 
-def test_a_sweep_of_another_shape_than_the_hello_says_is_bad() -> None:
+def test_a_sweep_unlike_the_hello_is_bad() -> None:
     conversation = greeted()
     assert hear(conversation, sweep(0, 10_000, read=words(slots=23)), T0) == []
     assert conversation.counters.bad_frames == 1

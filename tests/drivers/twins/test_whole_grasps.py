@@ -1,4 +1,4 @@
-"""Whole grasps: their course, sampling and noise, the demos, synthetic grasps, and slides.
+"""Whole grasps: their course, sampling and noise, the demos, and synthetic grasps.
 
 Figures of the untouched recording of a palm (`biotacs-noise`, 100 Hz): robust sigma 2.9 to 4.3
 counts, 0.75 to 1.22 % spikes of 25 to 150 counts, all downward, drift 0.56 to 0.84 counts/s, pairs
@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import csv
 import itertools
-from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +30,6 @@ from graspd.drivers.twins.grasps.whole_grasps import (
 )
 from tests.drivers.recordings.tables import rows_of
 from tests.drivers.twins.signals import played
-from tests.drivers.twins.slides import HeldNoise, held
 from tests.kit import demos
 from tests.kit.demos import STREAM_DURATIONS
 
@@ -81,7 +78,7 @@ def test_the_end_point_is_reached_when_the_lift_starts(
         assert np.abs(last.counts - end_point.counts.astype(float)).max() <= 2.0
 
 
-def test_the_same_seed_gives_the_same_stream_and_another_seed_another_one() -> None:
+def test_a_stream_follows_its_seed() -> None:
     def content(grasps: WholeGrasps) -> list[tuple[float, bytes, bytes]]:
         return [(m.t_s, m.counts.tobytes(), m.position_rad.tobytes()) for m in grasps]
 
@@ -106,7 +103,7 @@ def test_a_looped_stream_goes_on_with_other_numbers() -> None:
     assert objects == [(1, "thing_0"), (2, "thing_1"), (3, "thing_0"), (4, "thing_1")]
 
 
-def test_the_demo_is_a_small_stream_of_twelve_synthetic_grasps_half_of_them_slipping() -> None:
+def test_the_demo_has_twelve_synthetic_grasps_and_six_slips() -> None:
     assert DEMO_RECORDING.stat().st_size < 1_200_000
     rows = rows_of(DEMO_RECORDING.read_bytes(), strict=True)
     times = [row.t_s for row in rows if row.t_s is not None]
@@ -139,7 +136,7 @@ def untouched() -> NDArray[np.float64]:
     return counts_of(list(itertools.islice(grasps, 6000)))
 
 
-def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_palm() -> None:
+def test_held_values_follow_the_palms_requests() -> None:
     numbers = np.broadcast_to(np.arange(1000.0)[:, np.newaxis, np.newaxis], (1000, 3, 24))
     for seed in range(20):
         grasps = WholeGrasps(
@@ -211,7 +208,7 @@ def test_the_demos_are_made_again_byte_for_byte(tmp_path: Path) -> None:
         assert (tmp_path / demo.name).read_bytes() == demo.read_bytes()
 
 
-def test_the_demo_day_is_labelled_within_the_range_and_called_synthetic() -> None:
+def test_the_demo_day_is_labelled_and_synthetic() -> None:
     counts, slipped = load(DEMO_DAY)
     assert counts.shape == (300, 72)
     assert slipped.sum() == 150
@@ -235,78 +232,3 @@ def test_no_synthetic_grasp_is_a_real_one(bts3_dir: Path) -> None:
     real = np.vstack([load(bts3_dir / f"palm_{pose}.csv")[0] for pose in ("down", "side")])
     nearest = [np.abs(real - grasp).max(axis=1).min() for grasp in counts]
     assert min(nearest) > 100, "counts, at the electrode that differs most"
-
-
-STREAMS = 40
-# Mean over 24 electrodes of the absolute fitted slope, counts/s, of 306 real streams at 100 Hz, by
-# sweeps of 10 ms: quantiles of held touches at 5, 50, 90, 95, 99 %, ...
-TOUCH_QUANTILES = (0.05, 0.5, 0.9, 0.95, 0.99)
-TOUCHES = {
-    5: (80, 110, 138, 147, 165),
-    12: (28, 38, 49, 53, 63),
-    24: (10, 14, 22, 25, 34),
-}
-# ... and of slides at 5, 10, 25, 50, 75, 90, 95, 99 %.
-SLIDE_QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
-SLIDES = {
-    5: (90, 98, 113, 133, 163, 216, 277, 520),
-    12: (36, 39, 47, 62, 91, 142, 194, 369),
-    24: (16, 19, 25, 39, 65, 108, 147, 270),
-}
-
-
-@cache
-def streams(*, sliding: bool) -> list[NDArray[np.float64]]:
-    """Counts of streams of one finger, each of shape (300, 24)."""
-    return [
-        np.array([counts[0] for _, counts in held([sliding], seed=seed)], dtype=np.float64)
-        for seed in range(STREAMS)
-    ]
-
-
-def mean_slopes(counts: NDArray[np.float64], sweeps: int) -> NDArray[np.float64]:
-    """Return mean absolute slopes of every third window of `sweeps` sweeps at 100 Hz, counts/s."""
-    windows = np.lib.stride_tricks.sliding_window_view(counts, sweeps, axis=0)[::3]
-    columns = windows.reshape(-1, sweeps).T
-    slopes = np.polyfit(0.01 * np.arange(sweeps), columns, 1)[0]
-    return np.asarray(np.abs(slopes).reshape(len(windows), -1).mean(axis=1), dtype=np.float64)
-
-
-@pytest.mark.parametrize(
-    ("sliding", "shares", "measured"),
-    [(False, TOUCH_QUANTILES, TOUCHES), (True, SLIDE_QUANTILES, SLIDES)],
-    ids=["touch", "slide"],
-)
-@pytest.mark.parametrize("sweeps", TOUCHES)
-def test_slopes_are_those_of_real_touches_and_slides(
-    sweeps: int,
-    sliding: bool,
-    shares: tuple[float, ...],
-    measured: Mapping[int, tuple[float, ...]],
-) -> None:
-    slopes = [mean_slopes(counts, sweeps) for counts in streams(sliding=sliding)]
-    quantiles = np.quantile(np.concatenate(slopes), shares)
-    np.testing.assert_allclose(quantiles[:-1], measured[sweeps][:-1], rtol=0.27)
-    # One window of a hundred is of a stream or two.
-    assert quantiles[-1] == pytest.approx(measured[sweeps][-1], rel=0.35)
-
-
-def test_electrodes_of_a_held_touch_range_as_far_as_real_ones() -> None:
-    # Real ones range over 32 to 44 counts in three seconds.
-    ranges = [np.ptp(counts, axis=0).mean() for counts in streams(sliding=False)]
-    np.testing.assert_allclose(np.quantile(ranges, (0.05, 0.95)), (32.0, 44.0), rtol=0.15)
-
-
-def test_noise_is_correlated_and_spikes_go_down_alone() -> None:
-    # Measured: 2.9 to 4.2 counts (successive differences over the square root of two), correlations
-    # of 0.32 at one sweep and 0.03 at two; 0.17 % of values are more than 25 below, none above.
-    noise = HeldNoise(3, np.random.default_rng(1))
-    sweeps = np.array([noise.sweep(np.asarray(0.0)) for _ in range(4000)])
-    assert (sweeps > 25.0).mean() < 1e-5
-    assert (sweeps < -25.0).mean() == pytest.approx(0.0017, rel=0.2)
-    sweeps[sweeps < -20.0] = 0.0
-    deviations = np.diff(sweeps, axis=0).std(axis=(0, 2)) / np.sqrt(2.0)
-    assert ((deviations > 2.6) & (deviations < 4.3)).all()
-    unit = sweeps / sweeps.std(axis=(0, 2), keepdims=True)
-    assert (unit[1:] * unit[:-1]).mean() == pytest.approx(0.32, abs=0.03)
-    assert (unit[2:] * unit[:-2]).mean() == pytest.approx(0.03, abs=0.04)
