@@ -18,7 +18,7 @@ from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.can_files import read_asc, read_blf, read_trc
 from graspd.drivers.recordings.candump import ANY_BUS, NO_BUS, NS_PER_S, Line, read_candump
 from graspd.drivers.recordings.kinds import (
-    LINE_BYTES_MAX,
+    LINE_LENGTH_MAX,
     PAGE,
     Kind,
     kind_of,
@@ -92,7 +92,7 @@ def _lines(stream: BinaryIO) -> Iterator[str]:
     encoding = marked_encoding(stream.read(3)) or "latin-1"
     stream.seek(0)
     with io.TextIOWrapper(stream, encoding, errors="replace") as text:
-        while line := text.readline(LINE_BYTES_MAX):
+        while line := text.readline(LINE_LENGTH_MAX):
             yield line
 
 

@@ -13,12 +13,11 @@ from typing import BinaryIO, Final
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import has_electrodes
 from graspd.drivers.recordings.kinds import (
-    LINE_BYTES_MAX,
+    LINE_LENGTH_MAX,
     TABLES,
     Kind,
     kind_of_open,
     marked_encoding,
-    read_lines,
     reason,
 )
 from graspd.extras import needs
@@ -74,7 +73,7 @@ class Cells:
         """Return an error of the line that was read last."""
         if not self.has_end:
             problem += "; the file ends here without a line end, so it may be cut off"
-        return RecordingError(self._path, problem, line=self.line, column=column)
+        return RecordingError(self._path, problem, line=self.line or None, column=column)
 
     def _text(self, file: BinaryIO) -> Iterator[list[str]]:
         lines = self._lines(file)
@@ -124,44 +123,31 @@ class Cells:
                     )
                 continue
             self._length += len(line)
-            if self._length > LINE_BYTES_MAX:
-                raise self.error(f"the row is longer than {LINE_BYTES_MAX} characters")
+            if self._length > LINE_LENGTH_MAX:
+                raise self.error(f"the row is longer than {LINE_LENGTH_MAX} characters")
             yield line
 
     def _lines(self, file: BinaryIO) -> Iterator[str]:
         """Yield the lines of text with their ends: line feed, carriage return or both."""
-        head = file.read(LINE_BYTES_MAX)
+        encoding = marked_encoding(file.read(3)) or "utf-8"
         file.seek(0)
-        first = head.split(b"\n", 1)[0].removesuffix(b"\r")
-        encoding = marked_encoding(head) or "utf-8-sig"
-        if encoding == "utf-16" or b"\r" in first:
-            yield from self._lines_of(file, encoding)
-            return
-        for line in read_lines(self._path, file):
-            self.line += 1
-            if len(line) > LINE_BYTES_MAX:
-                raise self.error(f"the line is longer than {LINE_BYTES_MAX} bytes")
-            self.has_end = line.endswith(b"\n")
-            try:
-                yield line.decode(encoding)
-            except UnicodeDecodeError as error:
-                problem = "not UTF-8: this is a binary file or has another encoding"
-                raise self.error(problem) from error
-            encoding = "utf-8"
-
-    def _lines_of(self, file: BinaryIO, encoding: str) -> Iterator[str]:
-        """Yield the lines of text that has no line feed bytes at its line ends."""
-        text = io.TextIOWrapper(file, encoding, newline="")
+        # A byte that is not UTF-8 becomes a surrogate, so that its line is known.
+        errors = "strict" if encoding == "utf-16" else "surrogateescape"
+        text = io.TextIOWrapper(file, encoding, errors, newline="")
         try:
-            while line := text.readline(LINE_BYTES_MAX + 1):
+            while line := text.readline(LINE_LENGTH_MAX + 1):
                 self.line += 1
-                if len(line) > LINE_BYTES_MAX:
-                    raise self.error(f"the line is longer than {LINE_BYTES_MAX} characters")
+                if len(line) > LINE_LENGTH_MAX:
+                    raise self.error(f"the line is longer than {LINE_LENGTH_MAX} characters")
                 self.has_end = line.endswith(("\n", "\r"))
+                if not line.isascii():
+                    line.encode()
                 yield line
-        except (OSError, UnicodeError) as error:
-            said = reason(error) if isinstance(error, OSError) else f"is not {encoding}"
-            raise self.error(said) from error
+        except UnicodeError as error:
+            problem = f"not {encoding.upper()}: this is a binary file or has another encoding"
+            raise self.error(problem) from error
+        except OSError as error:
+            raise self.error(reason(error)) from error
         finally:
             if not file.closed:
                 text.detach()

@@ -26,8 +26,8 @@ STANDARD_INPUT: Final = Path("-")
 """Name of standard input on a command line."""
 COPIED_BYTES_MAX: Final = 4 * 2**30
 """Most bytes that are copied from a pipe, and most that a packed file unpacks to."""
-LINE_BYTES_MAX: Final = 65_536
-"""Longest line, bytes; a full row has 1,200. A disk image may have no line end at all."""
+LINE_LENGTH_MAX: Final = 65_536
+"""Longest line, characters; a full row has 1,200. A disk image may have no line end at all."""
 HEAD_BYTES: Final = 65_536
 """Bytes of a file that decide what it is."""
 PAGE: Final = "deploy/RECORDING.md"
@@ -192,9 +192,7 @@ def open_recording(path: Path) -> BinaryIO:
         mode = os.stat(path).st_mode
         if stat.S_ISREG(mode):
             file = path.open("rb")
-            packed = file.read(len(_GZIP)) == _GZIP
-            file.seek(0)
-            if packed:
+            if is_packed(path):
                 return io.BufferedReader(
                     Unpacked(file, cast(BinaryIO, gzip.GzipFile(fileobj=file)))
                 )
@@ -285,15 +283,6 @@ def _copy(path: Path, source: BinaryIO, target: BinaryIO) -> None:
         if left < 0:
             raise RecordingError(path, f"brings more than {COPIED_BYTES_MAX} bytes")
         target.write(chunk)
-
-
-def read_lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of `stream` with their ends, at most `LINE_BYTES_MAX` + 1 bytes each."""
-    try:
-        while line := stream.readline(LINE_BYTES_MAX + 1):
-            yield line
-    except OSError as error:
-        raise RecordingError(path, reason(error)) from error
 
 
 def reason(error: OSError | ValueError) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator
 from pathlib import Path
 
@@ -169,15 +168,3 @@ def test_an_error_waits_until_what_is_before_it_was_taken() -> None:
     with pytest.raises(RecordingError, match="no more"):
         player.take()
     assert player.exhausted
-
-
-def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
-    path = tmp_path / "pipe.serial"
-    os.mkfifo(path)
-    with pytest.raises(RecordingError, match="is not a regular file"):
-        SerialLog([path], ("ff",)).open()
-
-
-def test_a_folder_is_no_log(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="is a directory"):
-        SerialLog([tmp_path], ("ff",)).open()

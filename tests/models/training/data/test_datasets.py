@@ -167,7 +167,7 @@ def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
 def test_bytes_that_are_not_text_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "palm_down.csv"
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DatasetError, match="is not utf-16"):
+    with pytest.raises(DatasetError, match="not UTF-16"):
         read_table(path)
 
 
