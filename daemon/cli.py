@@ -14,6 +14,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
@@ -166,5 +167,20 @@ class _Version(argparse.Action):
         libraries = [f"Python {platform.python_version()}"]
         libraries += [f"{name} {version(name)}" for name in LIBRARIES]
         libraries.append(f"libzmq {zmq.zmq_version()}")
-        sys.stdout.write(f"graspd {__version__}\n{', '.join(libraries)}\n")
+        sys.stdout.write(f"graspd {__version__}{_commit()}\n{', '.join(libraries)}\n")
         parser.exit()
+
+
+def _commit() -> str:
+    """Return the commit of a checkout, such as ` at 1a2b3c4d`; empty for an installation."""
+    import subprocess
+
+    folder = Path(__file__).resolve().parents[1]
+    if not (folder / ".git").exists():
+        return ""
+    describe = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+    try:
+        told = subprocess.run(describe, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.SubprocessError):  # no git, or a checkout of another user
+        return ""
+    return f" at {told.strip()}"

@@ -20,7 +20,7 @@ Run it again to bring an installation up to date; where there is nothing to do i
                     (with extras: pip wheel -w DIR '.[record]')
   --extras LIST     optional parts of graspd, such as record (those that are there already; none: -)
   --python PROGRAM  the Python to use, 3.11 or newer (python3); not one below /home or /root, which
-                    the service cannot see (with --root a warning)
+                    the service cannot see (with --root a warning if it is named)
   --can             also have systemd-networkd bring up can0; an update keeps it
   --rebuild         make the virtual environment anew even if graspd has not changed
   --enable NAME     start graspd@NAME now and at boot, with the scene /etc/graspd/NAME.toml; where

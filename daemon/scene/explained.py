@@ -35,11 +35,14 @@ def examples() -> list[str]:
 
 
 def example(name: str) -> str:
-    """Return an example scene with absolute paths, so that it works from any folder."""
+    """Return an example scene with absolute paths, so that it works from any folder.
+
+    Links stay in the paths: an update of an installation changes the folder behind one.
+    """
     text = (EXAMPLES / f"{name}.toml").read_text()
-    recordings = Path(graspd.drivers.recordings.__file__).resolve().parent
+    recordings = Path(graspd.drivers.recordings.__file__).absolute().parent
     text = text.replace("../../drivers/recordings", str(recordings))
-    return text.replace(f"./{SCHEMA}", (EXAMPLES / SCHEMA).resolve().as_uri())
+    return text.replace(f"./{SCHEMA}", (EXAMPLES / SCHEMA).absolute().as_uri())
 
 
 def schema() -> dict[str, Any]:

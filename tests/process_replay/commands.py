@@ -123,7 +123,10 @@ _MASKS: Final = (
     (r'"(p50|p99|max|wall_s|t|t_mono_ns|age_ms|latency_us)": ?[0-9.e+-]+', r'"\1": *'),
     (r'"boot_id": ?"[0-9a-f]{32}"', '"boot_id": *'),
     (r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d, \d+ minutes ago", "*"),
-    (r"\b(graspd|Python|libzmq|onnxruntime|numpy|pyzmq|python-can|pyserial) [0-9.]+", r"\1 *"),
+    (
+        r"\b(graspd|Python|libzmq|onnxruntime|numpy|pyzmq|python-can|pyserial) [0-9.]+( at \S+)?",
+        r"\1 *",
+    ),
     (r"(?<=  arm  )\S{40}", "*"),
 )
 

@@ -12,6 +12,21 @@ from graspd_client import Client, Outcome
 VERDICTS, QUESTIONS = "ipc:///tmp/graspd-loop.ipc", "ipc:///tmp/graspd-loop.ask.ipc"
 
 
+def asked() -> Outcome:
+    """Return the outcome that a person types: y or h for held, n or s for slipped."""
+    while True:
+        sys.stdout.write("Did it hold? y/n ")
+        sys.stdout.flush()
+        line = sys.stdin.readline()
+        word = line.strip().lower()[:1]
+        if not line:
+            return Outcome.NOT_LIFTED
+        if word in ("y", "h"):
+            return Outcome.HELD
+        if word in ("n", "s"):
+            return Outcome.SLIPPED
+
+
 def main() -> None:
     """Ask and tell until the input ends."""
     with Client(VERDICTS, ask_endpoint=QUESTIONS) as client:
@@ -22,14 +37,11 @@ def main() -> None:
                 continue
             said = f"{verdict.decision}, p_slip {verdict.p_slip:.2f} {verdict.risk}"
             sys.stdout.write(f"grasp {verdict.grasp}: {said}\n")
-            sys.stdout.write(f"{verdict.outcomes} outcomes told. Did it hold? y/n ")
-            sys.stdout.flush()
-            line = sys.stdin.readline()
-            if not line:
-                client.tell(verdict, Outcome.NOT_LIFTED)
-                return
-            outcome = Outcome.HELD if line.strip() == "y" else Outcome.SLIPPED
+            sys.stdout.write(f"{verdict.outcomes} outcomes told. ")
+            outcome = asked()
             told = client.tell(verdict, outcome, "mug")
+            if outcome is Outcome.NOT_LIFTED:
+                return
             sys.stdout.write("told\n" if told else f"{told.why}\n")
 
 

@@ -260,7 +260,7 @@ def test_the_controller_of_the_whole_loop_asks_and_tells(tmp_path: Path) -> None
         controller = subprocess.run(
             [sys.executable, "-c", code.replace("/tmp/graspd-", f"{tmp_path}/")],
             env={**os.environ, "PYTHONPATH": str(DEPLOY / "clients/python")},
-            input="n\ny\n",  # and then the input ends
+            input="slipped\nwhat\nh\n",  # and then the input ends
             capture_output=True,
             text=True,
             timeout=TIMEOUT_S,

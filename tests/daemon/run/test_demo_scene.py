@@ -42,7 +42,7 @@ def test_the_demo_turns_solid_green_within_two_minutes(
     for former, instead in (
         ("loop = true", 'pace = "fast"'),
         ('"../../drivers/recordings/demo/synthetic_show.csv"', recordings),
-        ("/tmp/graspd-demo.ipc", f"{tmp_path}/v"),
+        ("/tmp/graspd-demo", f"{tmp_path}/v"),
     ):
         assert former in text
         text = text.replace(former, instead)
