@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import CodeType
 from typing import Final
@@ -74,18 +74,12 @@ class Mutant:
         return f"{self.file}:{self.line}: {self.what} in `{text}`"
 
 
-def mutants(source: str, *, within: str | None = None, file: str = "") -> Iterator[Mutant]:
-    """All mutants of a module, or of its function `within`."""
-    tree = ast.parse(source)
-    lines: Collection[int] | None = None
-    if within is not None:
-        (body,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == within]
-        lines = range(body.lineno, (body.end_lineno or body.lineno) + 1)
-    for place, (node, statement) in enumerate(_nodes(tree, None)):
+def mutants(source: str, *, file: str = "") -> Iterator[Mutant]:
+    """All mutants of a module."""
+    for place, (node, statement) in enumerate(_nodes(ast.parse(source), None)):
         line = getattr(node, "lineno", 0)
-        if lines is None or line in lines:
-            for kind, what, change in _changes(node):
-                yield Mutant(source, place, line, statement.lineno, kind, what, change, file)
+        for kind, what, change in _changes(node):
+            yield Mutant(source, place, line, statement.lineno, kind, what, change, file)
 
 
 def _nodes(

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import math
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
-from graspd.daemon.judge import decision
 from graspd.daemon.judge.decision import HELD, HoldDown, Limits, decide
 from graspd.daemon.judge.reasons import Decision, Moment, Reason
-from tests.kit.mutants import mutants
 
 LIMIT_NS = 100
 THRESHOLD = 0.4
@@ -78,9 +74,10 @@ def expected(
     return ("unknown" if against else worth), against
 
 
-def broken_cases(judge: Callable[..., Any]) -> Iterator[tuple[object, ...]]:
-    """Those of all combinations that are not judged by the rule, or raise."""
-    for case_of, limits in itertools.product(CASES, (LIMITS, ANY_CONFIDENCE)):
+@pytest.mark.parametrize("limits", [LIMITS, ANY_CONFIDENCE])
+def test_every_combination_is_judged_by_the_rule(limits: Limits) -> None:
+    assert len(CASES) == 16 * 6 * 3 * 3 * 2 * 2 * 2 * 3
+    for case_of in CASES:
         (p_slip, worth), (age_ns, fresh), health, gate, contact, settled, withheld, doubt = case_of
         if doubt is Decision.SLIP and worth.endswith("stable"):
             worth = "unsure slip"  # the more, the likelier it is to hold
@@ -90,19 +87,10 @@ def broken_cases(judge: Callable[..., Any]) -> Iterator[tuple[object, ...]]:
         if doubt is Decision.STABLE and withheld is None:
             given = {}  # the defaults
         well = contact and settled
-        decision, against = expected(worth, fresh, health, gate, well, withheld, doubt)
-        try:
-            found, reasons = judge(p_slip, health, moment, age_ns, limits, **given)
-            right = (found, set(reasons), len(reasons)) == (decision, against, len(against))
-        except Exception:  # noqa: BLE001 - a mutant may raise anything
-            right = False
-        if not right:
-            yield case_of
-
-
-def test_every_combination_is_judged_by_the_rule() -> None:
-    assert list(broken_cases(decide)) == []
-    assert len(CASES) == 16 * 6 * 3 * 3 * 2 * 2 * 2 * 3
+        wanted = expected(worth, fresh, health, gate, well, withheld, doubt)
+        found, reasons = decide(p_slip, health, moment, age_ns, limits, **given)
+        assert (found, set(reasons)) == wanted, case_of
+        assert len(reasons) == len(set(reasons))
 
 
 @pytest.mark.parametrize("where", ["health", "gate"])
@@ -123,15 +111,3 @@ def test_the_defaults_ask_for_no_confidence() -> None:
 def test_a_reading_is_stale_after_100_ms_by_default(age_ns: int, stale: bool) -> None:
     """Ten periods at 100 Hz: no message for so long means unknown, too."""
     assert decide(0.1, (), HELD, age_ns, Limits())[1] == ((Reason.STALE,) if stale else ())
-
-
-def test_every_small_mistake_in_the_rule_would_be_noticed() -> None:
-    changed = list(mutants(inspect.getsource(decision), within="decide"))
-    assert len(changed) > 30
-    survivors = []
-    for mutant in changed:
-        names: dict[str, Any] = {"__name__": decision.__name__}
-        exec(mutant.code(), names)
-        if next(broken_cases(names["decide"]), None) is None:
-            survivors.append(f"line {mutant.line}: {mutant.what}")
-    assert survivors == []

@@ -189,7 +189,7 @@ def test_the_newest_is_that_of_all_that_the_driver_has() -> None:
 
 def test_a_driver_with_endless_readings_does_not_hold_the_loop() -> None:
     clock = Clock()
-    driver = LiveDriver(stream(2.0, PERIOD_NS // 200), clock, at_once=20)
+    driver = LiveDriver(stream(0.6, PERIOD_NS // 200), clock, at_once=20)
     bench = OverloadedLoop(driver, clock, lambda: 30 * MS)
     rounds = len(bench.rounds_ns)
     assert driver.calls <= (DRAINS_MAX + 1) * rounds

@@ -29,7 +29,7 @@ from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_
 from graspd.models import zoo
 from tests.conftest import ROOT
 
-EXAMPLES = 80
+EXAMPLES = 50
 SHARE = 0.15
 """Share of the optional keys that are written."""
 CALIBRATION = str(ROOT / "deploy" / "calibration" / "example_hand.toml")
