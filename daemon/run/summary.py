@@ -251,11 +251,11 @@ def _learned(trust: Trust | None) -> Iterator[str]:
     yield f"learned from {trust.learner.outcomes} outcomes"
     report = trust.report()
     if report.target is not None and report.bound is not None:
+        awaited = f"; {report.outstanding} outcomes awaited" if report.outstanding else ""
         yield (
-            f"risk: of {report.lifts} lifts of `stable` {report.slips} slipped, allowed are "
-            f"{100 * report.target:g} % and {report.beyond_share:.2f} more, "
-            f"so at most {report.bound:.1f}"
-            + (f"; {report.outstanding} outcomes are still out" if report.outstanding else "")
+            f"risk: {report.slips} of {report.lifts} lifts of `stable` slipped, "
+            f"at most {int(report.bound)} can: {100 * report.target:g} % of them, "
+            f"and {report.beyond_share:.2f} more{awaited}"
         )
 
 
