@@ -44,7 +44,6 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["replay", "--model", "absent.onnx"], "absent.onnx: cannot read the model"),
         (["replay", "--speed", "nan"], "nan is not a number from 0.001 to 1e+06"),
         (["replay", "--publish", "tcp://1.2.3.4:5"], "not a loopback address"),
         (["replay", "--publish", "ipc://*"], "needs a path that subscribers can know"),
@@ -59,7 +58,6 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
         (["replay", "--min-confidence", "1"], "not a number from"),
         (["replay", str(DEMO_TABLE), str(DEMO_RECORDING)], "both grasp tables and streams"),
         (["doctor", "--listen", "inf"], "inf is not a number from 0.1 to 3600"),
-        (["doctor", "absent.toml"], "absent.toml: cannot read the scene"),
         (["twin"], "required"),
         (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
         (["twin", "spi", "--dead", "th"], "'th' is no electrode"),
@@ -247,9 +245,11 @@ def loop_scene(folder: Path) -> Path:
     return scene
 
 
-def test_the_demo_and_the_loop_share_no_socket() -> None:
+def test_demo_and_loop_have_sockets_that_their_pages_name() -> None:
     demo, loop = (scenes.load(DEPLOY / name) for name in ("scenes/demo.toml", "clients/loop.toml"))
     assert {demo.endpoint, demo.ask_endpoint}.isdisjoint({loop.endpoint, loop.ask_endpoint})
+    for page, scene in ((DEPLOY.parent / "README.md", demo), (DEPLOY / "clients/README.md", loop)):
+        assert set(re.findall(r"ipc:///tmp/graspd-[\w.]+", page.read_text())) == {scene.endpoint}
 
 
 def test_the_controller_of_the_whole_loop_asks_and_tells(tmp_path: Path) -> None:

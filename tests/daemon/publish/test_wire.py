@@ -54,7 +54,8 @@ def test_a_malformed_object_is_no_outcome(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_golden_messages_are_read_and_written_as_committed(name: str) -> None:
-    assert encode(golden(name)) == (GOLDEN / f"{name}.json").read_bytes().rstrip(b"\n")
+    made, kept = encode(golden(name)), (GOLDEN / f"{name}.json").read_bytes()
+    assert made == kept.rstrip(b"\n"), f"if that is meant, write {made.decode()} to {name}.json"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -64,7 +65,7 @@ def test_golden_messages_fit_the_exported_schema(name: str) -> None:
 
 
 def test_the_committed_schema_is_the_one_of_the_code() -> None:
-    assert SCHEMA_FILE.read_text() == schema_text()
+    assert SCHEMA_FILE.read_text() == schema_text(), f"graspd schema > {SCHEMA_FILE}"
     jsonschema.Draft202012Validator.check_schema(schema())
 
 
