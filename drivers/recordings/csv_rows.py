@@ -21,7 +21,7 @@ from graspd.drivers.base import ANGLE_MAX_RAD, Annotation, ElectrodeFault
 from graspd.drivers.recordings.cells import Cells
 from graspd.drivers.recordings.columns import SLIPPED
 from graspd.drivers.recordings.kinds import open_recording
-from graspd.drivers.recordings.layout import Layout, ReadAs, survey, time_value
+from graspd.drivers.recordings.layout import Layout, survey, time_value
 from graspd.drivers.recordings.values import (
     COUNT_OF_TEXT,
     are_texts,
@@ -51,9 +51,9 @@ class Row:
 class Recording:
     """The rows of one file. Iterate once.
 
-    The constructor raises `RecordingError` for what `survey` refuses, and iterating raises it for a
-    wrong row. A value that is no count makes its electrode faulty; with `strict` it raises. An
-    outcome that cannot be read is not known; with `outcomes` it raises.
+    Iterating raises `RecordingError` for a wrong row. A value that is no count makes its electrode
+    faulty; with `strict` it raises. An outcome that cannot be read is not known; with `outcomes` it
+    raises.
 
     A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
     without a line end may be cut off within a value, so all its electrodes are faulty and its
@@ -61,22 +61,13 @@ class Recording:
     """
 
     def __init__(
-        self,
-        path: Path,
-        file: BinaryIO,
-        fingers: Sequence[str],
-        *,
-        strict: bool = False,
-        outcomes: bool = False,
-        read_as: ReadAs | None = None,
-        rate_hz: float | None = None,
-        layout: Layout | None = None,
+        self, path: Path, file: BinaryIO, layout: Layout, *, strict: bool, outcomes: bool
     ) -> None:
-        """`file`: opened, at its start. `layout`: of this file, if it is known already."""
+        """`file`: opened, at its start. `layout`: of this file."""
         self._path = path
         self._strict = strict
         self._outcomes = outcomes
-        self.layout = layout or survey(path, file, fingers, read_as, rate_hz)
+        self.layout = layout
         columns = self.layout.columns
         self._cells = Cells(path, file)
         self._comma = self._cells.decimal_comma
@@ -188,17 +179,12 @@ def read_rows(
     *,
     strict: bool = False,
     outcomes: bool = False,
-    read_as: ReadAs | None = None,
     layout: Layout | None = None,
 ) -> Iterator[Row]:
-    """Yield the rows of a file: see `Recording`. Raises `RecordingError`."""
+    """Yield the rows of a file: see `Recording`. `layout`: of this file, if it is known already.
+
+    Raises `RecordingError`.
+    """
     with open_recording(path) as file:
-        yield from Recording(
-            path,
-            file,
-            fingers,
-            strict=strict,
-            outcomes=outcomes,
-            read_as=read_as,
-            layout=layout,
-        )
+        layout = layout or survey(path, file, fingers)
+        yield from Recording(path, file, layout, strict=strict, outcomes=outcomes)

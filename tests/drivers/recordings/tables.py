@@ -8,6 +8,7 @@ from pathlib import Path
 
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_rows import Recording, Row
+from graspd.drivers.recordings.layout import survey
 
 FINGERS = ("ff", "mf", "th")
 ELECTRODES = [f"{finger}_biotac_{number}" for finger in FINGERS for number in range(1, 25)]
@@ -67,8 +68,16 @@ def write(folder: Path, content: bytes, name: str = "grasps.csv") -> Path:
 PATH = Path("grasps.csv")
 
 
-def rows_of(content: bytes, fingers: Sequence[str] = FINGERS, *, strict: bool = False) -> list[Row]:
-    return list(Recording(PATH, io.BytesIO(content), fingers, strict=strict))
+def rows_of(
+    content: bytes,
+    fingers: Sequence[str] = FINGERS,
+    *,
+    strict: bool = False,
+    outcomes: bool = False,
+) -> list[Row]:
+    file = io.BytesIO(content)
+    layout = survey(PATH, file, fingers)
+    return list(Recording(PATH, file, layout, strict=strict, outcomes=outcomes))
 
 
 def rows_or_message(content: bytes) -> list[Row] | str:

@@ -14,8 +14,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from graspd.drivers.base import ElectrodeFault, RecordingError
-from graspd.drivers.recordings.csv_rows import Recording
 from graspd.drivers.recordings.kinds import open_recording
+from graspd.drivers.recordings.layout import survey
 from graspd.drivers.recordings.values import count_of, number_of
 from tests.drivers.recordings.tables import (
     ELECTRODES,
@@ -60,18 +60,16 @@ def test_columns_may_stand_in_any_order_and_only_those_asked_for_are_read() -> N
 def test_unknown_columns_are_listed_and_columns_of_other_fingers_are_not() -> None:
     header = [*TABLE_HEADER, "force", "", "force", "FFJ3"]
     content = ",".join(header).encode() + b"\n" + b"0," * 77 + b"0\n"
-    recording = Recording(PATH, io.BytesIO(content), ("mf",))
-    assert recording.layout.columns.ignored == ("force", "", "force")
+    found = survey(PATH, io.BytesIO(content), ("mf",))
+    assert found.columns.ignored == ("force", "", "force")
 
 
-def test_a_quoted_object_name_may_hold_commas_and_quotes() -> None:
-    (row,) = rows_of(table(1, {0: {"object": '"a ""red"" pen, long"'}}))
-    assert row.annotation.object_name == 'a "red" pen, long'
-
-
-def test_an_empty_object_name_is_none() -> None:
-    (row,) = rows_of(table(1, {0: {"object": "  "}}))
-    assert row.annotation.object_name is None
+@pytest.mark.parametrize(
+    ("cell", "name"), [('"a ""red"" pen, long"', 'a "red" pen, long'), ("  ", None)]
+)
+def test_an_object_name_may_be_quoted_or_blank(cell: str, name: str | None) -> None:
+    (row,) = rows_of(table(1, {0: {"object": cell}}))
+    assert row.annotation.object_name == name
 
 
 GOOD = table(2)
@@ -156,7 +154,7 @@ def test_an_outcome_that_cannot_be_read_matters_where_needed(label: str) -> None
     assert rows_of(content)[1].annotation.slipped is None
     told = rf"line 3, column slipped: {re.escape(repr(label))} is not an outcome"
     with pytest.raises(RecordingError, match=told):
-        list(Recording(PATH, io.BytesIO(content), FINGERS, outcomes=True))
+        rows_of(content, outcomes=True)
 
 
 @pytest.mark.parametrize("t", ["nan", "-inf", "", "1e999", "1_0", "\u0661"])
@@ -189,6 +187,8 @@ def test_a_last_row_without_line_end_is_cut_off() -> None:
 def test_a_value_can_be_no_count_and_cut_off_at_once() -> None:
     *_, last = rows_of(table(1, {0: {"th_biotac_24": "26x"}}).rstrip(b"\n"))
     both = ElectrodeFault.CUT_OFF | ElectrodeFault.NOT_A_COUNT
+    (row,) = rows_of(stream(["0"], {"FFJ1": ["0.5"]}).rstrip(b"\n"))
+    assert np.isnan(row.position_rad).all()
     assert last.faults[2, 23] == both
     assert (last.faults.ravel()[:-1] == ElectrodeFault.CUT_OFF).all()
 
@@ -212,9 +212,9 @@ def test_a_stream_gives_times_and_joints_without_hand_prefix() -> None:
     ],
 )  # fmt: skip
 def test_joints_are_those_of_the_shadow_hand(column: str, known: bool) -> None:
-    recording = Recording(PATH, io.BytesIO(stream(["0"], {column: ["0"]})), FINGERS)
-    assert (recording.layout.columns.ignored == ()) is known
-    assert len(recording.layout.joints) == known
+    found = survey(PATH, io.BytesIO(stream(["0"], {column: ["0"]})), FINGERS)
+    assert (found.columns.ignored == ()) is known
+    assert len(found.joints) == known
 
 
 @pytest.mark.parametrize("cell", ["nan", "", "1e999"])
@@ -224,11 +224,6 @@ def test_an_angle_that_is_no_number_is_nan(cell: str) -> None:
     np.testing.assert_array_equal(row.position_rad, [0.5, math.nan])
     with pytest.raises(RecordingError, match=r"line 2, column FFJ2: .* is not an angle in radians"):
         rows_of(content, strict=True)
-
-
-def test_angles_of_a_cut_off_row_are_nan() -> None:
-    (row,) = rows_of(stream(["0"], {"FFJ1": ["0.5"]}).rstrip(b"\n"))
-    assert np.isnan(row.position_rad).all()
 
 
 def test_a_missing_file_a_directory_and_a_device_are_refused(tmp_path: Path) -> None:
@@ -251,7 +246,7 @@ def test_an_error_while_reading_is_a_recording_error() -> None:
             raise OSError(5, "Input/output error")
 
     with pytest.raises(RecordingError, match=r"grasps.csv: input/output error"):
-        Recording(PATH, Broken(GOOD), FINGERS)
+        survey(PATH, Broken(GOOD), FINGERS)
 
 
 def test_a_sparse_file_of_many_gigabytes_without_a_line_end_is_refused_at_once(
@@ -264,7 +259,7 @@ def test_a_sparse_file_of_many_gigabytes_without_a_line_end_is_refused_at_once(
         open_recording(path) as opened,
         pytest.raises(RecordingError, match="of a kind that is not known"),
     ):
-        Recording(path, opened, FINGERS)
+        survey(path, opened, FINGERS)
 
 
 NOT_COUNTS = [

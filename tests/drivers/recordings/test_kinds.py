@@ -142,12 +142,9 @@ def test_any_other_file_is_named_with_the_page(
     assert str(caught.value).endswith("; deploy/RECORDING.md lists what graspd reads")
 
 
-def test_a_name_that_is_too_long_is_an_error() -> None:
+def test_a_long_name_and_an_empty_file_are_errors(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="file name too long"):
         kind_of(Path("a" * 300))
-
-
-def test_an_empty_file_is_called_empty(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"grasps\.csv: the file is empty"):
         kind_of(write(tmp_path, b""))
 
@@ -201,6 +198,8 @@ def test_standard_input_is_read_as_a_file(tmp_path: Path, monkeypatch: pytest.Mo
         assert copy.name == "standard input"
         assert same == plain
     assert not copy.exists()
+    with files_of([copy]) as paths:  # its reader says that it is not there
+        assert paths == [copy]
 
 
 def test_a_pipe_is_read_once_and_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,9 +219,3 @@ def test_a_pipe_is_read_once_and_bounded(tmp_path: Path, monkeypatch: pytest.Mon
         files_of([played(table(2))]),
     ):
         pass
-
-
-def test_a_path_that_is_not_there_is_left_for_its_reader(tmp_path: Path) -> None:
-    absent = tmp_path / "absent"
-    with files_of([absent]) as paths:
-        assert paths == [absent]

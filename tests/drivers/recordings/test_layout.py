@@ -15,15 +15,11 @@ from numpy.typing import NDArray
 
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
-from graspd.drivers.recordings.csv_rows import Recording, Row, read_rows
+from graspd.drivers.recordings.csv_rows import Row, read_rows
 from graspd.drivers.recordings.layout import ReadAs, layout_of
-from tests.drivers.recordings.tables import ELECTRODES, FINGERS, PATH, stream, table, write
+from tests.drivers.recordings.tables import ELECTRODES, FINGERS, rows_of, stream, table, write
 
 PLAIN = table(4)
-
-
-def rows_of(content: bytes, fingers: Sequence[str] = FINGERS) -> list[Row]:
-    return list(Recording(PATH, io.BytesIO(content), fingers))
 
 
 def values(rows: Sequence[Row]) -> list[object]:
@@ -408,5 +404,5 @@ def test_outcomes_are_read_as_tools_write_them(
     cells: Sequence[str], expected: Sequence[bool | None]
 ) -> None:
     content = table(4, {row: {"slipped": cell} for row, cell in enumerate(cells)})
-    rows = list(Recording(PATH, io.BytesIO(content), FINGERS, outcomes=True))
+    rows = rows_of(content, outcomes=True)
     assert [row.annotation.slipped for row in rows] == expected

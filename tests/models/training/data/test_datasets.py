@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -81,94 +81,30 @@ def test_the_list_of_published_tables_agrees_with_the_record() -> None:
     assert [table.upstream_name for table in TABLES] == [f"bts3v2_{name}.csv" for name in REAL]
 
 
-def _header(before: str, after: str) -> Callable[[str], str]:
-    return lambda text: text.replace(before, after, 1)
-
-
-def _cell(column: int, value: str) -> Callable[[str], str]:
-    def change(text: str) -> str:
-        lines = text.splitlines()
-        cells = lines[2].split(",")
-        cells[column] = value
-        lines[2] = ",".join(cells)
-        return "\n".join(lines) + "\n"
-
-    return change
-
-
-BROKEN: list[tuple[str, Callable[[str], str], str]] = [
-    ("empty file", lambda _: "", "the file is empty"),
-    ("no grasp", lambda text: text.splitlines()[0], "the file has a header and no rows"),
-    ("column missing", _header("mf_biotac_7,", ""), "column mf_biotac_7: this column is missing"),
-    ("column twice", _header("ff_", "slipped,ff_"), "column slipped: this column is there twice"),
-    ("row cut off", lambda text: text[:-40], "line 7: the row has "),
-    ("value too many", _cell(73, "1,2"), "line 3: the row has 75 cells, the header 74"),
-    ("no object", _cell(0, ""), "line 3, column object: object has no name"),
-    ("slip not 0 or 1", _cell(1, "yes"), "line 3, column slipped: 'yes' is not an outcome"),
-    (
-        "not 12 bit",
-        _cell(2, "4096"),
-        "line 3, column ff_biotac_1: '4096' is not a count",
-    ),
-    (
-        "negative",
-        _cell(26, "-1"),
-        "line 3, column mf_biotac_1: '-1' is not a count",
-    ),
-    (
-        "missing value",
-        _cell(73, ""),
-        "line 3, column th_biotac_24: '' is not a count",
-    ),
-    (
-        "a float",
-        _cell(5, "12.5"),
-        "line 3, column ff_biotac_4: '12.5' is not a count",
-    ),
-    (
-        "python's own",
-        _cell(5, "1_0"),
-        "line 3, column ff_biotac_4: '1_0' is not a count",
-    ),
-    (
-        "huge",
-        _cell(5, "9" * 5000),
-        "line 3, column ff_biotac_4: '9999999999999999999999999999999999999999...' is",
-    ),
-    ("open quote", _cell(0, '"ball'), "this is not CSV: unexpected end of data"),
-]
-
-
-@pytest.mark.parametrize(("change", "message"), [case[1:] for case in BROKEN], ids=lambda _: "")
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("mf_biotac_7,", "", "line 1, column mf_biotac_7: this column is missing"),
+        ("slipped,", "kept,", "line 1, column slipped: column is missing"),
+        ("\nball,", "\n,", "column object: object has no name"),
+        (",1,", ",yes,", "column slipped: 'yes' is not an outcome"),
+        (",1,", ",1,4096", "is not a count"),
+        (",1,", ",1,-", "is not a count"),
+    ],
+)
 def test_a_broken_table_is_one_clear_line(
-    tmp_path: Path, change: Callable[[str], str], message: str
+    tmp_path: Path, before: str, after: str, message: str
 ) -> None:
+    """More of them stand beside the reader of all tables."""
     path = tmp_path / "palm_down.csv"
     write_table(path, *separable_counts(6))
-    path.write_text(change(path.read_text()))
+    assert before in path.read_text()
+    path.write_text(path.read_text().replace(before, after, 1))
     with pytest.raises(DatasetError) as caught:
         read_table(path)
-    assert str(caught.value).startswith(f"{path}")
+    assert str(caught.value).startswith(f"{path}, line ")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
-    counts, slipped = separable_counts(6)
-    path = tmp_path / "palm_down.csv"
-    write_table(path, counts, slipped)
-    lines = [",".join(reversed(line.split(","))) for line in path.read_text().splitlines()]
-    path.write_text("\n".join(lines) + "\n")
-    grasps = read_table(path)
-    assert np.array_equal(grasps.counts, counts)
-    assert np.array_equal(grasps.slipped, slipped)
-
-
-def test_bytes_that_are_not_text_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "palm_down.csv"
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DatasetError, match="not UTF-16"):
-        read_table(path)
 
 
 def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
