@@ -108,7 +108,7 @@ outcomes = st.sampled_from([None, None, False, True])
     begin=begins,
     following=st.lists(st.tuples(outcomes, feels), min_size=3, max_size=12),
 )
-@settings(max_examples=150)
+@settings(max_examples=100)
 def test_whatever_comes_a_verdict_has_all_it_needs(
     gate: HandLimits,
     limits: RiskLimits | None,
