@@ -49,7 +49,7 @@ BEGUN_FIRST = (
     "models/training/making/test_making_export.py",
     "models/training/commands/test_evaluate.py",
     "models/training/commands/test_train.py",
-    "models/training/evaluating/test_run_jobs.py",
+    "models/training/evaluating/test_frame.py",
     "test_process_replay.py",
     "test_readme.py",
     "test_without_posix.py",

@@ -72,11 +72,11 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def exit_code(
-    command: str, folder: Path, work: Callable[[], None], failure: type[Exception]
+    command: str, folder: Path, work: Callable[[], None], *failures: type[Exception]
 ) -> int:
     """Run `work`, which writes into `folder`; print an error in one line.
 
-    Returns 0; 1 for `failure`; 2 for wrong input, data or folder; 130 for Ctrl-C.
+    Returns 0; 1 for `failures`; 2 for wrong input, data or folder; 130 for Ctrl-C.
     """
     try:
         work()
@@ -89,7 +89,7 @@ def exit_code(
     except (DatasetError, TooFewGraspsError, WrongInputError) as error:
         say(command, str(error))
         return 2
-    except failure as error:
+    except failures as error:
         say(command, str(error))
         return 1
     return 0

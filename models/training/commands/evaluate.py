@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dask",
         metavar="ADDRESS",
         help="scheduler of a Dask cluster of two threads or more, tcp://HOST:PORT, to run on "
-        "instead (extra: cluster); "
-        "it runs what it is sent: only in a network that you trust",
+        "instead (extra: cluster). Its computers share the folder --out. It runs what it is sent: "
+        "only in a network that you trust",
     )
     parser.add_argument(
         "--quick", action="store_true", help="few grasps, folds and epochs: does it run?"
@@ -53,13 +53,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the table of all results in --out beside the paper's; needs --data",
     )
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw them into this folder")
-    parser.add_argument("--json", action="store_true", help="print the summaries as JSON")
+    parser.add_argument("--json", action="store_true", help="print figures of each fold as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate; what is finished is kept and not run again.
-    Returns 0, 1 (the cluster failed), 2 (input or folder), 130 (Ctrl-C)."""
+    Returns 0, 1 (a worker was lost), 2 (input or folder), 130 (Ctrl-C)."""
     from graspd.models.training.commands.evaluation import evaluate
-    from graspd.models.training.evaluating.jobs import ClusterError
+    from graspd.models.training.evaluating.frame import LostWorkerError
 
-    return exit_code("evaluate", args.out, lambda: evaluate(args), ClusterError)
+    return exit_code("evaluate", args.out, lambda: evaluate(args), LostWorkerError)

@@ -9,26 +9,37 @@ import itertools
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from importlib.util import find_spec
 
+import joblib
 import numpy as np
+import pandas as pd
 from sklearn.model_selection import ParameterGrid
 
 from graspd.extras import needs
+from graspd.models.runtime import one_line
 from graspd.models.training.commands.common import WrongInputError, progress_bar, read_grasps, say
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
 from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
-from graspd.models.training.evaluating.files import to_json, write_whole
-from graspd.models.training.evaluating.jobs import Job, JobResult, jobs_of, run_jobs
-from graspd.models.training.evaluating.results_table import results_table
-from graspd.models.training.evaluating.summaries import (
-    SystemSummary,
+from graspd.models.training.evaluating.figures import (
+    Figures,
     made_with,
-    read_summaries,
-    summarise,
-    write_summary,
+    read,
+    with_probability,
+    write,
 )
+from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.evaluating.frame import (
+    Job,
+    LostWorkerError,
+    evaluated,
+    jobs_of,
+    processes,
+)
+from graspd.models.training.evaluating.results_table import results_table
 from graspd.models.training.making.plan import TrainingPlan, with_enough_folds
 from graspd.models.training.systems.registry import (
     SYSTEMS,
@@ -42,6 +53,11 @@ SEEDS = 3
 """Split seeds of an evaluation unless `--seeds` says otherwise."""
 QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 400, 2, 1
 """Grasps, folds and epochs of `--quick`: enough to see that all runs; figures mean nothing."""
+
+
+CONNECT_TIMEOUT_S = 10
+VERDICTS = "verdicts"
+"""Folder in --out of the rows of each system and protocol, as Parquet."""
 
 
 def evaluate(args: argparse.Namespace) -> None:
@@ -58,13 +74,33 @@ def evaluate(args: argparse.Namespace) -> None:
     folds = QUICK_FOLDS if args.quick else FOLDS
     if args.data is None:
         folds = _enough_folds(tried, protocols, folds, grasps, _seeds(args))
-    summaries = _summaries(tried, protocols, folds, grasps, args)
+    with _cluster(args.dask) if args.dask else processes(args.jobs):
+        made = _evaluated(tried, protocols, folds, grasps, args)
     if args.json:
-        sys.stdout.write(to_json(summaries).decode())
+        scores = pd.concat(
+            one.scores.assign(system=one.system, protocol=one.protocol) for one in made
+        )
+        sys.stdout.write(scores.reset_index().to_json(orient="records", indent=2) + "\n")
     if args.grid:
-        _report_grids(systems, summaries, args)
+        _report_grids(systems, made, args)
     if args.table or args.plots:
-        _report(grasps.digest(), args)
+        _report(grasps, args)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[None]:
+    """Run trainings on the cluster of the Dask scheduler at this address."""
+    from distributed import Client, KilledWorker
+
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT_S)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise WrongInputError(f"no Dask scheduler at {address}: {one_line(error)}") from error
+    try:
+        with client, joblib.parallel_config("dask"):
+            yield
+    except (KilledWorker, CancelledError) as error:
+        raise LostWorkerError(f"the cluster lost a training: {one_line(error)}") from error
 
 
 def grid_of(system: System) -> list[System]:
@@ -142,66 +178,66 @@ def _enough_folds(
     return folds
 
 
-def _summaries(
+def _evaluated(
     systems: Sequence[System],
     protocols: Sequence[EvalProtocol],
     folds: int,
     grasps: Grasps,
     args: argparse.Namespace,
-) -> list[SystemSummary]:
-    """Run all jobs. Each summary is stored and printed as soon as its jobs are done."""
+) -> list[Figures]:
+    """Run all jobs. The rows of a system in a protocol are kept and printed as soon as all are."""
     groups = {
         (system.name, protocol): jobs_of(system, protocol, grasps, _seeds(args), folds)
         for system in systems
         for protocol in protocols
     }
     wanted = [job for group in groups.values() for job in group]
-    found: dict[Job, JobResult] = {}
-    made: dict[tuple[str, str], SystemSummary] = {}
+    found: dict[Job, pd.DataFrame] = {}
+    made: dict[tuple[str, str], Figures] = {}
     with progress_bar("starting", len(wanted), hidden=args.quiet) as on_job:
-        results = run_jobs(wanted, grasps, args.out / "jobs", processes=args.jobs, dask=args.dask)
-        for job, result in results:
-            found[job] = result
+        for job, rows in evaluated(wanted, grasps, args.out / "jobs"):
+            found[job] = rows
             on_job(f"{job.system.name} {job.protocol}")
             key = (job.system.name, job.protocol)
             if all(each in found for each in groups[key]):
-                made[key] = summarise({each: found.pop(each) for each in groups[key]}, grasps)
+                parts = [found.pop(each) for each in groups[key]]
+                made[key] = Figures.of(with_probability(pd.concat(parts, ignore_index=True)))
                 _show(made[key], args)
     return [made[key] for key in groups]
 
 
-def _show(summary: SystemSummary, args: argparse.Namespace) -> None:
+def _show(one: Figures, args: argparse.Namespace) -> None:
     if args.grid:
         return
-    write_summary(summary, args.out)
+    write(one, args.out / VERDICTS)
     if args.json:
         return
-    f1, accuracy = (summary.main.spreads[name] for name in ("f1", "accuracy"))
+    f1, accuracy = one.spread("f1"), one.spread("accuracy")
     error = "" if f1.error is None else f", s.e. {100 * f1.error:.2f} over {f1.seeds} seeds"
     sys.stdout.write(
-        f"{summary.system} {summary.protocol} ({summary.headline}): "
+        f"{one.system} {one.protocol} ({one.headline}): "
         f"F1 {100 * f1.mean:.1f} +- {100 * f1.std:.1f} %{error}; "
-        f"accuracy {100 * accuracy.mean:.1f} %, {summary.seconds:.0f} s\n"
+        f"accuracy {100 * accuracy.mean:.1f} %, {one.trainings['seconds'].sum():.0f} s\n"
     )
     sys.stdout.flush()
 
 
-def _report(data: str, args: argparse.Namespace) -> None:
-    """Write table and plots of all summaries in the folder that are of this data (a digest)."""
+def _report(grasps: Grasps, args: argparse.Namespace) -> None:
+    """Write table and plots of all that the folder has of these grasps."""
     digests = {
         name: digest(with_recipes(system, epochs=QUICK_EPOCHS) if args.quick else system)
         for name, system in SYSTEMS.items()
     }
-    summaries = read_summaries(args.out, data, digests)
+    several = read(args.out / VERDICTS, grasps.digest(), digests)
     if args.table:
         command = "graspd " + " ".join(_command(args))
-        text = results_table(summaries, command, made_with(), quick=args.quick)
+        text = results_table(several, grasps, command, made_with(), quick=args.quick)
         args.table.parent.mkdir(parents=True, exist_ok=True)
         write_whole(args.table, text.encode())
     if args.plots:
         from graspd.models.training.evaluating.plots import draw
 
-        draw(summaries, args.plots, quick=args.quick)
+        draw(several, args.plots, quick=args.quick)
 
 
 def _command(args: argparse.Namespace) -> Iterator[str]:
@@ -227,22 +263,20 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
 
 
 def _report_grids(
-    systems: Sequence[System], summaries: Sequence[SystemSummary], args: argparse.Namespace
+    systems: Sequence[System], several: Sequence[Figures], args: argparse.Namespace
 ) -> None:
     """Write all points of each grid, the best F1 first, and name the best."""
     for system in systems:
         names = {point.name for point in grid_of(system)}
-        for protocol in dict.fromkeys(summary.protocol for summary in summaries):
-            points = [one for one in summaries if one.system in names and one.protocol == protocol]
-            points.sort(key=lambda one: -one.main.spreads["f1"].mean)
+        for protocol in dict.fromkeys(one.protocol for one in several):
+            points = [one for one in several if one.system in names and one.protocol == protocol]
+            points.sort(key=lambda one: -one.spread().mean)
             report = [
-                {"name": point.system}
-                | {name: point.main.spreads[name] for name in ("f1", "accuracy")}
+                {"name": point.system} | {name: point.spread(name) for name in ("f1", "accuracy")}
                 for point in points
             ]
             write_whole(args.out / f"{system.name}.{protocol}.grid.json", to_json(report))
             if not args.json:
-                best = points[0]
-                f1 = best.main.spreads["f1"]
+                best, f1 = points[0].system, points[0].spread()
                 score = f"F1 {100 * f1.mean:.2f} +- {100 * f1.std:.1f} %"
-                sys.stdout.write(f"{best.system} {protocol}: best of {len(points)}, {score}\n")
+                sys.stdout.write(f"{best} {protocol}: best of {len(points)}, {score}\n")

@@ -75,12 +75,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, measure, export. Returns 0, 1 (export failed), 2 (data or folder), 130 (Ctrl-C)."""
+    """Train, measure, export.
+    Returns 0, 1 (export failed, process lost), 2 (data or folder), 130 (Ctrl-C)."""
+    from graspd.models.training.evaluating.frame import LostWorkerError
     from graspd.models.training.making.export import ExportError
 
     plan = _plan(args)
     out: Path = args.out or Path("runs") / plan.model
-    return exit_code("train", out, lambda: _train(args, plan, out), ExportError)
+    return exit_code("train", out, lambda: _train(args, plan, out), ExportError, LostWorkerError)
 
 
 def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:

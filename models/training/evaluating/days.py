@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,20 +12,30 @@ from graspd.models.inputs import builder
 from graspd.models.judge.grasp_judge import GraspJudge
 from graspd.models.training.arrays import Bools, Floats, Ints
 from graspd.models.training.data.datasets import Grasps
-from graspd.models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED
+from graspd.models.training.fitting.standards import Variant
 from graspd.models.training.fitting.trained import Trained
 from graspd.models.training.systems.registry import SessionFeatures
 from graspd.models.trust.learner import sigmoid
 
-Judged = tuple[dict[str, Floats], dict[str, Bools], dict[str, Ints]]
-"""By variant: log-odds of slip, refusals, and age of the session at each grasp."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdicts:
+    """Verdicts of one variant on grasps, shape (N,) each."""
+
+    variant: Variant
+    margins: Floats
+    """Uncalibrated log-odds of slip."""
+    refused: Bools | None = None
+    """What the daemon would call `unknown`; None: not known."""
+    ages: Ints | None = None
+    """Grasps that the running session had before each one; None: there is no such session."""
 
 
-def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judged:
+def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iterator[Verdicts]:
     """Judge the rows `test` of grasps with a trained system; each table is a new session.
 
-    A session system judges each table in random order, and again object by object. Refused grasps,
-    which the daemon calls `unknown`, have margins too.
+    A session system judges each table in random order, and again object by object. Refused grasps
+    have margins too.
     """
     counts, table_of = grasps.counts[test], grasps.table_of[test]
     if not isinstance(trained.system.input, SessionFeatures):
@@ -30,22 +43,21 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judg
         found = [day.judge_of.examine(reading) for reading in counts]
         inputs, _ = day.network.inputs.build_batch(np.stack([each.counts for each in found]))
         refused = np.array([each.refusal is not None for each in found])
-        return {NONE: trained.fitted.margins(inputs)}, {NONE: refused}, {}
+        yield Verdicts(Variant.NONE, trained.fitted.margins(inputs), refused)
+        return
     random = np.random.default_rng(seed)
-    judged: Judged = {}, {}, {}
-    for variant in (RUNNING, RUNNING_SORTED):
+    for variant in (Variant.RUNNING, Variant.RUNNING_SORTED):
         days = [Day(trained) for _ in grasps.files]
         margins, refused = np.empty(len(test)), np.empty(len(test), np.bool_)
         ages = np.empty(len(test), np.int64)
         order = random.permutation(len(test))
-        if variant == RUNNING_SORTED:
+        if variant == Variant.RUNNING_SORTED:
             order = by_object(random, order, np.array(grasps.objects)[test[order]])
         for place in order.tolist():
             day = days[table_of[place]]
             ages[place] = day.grasps
             margins[place], refused[place] = day.judge(counts[place])
-        judged[0][variant], judged[1][variant], judged[2][variant] = margins, refused, ages
-    return judged
+        yield Verdicts(variant, margins, refused, ages)
 
 
 def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]) -> Ints:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
+from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
+from graspd.models.training.evaluating.figures import GROUPS, Figures, by_age, by_day
+from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.training.evaluating.findings import FINDINGS, HOW_SURE
 from graspd.models.training.evaluating.metrics import Spread, paired_difference
-from graspd.models.training.evaluating.summaries import GROUPS, HEADLINE, SystemSummary
-from graspd.models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
+from graspd.models.training.fitting.standards import SESSION_VARIANTS, Variant
 from graspd.models.training.systems.registry import SYSTEMS, PaperFigure, System
 
 NOT_RUN = "-"
@@ -25,11 +27,12 @@ ONE_ROW = (
 
 
 Row = Sequence[str]
-ByGroup = dict[tuple[str, EvalProtocol], SystemSummary]
+ByGroup = dict[tuple[str, EvalProtocol], Figures]
 
 
 def results_table(
-    summaries: Sequence[SystemSummary],
+    several: Sequence[Figures],
+    grasps: Grasps,
     command: str,
     made_with: Mapping[str, str],
     *,
@@ -37,24 +40,25 @@ def results_table(
 ) -> str:
     """Return the whole document as Markdown; what was not run is `-`.
 
-    `command`, `made_with`: the command line, and versions by name, that made the summaries.
+    `grasps`, `command`, `made_with`: what was judged, and the command line and versions by name
+    that did it.
     """
-    by_group: ByGroup = {(summary.system, summary.protocol): summary for summary in summaries}
+    by_group: ByGroup = {(one.system, one.protocol): one for one in several}
     sections = (
-        _head(summaries, quick=quick),
+        _head(several, quick=quick),
         _findings(by_group),
         _paper(by_group),
         _systems(by_group),
         _sessions(by_group),
         _days(by_group),
         _differences(by_group),
-        _everything(summaries),
-        _how(summaries, command, made_with),
+        _everything(several),
+        _how(several, grasps, command, made_with),
     )
     return "\n\n".join(paragraph for section in sections for paragraph in section) + "\n"
 
 
-def _head(summaries: Sequence[SystemSummary], *, quick: bool) -> Iterator[str]:
+def _head(several: Sequence[Figures], *, quick: bool) -> Iterator[str]:
     yield "# Results"
     yield (
         "This page is for those who compare models. Figures are F1 in %, slip positive, unless a "
@@ -64,7 +68,7 @@ def _head(summaries: Sequence[SystemSummary], *, quick: bool) -> Iterator[str]:
     )
     if quick:
         yield "**Made with `--quick`: hardly trained, on few grasps. The figures mean nothing.**"
-    shown = {*STANDARD, *(summary.protocol for summary in summaries)}
+    shown = {*STANDARD, *(one.protocol for one in several)}
     yield "\n".join(f"- `{name}`: {ABOUT[name]}" for name in PROTOCOLS if name in shown)
 
 
@@ -81,15 +85,15 @@ def _findings(by_group: ByGroup) -> Iterator[str]:
 
 
 def _figures(by_group: ByGroup) -> dict[str, str]:
-    """Return the figures of all summaries by their key in a finding."""
+    """Return all figures by their key in a finding."""
     figures = {}
-    for (system, protocol), summary in by_group.items():
-        key, spreads = f"{system}/{protocol}", summary.main.spreads
-        figures[key] = _value(spreads["f1"])
-        figures[f"{key}/auc"] = f"{spreads['auc'].mean:.2f}"
+    for (system, protocol), one in by_group.items():
+        key = f"{system}/{protocol}"
+        figures[key] = _value(one.spread())
+        figures[f"{key}/auc"] = f"{one.spread('auc').mean:.2f}"
         reference = by_group.get((REFERENCE, protocol))
         if reference is not None:
-            figures[f"{key}/difference"] = _difference(summary, reference)
+            figures[f"{key}/difference"] = _difference(one, reference)
         for published in SYSTEMS[system].published:
             if published.protocol == protocol:
                 figures[f"{key}/paper"] = _of_paper(published.f1)
@@ -100,23 +104,23 @@ def _paper(by_group: ByGroup) -> Iterator[str]:
     yield "## 1. The paper's systems"
     yield _table(
         ("system", "protocol", "figure", "paper", "ours", "difference"),
-        (
+        [
             row
             for system in SYSTEMS.values()
             for published in system.published
             for row in _published(system, published, by_group)
-        ),
+        ],
     )
 
 
 def _published(system: System, published: PaperFigure, by_group: ByGroup) -> Iterator[Row]:
     """A row for each figure that the paper gives."""
-    summary = by_group.get((system.name, published.protocol))
+    one = by_group.get((system.name, published.protocol))
     for figure in FIGURES:
         paper = getattr(published, figure)
         if paper is None:
             continue
-        ours = summary.main.spreads[figure] if summary else None
+        ours = one.spread(figure) if one else None
         yield (
             f"`{system.name}`",
             f"`{published.protocol}`",
@@ -134,16 +138,15 @@ def _of_paper(figure: tuple[float, float]) -> str:
 def _systems(by_group: ByGroup) -> Iterator[str]:
     yield "## 2. All systems, all protocols"
     yield (
-        f"In `session`, systems with session calibration have seen {HEADLINE[1:]} unlabelled "
-        "grasps of other objects of that session, the others none. `parameters` are the most of "
-        "any protocol."
+        "In `session`, systems with session calibration have seen 50 unlabelled grasps of other "
+        "objects of that session, the others none. `parameters` are the most of any protocol."
     )
     rows = []
     for name in SYSTEMS:
         row = [by_group.get((name, protocol)) for protocol in STANDARD]
         if any(row):
-            size = max(summary.parameters for summary in row if summary)
-            rows.append((f"`{name}`", f"{size:,}", *(_with_error(summary) for summary in row)))
+            size = max(one.parameters for one in row if one)
+            rows.append((f"`{name}`", f"{size:,}", *map(_with_error, row)))
     yield _table(("system", "parameters", *(f"`{protocol}`" for protocol in STANDARD)), rows)
 
 
@@ -158,24 +161,28 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
         variant[1:] if variant[1:].isdigit() else variant.replace("-", ", ")
         for variant in SESSION_VARIANTS
     ]
-    here = {
-        name: by_group[name, "session"].variants
-        for name in SYSTEMS
-        if (name, "session") in by_group
-    }
+    here = [by_group[name, "session"] for name in SYSTEMS if (name, "session") in by_group]
     shown = []
-    for name, variants in here.items():
-        f1 = {key: variant.spreads["f1"] for key, variant in variants.items()}
-        shown.append((f"`{name}`", *(_value(f1.get(key)) for key in SESSION_VARIANTS)))
+    for one in here:
+        f1 = {variant: _value(one.spread(variant=variant)) for variant in one.variants}
+        cells = (f1.get(variant, NOT_RUN) for variant in SESSION_VARIANTS)
+        shown.append((f"`{one.system}`", *cells))
     yield _table(("system", *columns), shown)
-    young = {name: variants[RUNNING].ages for name, variants in here.items() if RUNNING in variants}
+    young = {
+        one.system: {age.grasps_before: age for age in by_age(one.of_variant(Variant.RUNNING))}
+        for one in here
+        if Variant.RUNNING in one.variants
+    }
     if young:
         yield "Accuracy, %, in a running session (objects mixed), by grasps before:"
-        bounds = sorted({age.grasps_before for ages in young.values() for age in ages})
-        rows = []
-        for name, ages in young.items():
-            by_bound = {age.grasps_before: f"{100 * age.share.accuracy:.1f}" for age in ages}
-            rows.append((f"`{name}`", *(by_bound.get(bound, NOT_RUN) for bound in bounds)))
+        bounds = sorted({bound for ages in young.values() for bound in ages})
+        rows = [
+            (
+                f"`{name}`",
+                *(_percent(ages[bound].accuracy if bound in ages else None) for bound in bounds),
+            )
+            for name, ages in young.items()
+        ]
         yield _table(("system", *map(str, bounds)), rows)
 
 
@@ -188,23 +195,24 @@ def _days(by_group: ByGroup) -> Iterator[str]:
         "other before they count, without labels. F1 / slips among what is called stable, "
         "%, every grasp judged, in random order; seeds times trainings: " + (trainings or NOT_RUN)
     )
-    order = {RUNNING: "random", RUNNING_SORTED: "object by object"}
+    order: dict[str, str] = {Variant.RUNNING: "random", Variant.RUNNING_SORTED: "object by object"}
     rows, more = [], []
     for one in here:
         cells = (
-            f"{_percent(each.every.f1)} / {_percent(each.every.slips_among_stable)}"
-            for each in one.main.days.values()
+            f"{_percent(day['every']['f1'])} / {_percent(day['every']['slips_among_stable'])}"
+            for day in by_day(one.of_variant()).values()
         )
         rows.append((f"`{one.system}`", *cells))
-        for name, variant in one.variants.items():
-            figures = variant.days["all"]
-            every, judged = figures.every, figures.judged
+        for variant in one.variants:
+            every_day = by_day(one.of_variant(variant))["all"]
+            every, judged = every_day["every"], every_day["judged"]
             fractions = (
-                *(every.f1, every.slips_among_stable),
-                *(every.slips_called_stable, every.stable_called_slip),
-                *(figures.coverage, judged.f1, judged.slips_among_stable, figures.refused_slipped),
+                *(every["f1"], every["slips_among_stable"]),
+                *(every["slips_called_stable"], every["stable_called_slip"]),
+                *(every_day["coverage"], judged["f1"], judged["slips_among_stable"]),
+                every_day["refused_slipped"],
             )
-            names = f"`{one.system}`", order.get(name, "any")
+            names = f"`{one.system}`", order.get(variant, "any")
             more.append((*names, *map(_percent, fractions)))
     yield _table(("system", *GROUPS), rows)
     yield (
@@ -228,94 +236,70 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
         here = [by_group[name, protocol] for name in SYSTEMS if (name, protocol) in by_group]
         if len(here) < 2:
             continue
-        best = max(here, key=lambda summary: summary.main.spreads["f1"].mean)
+        best = max(here, key=lambda one: one.spread().mean)
         reference = by_group.get((REFERENCE, protocol))
-        for summary in here:
-            to_others = [_difference(summary, other) for other in (reference, best)]
+        for one in here:
+            to_others = [_difference(one, other) for other in (reference, best)]
             if to_others != [NOT_RUN, NOT_RUN]:
-                rows.append((f"`{summary.system}`", f"`{protocol}`", *to_others))
+                rows.append((f"`{one.system}`", f"`{protocol}`", *to_others))
     yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best"), rows)
 
 
-def difference(ours: SystemSummary, theirs: SystemSummary) -> tuple[float, float | None] | None:
+def difference(ours: Figures, theirs: Figures) -> tuple[float, float | None] | None:
     """Return our mean F1 less theirs on the splits that both have judged, and its standard error.
-    None: no split is the same, for other data or another number of folds, say."""
-    seeds = [seed for seed in ours.seeds if seed in theirs.seeds]
-    if not seeds or ours.folds != theirs.folds or ours.data != theirs.data:
+    None: no split is the same, for another number of folds, say."""
+    if ours.folds != theirs.folds:
         return None
-    pairs = [
-        (one, other)
-        for seed in seeds
-        for one, other in zip(_f1_of(ours, seed), _f1_of(theirs, seed), strict=True)
-        if one is not None and other is not None
-    ]
-    if not pairs:
+    gaps = (ours.folds_of("f1") - theirs.folds_of("f1")).stack().dropna()
+    if gaps.empty:
         return None
-    overlap = ours.test_grasps / ours.train_grasps if ours.folds > 1 else 0.0
-    return paired_difference([one for one, _ in pairs], [other for _, other in pairs], overlap)
+    train_grasps = float(ours.trainings["train_grasps"].mean())
+    overlap = ours.test_grasps / train_grasps if ours.folds > 1 else 0.0
+    return paired_difference(gaps.to_numpy(), overlap)
 
 
-def _f1_of(summary: SystemSummary, seed: int) -> list[float | None]:
-    return summary.main.figures["f1"][summary.seeds.index(seed)]
-
-
-def _everything(summaries: Sequence[SystemSummary]) -> Iterator[str]:
+def _everything(several: Sequence[Figures]) -> Iterator[str]:
     yield "## 6. Every figure"
     yield (
         "Means. Accuracy, precision and recall are in %. The expected calibration error (ECE) is "
         "of probabilities calibrated by a temperature of the other folds. `at 80 %` is the "
         "accuracy, %, of the 80 % most confident verdicts, `s` the seconds of one training."
     )
-    percent, fractions = ("accuracy", "precision", "recall"), ("auc", "ece")
-    yield _table(
+    rows = [
         (
-            *("system", "protocol", "accuracy", "precision", "recall"),
-            *("AUC", "ECE", "at 80 %", "seeds", "s"),
-        ),
-        (
-            (
-                f"`{summary.system}`",
-                f"`{summary.protocol}`",
-                *(_percent(summary.main.spreads[name].mean) for name in percent),
-                *(f"{summary.main.spreads[name].mean:.3f}" for name in fractions),
-                f"{100 * summary.main.coverages['0.8']:.1f}",
-                str(len(summary.seeds)),
-                f"{summary.seconds / _trainings(summary):.1f}",
-            )
-            for summary in summaries
-        ),
-    )
+            f"`{one.system}`",
+            f"`{one.protocol}`",
+            *(_percent(one.spread(name).mean) for name in ("accuracy", "precision", "recall")),
+            *(f"{one.spread(name).mean:.3f}" for name in ("auc", "ece")),
+            _percent(one.accuracy_at(0.8)),
+            str(len(one.seeds)),
+            f"{one.trainings['seconds'].mean():.1f}",
+        )
+        for one in several
+    ]
+    titles = ("system", "protocol", "accuracy", "precision", "recall", "AUC", "ECE", "at 80 %")
+    yield _table((*titles, "seeds", "s"), rows)
 
 
 def _how(
-    summaries: Sequence[SystemSummary], command: str, made_with: Mapping[str, str]
+    several: Sequence[Figures], grasps: Grasps, command: str, made_with: Mapping[str, str]
 ) -> Iterator[str]:
     yield "## How this was made"
     yield f"    {command}"
     yield ONE_ROW
-    total = sum(summary.seconds for summary in summaries)
+    seconds = [one.trainings["seconds"] for one in several]
     yield (
-        f"{sum(map(_trainings, summaries))} trainings, {_duration(total)} in all on one thread "
-        "each. Without names, protocols and seeds the command makes everything, what is `-` too: "
-        "more than a day on two cores."
+        f"{sum(map(len, seconds))} trainings, {_duration(sum(map(sum, seconds)))} in all on one "
+        "thread each. Without names, protocols and seeds the command makes everything, what is `-` "
+        "too: more than a day on two cores."
     )
     yield ", ".join(f"{name} {version}" for name, version in made_with.items()) + "."
-    files = {file.name: file for summary in summaries for file in summary.files}
-    if files:
-        yield "Data (SHA-256, grasps used):"
-        yield "\n".join(
-            f"- `{file.name}.csv` {file.sha256}, {file.rows}" for file in files.values()
-        )
+    yield "Data (SHA-256, grasps used):"
+    yield "\n".join(f"- `{file.name}.csv` {file.sha256}, {file.rows}" for file in grasps.files)
 
 
-def _table(header: Row, rows: Iterable[Row]) -> str:
-    lines = [" | ".join(cells) for cells in (header, *rows)]
-    rule = "|" + "---|" * len(header)
-    return "\n".join((f"| {lines[0]} |", rule, *(f"| {line} |" for line in lines[1:])))
-
-
-def _trainings(summary: SystemSummary) -> int:
-    return len(summary.seeds) * summary.folds
+def _table(titles: Row, rows: Sequence[Row]) -> str:
+    return "\n".join(markdown_table(titles, rows))
 
 
 def _percent(fraction: float | None) -> str:
@@ -329,18 +313,16 @@ def _value(spread: Spread | None) -> str:
     return f"{100 * spread.mean:.1f}" + ("" if alone else f" +- {100 * spread.std:.1f}")
 
 
-def _with_error(summary: SystemSummary | None) -> str:
-    if summary is None:
+def _with_error(one: Figures | None) -> str:
+    if one is None:
         return NOT_RUN
-    spread = summary.main.spreads["f1"]
+    spread = one.spread()
     error = "" if spread.error is None else f" (s.e. {100 * spread.error:.2f})"
     return _value(spread) + error
 
 
-def _difference(ours: SystemSummary, theirs: SystemSummary | None) -> str:
-    if theirs is None or ours is theirs:
-        return NOT_RUN
-    gap = difference(ours, theirs)
+def _difference(ours: Figures, theirs: Figures | None) -> str:
+    gap = None if theirs is None or ours is theirs else difference(ours, theirs)
     if gap is None:
         return NOT_RUN
     mean, error = gap

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -13,13 +14,32 @@ PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""
 CALIBRATED_FROM = 20.0
 """Grasps from which a session counts as calibrated; more gain at most two points."""
-NONE, TRAINING, ALL = "none", "training", "all"
-"""Variants of calibration: none; training rows of the same table; the whole pool."""
-RUNNING, RUNNING_SORTED = "running", "running-sorted"
-"""Variants of a running session from nothing: objects mixed, or one after the other."""
-DRAWS = (5, 10, 20, 50)
-"""Variants `n5` ...: calibrated by 5 ... grasps of the pool, drawn at random."""
-SESSION_VARIANTS = (NONE, *(f"n{number}" for number in DRAWS), ALL, RUNNING, RUNNING_SORTED)
+
+
+class Variant(StrEnum):
+    """What standardises the features of a grasp that is judged."""
+
+    NONE = "none"
+    """Nothing of its session: the training's statistics, or no session model at all."""
+    N5 = "n5"
+    """Five unlabelled grasps of its session, and of other objects, drawn at random."""
+    N10 = "n10"
+    N20 = "n20"
+    N50 = "n50"
+    ALL = "all"
+    """All grasps of its session that are of other objects."""
+    RUNNING = "running"
+    """A session from nothing: the grasps before it, objects mixed."""
+    RUNNING_SORTED = "running-sorted"
+    """The same, one object after the other."""
+    TRAINING = "training"
+    """The training grasps of its own table."""
+
+
+SESSION_VARIANTS = tuple(variant for variant in Variant if variant != Variant.TRAINING)
+"""Variants of the protocol `session`."""
+DRAWN = {Variant.N5: 5, Variant.N10: 10, Variant.N20: 20, Variant.N50: 50}
+"""Number of grasps that are drawn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,22 +95,23 @@ class TrainingStandards:
 
 def later_session(
     features: Floats, test: Ints, pool: Ints, training: TrainingStandards, seed: int
-) -> tuple[dict[str, Standards], dict[str, Ints]]:
+) -> tuple[dict[Variant, Standards], dict[Variant, Ints]]:
     """Return standards of the rows `test` of features (all grasps, M), by variant.
 
     The second result has, for running variants, the grasps (N,) before each test grasp. The rows
-    `pool` calibrate `n5` ... and `all`.
+    `pool` calibrate the others.
     """
     random = np.random.default_rng(seed)
-    standards = {NONE: training.prior, ALL: Standards.of(features[pool])}
-    for number in DRAWS:
+    standards = {Variant.NONE: training.prior, Variant.ALL: Standards.of(features[pool])}
+    for variant, number in DRAWN.items():
         statistics = training.statistics()
         for row in random.permutation(pool)[:number]:
             statistics.observe(features[row])
-        standards[f"n{number}"] = Standards(statistics.mean, statistics.spread)
-    ages: dict[str, Ints] = {}
+        standards[variant] = Standards(statistics.mean, statistics.spread)
+    ages: dict[Variant, Ints] = {}
     session = np.sort(np.concatenate((test, pool)))
-    for variant, order in ((RUNNING, random.permutation(session)), (RUNNING_SORTED, session)):
+    mixed = random.permutation(session)
+    for variant, order in ((Variant.RUNNING, mixed), (Variant.RUNNING_SORTED, session)):
         standards[variant], ages[variant] = _running(features, order, test, training)
     return standards, ages
 

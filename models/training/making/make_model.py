@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from graspd.models.bts3 import CITATIONS, LICENCE, REPOSITORY
 from graspd.models.contract import (
@@ -21,13 +22,27 @@ from graspd.models.contract import (
 )
 from graspd.models.training.data.datasets import ENOUGH_GRASPS, Grasps, lab_table_names, unpublished
 from graspd.models.training.estimators.graphs import OPSET
-from graspd.models.training.evaluating import jobs
 from graspd.models.training.evaluating.broken import broken_study
+from graspd.models.training.evaluating.figures import (
+    COVERAGES,
+    Figures,
+    by_age,
+    by_day,
+    made_with,
+    right,
+    temperature,
+    with_probability,
+)
 from graspd.models.training.evaluating.files import to_json, write_whole
-from graspd.models.training.evaluating.metrics import FEWEST_JUDGED
-from graspd.models.training.evaluating.summaries import SystemSummary, made_with, summarise
+from graspd.models.training.evaluating.frame import evaluated, judged, processes
+from graspd.models.training.evaluating.metrics import (
+    FEWEST_JUDGED,
+    confusion,
+    coverage_curve,
+    verdict_figures,
+)
 from graspd.models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
-from graspd.models.training.fitting.standards import RUNNING
+from graspd.models.training.fitting.standards import Variant
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.making.export import export
 from graspd.models.training.making.plan import TrainingPlan
@@ -60,25 +75,26 @@ def make_model(
     """
     wanted = plan.jobs(grasps)
     found = {}
-    for job, result in jobs.run_jobs(wanted, grasps, results, processes=plan.processes):
-        found[job] = result
-        on_done()
-    summaries = [
-        summarise({job: found[job] for job in wanted if job.protocol == protocol}, grasps)
-        for protocol in plan.protocols(grasps)
+    with processes(plan.processes):
+        for job, rows in evaluated(wanted, grasps, results):
+            found[job] = rows
+            on_done()
+    every = pd.concat([found[job] for job in wanted], ignore_index=True)
+    measured = [
+        Figures.of(with_probability(rows)) for _, rows in every.groupby("protocol", sort=False)
     ]
-    again = jobs.run(wanted[0], grasps)
+    again = judged(wanted[0], grasps)
     on_done()
     system = plan.system
     trained = train(system, plan.chosen(grasps).of_fingers(system.fingers), plan.seed)
     on_done()
-    contract = _contract(plan, trained, summaries)
-    calibrator = _calibrator(summaries)
+    contract = _contract(plan, trained, measured)
     path = out / f"{plan.model}.onnx"
-    temperature = calibrator.main.temperature
+    calibrator = _calibrator(measured)
+    of_margins = temperature(calibrator.of_variant())
     tables = trained.standards
     standards = None if tables is None else tables.each(trained.grasps.table_of)
-    parity = export(trained.fitted, temperature, contract, trained.grasps.counts, path, standards)
+    parity = export(trained.fitted, of_margins, contract, trained.grasps.counts, path, standards)
     data, first = path.read_bytes(), found[wanted[0]]
     card = {
         "what": system.description,
@@ -92,71 +108,65 @@ def make_model(
         "parameters": trained.fitted.parameters,
         "data": _data_sources(grasps.files),
         "system": configuration(system, "input", "estimator", "recipe", "augmentation", "tables"),
-        "protocols": {summary.protocol: _card_figures(summary) for summary in summaries},
-        "temperature": temperature,
+        "protocols": {one.protocol: _card_figures(one) for one in measured},
+        "temperature": of_margins,
         "calibrated_by": calibrator.protocol,
         "broken": None if plan.only else broken_study(system, trained.grasps, plan.seed),
         "never_seen": _never_seen(trained, contract, plan.seed),
         # Training the first fold again gave bit-identical margins.
-        "same_seed_same_margins": all(
-            np.array_equal(margins, again.margins[name]) for name, margins in first.margins.items()
-        ),
+        "same_seed_same_margins": first["margin"].equals(again["margin"]),
         "command": plan.command,
         "made_with": made_with(LIBRARIES) | {"machine": platform.machine()},
-        "weak_points": _weak_points(summaries, trained.grasps),
+        "weak_points": _weak_points(measured, trained.grasps),
         "worth": None,  # `graspd report worth --card` fills it in
     }
     write_whole(path.with_suffix(".json"), to_json(card))
     return contract
 
 
-def _calibrator(summaries: list[SystemSummary]) -> SystemSummary:
-    """Return the summary that calibrates probabilities: of new objects, if measured."""
-    return summaries[min(1, len(summaries) - 1)]
+def _calibrator(measured: list[Figures]) -> Figures:
+    """Return the figures that calibrate probabilities: of new objects, if measured."""
+    return measured[min(1, len(measured) - 1)]
 
 
-def _contract(
-    plan: TrainingPlan, trained: Trained, summaries: list[SystemSummary]
-) -> ModelContract:
+def _contract(plan: TrainingPlan, trained: Trained, measured: list[Figures]) -> ModelContract:
     return ModelContract(
         version=2,
         name=plan.model,
-        input=trained.takes(_sharpness(summaries)),
+        input=trained.takes(_sharpness(measured)),
         fingers=plan.system.fingers,
         classes=CLASSES,
         seed=plan.seed,
         datasets=tuple(file for file in trained.grasps.files if file.rows),
-        measured=tuple(map(_measured, summaries)),
-        confidence=_confidence(_calibrator(summaries)),
+        measured=tuple(map(_measured, measured)),
+        confidence=_confidence(_calibrator(measured)),
         seen=trained.seen(),
     )
 
 
-def _confidence(summary: SystemSummary) -> tuple[ConfidenceStep, ...]:
+def _confidence(one: Figures) -> tuple[ConfidenceStep, ...]:
     """Return the steps with enough grasps; few grasps do not show how often they are right."""
-    judged = summary.folds * summary.test_grasps
+    rows = one.of_variant()
     return tuple(
         step
-        for step in reversed(summary.main.curve)
-        if round(step.coverage * judged) >= FEWEST_JUDGED
+        for step in reversed(coverage_curve(rows["probability"], rows["slipped"]))
+        if round(step.coverage * len(rows)) >= FEWEST_JUDGED
     )
 
 
-def _measured(summary: SystemSummary) -> MeasuredError:
-    f1, accuracy = summary.main.spreads["f1"], summary.main.spreads["accuracy"]
-    return MeasuredError(
-        summary.protocol, summary.folds, f1.mean, f1.std, accuracy.mean, accuracy.std
-    )
+def _measured(one: Figures) -> MeasuredError:
+    f1, accuracy = one.spread("f1"), one.spread("accuracy")
+    return MeasuredError(one.protocol, one.folds, f1.mean, f1.std, accuracy.mean, accuracy.std)
 
 
-def _sharpness(summaries: list[SystemSummary]) -> tuple[Sharpness, ...]:
+def _sharpness(measured: list[Figures]) -> tuple[Sharpness, ...]:
     """Return the temperatures of a young session, which is never surer than a calibrated one."""
-    base = _calibrator(summaries).main.temperature
-    later = next((s for s in summaries if s.protocol == "days"), None)
-    if later is None or RUNNING not in later.variants:
+    base = temperature(_calibrator(measured).of_variant())
+    later = next((one for one in measured if one.protocol == "days"), None)
+    if later is None or Variant.RUNNING not in later.variants:
         return (Sharpness(0.0, 1.0),)
     steps: list[Sharpness] = []
-    for age in reversed(later.variants[RUNNING].ages):
+    for age in reversed(by_age(later.of_variant(Variant.RUNNING))):
         least = steps[-1].temperature if steps else 1.0
         steps.append(Sharpness(float(age.grasps_before), max(least, age.temperature / base)))
     return tuple(reversed(steps))
@@ -192,75 +202,79 @@ def _data_sources(files: Sequence[Dataset]) -> dict[str, object]:
     return {**sources, "not_published": not_published}
 
 
-def _card_figures(summary: SystemSummary) -> dict[str, object]:
+def _card_figures(one: Figures) -> dict[str, object]:
     """Return the figures of a protocol that a user of the model needs, slip positive.
 
     `calibrated_by`: F1 by variant of session calibration; empty where no session is left out.
     """
-    main = summary.main
-    several = summary.variants if len(summary.variants) > 1 else {}
+    rows = one.of_variant()
+    several = one.variants if len(one.variants) > 1 else []
     return {
-        "folds": summary.folds,
-        "train_grasps": summary.train_grasps,
-        "test_grasps": summary.test_grasps,
-        "spreads": main.spreads,
-        "temperature": main.temperature,
-        "confusion": main.confusion,
-        "palms": main.palms,
-        "objects": main.objects,
-        "accuracy_at_coverage": main.coverages,
-        "thresholds": main.thresholds,
-        "calibrated_by": {name: variant.spreads["f1"] for name, variant in several.items()},
-        "days": main.days,
+        "folds": one.folds,
+        "train_grasps": float(one.trainings["train_grasps"].mean()),
+        "test_grasps": one.test_grasps,
+        "spreads": {figure: one.spread(figure) for figure in one.scores},
+        "temperature": temperature(rows),
+        "confusion": confusion(rows).tolist(),
+        "f1_interval": one.f1_interval(),
+        "palms": {table: _share(part) for table, part in rows.groupby("table")},
+        "objects": {
+            name: {"share": _share(part), "f1": verdict_figures(part)["f1"]}
+            for name, part in rows.groupby("object")
+        },
+        "accuracy_at_coverage": {f"{share:g}": one.accuracy_at(share) for share in COVERAGES},
+        "calibrated_by": {variant: one.spread(variant=variant) for variant in several},
+        "days": by_day(rows) if one.protocol == "days" else {},
     }
 
 
-def _weak_points(summaries: Sequence[SystemSummary], grasps: Grasps) -> tuple[str, ...]:
+def _share(rows: pd.DataFrame) -> dict[str, object]:
+    return {"grasps": len(rows), "accuracy": float(right(rows).mean())}
+
+
+def _weak_points(measured: Sequence[Figures], grasps: Grasps) -> tuple[str, ...]:
     """Return sentences on what the model cannot do, with figures; `grasps` are trained on."""
     texts = []
-    for summary in summaries:
-        f1 = 100 * summary.main.spreads["f1"].mean
-        if summary.protocol.startswith("objects"):
-            worst = min(summary.main.objects.items(), key=lambda item: item[1].share.accuracy)
+    for one in measured:
+        f1, rows = 100 * one.spread().mean, one.of_variant()
+        if one.protocol.startswith("objects"):
+            shares = right(rows).groupby(rows["object"]).mean()
             texts.append(
-                f"New objects do worse than known ones: F1 {f1:.1f} %; the worst is {worst[0]}, "
-                f"of which {100 * worst[1].share.accuracy:.0f} % are judged rightly."
+                f"New objects do worse than known ones: F1 {f1:.1f} %; the worst is "
+                f"{shares.idxmin()}, of which {100 * shares.min():.0f} % are judged rightly."
             )
-        elif summary.protocol == "days":
-            figures = summary.main.days["all"].every
-            among, missed = figures.slips_among_stable, figures.slips_called_stable
+        elif one.protocol == "days":
+            figures = verdict_figures(rows)
+            among, missed = figures["slips_among_stable"], figures["slips_called_stable"]
             if among is not None and missed is not None:
                 texts.append(
                     f"On days that it was not trained on, with new objects, {100 * among:.0f} % of "
                     f"what it calls stable slips, and {100 * missed:.0f} % of the slips are called "
                     "stable, as long as it is told no outcomes."
                 )
-        elif summary.protocol == "session" and len(summary.variants) > 1:
-            none = 100 * summary.variants["none"].spreads["f1"].mean
+        elif one.protocol == "session" and one.headline != Variant.NONE:
+            none = 100 * one.spread(variant=Variant.NONE).mean
             texts.append(
                 f"On another day it needs the session's grasps: F1 {none:.1f} % without any, "
                 f"{f1:.1f} % with fifty."
             )
-        elif summary.protocol == "session":
-            auc = summary.main.spreads["auc"].mean
+        elif one.protocol == "session":
             texts.append(
                 f"On another day (palm_45: same hand, other palm pose, drifted sensors) F1 is "
-                f"{f1:.1f} %: it still ranks (AUC {auc:.2f}), its zero has moved. What looks "
-                "unlike the training data is refused."
+                f"{f1:.1f} %: it still ranks (AUC {one.spread('auc').mean:.2f}), its zero has "
+                "moved. What looks unlike the training data is refused."
             )
     own = lab_table_names(grasps.files)
-    return (*texts, *(_own_data(grasps, own, summaries) if own else [PUBLISHED_DATA]), *WEAK_POINTS)
+    return (*texts, *(_own_data(grasps, own, measured) if own else [PUBLISHED_DATA]), *WEAK_POINTS)
 
 
-def _own_data(
-    grasps: Grasps, own: Sequence[str], summaries: Sequence[SystemSummary]
-) -> Iterator[str]:
+def _own_data(grasps: Grasps, own: Sequence[str], measured: Sequence[Figures]) -> Iterator[str]:
     objects, tables = len(set(grasps.objects)), sum(file.rows > 0 for file in grasps.files)
     yield (
         f"The data is of {objects} {'object' if objects == 1 else 'objects'} in {tables} "
         f"{'table' if tables == 1 else 'tables'}. Not published: {', '.join(own)}."
     )
-    if any(summary.protocol == "session" for summary in summaries):
+    if any(one.protocol == "session" for one in measured):
         yield "The figures of another day are of the published tables alone."
     else:
         yield "What it is worth on another day than those of its data was not measured."

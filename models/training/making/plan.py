@@ -21,7 +21,7 @@ from graspd.models.training.data.protocols import (
     splits,
 )
 from graspd.models.training.evaluating.broken import left_out
-from graspd.models.training.evaluating.jobs import Job, jobs_of
+from graspd.models.training.evaluating.frame import Job, jobs_of
 from graspd.models.training.systems.registry import SessionFeatures, System
 from graspd.models.zoo import NAME_MAX
 

@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from sklearn.metrics import f1_score
 
 from graspd.models.training.commands.common import progress_bar
 from graspd.models.training.data.datasets import read_all
@@ -33,7 +34,6 @@ from graspd.models.training.evaluating.style import (
     style,
     to_svg,
 )
-from graspd.models.training.evaluating.summaries import VerdictFigures
 from graspd.models.training.reports.reliability import (
     Reliability,
     fitted_scales,
@@ -244,7 +244,7 @@ def _day_f1(day: str, learning: Sequence[Life]) -> DayF1:
     slipped = np.concatenate([one.slipped for one in several])[judged]
     alone = np.concatenate([one.margins for one in several])[judged] >= 0.0
     after = np.concatenate([life.p_slip for life in learning])[judged] >= 0.5
-    f1 = (VerdictFigures.of(called, slipped).f1 for called in (alone, after))
+    f1 = (float(f1_score(slipped, called, zero_division=0.0)) for called in (alone, after))
     return DayF1(day, len(learning), *f1)
 
 

@@ -12,16 +12,17 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 pytest.importorskip("torch", reason="needs the extra `train`")
 
 from graspd.models.training.commands import evaluation
 from graspd.models.training.commands.evaluation import grid_of
-from graspd.models.training.data.datasets import read_all
+from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.estimators.configs import GRIDS, ForestConfig, SvmConfig
-from graspd.models.training.evaluating import jobs
-from graspd.models.training.evaluating.jobs import Job
+from graspd.models.training.evaluating import frame
+from graspd.models.training.evaluating.frame import Job, evaluated, jobs_of, judged
 from graspd.models.training.systems.registry import SYSTEMS
 from tests.kit.inside import graspd
 from tests.models.training.samples import OBJECTS, table, write, write_sessions
@@ -34,6 +35,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     write_sessions(folder, 160)
     return folder
+
+
+def kept(out: Path) -> int:
+    """Number of trainings that are kept in a folder for results."""
+    return len(list((out / "jobs").rglob("output.pkl")))
 
 
 def test_a_table_of_ones_own_is_measured_alone(tmp_path: Path) -> None:
@@ -50,7 +56,7 @@ def test_a_table_of_ones_own_is_measured_alone(tmp_path: Path) -> None:
     assert done.stderr == (
         "graspd evaluate: takes 4 folds: 10 folds need 10 objects, there are 4\n"
     )
-    assert len(list((out / "jobs").iterdir())) == 2 * 4
+    assert kept(out) == 2 * 4
     assert "it needs --data" in graspd("evaluate", *options, "--table", "x.md").stderr
     nothing = graspd("evaluate", "svm-session")
     assert (nothing.returncode, nothing.stderr) == (
@@ -65,11 +71,10 @@ def test_a_quick_run_writes_summaries_and_table(data: Path, tmp_path: Path) -> N
     done = graspd("evaluate", "svm-session", *options)
     assert done.returncode == 0
     protocols = ("cv", "unknown", "objects", "objects-whole", "session", "days")
-    assert {path.name for path in out.glob("*.json")} == {
-        f"svm-session.{protocol}.json" for protocol in protocols
-    }
+    rows = pd.read_parquet(out / "verdicts")
+    assert set(rows["protocol"]) == set(protocols)
     # Unknown has one split, days have two of each of four.
-    assert len(list((out / "jobs").iterdir())) == 4 * 2 + 1 + 8
+    assert kept(out) == 4 * 2 + 1 + 8
     text = table.read_text()
     assert "graspd evaluate svm-session --data DIR --out DIR --quick --table FILE" in text
     assert "mean nothing" in text
@@ -90,13 +95,15 @@ def test_what_is_finished_is_not_run_again(
     def fail(*_: object) -> None:
         pytest.fail("a finished job was run again")
 
-    monkeypatch.setattr(jobs, "run", fail)
+    monkeypatch.setattr(frame, "judged", fail)
     assert json.loads(graspd("evaluate", *options).stdout) == first
-    (summary,) = first
-    assert (summary["system"], summary["protocol"], summary["seeds"]) == ("svm", "cv", [0, 1])
-    assert len(summary["variants"]["none"]["figures"]["f1"]) == 2
-    assert len(summary["variants"]["none"]["figures"]["f1"][0]) == 10
-    assert json.loads((tmp_path / "svm.cv.json").read_text()) == summary
+    assert [(one["seed"], one["fold"]) for one in first] == [
+        (seed, fold) for seed in range(2) for fold in range(10)
+    ]
+    assert {(one["system"], one["protocol"], one["variant"]) for one in first} == {
+        ("svm", "cv", "none")
+    }
+    assert all(0.5 < one["f1"] <= 1.0 for one in first)
 
 
 def test_a_grid_names_the_best_of_all_its_points(
@@ -110,7 +117,7 @@ def test_a_grid_names_the_best_of_all_its_points(
     figures = [point["f1"]["mean"] for point in report]
     assert figures == sorted(figures, reverse=True)
     assert done.stdout.startswith(f"{report[0]['name']} cv: best of 4, F1 ")
-    assert not (tmp_path / "svm.cv.json").exists()
+    assert not (tmp_path / "verdicts").exists()
 
 
 def test_grids_are_the_papers() -> None:
@@ -158,14 +165,18 @@ def test_data_without_a_later_session_have_no_session_protocol(data: Path, tmp_p
     assert graspd("evaluate", *options, "--protocol", "objects-whole").returncode == 0
 
 
-def test_no_cluster_is_exit_code_1_and_says_so(
+def test_no_cluster_is_exit_code_2_and_says_so(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("distributed", reason="needs the extra `cluster`")
-    monkeypatch.setattr(jobs, "CONNECT_TIMEOUT_S", 1)
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError("Timed out")  # a real client would leave a thread running
+
+    monkeypatch.setattr(distributed, "Client", refused)
     options = "--data", data, "--out", tmp_path, "--dask", "tcp://127.0.0.1:9"
     done = graspd("evaluate", "svm", "--quick", *options)
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "graspd evaluate: no Dask scheduler at tcp://127.0.0.1:9" in done.stderr
 
 
@@ -186,7 +197,7 @@ def test_what_is_not_installed_is_said_before_any_training(
 
 
 def test_ctrl_c_ends_processes_with_130_and_leaves_results_of_one_process(
-    data: Path, tmp_path: Path
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command = [sys.executable, "-m", "graspd", "evaluate", "mlp", "--protocol", "cv"]
     options = ["--data", str(data), "--out", str(tmp_path), "--jobs", "2", "--seeds", "30"]
@@ -201,7 +212,7 @@ def test_ctrl_c_ends_processes_with_130_and_leaves_results_of_one_process(
     try:
         # Each process imports torch first: minutes on a busy computer.
         deadline_s = time.monotonic() + 600.0
-        while len(list(tmp_path.glob("jobs/mlp*.npz"))) < 2:
+        while kept(tmp_path) < 2:
             assert time.monotonic() < deadline_s
             time.sleep(0.02)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers, too
@@ -213,12 +224,15 @@ def test_ctrl_c_ends_processes_with_130_and_leaves_results_of_one_process(
     lines = [line for line in errors.splitlines() if "published" not in line]
     # A thread of joblib that was about to hand out a job may complain before.
     assert lines[-1] == "graspd evaluate: interrupted; the same command goes on from here"
-    assert 2 <= len(list((tmp_path / "jobs").iterdir())) < 300
-    grasps = read_all(data)
-    folder, digest = tmp_path / "jobs", grasps.digest()
-    made = [Job(SYSTEMS["mlp"], "cv", 0, fold) for fold in range(10)]
-    job = next(job for job in made if (folder / job.file_name(digest)).exists())
-    stored = jobs.load(folder, job, digest)
-    assert stored is not None
-    expected = jobs.run(job, grasps)
-    assert np.array_equal(stored.margins["none"], expected.margins["none"])
+    assert 2 <= kept(tmp_path) < 300
+    grasps, ran = read_all(data), []
+
+    def counted(job: Job, grasps: Grasps) -> pd.DataFrame:
+        ran.append(job)
+        return judged(job, grasps)
+
+    monkeypatch.setattr(frame, "judged", counted)
+    wanted = jobs_of(SYSTEMS["mlp"], "cv", grasps, [0], 10)
+    found = dict(evaluated(wanted, grasps, tmp_path / "jobs"))
+    job = next(job for job in wanted if job not in ran)
+    np.testing.assert_array_equal(found[job]["margin"], judged(job, grasps)["margin"])

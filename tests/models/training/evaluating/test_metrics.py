@@ -5,87 +5,76 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
 from graspd.models.training.evaluating.metrics import (
     accuracy_at,
     coverage_curve,
-    cross_fitted_p_slip,
+    cross_fitted,
     fit_temperature,
+    interval,
     over_seeds,
-    p_slip,
     paired_difference,
-    reject_threshold,
-    reliability_bins,
     score,
-    wilson,
+    verdict_figures,
 )
 
 # Six verdicts, the surest first: right, right, wrong, right, wrong, right.
-PROBABILITY = np.array([0.99, 0.05, 0.90, 0.80, 0.30, 0.60])
-SLIPPED = np.array([True, False, False, True, True, True])
+PROBABILITY = pd.Series([0.99, 0.05, 0.90, 0.80, 0.30, 0.60])
+SLIPPED = pd.Series([True, False, False, True, True, True])
 
 
 def test_one_class_alone_has_no_auc() -> None:
     result = score(np.array([1.0, -1.0]), np.array([True, True]), np.array([0.9, 0.1]))
-    assert result["auc"] is None
+    assert math.isnan(result["auc"])
     assert (result["accuracy"], result["recall"]) == (0.5, 0.5)
 
 
 def test_spread_over_folds_and_error_over_seeds() -> None:
-    result = over_seeds([[0.8, 1.0], [0.6, 0.8]])
+    result = over_seeds(np.array([[0.8, 1.0], [0.6, 0.8]]))
     # Fold means 0.9 and 0.7; each seed's folds lie 0.1 off their mean; error 0.1 * sqrt(2/2).
     assert result.mean == pytest.approx(0.8)
     assert result.std == pytest.approx(0.1)
     assert result.error == pytest.approx(0.1)
     assert (result.seeds, result.folds) == (2, 2)
-    assert over_seeds([[0.8, 1.0]]).error is None
+    assert over_seeds(np.array([[0.8, 1.0]])).error is None
     # One fold of each seed: the spread is that of the trainings.
-    assert over_seeds([[0.8], [1.0]]).std == pytest.approx(0.1)
+    assert over_seeds(np.array([[0.8], [1.0]])).std == pytest.approx(0.1)
 
 
 def test_a_figure_that_a_fold_lacks_is_left_out() -> None:
-    assert over_seeds([[0.8, None, 0.6]]).mean == pytest.approx(0.7)
-    assert math.isnan(over_seeds([[None, None]]).mean)
+    assert over_seeds(np.array([[0.8, math.nan, 0.6]])).mean == pytest.approx(0.7)
+    assert math.isnan(over_seeds(np.array([[math.nan, math.nan]])).mean)
 
 
 def test_differences_of_overlapping_trainings_are_less_sure_than_they_look() -> None:
-    ours, theirs = [0.95, 0.93, 0.94, 0.96], [0.92, 0.92, 0.92, 0.92]
-    # Differences 3, 1, 2, 4 points: mean 2.5, variance 5/3. Ten folds: test/train = 1/9.
-    mean, error = paired_difference(ours, theirs, 1.0 / 9.0)
+    gaps = np.array([0.03, 0.01, 0.02, 0.04])
+    # Mean 2.5 points, variance 5/3. Ten folds: test/train = 1/9.
+    mean, error = paired_difference(gaps, 1.0 / 9.0)
     assert mean == pytest.approx(0.025)
     assert error == pytest.approx(math.sqrt((1 / 4 + 1 / 9) * 5 / 3) / 100)
-    _, naive = paired_difference(ours, theirs, 0.0)
+    _, naive = paired_difference(gaps, 0.0)
     assert naive == pytest.approx(math.sqrt(5 / 3 / 4) / 100)
-    assert paired_difference([0.9], [0.8], 0.1)[1] is None
+    assert paired_difference(gaps[:1], 0.1)[1] is None
 
 
-@pytest.mark.parametrize(
-    ("right", "grasps", "low", "high"),
-    # Newcombe 1998, Statistics in Medicine 17, table I, method 3 (score without continuity
-    # correction): 81/263, 15/148, 0/20, 1/29.
-    [
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-    ],
-)
-def test_intervals_are_those_of_newcombes_table(
-    right: int, grasps: int, low: float, high: float
-) -> None:
-    result = wilson(right / grasps, grasps)
-    assert result.low == pytest.approx(low, abs=5e-5)
-    assert result.high == pytest.approx(high, abs=5e-5)
+def right_of(*objects: list[int]) -> tuple[pd.Series, pd.Series, pd.Series]:
+    """Verdicts by object, 1 where right: what is right, of what, and the objects."""
+    names = np.repeat(np.arange(len(objects)), [len(verdicts) for verdicts in objects])
+    right = pd.Series(np.concatenate(objects))
+    return right, pd.Series(np.ones(len(right))), pd.Series(names)
 
 
-def test_an_interval_holds_its_share_even_at_the_ends() -> None:
-    for grasps in range(1, 300):
-        for accuracy in (0.0, 1.0):
-            result = wilson(accuracy, grasps)
-            assert 0.0 <= result.low <= accuracy <= result.high <= 1.0
+def test_an_interval_is_that_of_the_objects() -> None:
+    # Objects that are judged alike tell nothing of others: 3 of 4 each.
+    assert interval(*right_of(*[[1, 1, 1, 0]] * 30)) == (0.75, 0.75)
+    # Forty objects, of which ten are always judged wrongly: as forty draws of a coin of 3/4.
+    low, high = interval(*right_of(*[[1] * 50] * 30, *[[0] * 50] * 10))
+    assert (low, high) == pytest.approx(stats.binom.ppf((0.025, 0.975), 40, 0.75) / 40, abs=0.03)
+    # The same grasps ten times say nothing more.
+    assert (low, high) == interval(*right_of(*[[1] * 500] * 30, *[[0] * 500] * 10))
 
 
 def test_the_curve_of_six_verdicts_worked_out_by_hand() -> None:
@@ -98,8 +87,8 @@ def test_the_curve_of_six_verdicts_worked_out_by_hand() -> None:
 
 
 def test_verdicts_of_the_same_confidence_are_judged_or_rejected_together() -> None:
-    probability = np.array([0.9, 0.9, 0.1, 0.6])
-    curve = coverage_curve(probability, np.array([True, True, True, True]), steps=4)
+    probability = pd.Series([0.9, 0.9, 0.1, 0.6])
+    curve = coverage_curve(probability, pd.Series([True, True, True, True]), steps=4)
     assert [point.coverage for point in curve] == [0.75, 1.0]
     assert [point.accuracy for point in curve] == pytest.approx([2 / 3, 3 / 4])
 
@@ -110,57 +99,11 @@ def test_accuracy_at_a_coverage_is_that_of_the_surest() -> None:
     assert accuracy_at(PROBABILITY, SLIPPED, 0.0) == 1.0
 
 
-def test_a_threshold_rejects_as_little_as_the_wanted_accuracy_allows() -> None:
-    random = np.random.default_rng(8)
-    probability = random.random(4000)
-    slipped = random.random(4000) < probability  # calibrated
-    found = reject_threshold(probability, slipped, 0.9)
-    assert found is not None
-    confidence = np.maximum(probability, 1 - probability)
-    right = (probability > 0.5) == slipped
-    judged = confidence >= found.confidence
-    assert found.accuracy == pytest.approx(right[judged].mean())
-    assert found.coverage == pytest.approx(judged.mean())
-    assert found.accuracy >= 0.9
-    lower = [c for c in confidence if c < found.confidence]
-    for c in lower[:200]:
-        several = right[confidence >= c]
-        interval = stats.binomtest(int(several.sum()), len(several)).proportion_ci(method="wilson")
-        assert interval.low < 0.9
-    # Confidences are uniform in 0.5..1, so 0.9 on average means judging from 0.8 on.
-    assert found.confidence == pytest.approx(0.83, abs=0.05)
-    again = reject_threshold(np.tile(probability, 5), np.tile(slipped, 5), 0.9, repeats=5)
-    assert again is not None
-    assert again.confidence == found.confidence
-
-
-def test_confidences_that_say_nothing_set_no_threshold() -> None:
-    """Of verdicts that are right in 92 of 100 cases, however sure, none are in 95 of 100."""
-    random = np.random.default_rng(0)
-    found = 0
-    for _ in range(200):
-        confidence, says_slip = random.uniform(0.5, 1.0, 1000), random.random(1000) < 0.5
-        right = random.random(1000) < 0.92
-        probability = np.where(says_slip, confidence, 1.0 - confidence)
-        found += reject_threshold(probability, says_slip == right, 0.95) is not None
-    assert found <= 10
-
-
-def test_a_few_lucky_verdicts_set_no_threshold() -> None:
-    assert reject_threshold(PROBABILITY, SLIPPED, 0.9) is None
-
-
-def test_reliability_bins_hold_every_grasp_once() -> None:
-    bins = reliability_bins(np.array([0.0, 0.01, 0.5, 1.0]), np.array([False, True, True, True]))
-    assert [number for _, _, number in bins] == [2, 1, 1]
-    assert bins[0][:2] == pytest.approx((0.005, 0.5))
-
-
 def test_scores_take_slip_for_positive() -> None:
     # Verdicts slip, slip, slip, stable, stable against slip, slip, stable, slip, stable.
     values = np.array([1.0, 2.0, 3.0, -1.0, -2.0])
     slipped = np.array([True, True, False, True, False])
-    result = score(values, slipped, p_slip(values))
+    result = score(values, slipped, 1.0 / (1.0 + np.exp(-values)))
     assert result["accuracy"] == pytest.approx(3 / 5)
     assert result["precision"] == pytest.approx(2 / 3)
     assert result["recall"] == pytest.approx(2 / 3)
@@ -173,31 +116,19 @@ def test_a_model_that_never_says_slip_scores_zero_without_complaint() -> None:
     assert [result[name] for name in ("precision", "recall", "f1", "auc")] == [0.0, 0.0, 0.0, 0.5]
 
 
-def margins_of(logits: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Log-odds of slip (N,) of logits (N, 2), order (stable, slip)."""
-    margins: NDArray[np.float64] = logits[:, 1] - logits[:, 0]
-    return margins
-
-
 @pytest.mark.parametrize("true_temperature", [0.5, 1.0, 3.0])
 def test_the_temperature_that_made_the_labels_is_found(true_temperature: float) -> None:
     random = np.random.default_rng(3)
-    logits = random.normal(0.0, 4.0, (40_000, 2))
-    chance = 1.0 / (1.0 + np.exp((logits[:, 0] - logits[:, 1]) / true_temperature))
-    slipped = random.random(40_000) < chance
-    assert fit_temperature(margins_of(logits), slipped) == pytest.approx(true_temperature, rel=0.03)
+    margins = random.normal(0.0, 5.0, 40_000)
+    slipped = random.random(40_000) < 1.0 / (1.0 + np.exp(-margins / true_temperature))
+    assert fit_temperature(margins, slipped) == pytest.approx(true_temperature, rel=0.03)
 
 
 @pytest.mark.parametrize(("sign", "end"), [(1.0, 0.05), (-1.0, 20.0)])
 def test_labels_without_overlap_end_at_a_bound(sign: float, end: float) -> None:
-    logits = sign * np.array([[1.0, 0.0], [0.0, 1.0], [2.0, 0.0], [0.0, 3.0]])
+    margins = sign * np.array([-1.0, 1.0, -2.0, 3.0])
     slipped = np.array([False, True, False, True])
-    assert fit_temperature(margins_of(logits), slipped) == pytest.approx(end)
-
-
-def test_probabilities_of_extreme_logits_are_finite() -> None:
-    logits = np.array([[0.0, 5000.0], [5000.0, 0.0], [1.0, 1.0]])
-    assert p_slip(margins_of(logits)).tolist() == [1.0, 0.0, 0.5]
+    assert fit_temperature(margins, slipped) == pytest.approx(end)
 
 
 def test_scores_of_four_probabilities_are_those_worked_out_by_hand() -> None:
@@ -213,10 +144,27 @@ def test_scores_of_four_probabilities_are_those_worked_out_by_hand() -> None:
 
 def test_a_fold_is_calibrated_by_the_other_folds_alone() -> None:
     random = np.random.default_rng(5)
-    margins, slipped = random.normal(size=300), random.random(300) < 0.5
-    fold_of = np.arange(300) % 3
-    before = cross_fitted_p_slip(margins, slipped, fold_of)
-    other_labels = np.where(fold_of == 1, ~slipped, slipped)
-    after = cross_fitted_p_slip(margins, other_labels, fold_of)
-    assert np.array_equal(before[fold_of == 1], after[fold_of == 1])
-    assert not np.array_equal(before[fold_of == 0], after[fold_of == 0])
+    fold_of = pd.Series(np.arange(300) % 3)
+    rows = pd.DataFrame(
+        {
+            "margin": random.normal(size=300),
+            "slipped": random.random(300) < 0.5,
+            "fold": fold_of,
+        }
+    )
+    before = cross_fitted(rows)
+    after = cross_fitted(rows.assign(slipped=rows["slipped"] ^ (fold_of == 1)))
+    assert before[fold_of == 1].equals(after[fold_of == 1])
+    assert not before[fold_of == 0].equals(after[fold_of == 0])
+
+
+def test_verdicts_are_counted_by_what_they_cost() -> None:
+    slipped = np.array([True] * 4 + [False] * 6)
+    called = np.array([True, True, True, False, True, True, False, False, False, False])
+    figures = verdict_figures(pd.DataFrame({"slipped": slipped, "margin": called - 0.5}))
+    assert figures["f1"] == pytest.approx(2 * 3 / (2 * 3 + 1 + 2))
+    assert figures["slips_among_stable"] == pytest.approx(1 / 5)
+    assert figures["slips_called_stable"] == pytest.approx(1 / 4)
+    assert figures["stable_called_slip"] == pytest.approx(2 / 6)
+    nothing = verdict_figures(pd.DataFrame({"slipped": slipped[:0], "margin": called[:0] - 0.5}))
+    assert (nothing["grasps"], nothing["slips_among_stable"]) == (0, None)

@@ -1,4 +1,4 @@
-"""Summaries and the table: what is published, what was run, and `-` for what was not."""
+"""Figures and the table: what is published, what was run, and `-` for what was not."""
 
 from __future__ import annotations
 
@@ -6,24 +6,31 @@ import dataclasses
 import logging
 import re
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from sklearn.metrics import log_loss
 
 pytest.importorskip("torch", reason="needs the extra `train`")
 
+from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import EvalProtocol, splits
-from graspd.models.training.evaluating.jobs import Job, JobResult
-from graspd.models.training.evaluating.metrics import fit_temperature
-from graspd.models.training.evaluating.results_table import ONE_ROW, difference, results_table
-from graspd.models.training.evaluating.summaries import (
-    SystemSummary,
-    read_summaries,
-    summarise,
-    write_summary,
+from graspd.models.training.evaluating import frame
+from graspd.models.training.evaluating.figures import (
+    Figures,
+    by_age,
+    by_day,
+    read,
+    temperature,
+    with_probability,
+    write,
 )
+from graspd.models.training.evaluating.frame import Job, evaluated, jobs_of
+from graspd.models.training.evaluating.metrics import confusion, fit_temperature
+from graspd.models.training.evaluating.results_table import ONE_ROW, difference, results_table
 from graspd.models.training.fitting.standards import SESSION_VARIANTS
 from graspd.models.training.systems.registry import SYSTEMS, digest
 from tests.models.training.samples import sessions
@@ -38,103 +45,129 @@ def margins_of(name: str, wrong: float) -> NDArray[np.float64]:
     return np.where(flip, -TRUTH, TRUTH)
 
 
-def summary_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) -> SystemSummary:
+def figures_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) -> Figures:
     """A system that is wrong on this share of the grasps, at random."""
     margins = margins_of(name, wrong)
+    several = ("none", "n50", "running") if protocol == "session" else ("none",)
 
-    def result(test: NDArray[np.int64], train: int) -> JobResult:
-        variants = {"none": margins[test]}
-        if protocol == "session":
-            variants |= {"n50": margins[test], "running": margins[test]}
-        ages = {"running": np.arange(len(test))} if protocol == "session" else {}
-        return JobResult(test, variants, train, 2.0, 1000, ages)
+    def trained(job: Job, grasps: Grasps) -> pd.DataFrame:
+        split = splits(protocol, grasps, job.seed, job.folds)[job.fold]
+        parts = [
+            pd.DataFrame({"variant": variant, "grasp": split.test, "margin": margins[split.test]})
+            for variant in several
+        ]
+        return pd.concat(parts, ignore_index=True).assign(
+            refused=pd.NA,
+            age=np.tile(np.arange(len(split.test)), len(several)),
+            fold_name=split.name,
+            train_grasps=len(split.train),
+            parameters=1000,
+            seconds=2.0,
+        )
 
-    found = {
-        Job(SYSTEMS[name], protocol, seed, fold, 4): result(split.test, len(split.train))
-        for seed in range(seeds)
-        for fold, split in enumerate(splits(protocol, GRASPS, seed, 4))
-    }
-    return summarise(found, GRASPS)
+    jobs = jobs_of(SYSTEMS[name], protocol, GRASPS, range(seeds), 4)
+    with pytest.MonkeyPatch.context() as patched, TemporaryDirectory() as folder:
+        patched.setattr(frame, "judged", trained)
+        parts = [rows for _, rows in evaluated(jobs, GRASPS, Path(folder))]
+    return Figures.of(with_probability(pd.concat(parts, ignore_index=True)))
 
 
-def test_a_summary_counts_every_grasp() -> None:
-    made = summary_of("cnn1", "cv", wrong=0.1)
-    (stable, false_alarm), (missed, slip) = made.main.confusion
+def test_figures_count_every_grasp() -> None:
+    made = figures_of("cnn1", "cv", wrong=0.1)
+    (stable, false_alarm), (missed, slip) = confusion(made.of_variant())
     assert stable + false_alarm == 2 * int((~GRASPS.slipped[:400]).sum())
     assert missed + slip == 2 * int(GRASPS.slipped[:400].sum())
-    accuracy = (stable + slip) / 800
-    assert made.main.spreads["accuracy"].mean == pytest.approx(accuracy)
-    assert sum(one.share.grasps for one in made.main.objects.values()) == 400
-    assert {name: palm.grasps for name, palm in made.main.palms.items()} == {
-        "palm_down": 200,
-        "palm_side": 200,
-    }
-    assert sum(number for _, _, number in made.main.bins) == 800
-    assert (made.seeds, made.folds, made.train_grasps) == ((0, 1), 4, 300.0)
-    assert made.seconds == pytest.approx(16.0)
+    assert made.spread("accuracy").mean == pytest.approx((stable + slip) / 800)
+    assert made.rows["table"].value_counts().to_dict() == {"palm_down": 400, "palm_side": 400}
+    assert (made.seeds, made.folds, made.test_grasps) == ([0, 1], 4, 100.0)
+    assert set(made.trainings["train_grasps"]) == {300}
+    low, high = made.f1_interval()
+    assert low < made.spread().mean < high
 
 
 def test_probabilities_are_calibrated_by_the_other_folds() -> None:
-    made = summary_of("cnn1", "cv", wrong=0.1)
+    made = figures_of("cnn1", "cv", wrong=0.1)
     # Margins of +-2, right nine times in ten: log-odds of 0.9 are 2.2, so T is about 2 / 2.2.
-    assert made.main.temperature == pytest.approx(2.0 / np.log(9.0), rel=0.2)
-    assert made.main.spreads["ece"].mean < 0.06
+    assert temperature(made.of_variant()) == pytest.approx(2.0 / np.log(9.0), rel=0.2)
+    assert made.spread("ece").mean < 0.06
     first, *others = (split.test for split in splits("cv", GRASPS, 0, 4))
     rest, margins = np.concatenate(others), margins_of("cnn1", wrong=0.1)
-    temperature = fit_temperature(margins[rest], GRASPS.slipped[rest])
-    probability = 1.0 / (1.0 + np.exp(-margins[first] / temperature))
+    of_rest = fit_temperature(margins[rest], GRASPS.slipped[rest])
+    probability = 1.0 / (1.0 + np.exp(-margins[first] / of_rest))
     expected = log_loss(GRASPS.slipped[first], probability)
-    assert made.main.figures["log_loss"][0][0] == pytest.approx(expected)
+    assert made.folds_of("log_loss").loc[0, 0] == pytest.approx(expected)
 
 
 def test_a_single_split_is_calibrated_by_its_other_objects() -> None:
-    made = summary_of("cnn1", "unknown", wrong=0.1)
+    made = figures_of("cnn1", "unknown", wrong=0.1)
     assert made.folds == 1
-    assert made.main.spreads["ece"].mean < 0.06
-    assert len(made.main.objects) == 8
+    assert made.spread("ece").mean < 0.06
+    assert made.rows["object"].nunique() == 8
 
 
 def test_fifty_grasps_speak_for_a_calibrated_session() -> None:
-    made = summary_of("svm-session", "session", wrong=0.2)
+    made = figures_of("svm-session", "session", wrong=0.2)
     assert made.headline == "n50"
-    assert [age.grasps_before for age in made.variants["running"].ages] == [0, 5, 10, 20]
-    assert not made.main.ages
+    ages = by_age(made.of_variant("running"))
+    assert [age.grasps_before for age in ages] == [0, 5, 10, 20]
 
 
-def test_a_summary_comes_back_from_its_file(tmp_path: Path) -> None:
-    made = summary_of("cnn1", "cv", wrong=0.1)
-    write_summary(made, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["cnn1.cv.json"]
-    digests = {"cnn1": digest(SYSTEMS["cnn1"])}
-    assert read_summaries(tmp_path, GRASPS.digest(), digests) == [made]
+def test_each_stream_is_counted_for_itself_and_the_refused_apart() -> None:
+    parts = []
+    for split in splits("days", GRASPS, 0, 2):
+        test = split.test
+        table = np.array([file.name for file in GRASPS.files])[GRASPS.table_of[test]]
+        sign = -1.0 if split.name.startswith("B") else 1.0
+        parts.append(
+            pd.DataFrame(
+                {
+                    "fold_name": split.name,
+                    "margin": sign * TRUTH[test],
+                    "slipped": GRASPS.slipped[test],
+                    "table": table,
+                    "refused": pd.array(table == "palm_45", dtype="boolean"),
+                }
+            )
+        )
+    found = by_day(pd.concat(parts, ignore_index=True))
+    rights = [found[name]["every"]["f1"] for name in ("A palm_45", "B palm_down", "C palm_side")]
+    assert rights == [1.0, 0.0, 1.0]
+    first = found["A palm_45"]
+    assert (first["every"]["grasps"], first["coverage"]) == (200, 0.0)
+    assert first["judged"]["slips_among_stable"] is None
+    assert first["refused_slipped"] == pytest.approx(GRASPS.slipped[400:].mean())
+    assert found["A and C"]["coverage"] == pytest.approx(2 / 3)
+    assert found["B palm_side"]["every"]["slips_called_stable"] == 1.0
+    slips = int(GRASPS.slipped[:400].sum())
+    every = 2 * slips + int(GRASPS.slipped[400:].sum())
+    assert found["all"]["every"]["slips_called_stable"] == pytest.approx(slips / every)
 
 
-def test_a_summary_of_other_data_or_configuration_is_left_out(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    made = summary_of("cnn1", "cv", wrong=0.1)
-    write_summary(made, tmp_path)
-    write_summary(dataclasses.replace(made, system="cnn2"), tmp_path)
-    write_summary(dataclasses.replace(made, system="cnn3", data="other"), tmp_path)
-    (tmp_path / "rf.cv.json").write_text("{")
+def test_rows_come_back_from_their_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    made = figures_of("cnn1", "cv", wrong=0.1)
+    write(made, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["cnn1.cv.parquet"]
+    for name, other in (("cnn2", {"system": "cnn2"}), ("cnn3", {"data": "other"})):
+        write(dataclasses.replace(made, rows=made.rows.assign(protocol=name, **other)), tmp_path)
+    (tmp_path / "rf.cv.parquet").write_text("{")
     digests = {name: digest(system) for name, system in SYSTEMS.items()}
     with caplog.at_level(logging.WARNING):
-        found = read_summaries(tmp_path, GRASPS.digest(), digests)
-    assert found == [made]
+        (found,) = read(tmp_path, GRASPS.digest(), digests)
     assert len(caplog.records) == 3
+    pd.testing.assert_frame_equal(found.scores, made.scores)
 
 
 def rows(text: str, section: int) -> list[list[str]]:
     """Cells of the table's rows in a numbered section."""
     part = text.split("\n## ")[section]
-    lines = [line for line in part.splitlines() if line.startswith("| ")]
+    lines = [line for line in part.splitlines() if line.startswith("| ") and "| --- |" not in line]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
 def test_the_papers_figures_stand_beside_ours() -> None:
-    ours = summary_of("cnn1", "cv", wrong=0.1)
-    f1 = ours.main.spreads["f1"]
-    text = results_table([ours], *MADE)
+    ours = figures_of("cnn1", "cv", wrong=0.1)
+    f1 = ours.spread()
+    text = results_table([ours], GRASPS, *MADE)
     first = rows(text, 1)
     assert "## Findings" not in text
     found = {(row[0], row[1], row[2]): row[3:] for row in first}
@@ -171,14 +204,14 @@ PUBLISHED = [
 
 
 def test_every_published_row_is_there_even_if_nothing_was_run() -> None:
-    shown = rows(results_table([], *MADE), 1)
+    shown = rows(results_table([], GRASPS, *MADE), 1)
     for system, protocol, figure, paper in PUBLISHED:
         assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-"] in shown
 
 
 def test_the_document_says_itself_how_one_row_is_made_again() -> None:
     kept = (Path(__file__).parents[4] / "models/RESULTS.md").read_text()
-    for text in (kept, results_table([], *MADE)):
+    for text in (kept, results_table([], GRASPS, *MADE)):
         command, sentence, *_ = text.split("## How this was made\n\n")[1].split("\n\n")
         assert command.startswith("    graspd evaluate ")
         assert sentence == ONE_ROW
@@ -186,11 +219,11 @@ def test_the_document_says_itself_how_one_row_is_made_again() -> None:
 
 def test_a_finding_has_the_figures_of_the_tables() -> None:
     tried = [("cnn1", 0.1), ("svm", 0.05), ("mlp", 0.2), ("rf", 0.3)]
-    made = {name: summary_of(name, "cv", wrong) for name, wrong in tried}
-    text = results_table(list(made.values()), *MADE)
+    made = {name: figures_of(name, "cv", wrong) for name, wrong in tried}
+    text = results_table(list(made.values()), GRASPS, *MADE)
     (finding,) = re.findall(r"^- \*\*.*$", text, re.MULTILINE)
     for name, one in made.items():
-        f1 = one.main.spreads["f1"]
+        f1 = one.spread()
         assert f"`{name}` {100 * f1.mean:.1f} +- {100 * f1.std:.1f}" in finding
     mean, _ = difference(made["svm"], made["cnn1"]) or (0.0, None)
     assert f"`svm` {100 * mean:+.1f} +- " in finding
@@ -199,47 +232,48 @@ def test_a_finding_has_the_figures_of_the_tables() -> None:
 
 
 def test_sessions_are_told_by_the_number_of_grasps() -> None:
-    ours = summary_of("svm-session", "session", wrong=0.2)
-    _, row, *_ = rows(results_table([ours], *MADE), 3)
-    f1 = ours.main.spreads["f1"]
+    ours = figures_of("svm-session", "session", wrong=0.2)
+    _, row, *_ = rows(results_table([ours], GRASPS, *MADE), 3)
+    f1 = ours.spread()
     value = f"{100 * f1.mean:.1f} +- {100 * f1.std:.1f}"
     assert row == ["`svm-session`", value, "-", "-", "-", value, "-", value, "-"]
 
 
 def test_differences_are_taken_fold_by_fold_on_common_seeds() -> None:
-    good, bad = summary_of("cnn2", "cv", 0.05, seeds=3), summary_of("cnn1", "cv", 0.15, seeds=2)
+    good, bad = figures_of("cnn2", "cv", 0.05, seeds=3), figures_of("cnn1", "cv", 0.15, seeds=2)
     mean, error = difference(good, bad) or (0.0, None)
     assert error is not None
-    figures = [np.array(each.main.figures["f1"])[:2] for each in (good, bad)]
+    figures = [each.folds_of("f1").to_numpy()[:2] for each in (good, bad)]
     gaps = (figures[0] - figures[1]).ravel()
     assert len(gaps) == 8
     assert mean == pytest.approx(gaps.mean())
     # Four folds: 100 judged, 300 trained on.
     assert error == pytest.approx(np.sqrt((1 / 8 + 1 / 3) * gaps.var(ddof=1)))
-    fifth = rows(results_table([bad, good], *MADE), 5)
+    fifth = rows(results_table([bad, good], GRASPS, *MADE), 5)
     cell = f"{100 * mean:+.1f} +- {100 * error:.1f}"
     assert ["`cnn2`", "`cv`", cell, "-"] in fifth
 
 
-def test_other_data_are_not_compared() -> None:
-    one = summary_of("cnn1", "cv", 0.1)
-    assert difference(one, dataclasses.replace(one, data="other")) is None
-    assert difference(one, dataclasses.replace(one, seeds=(8, 9))) is None
+def test_only_the_same_splits_are_compared() -> None:
+    one, alone = figures_of("cnn1", "cv", 0.1), figures_of("cnn2", "unknown", 0.1)
+    other = one.scores.rename(index={0: 8, 1: 9}, level="seed")
+    assert difference(one, dataclasses.replace(one, scores=other)) is None
+    assert difference(one, alone) is None
 
 
 def test_the_table_says_how_it_was_made() -> None:
-    text = results_table([summary_of("cnn1", "cv", wrong=0.1)], *MADE)
+    text = results_table([figures_of("cnn1", "cv", wrong=0.1)], GRASPS, *MADE)
     assert "    graspd evaluate --data DIR\n" in text
     assert "8 trainings, 16 s in all on one thread each." in text
     assert "machine a desk, numpy 2." in text
     assert f"- `palm_down.csv` {GRASPS.files[0].sha256}, 200" in text
     assert "--quick" not in text
-    assert "mean nothing" in results_table([], *MADE, quick=True)
+    assert "mean nothing" in results_table([], GRASPS, *MADE, quick=True)
 
 
 def test_every_row_has_as_many_cells_as_its_header() -> None:
-    made = [summary_of("cnn1", "cv", 0.1), summary_of("svm-session", "session", 0.2)]
-    text = results_table(made, *MADE)
+    made = [figures_of("cnn1", "cv", 0.1), figures_of("svm-session", "session", 0.2)]
+    text = results_table(made, GRASPS, *MADE)
     width = 0
     for before, line in zip(["", *text.splitlines()], text.splitlines(), strict=False):
         if line.startswith("|"):
@@ -253,12 +287,13 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     pytest.importorskip("matplotlib", reason="needs the extra `report`")
     from graspd.models.training.evaluating import plots
 
-    session = summary_of("svm-session", "session", 0.2)
-    every = dict.fromkeys(SESSION_VARIANTS, session.variants["n50"])
+    session = figures_of("svm-session", "session", 0.2)
+    of_n50 = session.of_variant("n50")
+    every = [of_n50.assign(variant=str(variant)) for variant in SESSION_VARIANTS]
     made = [
-        summary_of("cnn1", "cv", 0.1),
-        summary_of("cnn2", "cv", 0.0),
-        dataclasses.replace(session, variants=every),
+        figures_of("cnn1", "cv", 0.1),
+        figures_of("cnn2", "cv", 0.0),
+        Figures.of(pd.concat(every, ignore_index=True)),
     ]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(plots, "DPI", 20)

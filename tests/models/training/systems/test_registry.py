@@ -15,8 +15,7 @@ from graspd.models import zoo
 from graspd.models.contract import VectorInput
 from graspd.models.runtime import TactileModel
 from graspd.models.training.estimators.configs import CNN1, PublishedRecipe, Recipe, SvmConfig
-from graspd.models.training.evaluating import jobs
-from graspd.models.training.evaluating.jobs import Job
+from graspd.models.training.evaluating.frame import Job, judged
 from graspd.models.training.making.make_model import make_model
 from graspd.models.training.making.plan import TrainingPlan
 from graspd.models.training.systems.registry import (
@@ -119,12 +118,11 @@ def test_what_the_other_fingers_feel_changes_nothing() -> None:
     other = replace(grasps, counts=grasps.counts.copy())
     other.counts[:, 1] = 3000
     job = Job(with_recipes(SYSTEMS["small-session-ff-th"], epochs=1), "cv", 0, 0, 3)
-    one, two = (jobs.run(job, sample) for sample in (grasps, other))
-    for name, margins in one.margins.items():
-        np.testing.assert_array_equal(margins, two.margins[name])
+    one, two = (judged(job, sample) for sample in (grasps, other))
+    np.testing.assert_array_equal(one["margin"], two["margin"])
 
     whole = Job(with_recipes(SYSTEMS["small-session"], epochs=1), "cv", 0, 0, 3)
-    assert one.parameters < jobs.run(whole, grasps).parameters
+    assert one["parameters"].max() < judged(whole, grasps)["parameters"].min()
 
 
 def test_a_model_of_two_fingers_takes_the_features_of_two(tmp_path: Path) -> None:
