@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,8 @@ SHOWN = {
     "each other day": ("days",),
 }
 """Columns of the list: the first of these protocols that a card has."""
+SYSTEMS = "graspd.models.training.systems.registry"
+"""Module with what can be trained; it needs no library of the training."""
 LEFT_COLUMNS = 2
 """Columns of the list that begin at the left: name and fingers."""
 
@@ -67,6 +70,9 @@ def _content_of(what: str) -> dict[str, Any]:
     """Return the card of a name or a file, as it is."""
     if what in zoo.names():
         return _card_of(zoo.find(what))
+    if what in importlib.import_module(SYSTEMS).SYSTEMS:
+        made_by = f"`graspd train {what} --data DIR`, or --own FILE, makes it (extra `train`)"
+        raise ModelError(f"{what} is a system that graspd does not ship: {made_by}")
     is_file = what.endswith(".onnx") or os.sep in what
     return trial.card(Path(what) if is_file else zoo.find(what))
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from graspd.models.training.commands.common import add_shared_arguments, exit_code, whole
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS
+from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.training.systems.registry import SYSTEMS
 
 
@@ -52,6 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write the table of all results in --out beside the paper's; needs --data",
     )
+    parser.add_argument(
+        "--list",
+        action="store_true",
+        help="say of each system what it is, which row of the paper it answers, and the command "
+        "that makes that row",
+    )
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw them into this folder")
     parser.add_argument("--json", action="store_true", help="print figures of each fold as JSON")
 
@@ -59,6 +67,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate; what is finished is kept and not run again.
     Returns 0, 1 (a worker was lost), 2 (input or folder), 130 (Ctrl-C)."""
+    if args.list:
+        from graspd.models.training.systems.explained import TITLES, explained
+
+        sys.stdout.write("\n".join(markdown_table(TITLES, explained())) + "\n")
+        return 0
     from graspd.models.training.commands.evaluation import evaluate
     from graspd.models.training.evaluating.frame import LostWorkerError
 

@@ -26,7 +26,7 @@ class Verdicts:
     margins: Floats
     """Uncalibrated log-odds of slip."""
     refused: Bools | None = None
-    """What the daemon would call `unknown`; None: not known."""
+    """Grasps that the daemon would call `unknown`; None: not known."""
     ages: Ints | None = None
     """Grasps that the running session had before each one; None: there is no such session."""
 

@@ -1,6 +1,6 @@
 """Judge held-out grasps by trained systems: one table, with a row for each verdict.
 
-What is judged is kept by `joblib.Memory`. `joblib.parallel_config` says where trainings run: in
+`joblib.Memory` keeps the verdicts. `joblib.parallel_config` says where trainings run: in
 processes, or on a Dask cluster.
 """
 
@@ -73,7 +73,7 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
 
     Columns: `variant`; `grasp`, its index in `grasps`; `margin`, the uncalibrated log-odds of slip;
     `refused`, true if the daemon would call it `unknown` (only `days` tells); `age`, the grasps
-    that its running session had before. Of the training: `fold_name`, `train_grasps`, `parameters`
+    that its running session had before. The training has `fold_name`, `train_grasps`, `parameters`
     (numbers that the trained system consists of) and `seconds` (with judging).
 
     Depends on the arguments alone, whatever runs beside it. Raises `TooFewGraspsError` if the data

@@ -9,9 +9,10 @@ from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from graspd.models.training.evaluating.figures import GROUPS, Figures, by_age, by_day
 from graspd.models.training.evaluating.files import markdown_table
-from graspd.models.training.evaluating.findings import FINDINGS, HOW_SURE
+from graspd.models.training.evaluating.findings import FINDINGS, HOW_SURE, SEALED
 from graspd.models.training.evaluating.metrics import Spread, paired_difference
 from graspd.models.training.fitting.standards import SESSION_VARIANTS, Variant
+from graspd.models.training.systems.explained import TITLES, explained
 from graspd.models.training.systems.registry import SYSTEMS, PaperFigure, System
 
 NOT_RUN = "-"
@@ -53,6 +54,8 @@ def results_table(
         _days(by_group),
         _differences(by_group),
         _everything(several),
+        _explained(),
+        _sealed(),
         _how(several, grasps, command, made_with),
     )
     return "\n\n".join(paragraph for section in sections for paragraph in section) + "\n"
@@ -279,6 +282,27 @@ def _everything(several: Sequence[Figures]) -> Iterator[str]:
     ]
     titles = ("system", "protocol", "accuracy", "precision", "recall", "AUC", "ECE", "at 80 %")
     yield _table((*titles, "seeds", "s"), rows)
+
+
+def _explained() -> Iterator[str]:
+    yield "## 7. Systems in words"
+    yield (
+        "The place is that of the row in the paper (arXiv:1809.05551), which has its results in "
+        "table III, figure 4 and sections III-B, III-C and III-E. Each command makes the row of "
+        "one seed; minutes are of two cores. `graspd evaluate --list` prints this table."
+    )
+    rows = [
+        (f"`{name}`", *words, f"`{command}`", time) for name, *words, command, time in explained()
+    ]
+    yield _table(TITLES, rows)
+
+
+def _sealed() -> Iterator[str]:
+    text, titles, rows, commands = SEALED
+    yield "## 8. The sealed day"
+    yield text
+    yield _table(titles, rows)
+    yield commands
 
 
 def _how(

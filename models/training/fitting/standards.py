@@ -17,10 +17,10 @@ CALIBRATED_FROM = 20.0
 
 
 class Variant(StrEnum):
-    """What standardises the features of a grasp that is judged."""
+    """Grasps whose statistics standardise the features of a judged grasp."""
 
     NONE = "none"
-    """Nothing of its session: the training's statistics, or no session model at all."""
+    """No grasps of its session: those of the training, or no session model at all."""
     N5 = "n5"
     """Five unlabelled grasps of its session, and of other objects, drawn at random."""
     N10 = "n10"

@@ -75,6 +75,8 @@ Estimator = NetworkConfig | ClassicalConfig | BlendConfig
 class PaperFigure:
     """A figure of the paper, %, slip positive: mean and standard deviation."""
 
+    place: str
+    """Table, figure or section of the paper (arXiv:1809.05551), and the row."""
     protocol: EvalProtocol
     f1: tuple[float, float]
     accuracy: tuple[float, float] | None = None
@@ -176,15 +178,18 @@ def cnn(
     return System(name, description, takes, network, recipe, augmentation, published=published)
 
 
-_CNN1_FIGURES = (PaperFigure("cv", (94.2, 0.8)), PaperFigure("unknown", (87.7, 0.4)))
-_CNN3_FIGURES = PaperFigure("cv", (92.2, 2.0))
+_CNN1_FIGURES = (
+    PaperFigure("figure 4, CNN1", "cv", (94.2, 0.8)),
+    PaperFigure("III-E, CNN1", "unknown", (87.7, 0.4)),
+)
+_CNN3_FIGURES = PaperFigure("figure 4, CNN3", "cv", (92.2, 2.0))
 
 _PAPER = (
     cnn(
         "cnn0",
         "Conv32 - FC128 on the D1 image, neighbour mean, fingers as channels.",
         CNN0,
-        PaperFigure("cv", (92.6, 1.7)),
+        PaperFigure("III-B, neighbour mean; III-C, channels", "cv", (92.6, 1.7)),
     ),
     cnn(
         "cnn1",
@@ -192,7 +197,12 @@ _PAPER = (
         CNN1,
         *_CNN1_FIGURES,
     ),
-    cnn("cnn2", "Conv32 - MaxPool2 - FC1024.", CNN2, PaperFigure("cv", (92.0, 2.0))),
+    cnn(
+        "cnn2",
+        "Conv32 - MaxPool2 - FC1024.",
+        CNN2,
+        PaperFigure("figure 4, CNN2", "cv", (92.0, 2.0)),
+    ),
     cnn(
         "cnn3",
         "Conv32 - MaxPool2 - Conv64 (1 x 1, as in the notebooks) - FC1024.",
@@ -216,7 +226,7 @@ _PAPER = (
         "cnn1-augmented",
         "CNN1 for new objects as published: flips and rotations, dropout, 30 epochs.",
         replace(CNN1, dropout=0.25),
-        PaperFigure("unknown", (90.1, 0.4)),
+        PaperFigure("III-E, CNN1 augmented", "unknown", (90.1, 0.4)),
         recipe=PublishedRecipe(epochs=30, l2=0.015),
         augmentation=Augmentation(),
     ),
@@ -236,7 +246,7 @@ _PAPER = (
         "Support vector machine on the 72 z-scored counts.",
         VECTOR,
         SvmConfig(c=3.0, gamma=0.1),
-        published=(PaperFigure("cv", (88.0, 2.9)),),
+        published=(PaperFigure("figure 4, SVM", "cv", (88.0, 2.9)),),
     ),
     System("mlp", "Multi-layer perceptron on the 72 z-scored counts.", VECTOR, MlpConfig((300,))),
     System(
@@ -244,11 +254,14 @@ _PAPER = (
         "Random forest on the 72 z-scored counts.",
         VECTOR,
         ForestConfig(101, None),
-        published=(PaperFigure("cv", (92.6, 1.5)), PaperFigure("unknown", (90.2, 0.5))),
+        published=(
+            PaperFigure("figure 4, RF", "cv", (92.6, 1.5)),
+            PaperFigure("III-E, RF", "unknown", (90.2, 0.5)),
+        ),
     ),
 )
 
-_D2_FIGURES = PaperFigure("cv", (89.7, 1.5), (89.6, 1.7))
+_D2_FIGURES = PaperFigure("table III, D2", "cv", (89.7, 1.5), (89.6, 1.7))
 _LAYOUTS = tuple(
     cnn(
         f"cnn0-{layout.name.lower()}-{Fill.LEAST_CONTACT.value}",
@@ -258,20 +271,23 @@ _LAYOUTS = tuple(
         takes=image(layout.name, Fill.LEAST_CONTACT),
     )
     for layout, published in (
-        (D1, PaperFigure("cv", (91.0, 1.4), (90.9, 1.5), (90.4, 2.4), (91.6, 2.4))),
+        (
+            D1,
+            PaperFigure("table III, D1", "cv", (91.0, 1.4), (90.9, 1.5), (90.4, 2.4), (91.6, 2.4)),
+        ),
         (D2A, _D2_FIGURES),
         (D2B, _D2_FIGURES),
-        (D3, PaperFigure("cv", (89.7, 1.4), (89.7, 1.3))),
+        (D3, PaperFigure("table III, D3", "cv", (89.7, 1.4), (89.7, 1.3))),
     )
 )
-"""CNN0 on the images of the paper's table I."""
+"""CNN0 on the images of the paper's table III."""
 
 _COMPOSITIONS = tuple(
     cnn(
         f"cnn0-{composition.value}",
         f"CNN0 on one image with the fingers {where}.",
         CNN0,
-        PaperFigure("cv", f1),
+        PaperFigure(f"III-C, {composition.value}", "cv", f1),
         takes=image(composition=composition),
     )
     for composition, where, f1 in (
@@ -279,7 +295,7 @@ _COMPOSITIONS = tuple(
         (Composition.VERTICAL, "below one another", (92.3, 1.8)),
     )
 )
-"""CNN0 on the images of the paper's table II, beside `cnn0` itself."""
+"""CNN0 on the images of the paper's section III-C, beside `cnn0` itself."""
 
 _ELECTRODES = (
     System(

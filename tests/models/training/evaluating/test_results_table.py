@@ -28,6 +28,7 @@ from graspd.models.training.evaluating.figures import (
     with_probability,
     write,
 )
+from graspd.models.training.evaluating.findings import HOW_SURE
 from graspd.models.training.evaluating.frame import Job, evaluated, jobs_of
 from graspd.models.training.evaluating.metrics import confusion, fit_temperature
 from graspd.models.training.evaluating.results_table import ONE_ROW, difference, results_table
@@ -181,7 +182,7 @@ def test_the_papers_figures_stand_beside_ours() -> None:
     assert all(row[1:] == ["-", "-"] for key, row in found.items() if key[0] != "system")
 
 
-# arXiv:1809.05551: tables I to IV.
+# arXiv:1809.05551: table III, figure 4 and sections III-B, III-C, III-E.
 PUBLISHED = [
     ("cnn0-d1-least-contact", "cv", "F1", "91.0 +- 1.4"),
     ("cnn0-d1-least-contact", "cv", "accuracy", "90.9 +- 1.5"),
@@ -211,10 +212,28 @@ def test_every_published_row_is_there_even_if_nothing_was_run() -> None:
 
 def test_the_document_says_itself_how_one_row_is_made_again() -> None:
     kept = (Path(__file__).parents[4] / "models/RESULTS.md").read_text()
-    for text in (kept, results_table([], GRASPS, *MADE)):
+    made = results_table([], GRASPS, *MADE)
+    for text in (kept, made):
         command, sentence, *_ = text.split("## How this was made\n\n")[1].split("\n\n")
         assert command.startswith("    graspd evaluate ")
         assert sentence == ONE_ROW
+    in_words = made[made.index("## 7.") : made.index("## How")]
+    assert in_words in kept
+    assert HOW_SURE in kept
+
+
+def test_the_minutes_are_those_of_the_trainings() -> None:
+    kept = (Path(__file__).parents[4] / "models/RESULTS.md").read_text()
+    seconds = {(row[0], row[1]): float(row[-1]) for row in rows(kept, 7)[1:]}
+    for system, _, _, _, command, minutes in rows(kept, 8)[1:]:
+        protocol = command.split(" --protocol ")[1].split()[0]
+        took = seconds.get((system, f"`{protocol}`"))
+        if took is None:
+            assert "small-session-" in system
+        elif protocol == "unknown":  # one training
+            assert float(minutes) == pytest.approx(max(1.0, took / 60.0), abs=0.51)
+        else:  # ten trainings, two at a time
+            assert float(minutes) == pytest.approx(max(1.0, took * 10 / 2 / 60.0), abs=0.51)
 
 
 def test_a_finding_has_the_figures_of_the_tables() -> None:
