@@ -122,9 +122,10 @@ def survey(
             problem = "the rows have times: --rate-hz is for --as stream, which leaves them out"
             raise RecordingError(path, problem, column=columns.time.name)
         rows.refuse_degrees()
-        layout = _stream(rows, rate_hz if read_as == "stream" else None)
-        if layout.rate_hz is None:
-            _refuse_slow(rows, layout, read_as)
+        if columns.time is None or rate_hz is not None:
+            layout = Layout(columns, is_stream=True, rate_hz=rate_hz)
+        else:
+            layout = _timed(rows, columns.time, read_as)
     else:
         _refuse_sweeps(rows, read_as)
         layout = Layout(columns, is_stream=False)
@@ -234,29 +235,21 @@ def time_value(
     return None if rest_ns is None else value + rest_ns * 1e-9
 
 
-def _stream(rows: _Rows, rate_hz: float | None) -> Layout:
-    """Return the layout of a stream. Raises `RecordingError` if its times mean little."""
-    column = rows.columns.time
-    if column is None or rate_hz is not None:
-        return Layout(rows.columns, is_stream=True, rate_hz=rate_hz)
+def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float) -> float:
+    """Return the unit of times, s: as it is called, as large times have, or as steps are usual."""
     if column.unit_s is not None or rows.is_clock(column):
-        return Layout(rows.columns, is_stream=True, unit_s=column.unit_s or 1.0)
-    times = rows.times(column)
-    step = _median_step(times)
+        return column.unit_s or 1.0
     usual = [unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if STEP_S[0] <= step * unit <= STEP_S[1]]
     largest = max(map(abs, times), default=0.0)
     epoch = next((unit for least, unit in EPOCHS if largest > least), None)
-    unit = epoch or (usual[0] if usual else 1.0)
-    return Layout(rows.columns, is_stream=True, unit_s=unit)
+    return epoch or (usual[0] if usual else 1.0)
 
 
-def _refuse_slow(rows: _Rows, layout: Layout, read_as: ReadAs | None) -> None:
-    """Raise if the times are those of grasps, or none at all."""
-    column = rows.columns.time
-    if column is None:
-        return
+def _timed(rows: _Rows, column: TimeColumn, read_as: ReadAs | None) -> Layout:
+    """Return the layout of rows with times. Raises if these are of grasps, or none at all."""
     times = rows.times(column)
     step = _median_step(times)
+    layout = Layout(rows.columns, is_stream=True, unit_s=_unit_s(rows, column, times, step))
     is_read = len(times) >= FEW_ROWS
     if is_read and step == 0.0:
         problem = (
@@ -272,7 +265,7 @@ def _refuse_slow(rows: _Rows, layout: Layout, read_as: ReadAs | None) -> None:
         )
         raise RecordingError(rows.path, problem, column=column.name)
     if read_as is not None or len(times) < 2:
-        return
+        return layout
     is_known = layout.unit_s == 1.0 or column.unit_s is not None or abs(times[0]) > EPOCHS[-1][0]
     step_s = step * layout.unit_s
     if step_s >= SLOWEST_S or not (is_known or rows.follow_each_other()):
@@ -281,6 +274,7 @@ def _refuse_slow(rows: _Rows, layout: Layout, read_as: ReadAs | None) -> None:
             f"{step_s:g} s apart (--as stream)?"
         )
         raise RecordingError(rows.path, problem, column=column.name)
+    return layout
 
 
 def _refuse_sweeps(rows: _Rows, read_as: ReadAs | None) -> None:
