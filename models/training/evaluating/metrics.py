@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.special import expit
 from sklearn.metrics import (
     accuracy_score,
     brier_score_loss,
@@ -84,6 +83,13 @@ def _ece(probability: Floats, slipped: Bools) -> float:
     return float(np.abs(gaps).sum() / len(probability))
 
 
+def p_slip(margins: Floats, temperature: float) -> Floats:
+    """Return sigmoid(margin / temperature) of margins (N,): as sure of slip as of stable."""
+    small = np.exp(-np.abs(margins / temperature))
+    probability: Floats = np.where(margins >= 0.0, 1.0, small) / (1.0 + small)
+    return probability
+
+
 def fit_temperature(margins: Floats, slipped: Bools) -> float:
     """Return the T that makes sigmoid(margin / T) most likely, of margins (N,) and labels (N,).
     The grasps must not have been trained on."""
@@ -91,7 +97,7 @@ def fit_temperature(margins: Floats, slipped: Bools) -> float:
     for _ in range(HALVINGS):
         middle = (low + high) / 2.0
         # The likelihood is concave in 1/T; its slope there says on which side of T the peak is.
-        slope = np.mean((slipped - expit(margins / np.exp(middle))) * margins)
+        slope = np.mean((slipped - p_slip(margins, np.exp(middle))) * margins)
         low, high = (low, middle) if slope > 0.0 else (middle, high)
     return float(np.exp((low + high) / 2.0))
 
@@ -108,7 +114,7 @@ def cross_fitted(rows: pd.DataFrame) -> pd.Series:
         rest, temperature = rows[~inside], 1.0
         if len(rest):
             temperature = fit_temperature(rest["margin"].to_numpy(), rest["slipped"].to_numpy())
-        probability[inside] = expit(rows["margin"][inside] / temperature)
+        probability[inside] = p_slip(rows["margin"][inside].to_numpy(), temperature)
     return probability
 
 
