@@ -59,6 +59,7 @@ A name that begins with a dot is one of `graspd.daemon.commands`.
 """
 EXTRAS = {
     "export-grasps": "record",
+    "models": "train",
     "train": "train",
     "evaluate": "train",
     "report": "train,report",

@@ -22,8 +22,10 @@ VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 """Wire types of fields; the other two, groups, are out of use."""
 
 _OF_ONNX = """
-    Add Cast Clip Concat Conv Div Exp Gather Gemm Log MatMul MaxPool Mul ReduceSumSquare Relu
-    Reshape Slice Softmax Sub Sum Transpose
+    Add AveragePool BatchNormalization Cast Clip Concat Constant Conv Div Elu Erf Exp Flatten Gather
+    Gelu Gemm GlobalAveragePool Identity LayerNormalization LeakyRelu Log LogSoftmax MatMul MaxPool
+    Mul Neg Pow ReduceMean ReduceSumSquare Relu Reshape Sigmoid Slice Softmax Sqrt Squeeze Sub Sum
+    Tanh Transpose Unsqueeze
     """
 TREES = frozenset({"TreeEnsembleClassifier", "TreeEnsembleRegressor"})
 OPERATORS = {
@@ -33,10 +35,11 @@ OPERATORS = {
 }
 """Operators that a model may use, by domain; the first two domains are one.
 
-They are those of the models that `graspd train` makes. Each ends, whatever the counts, and the size
-of its result does not depend on values: of `SHAPED` and `TREES` that is checked.
+They are those of `graspd train` and of plain networks made elsewhere. Each ends, whatever the
+counts, and the size of its result does not depend on values: of `SHAPED` and `TREES` that is
+checked.
 """
-SHAPED = frozenset({"ReduceSumSquare", "Reshape", "Slice"})
+SHAPED = frozenset({"ReduceMean", "ReduceSumSquare", "Reshape", "Slice", "Squeeze", "Unsqueeze"})
 """Operators whose further inputs give the size of the result.
 
 These inputs must be constants of the model, so that each run takes as long as the first.

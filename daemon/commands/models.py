@@ -12,12 +12,15 @@ from typing import Any
 import msgspec
 
 from graspd.daemon.assembly.assembly import DEFAULT_MODEL
+from graspd.daemon.commands.arguments import UsageError
 from graspd.daemon.process.text import printable, write_json, write_lines
 from graspd.models import trial, zoo
 from graspd.models.contract import MeasuredError, ModelContract, ModelError
 from graspd.models.runtime import read
 
+WRAP = "graspd.models.training.commands.wrap"
 TITLES = {
+    "table": "the table it came with",
     "cv": "known objects",
     "unknown": "the paper's 8 other objects",
     "objects": "other objects",
@@ -43,21 +46,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
         "what",
-        nargs="?",
+        nargs="*",
         metavar="NAME",
-        help="show the card of this model, or of an .onnx file; without it, list all",
+        help="show the card of this model, or of an .onnx file; without it, list all. `wrap FILE` "
+        "makes a model for a scene of an ONNX network (extra: train)",
+    )
+    parser.add_argument(
+        "--data",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="TABLE",
+        help="with wrap: a grasp table, by which the model's bounds are worked out",
+    )
+    parser.add_argument("--name", help="with wrap: name of the model (FILE-wrapped)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs"),
+        metavar="DIR",
+        help="with wrap: folder for the model and its card (runs)",
     )
     parser.add_argument("--json", action="store_true", help="the cards as JSON on stdout")
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the models, or show the card of one. Raises `ModelError`."""
-    if args.what is None:
+    """List the models, show the card of one, or wrap one. Raises `ModelError`, `UsageError`."""
+    is_wrap = args.what[:1] == ["wrap"]
+    if len(args.what) > 1 + is_wrap or (is_wrap and (len(args.what) != 2 or not args.data)):
+        raise UsageError("give one NAME, or `wrap FILE --data TABLE`")
+    if is_wrap:
+        code: int = importlib.import_module(WRAP).run(args)
+        return code
+    if not args.what:
         cards = {name: _card_of(zoo.find(name)) for name in zoo.names()}
         lines = _listing({name: _parsed(content) for name, content in cards.items()})
         document: dict[str, Any] = cards
     else:
-        document = _content_of(args.what)
+        document = _content_of(args.what[0])
         lines = _details(_parsed(document))
     if args.json:
         write_json(document)

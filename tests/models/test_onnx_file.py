@@ -130,7 +130,7 @@ def test_the_zoo_may_be_used(name: str) -> None:
     onnx_file.check(zoo.find(name).read_bytes())
 
 
-def test_operators_are_those_of_zoo_and_training() -> None:
+def test_operators_of_zoo_and_training_may_be_used() -> None:
     """The zoo has no network with pooling, no blend and no boosting; training has."""
     pytest.importorskip("torch", reason="needs the extra `train`")
     from graspd.models.training.fitting.trained import fit
@@ -144,7 +144,7 @@ def test_operators_are_those_of_zoo_and_training() -> None:
         models.append(fit(system, inputs, draw.random(60) < 0.5, seed=0).to_onnx(1.0, "x"))
     used = {(node.domain, node.op_type) for model in models for node in model.graph.node}
     allowed = {(domain, name) for domain, names in onnx_file.OPERATORS.items() for name in names}
-    assert used == {each for each in allowed if each[0] != "ai.onnx"}  # another name of ""
+    assert used < allowed
 
 
 def test_a_small_model_may_be_used() -> None:

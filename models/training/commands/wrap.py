@@ -1,0 +1,202 @@
+"""`graspd models wrap`: an ONNX classifier made elsewhere becomes a model that the daemon takes."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, compose, helper, numpy_helper
+
+from graspd.biotac import ELECTRODES
+from graspd.models import trial, zoo
+from graspd.models.contract import (
+    CLASSES,
+    METADATA_KEY,
+    OUTPUT_NAME,
+    CountsInput,
+    MeasuredError,
+    ModelContract,
+    ModelError,
+)
+from graspd.models.inputs import builder
+from graspd.models.runtime import one_line, single_threaded
+from graspd.models.training.data.datasets import DatasetError, Grasps, concatenate, read_table
+from graspd.models.training.data.protocols import FOLDS, object_folds
+from graspd.models.training.evaluating.files import replacing, to_json, write_whole
+from graspd.models.training.fitting.novelty import seen_counts
+
+Train = Callable[[NDArray[np.uint16], NDArray[np.bool_]], bytes]
+"""Takes counts (n, fingers, 24) and slipped (n,); returns an ONNX file."""
+FLOAT_ERROR_MAX = 1e-4
+"""Largest distance from 1 of two probabilities' sum."""
+ON_TABLE = "Measured on its own table alone: its worth on other objects and days is not known."
+BY_OBJECTS = "Its worth on another day than those of its table was not measured."
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write NAME.onnx and its card. Raises `ModelError` and `DatasetError` for wrong input."""
+    source = Path(args.what[1])
+    grasps = concatenate([read_table(path) for path in args.data])
+    if grasps.slipped.all() or not grasps.slipped.any():
+        raise DatasetError(args.data[0], "has one kind of grasps, a model needs both kinds")
+    name = args.name or f"{source.stem}-wrapped"
+    if not zoo.is_name(name) or name in zoo.names():
+        raise ModelError(f"{name!r} cannot be the name of a model: give another --name")
+    measured, network = _measured(source, grasps)
+    contract = ModelContract(
+        version=2,
+        name=name,
+        input=CountsInput(),
+        fingers=grasps.fingers,
+        classes=CLASSES,
+        seed=0,
+        datasets=grasps.files,
+        measured=(measured,),
+        confidence=(),
+        seen=seen_counts(grasps.counts),
+    )
+    model = _with_ends(network, grasps)
+    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+    args.out.mkdir(parents=True, exist_ok=True)
+    path = args.out / f"{name}.onnx"
+    content: bytes = model.SerializeToString(deterministic=True)
+    with replacing(path) as part:
+        part.write_bytes(content)
+        trial.load(part)
+    weak = ON_TABLE if measured.protocol == "table" else BY_OBJECTS
+    card = {
+        "what": f"made elsewhere, from {source.name}",
+        "contract": contract,
+        "file": {"sha256": hashlib.sha256(content).hexdigest(), "size_bytes": len(content)},
+        "weak_points": (weak, "It keeps no session: it is wrong more often when sensors drift."),
+    }
+    write_whole(path.with_suffix(".json"), to_json(card))
+    f1, of = 100 * measured.f1_mean, f"{measured.folds} folds of objects"
+    how = of if measured.protocol == "objects" else "the table itself"
+    sys.stdout.write(f"{path}: F1 {f1:.1f} % on {how}\n")
+    sys.stdout.write(f"for a scene, below [model]: path = {json.dumps(str(path.absolute()))}\n")
+    return 0
+
+
+def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, bytes]:
+    """Return the error and the ONNX file; a Python file is trained by folds of objects, then on
+    all grasps."""
+    if source.suffix != ".py":
+        try:
+            network = source.read_bytes()
+        except OSError as error:
+            raise ModelError(f"{source}: cannot read: {error.strerror}") from error
+        return _error("table", [_scores(network, grasps, np.arange(len(grasps)))]), network
+    train: Train | None = runpy.run_path(str(source)).get("train")
+    if train is None:
+        raise ModelError(f"{source}: has no function train(counts, slipped)")
+    folds = min(FOLDS, len(set(grasps.objects)))
+    if folds < 2:
+        raise ModelError("the grasps are of one object: their folds need two or more")
+    fold_of = object_folds(grasps.objects, folds, 0)
+    scores = []
+    for fold in range(folds):
+        rows = np.flatnonzero(fold_of != fold)
+        network = train(grasps.counts[rows], grasps.slipped[rows])
+        scores.append(_scores(network, grasps, np.flatnonzero(fold_of == fold)))
+    return _error("objects", scores), train(grasps.counts, grasps.slipped)
+
+
+def _scores(network: bytes, grasps: Grasps, rows: NDArray[np.int64]) -> tuple[float, float]:
+    """Return F1, slip positive, and accuracy on these rows."""
+    from sklearn.metrics import accuracy_score, f1_score
+
+    session = _session(_with_ends(network, grasps).SerializeToString())
+    given = builder(CountsInput(), len(grasps.fingers))
+    inputs = given.build_batch(grasps.counts[rows])[0]
+    said = [session.run([OUTPUT_NAME], {given.name: each[np.newaxis]})[0][0, 1] for each in inputs]
+    slips, slipped = np.array(said) >= 0.5, grasps.slipped[rows]
+    return float(f1_score(slipped, slips)), float(accuracy_score(slipped, slips))
+
+
+def _error(protocol: str, scores: list[tuple[float, float]]) -> MeasuredError:
+    f1, accuracy = np.array(scores).T
+    means = float(f1.mean()), float(f1.std()), float(accuracy.mean()), float(accuracy.std())
+    return MeasuredError(protocol, len(scores), *means)
+
+
+def _session(network: bytes) -> Any:  # noqa: ANN401 - onnxruntime has no types
+    try:
+        return single_threaded(network)
+    except Exception as error:  # onnxruntime's exceptions share no narrower base
+        raise ModelError(f"not a usable ONNX model: {one_line(error)}") from error
+
+
+def _with_ends(network: bytes, grasps: Grasps) -> onnx.ModelProto:
+    """Return the network with the daemon's input and output. Raises `ModelError`."""
+    fingers = len(grasps.fingers)
+    session = _session(network)
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    of_two = [each for each in outputs if each.type == "tensor(float)" and each.shape[-1:] == [2]]
+    of_one = [each for each in outputs if each.type == "tensor(float)" and each.shape[1:] == [1]]
+    shapes = ([fingers, ELECTRODES], [fingers * ELECTRODES])
+    fits = len(inputs) == 1 and inputs[0].type == "tensor(float)" and inputs[0].shape[1:] in shapes
+    if not fits or not (of_two or of_one):
+        ends = [f"{each.name} {each.type} {each.shape}" for each in (*inputs, *outputs)]
+        raise ModelError(
+            f"the network must take float counts (n, {fingers}, 24) or (n, {24 * fingers}) and "
+            "return (n, 2), stable and slip, or (n, 1), log-odds of slip; it has "
+            f"{', '.join(ends)}"
+        )
+    given, answer = inputs[0], (of_two or of_one)[0]
+    read = _answers(given.name, answer.name, grasps.counts, given.shape[1:], session)
+    model = compose.add_prefix(onnx.load_from_string(network), "made/")
+    graph, width = model.graph, fingers * ELECTRODES
+    shape = np.array([-1, *given.shape[1:]], np.int64)
+    graph.initializer.append(numpy_helper.from_array(shape, "shape"))
+    name = builder(CountsInput(), fingers).name
+    graph.node.insert(0, helper.make_node("Reshape", [name, "shape"], [f"made/{given.name}"]))
+    graph.node.extend(_last(f"made/{answer.name}", read, graph))
+    del graph.input[:], graph.output[:]
+    graph.input.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", width]))
+    graph.output.append(helper.make_tensor_value_info(OUTPUT_NAME, TensorProto.FLOAT, ["N", 2]))
+    del graph.value_info[:]
+    return model
+
+
+def _answers(
+    name: str,
+    answer: str,
+    counts: NDArray[np.uint16],
+    shape: list[int],
+    session: Any,  # noqa: ANN401
+) -> NDArray[np.float32]:
+    """Return the answers of the network, one grasp at a time."""
+    one = (each.reshape(1, *shape).astype(np.float32) for each in counts)
+    return np.concatenate([session.run([answer], {name: each})[0] for each in one])
+
+
+def _last(answer: str, read: NDArray[np.float32], graph: onnx.GraphProto) -> list[onnx.NodeProto]:
+    """Return the nodes from the network's answer to two probabilities.
+
+    `read`: its answers on the table, which say whether they are probabilities.
+    """
+    if not np.isfinite(read).all():
+        raise ModelError("the network answers grasps of the table with values that are no numbers")
+    two = np.array([-1, read.shape[-1]], np.int64)
+    graph.initializer.append(numpy_helper.from_array(two, "answer_shape"))
+    nodes = [helper.make_node("Reshape", [answer, "answer_shape"], ["answer"])]
+    if read.shape[-1] == 1:
+        column = np.array([[0.0, 1.0]], np.float32)
+        graph.initializer.append(numpy_helper.from_array(column, "stable_slip"))
+        nodes.append(helper.make_node("MatMul", ["answer", "stable_slip"], ["logits"]))
+        return [*nodes, helper.make_node("Softmax", ["logits"], [OUTPUT_NAME], axis=1)]
+    sums = np.abs(read.sum(axis=1) - 1.0)
+    if read.min() >= 0.0 and sums.max() <= FLOAT_ERROR_MAX:
+        nodes[0].output[0] = OUTPUT_NAME
+        return nodes
+    return [*nodes, helper.make_node("Softmax", ["answer"], [OUTPUT_NAME], axis=1)]

@@ -1,0 +1,93 @@
+"""`graspd models wrap`: a network made elsewhere judges as it did, with the daemon's refusals."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the extra `train`")
+
+import torch
+
+import graspd
+from graspd.models.runtime import TactileModel
+from tests.kit.inside import graspd as command
+from tests.models.training.samples import separable_counts, write_table
+
+PAGE = Path(__file__).parents[4] / "deploy" / "RECORDING.md"
+pytestmark = [
+    pytest.mark.timeout(300),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of torch's exporter
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the page's program, its network and a table of two objects."""
+    made = tmp_path_factory.mktemp("wrap")
+    (program,) = re.findall(r"```python\n(import io, torch\n.*?)```", PAGE.read_text(), re.DOTALL)
+    (made / "net.py").write_text(program)
+    counts, slipped = separable_counts(60)
+    write_table(made / "own.csv", counts, slipped, ["ball", "box"] * 15 + ["box", "ball"] * 15)
+    train = runpy.run_path(str(made / "net.py"))["train"]
+    (made / "net.onnx").write_bytes(train(counts, slipped))
+    return made
+
+
+@pytest.mark.parametrize(("file", "protocol"), [("net.py", "objects"), ("net.onnx", "table")])
+def test_a_wrapped_network_separates_what_is_separable(
+    folder: Path, file: str, protocol: str
+) -> None:
+    out = folder / protocol
+    done = command(
+        "models", "wrap", folder / file, "--data", folder / "own.csv", "--name", "net", "--out", out
+    )
+    assert done.returncode == 0, done.stderr
+    card = json.loads((out / "net.json").read_text())
+    (measured,) = card["contract"]["measured"]
+    assert (measured["protocol"], measured["f1_mean"]) == (protocol, 1.0)
+    assert ("on its own table alone" in card["weak_points"][0]) == (protocol == "table")
+    counts, slipped = separable_counts(60)
+    seen = TactileModel(out / "net.onnx").contract.seen
+    np.testing.assert_array_equal(seen.low, counts.min(axis=0))
+    np.testing.assert_array_equal(seen.high, counts.max(axis=0))
+    said = graspd.load(out / "net.onnx").predict(counts)
+    judged = said != "unknown"
+    assert judged.mean() > 0.5
+    np.testing.assert_array_equal(said[judged] == "slip", slipped[judged])
+    assert set(graspd.load(out / "net.onnx").predict(np.full((1, 3, 24), 2000))) == {"unknown"}
+
+
+def wrapped(folder: Path, network: torch.nn.Module, shape: tuple[int, ...]) -> str:
+    path = folder / "other.onnx"
+    torch.onnx.export(network.eval(), (torch.ones(shape),), path, dynamo=False)
+    done = command("models", "wrap", path, "--data", folder / "own.csv", "--out", folder / "other")
+    return done.stderr if done.returncode else done.stdout
+
+
+def test_log_odds_of_one_column_are_those_of_slip(folder: Path) -> None:
+    class Ramp(torch.nn.Module):
+        """The last electrode of the first finger less the first one: falls in a stable grasp."""
+
+        def forward(self, counts: torch.Tensor) -> torch.Tensor:
+            return 0.01 * (counts[:, 23:24] - counts[:, :1])
+
+    assert "F1 100.0 % on the table itself" in wrapped(folder, Ramp(), (1, 72))
+
+
+@pytest.mark.parametrize(
+    ("network", "shape", "problem"),
+    [
+        (torch.nn.Linear(48, 2), (1, 48), "must take float counts"),
+        (torch.nn.Linear(72, 3), (1, 72), "must take float counts"),
+    ],
+)
+def test_a_network_of_another_shape_is_refused(
+    folder: Path, network: torch.nn.Module, shape: tuple[int, ...], problem: str
+) -> None:
+    assert problem in wrapped(folder, network, shape)
