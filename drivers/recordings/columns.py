@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from graspd.biotac import ELECTRODES, FINGERS, FORMER_ELECTRODES
+from graspd.biotac import ELECTRODES, FINGERS, FORMER_ELECTRODES, Finger
 from graspd.drivers.base import RecordingError, joint_name
 from graspd.drivers.recordings.kinds import PAGE
 from graspd.drivers.recordings.values import are_numbers
@@ -72,7 +72,7 @@ class Columns:
     slipped: int | None
     ignored: tuple[str, ...]
     """Columns of unknown names; electrodes of other fingers do not count."""
-    fingers: tuple[str, ...]
+    fingers: tuple[Finger, ...]
     """Fingers that the file has, asked for or not."""
 
     @classmethod

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from graspd.models.training.data.datasets import (
     unpublished,
 )
 from graspd.models.training.data.protocols import TooFewGraspsError, near_copies
+from graspd.models.training.systems.registry import SYSTEMS, System
 
 
 class WrongInputError(Exception):
@@ -41,8 +42,9 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
         "--data",
         type=Path,
         metavar="DIR",
+        action=_Data,
         help="folder with the published grasp tables: palm_down.csv, palm_side.csv and, for some "
-        "models and protocols, palm_45.csv",
+        "models and protocols, palm_45.csv; a file is one of --own",
     )
     parser.add_argument(
         "--own",
@@ -69,6 +71,22 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
         help="trainings at once on this machine (default: 1)",
     )
     parser.add_argument("--quiet", action="store_true", help="show no progress bar")
+
+
+class _Data(argparse.Action):
+    """Keep a folder as `data`, and add a file to `own`."""
+
+    def __call__(
+        self,
+        _parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        _option: str | None = None,
+    ) -> None:
+        if isinstance(values, Path) and values.is_file():
+            namespace.own = [*namespace.own, values]
+        else:
+            namespace.data = values
 
 
 def exit_code(
@@ -118,6 +136,18 @@ def read_grasps(command: str, args: argparse.Namespace) -> Grasps:
             text = f"{name}.csv is not the published table; the figures are of this data only"
             say(command, f"warning: {text}")
     return grasps
+
+
+def check_fingers(systems: Iterable[System], grasps: Grasps) -> None:
+    """Raise `WrongInputError` for a system that judges a finger which the grasps lack."""
+    for system in systems:
+        there = set(grasps.fingers)
+        if not there.issuperset(system.fingers):
+            forms = [name for name, one in SYSTEMS.items() if there.issuperset(one.fingers)]
+            raise WrongInputError(
+                f"{system.name} judges {', '.join(system.fingers)}, the grasps have "
+                f"{', '.join(grasps.fingers)}: systems for them are {', '.join(forms) or 'none'}"
+            )
 
 
 def say(command: str, text: str) -> None:

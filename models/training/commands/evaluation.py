@@ -20,7 +20,13 @@ from sklearn.model_selection import ParameterGrid
 
 from graspd.extras import needs
 from graspd.models.runtime import one_line
-from graspd.models.training.commands.common import WrongInputError, progress_bar, read_grasps, say
+from graspd.models.training.commands.common import (
+    WrongInputError,
+    check_fingers,
+    progress_bar,
+    read_grasps,
+    say,
+)
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
 from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
@@ -65,6 +71,7 @@ def evaluate(args: argparse.Namespace) -> None:
     systems = _systems(args.names, grid=args.grid)
     _check_extras(args)
     grasps = read_grasps("evaluate", args)
+    check_fingers(systems, grasps)
     if args.quick:
         systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
         chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]

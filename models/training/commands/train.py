@@ -15,6 +15,7 @@ from graspd.models import zoo
 from graspd.models.training.commands.common import (
     WrongInputError,
     add_shared_arguments,
+    check_fingers,
     exit_code,
     progress_bar,
     read_grasps,
@@ -93,6 +94,7 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
     if args.own and plan.model in zoo.names():
         raise WrongInputError(f"graspd ships a model {plan.model!r}: choose another --name")
     grasps = read_grasps("train", args)
+    check_fingers([plan.system], grasps)
     if args.data is not None:
         there = {file.name for file in grasps.files}
         for table in plan.system.tables:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import TABLE_FINGERS
+from graspd.biotac import TABLE_FINGERS, Finger
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED
 from graspd.drivers.recordings.csv_rows import read_rows
@@ -43,7 +43,7 @@ class Grasps:
     """Labelled grasps and the files they come from."""
 
     counts: NDArray[np.uint16]
-    """Shape (N, fingers, 24), raw counts 0..4095; a table has the fingers ff, mf, th."""
+    """Shape (N, fingers, 24), raw counts 0..4095."""
     slipped: Bools
     """Shape (N,): True where the object slipped in the lift."""
     objects: tuple[str, ...]
@@ -52,6 +52,8 @@ class Grasps:
     """Name, digest and rows of each file, in the order of the grasps."""
     without_outcome: int = 0
     """Rows of the files that are left out, because their outcome is not known."""
+    fingers: tuple[Finger, ...] = TABLE_FINGERS
+    """Fingers in the order of the counts."""
 
     def __len__(self) -> int:
         return len(self.slipped)
@@ -72,6 +74,7 @@ class Grasps:
                 Dataset(file.name, file.sha256, int(rows))
                 for file, rows in zip(self.files, kept, strict=True)
             ),
+            fingers=self.fingers,
         )
 
     def few(self) -> Grasps:
@@ -83,13 +86,15 @@ class Grasps:
         wanted = [index for index, file in enumerate(self.files) if file.name in tables]
         return np.flatnonzero(np.isin(self.table_of, wanted)).astype(np.int64)
 
-    def of_fingers(self, fingers: Sequence[str]) -> Grasps:
+    def of_fingers(self, fingers: Sequence[Finger]) -> Grasps:
         """Return the grasps with these fingers alone, in this order.
-        Raises `ValueError` for a finger that a table lacks, or if fingers are missing already."""
-        if self.counts.shape[1] != len(TABLE_FINGERS) or not set(fingers) <= set(TABLE_FINGERS):
-            raise ValueError(f"the grasps have not the fingers {', '.join(fingers)}")
-        chosen = [TABLE_FINGERS.index(finger) for finger in fingers]
-        return dataclasses.replace(self, counts=np.ascontiguousarray(self.counts[:, chosen]))
+        Raises `ValueError` for a finger that a table lacks."""
+        if not set(fingers) <= set(self.fingers):
+            have = ", ".join(self.fingers)
+            raise ValueError(f"the grasps have not the fingers {', '.join(fingers)}, but {have}")
+        chosen = [self.fingers.index(finger) for finger in fingers]
+        counts = np.ascontiguousarray(self.counts[:, chosen])
+        return dataclasses.replace(self, counts=counts, fingers=tuple(fingers))
 
     def digest(self) -> str:
         """SHA-256, hexadecimal, of counts, labels, objects and the tables' names and rows."""
@@ -105,7 +110,8 @@ def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
     `DatasetError`, with file, line and column.
     """
     data = _read(path)
-    layout = layout_of(path, TABLE_FINGERS, read_as)
+    layout = layout_of(path, (), read_as)
+    fingers = layout.columns.fingers
     if layout.is_stream:
         raise DatasetError(path, "is a stream: its rows are sweeps, and not grasps")
     for name, place in ((OBJECT, layout.columns.object), (SLIPPED, layout.columns.slipped)):
@@ -115,7 +121,7 @@ def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
     slipped: list[bool] = []
     counts: list[NDArray[np.uint16]] = []
     without = 0
-    for row in read_rows(path, TABLE_FINGERS, strict=True, outcomes=True, layout=layout):
+    for row in read_rows(path, fingers, strict=True, outcomes=True, layout=layout):
         note = row.annotation
         if note.slipped is None:
             without += 1
@@ -133,6 +139,7 @@ def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
         tuple(objects),
         (Dataset(table_name(path), hashlib.sha256(data).hexdigest(), len(counts)),),
         without,
+        fingers,
     )
 
 
@@ -170,13 +177,22 @@ def read_with_lab_tables(
 
 
 def concatenate(parts: Sequence[Grasps]) -> Grasps:
-    """The grasps of several tables, one after the other."""
+    """Return the grasps of several tables, one after the other, with the fingers that all have.
+
+    Raises `DatasetError` if there are none.
+    """
+    has = set.intersection(*(set(part.fingers) for part in parts))
+    fingers = tuple(finger for finger in parts[0].fingers if finger in has)
+    if not fingers:
+        raise DatasetError(Path(parts[-1].files[0].name), "has no finger of the other tables")
+    parts = [part.of_fingers(fingers) for part in parts]
     return Grasps(
         np.concatenate([part.counts for part in parts]),
         np.concatenate([part.slipped for part in parts]),
         tuple(name for part in parts for name in part.objects),
         tuple(file for part in parts for file in part.files),
         sum(part.without_outcome for part in parts),
+        fingers,
     )
 
 

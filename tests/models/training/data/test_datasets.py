@@ -20,6 +20,7 @@ from graspd.models.training.data.datasets import (
     read_with_lab_tables,
     unpublished,
 )
+from tests.kit.inside import graspd
 from tests.models.training.samples import (
     separable_counts,
     table,
@@ -201,3 +202,23 @@ def test_two_lab_tables_have_two_names(tmp_path: Path) -> None:
         path.parent.mkdir()
         write(path, table("lab", 40, seed))
     assert refusal(paths) == f"{paths[1]}: has the same name as {paths[0]}: rename one"
+
+
+def test_a_table_has_the_fingers_of_its_header(tmp_path: Path) -> None:
+    counts, slipped = separable_counts(30)
+    write_table(tmp_path / "three.csv", counts, slipped)
+    (tmp_path / "two.csv").write_text(
+        "\n".join(
+            ",".join(line.split(",")[:26] + line.split(",")[50:])
+            for line in [*(tmp_path / "three.csv").read_text().splitlines(), ""]
+        )
+    )
+    two = read_table(tmp_path / "two.csv")
+    assert two.fingers == ("ff", "th")
+    np.testing.assert_array_equal(two.counts, counts[:, [0, 2]])
+    both = concatenate([read_table(tmp_path / "three.csv"), two])
+    assert both.fingers == ("ff", "th")
+    refused = graspd("train", "small-session", "--data", tmp_path / "two.csv")
+    assert refused.returncode == 2
+    assert "small-session judges ff, mf, th, the grasps have ff, th" in refused.stderr
+    assert "small-session-ff-th" in refused.stderr
