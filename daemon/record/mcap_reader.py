@@ -7,13 +7,16 @@ of graspd anywhere or nowhere.
 from __future__ import annotations
 
 import heapq
+import shutil
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import BinaryIO, Final, NamedTuple, Self
 
 import lz4.frame
@@ -30,7 +33,7 @@ from graspd.biotac import Finger
 from graspd.daemon.record.mcap import METADATA, RecordingHeader
 from graspd.daemon.record.topics import Topic
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.kinds import open_recording
+from graspd.drivers.recordings.kinds import is_packed, open_recording
 
 RECORD_MAX_BYTES: Final = 64 << 20
 """Largest record, bytes; a longer one is damaged."""
@@ -223,6 +226,26 @@ class McapReader:
     def _messages(self, offset_ns: int) -> Iterator[RecordedMessage]:
         """Yield the messages of all parts; `offset_ns`: log time less monotonic time."""
         parts = sorted(self._parts, key=lambda part: (part.begin_ns, part.place), reverse=True)
+        with self._in_order_of(parts):
+            yield from self._merged(parts, offset_ns)
+
+    @contextmanager
+    def _in_order_of(self, parts: Sequence[_Part]) -> Iterator[None]:
+        """Copy a packed file unpacked, if steps back in it would each begin at its start."""
+        places = [part.place for part in reversed(parts)]
+        if places == sorted(places) or not is_packed(self.path):
+            yield
+            return
+        packed = self._stream
+        with TemporaryFile() as self._stream:
+            packed.seek(0)
+            with suppress(OSError):  # damage is known already
+                shutil.copyfileobj(packed, self._stream)
+            yield
+        self._stream = packed
+
+    def _merged(self, parts: list[_Part], offset_ns: int) -> Iterator[RecordedMessage]:
+        """Yield the messages of parts, the oldest part last, in the order of time."""
         opened: list[tuple[int, int, _Content]] = []
         now_ns = 0
         try:

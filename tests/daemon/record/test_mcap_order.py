@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import io
 import json
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late
 from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.kinds import open_recording
 from tests.daemon.record.recorded import BOOT
 from tests.daemon.record.test_mcap import OFFSET_NS, START_NS, WHOLE, header, read
 
@@ -65,6 +67,25 @@ def test_any_order_of_a_file_gives_the_order_of_time(
     order: Callable[[list[RecordedMessage]], list[RecordedMessage]], options: dict[str, int]
 ) -> None:
     assert read(packed_again(WHOLE, order, **options)) == read(WHOLE)
+
+
+def test_a_packed_file_in_any_order_is_unpacked_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps_back: list[int] = []
+    seek = gzip.GzipFile.seek
+
+    def counted(file: gzip.GzipFile, offset: int, whence: int = 0) -> int:
+        if whence == 0 and offset < seek(file, 0, 1):
+            steps_back.append(offset)
+        return seek(file, offset, whence)
+
+    monkeypatch.setattr(gzip.GzipFile, "seek", counted)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(gzip.compress(packed_again(WHOLE, backwards)))
+    with open_recording(path) as stream:
+        assert list(McapReader(path, stream)) == read(WHOLE)
+    assert steps_back == [0]
 
 
 @given(st.randoms(use_true_random=False), st.integers(1, 20_000))
