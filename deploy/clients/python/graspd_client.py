@@ -445,14 +445,18 @@ class _Hand:
             self._link.close()
             self._turn.release()
 
-    @contextmanager
-    def _one_call(self, steps: Waits[Any]) -> Iterator[None]:
-        """Refuse a call after a fork, for ZeroMQ's thread is the parent's, and a second call."""
+    def _refuse_fork(self) -> None:
+        """Raise `RuntimeError` after a fork: ZeroMQ's thread is the parent's."""
         if os.getpid() != self._pid:
             raise RuntimeError(
                 f"this client is of process {self._pid}: make another one in this process, "
                 f"{os.getpid()}, after the fork"
             )
+
+    @contextmanager
+    def _one_call(self, steps: Waits[Any]) -> Iterator[None]:
+        """Refuse a call after a fork, and a second call."""
+        self._refuse_fork()
         if not self._turn.acquire(blocking=False):
             raise RuntimeError("another call is under way: one call at a time, or two clients")
         try:
@@ -716,6 +720,7 @@ class AsyncClient(_Hand):
             await self._woken
         finally:
             timer.cancel()
+            self._refuse_fork()  # and leave the loop's selector, which is the parent's too
             for descriptor in descriptors:
                 loop.remove_reader(descriptor)
 
