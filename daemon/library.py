@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -23,8 +24,9 @@ from graspd.daemon.assembly.sources import Source, Tables
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
 from graspd.daemon.run.unjudged import Unjudged
+from graspd.daemon.scene import SceneError
 from graspd.daemon.session import file as session_file
-from graspd.drivers.base import JointReading
+from graspd.drivers.base import JointReading, RecordingError
 from graspd.drivers.recordings.columns import time_column
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
 from graspd.drivers.recordings.layout import ReadAs
@@ -36,6 +38,9 @@ from graspd.models.runtime import read
 
 if TYPE_CHECKING:
     from graspd.daemon.publish.messages import Verdict
+
+ARGUMENTS = {"--as ": "read_as=", "--rate-hz": "rate_hz=", "--model ": "model="}
+"""Arguments of `judge`, by the options of the command line for the same."""
 
 
 class GraspModel:
@@ -145,25 +150,40 @@ class GraspModel:
 
 def _grasps(given: ArrayLike, fingers: Sequence[Finger]) -> NDArray[np.float64]:
     """Return the counts of grasps. Raises `ValueError`, also for a table with times, a stream."""
-    time_of_sweeps = time_column([str(name) for name in column_names(given)])
+    time_of_sweeps = _time_of(given)
     if time_of_sweeps is not None:
         raise ValueError(
-            f"the table is a stream, by its column {time_of_sweeps.name}: its rows are sweeps and "
+            f"the table is a stream, by its column {time_of_sweeps}: its rows are sweeps and "
             "not grasps; graspd.judge(table) judges it"
         )
     return counts_of(given, fingers)
 
 
+def _time_of(table: Any) -> str | None:  # noqa: ANN401
+    """Return the column of times; None: there is none. Raises `ValueError` for an index of them."""
+    index = getattr(table, "index", None)
+    kind = getattr(getattr(index, "dtype", None), "kind", "O")
+    if kind in "fmM" or time_column([str(name) for name in getattr(index, "names", ())]):
+        raise ValueError(
+            "the index of the table is a time: table.reset_index(names='t') makes a column of it"
+        )
+    column = time_column([str(name) for name in column_names(table)])
+    return None if column is None else column.name
+
+
 def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> GraspModel:
     """Return a model by its name (`graspd models` lists them) or by the path of an ONNX file.
 
-    `fingers`: those of the hand, for the form of the model that judges fewer. Raises `ModelError`,
-    and `ValueError` for a name that is not a finger's.
+    `fingers`: those of the hand, in the order of the counts, for the form of the model that judges
+    fewer. Raises `ModelError`, also for another order than the model's, and `ValueError` for a name
+    that is not a finger's.
     """
     check_fingers(fingers)
     found = GraspModel(_path(model, fingers))
     if fingers and not set(found.fingers).issubset(fingers):
         raise ModelError(f"{found} does not judge a hand of {', '.join(fingers)}")
+    if fingers and [each for each in fingers if each in found.fingers] != list(found.fingers):
+        raise ModelError(f"{found} takes counts in this order, not of {', '.join(fingers)}")
     return found
 
 
@@ -211,7 +231,10 @@ def judge(
 def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
     """Return the paths of recordings; a table is written into a file until `stack` closes."""
     if column_names(recordings):
-        return [write_csv(recordings, stack.enter_context(TemporaryDirectory()))]
+        _refuse_coarse(recordings, _time_of(recordings))
+        path = write_csv(recordings, stack.enter_context(TemporaryDirectory()))
+        stack.enter_context(_named_as_given(path))
+        return [path]
     if isinstance(recordings, str | os.PathLike):
         recordings = [recordings]
     try:
@@ -224,6 +247,33 @@ def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
     if not paths:
         raise ValueError("no recording was given")
     return paths
+
+
+def _refuse_coarse(table: Any, time: str | None) -> None:  # noqa: ANN401
+    """Raise `ValueError` for times that are rounded by a hundredth of a step, or more."""
+    times = np.asarray(table[time]) if time is not None else np.empty(0)
+    if times.dtype == np.float32 and len(times) > 1:
+        step = np.median(np.abs(np.diff(times.astype(float))))
+        rounding = np.spacing(np.nanmax(np.abs(times)))
+        if not rounding < step / 100:
+            raise ValueError(
+                f"the column {time}: float32 rounds these times to {rounding:.2g}, and they are "
+                f"{step:.2g} apart: give float64, or times from 0 on"
+            )
+
+
+@contextmanager
+def _named_as_given(path: Path) -> Iterator[None]:
+    """Have errors name the table that was given, and not the file that it was written into."""
+    try:
+        yield
+    except (RecordingError, SceneError) as error:
+        said = str(error).replace(str(path), "the table")
+        said = said.replace(", line 1:", ":")
+        said = re.sub(r", line (\d+)", lambda found: f", row {int(found[1]) - 2} (from 0)", said)
+        for option, argument in ARGUMENTS.items():
+            said = said.replace(option, argument)
+        raise ValueError(said) from None
 
 
 def _parts(

@@ -64,19 +64,29 @@ def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
 def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
     """Write a table into a file, a missing value as an empty cell; return its path.
 
-    Raises `ValueError` for a column that is there twice.
+    Raises `ValueError` for a column that is there twice, is rounded, or is longer than others.
     """
     names, path = column_names(table), Path(folder, "table.csv")
-    _refuse_twice(names, names)
-    columns: list[Any] = [np.ma.array(_without_na(table[name])) for name in names]
-    for name, each in zip(names, columns, strict=True):
-        _refuse_rounded(each.dtype, f"the column {name}")
-    # An outcome is 0 or 1 in a file.
-    columns = [each.astype(int) if each.dtype.kind == "b" else each for each in columns]
+    columns = [_cells(column, what) for what, column in _columns(table, names, names).items()]
     with path.open("w", newline="", encoding="utf-8") as file:
-        rows = [names, *zip(*(each.tolist() for each in columns), strict=True)]
+        rows = [names, *zip(*columns, strict=True)]
         csv.writer(file, quoting=csv.QUOTE_NONNUMERIC).writerows(rows)  # `#1` begins no comment
     return path
+
+
+def _cells(column: Any, what: str) -> list[Any]:  # noqa: ANN401
+    """Return the values of a column as they are written into a file."""
+    values: Any = np.ma.array(column)
+    _refuse_rounded(values.dtype, what)
+    if values.dtype.kind == "b":
+        values = values.astype(int)  # an outcome
+    elif values.dtype == np.float32:
+        values = values.astype(str)  # as it was meant: 28.35, which is 28.350000381 as a double
+    elif values.dtype.kind in "mM":  # without the unit that a number of them would have
+        since = values - values.dtype.type(0, "us")
+        values = np.datetime64(0, "us") + since.astype("timedelta64[us]")
+    cells: list[Any] = values.tolist()
+    return cells
 
 
 def check_fingers(fingers: Sequence[str]) -> None:
@@ -95,24 +105,31 @@ def _of_table(table: Any, names: Sequence[str], fingers: Sequence[str]) -> NDArr
         begin = ", ".join(map(str, names[:3]))
         first = missing[0] if missing else "ff_biotac_1"
         raise ValueError(f"the table has no column {first}; its columns begin with {begin}")
-    _refuse_twice(needed, names)
-    columns = [_numbers(_without_na(table[name]), f"the column {name}") for name in needed]
+    columns = [_numbers(column, what) for what, column in _columns(table, needed, names).items()]
     return np.stack(columns, axis=-1).reshape(-1, len(fingers), ELECTRODES)
 
 
-def _refuse_twice(needed: Sequence[str], names: Sequence[str]) -> None:
-    twice = [name for name in needed if names.count(name) > 1]
-    if twice:
-        raise ValueError(f"the table has the column {twice[0]} more than once")
+def _columns(table: Any, needed: Sequence[str], names: Sequence[str]) -> dict[str, Any]:  # noqa: ANN401
+    """Return columns by what to call them, with None for what pandas calls NA, which is no number.
 
-
-def _without_na(column: Any) -> Any:  # noqa: ANN401
-    """Return a column with None for what pandas calls NA, which is not a number."""
-    values = np.asarray(column)
-    if values.dtype.kind == "O" and hasattr(column, "isna"):
-        values = values.copy()
-        values[np.asarray(column.isna())] = None
-    return column if isinstance(column, np.ma.MaskedArray) else values
+    Raises `ValueError` for one that is there twice, or is not one value for each row.
+    """
+    found: dict[str, Any] = {}
+    shape = None
+    for name in needed:
+        what = f"the column {name}"
+        if names.count(name) > 1:
+            raise ValueError(f"the table has {what} more than once")
+        column = table[name]
+        values = np.asarray(column)
+        shape = (values.size,) if shape is None else shape
+        if values.shape != shape:
+            raise ValueError(f"{what} has shape {values.shape}, and others {shape}")
+        if values.dtype.kind == "O" and hasattr(column, "isna"):
+            values = values.copy()
+            values[np.asarray(column.isna())] = None
+        found[what] = column if isinstance(column, np.ma.MaskedArray) else values
+    return found
 
 
 def _numbers(given: Any, what: str) -> NDArray[np.float64]:  # noqa: ANN401

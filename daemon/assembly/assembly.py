@@ -33,7 +33,7 @@ from graspd.models.trust.risk import RiskLimits
 
 DEFAULT_MODEL = "small-session"
 RECORDED_MAX_AGE_MS = 1000.0
-"""Age limit of recorded readings, ms; generous, because a recording has no link to be late on."""
+"""Time without a reading, ms, that counts as silence where a table is replayed at some speed."""
 NO_SILENCE_NS = 3_600_000_000_000
 """Time without a reading, ns, that counts as silence: no pause of a recording does."""
 

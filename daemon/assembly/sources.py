@@ -18,7 +18,6 @@ from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import CanTactile, SpiTactile
 from graspd.daemon.scene.scene import Hand
-from graspd.drivers.base import Driver
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.kinds import BAGS, CAN_LOGS, Kind, kind_of, kind_of_all
 from graspd.drivers.recordings.layout import ReadAs, fingers_in_header
@@ -26,6 +25,7 @@ from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
+    from graspd.drivers.recordings.bag import BagDriver
     from graspd.drivers.recordings.player import LinkLogDriver
 
 DRAWS = "replay"
@@ -113,11 +113,13 @@ class Tables(Source):
         for path in self._paths:
             self._refuse_other_fingers(path, model)
         plan = Plan.of(replayed.model_copy(update={"hand": hand}))
-        play = self._bags if kind_of_all(self._paths) in BAGS else self._driver
-        parts = Parts.of(plan, model, play(hand.fingers, speed=speed))
+        driver = self._player(hand.fingers, speed)
+        parts = Parts.of(plan, model, driver, lambda: driver.handed_over_ns)
         return replace(parts, boot_id=DRAWS)
 
-    def _bags(self, fingers: Sequence[Finger], speed: float | None) -> Driver:
+    def _player(self, fingers: Sequence[Finger], speed: float | None) -> ReplayDriver | BagDriver:
+        if kind_of_all(self._paths) not in BAGS:
+            return self._driver(fingers, speed=speed)
         from graspd.drivers.recordings.bag import BagDriver
 
         return BagDriver(self._paths, fingers, speed=speed)

@@ -215,9 +215,11 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         stack.callback(loop.close)
         stack.callback(controller.tell)
         loop.run()
+        if stop.received is None:
+            why.end(parts.drivers[0].counters)
     if stop.received is not None:
         return 128 + stop.received
-    return 0 if why.end(parts.drivers[0].counters) else 1
+    return 0 if why.judged else 1
 
 
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:

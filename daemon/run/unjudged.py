@@ -86,8 +86,8 @@ class Unjudged(Companion):
         if moment.state not in OPEN:
             self._now.update(judgement.reasons)
 
-    def end(self, counters: DriverCounters | None = None) -> int:
-        """Say why nothing, or little, was judged; return the number of grasps that were.
+    def end(self, counters: DriverCounters | None = None) -> None:
+        """Say why nothing, or little, was judged.
 
         `counters`: what the driver counted.
         """
@@ -98,10 +98,9 @@ class Unjudged(Companion):
         elif missed > self.judged:
             self._say(f"of {self.judged + missed} grasps {missed} were not judged:")
         else:
-            return self.judged
+            return
         for cause in self._causes(counters):
             self._say(f"  {cause}")
-        return self.judged
 
     def _end_grasp(self) -> None:
         if self._is_judged:
@@ -173,7 +172,7 @@ class Unjudged(Companion):
                 return f"readings are {step_s:g} s apart: is the time in {unit}?"
         return (
             f"readings are {step_s * 1e3:.3g} ms apart ({1 / step_s:.3g} Hz): a grasp settles from "
-            f"{1 / STEP_MAX_S:g} Hz on"
+            f"{1 / STEP_MAX_S:g} Hz on, or {0.5 / STEP_MAX_S:g} Hz while no reading is late"
         )
 
     def _look_at_angles(self, reading: JointReading) -> None:

@@ -120,8 +120,8 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         self._interrupted |= recorded_period_ns is None and at_ns > 0  # another stream begins
         if recorded_period_ns is not None:
             self.period_ns = round(recorded_period_ns / (self.speed or 1.0))
-        t_ns = self._clock() if self.speed is None else self.played_ns(at_ns)
-        return self._readings(row, t_ns, at_ns)
+        self.handed_over_ns = self._clock() if self.speed is None else self.played_ns(at_ns)
+        return self._readings(row, self.handed_over_ns, at_ns)
 
     def _items(self) -> Generator[tuple[int, tuple[Row, int | None]], None, None]:
         """Yield the rows of all files on one time axis, with the recorded period."""
@@ -147,7 +147,8 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
                 first_s = row.t_s
             else:
                 before_ns = at_ns
-                at_ns = start_ns + round((row.t_s - first_s) * _NS_PER_S)
+                # A float of seconds since 1970 is no finer than a microsecond.
+                at_ns = start_ns + 1000 * round((row.t_s - first_s) * 1e6)
                 if at_ns > before_ns:  # the shortest step, so that a gap is noticed
                     period_ns = min(at_ns - before_ns, period_ns or at_ns)
             yield at_ns, (row, period_ns)

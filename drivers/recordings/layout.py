@@ -237,8 +237,10 @@ def time_value(
 
 def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float) -> float:
     """Return the unit of times, s: as it is called, as large times have, or as steps are usual."""
-    if column.unit_s is not None or rows.is_clock(column):
-        return column.unit_s or 1.0
+    if rows.is_clock(column):
+        return 1.0
+    if column.unit_s is not None:
+        return column.unit_s
     usual = [unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if STEP_S[0] <= step * unit <= STEP_S[1]]
     largest = max(map(abs, times), default=0.0)
     epoch = next((unit for least, unit in EPOCHS if largest > least), None)

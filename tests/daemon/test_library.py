@@ -28,7 +28,6 @@ from graspd.models import zoo
 from graspd.models.contract import ModelError
 from tests.conftest import ROOT
 from tests.kit import inside
-from tests.kit.waiting import wait_until
 
 PAGE = (ROOT / "deploy" / "LIBRARY.md").read_text()
 
@@ -42,26 +41,10 @@ def counts() -> NDArray[np.float64]:
     return rows[:, places].reshape(-1, 3, 24)
 
 
-def prompt(judge: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Verdicts of a run in which none was late: a computer that stands still makes some `stale`."""
-    said: list[dict[str, Any]] = []
-
-    def is_prompt() -> bool:
-        said[:] = judge()
-        return not any("stale" in each["reasons"] for each in said)
-
-    wait_until(is_prompt)
-    return said
-
-
 def messages(*words: object) -> list[dict[str, Any]]:
     """What `graspd replay` says."""
-
-    def judge() -> list[dict[str, Any]]:
-        done = inside.graspd("replay", *words, "--json")
-        return [json.loads(line) for line in done.stdout.splitlines()]
-
-    return prompt(judge)
+    done = inside.graspd("replay", *words, "--json")
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 def test_importing_graspd_loads_neither_onnxruntime_nor_numpy() -> None:
@@ -295,6 +278,14 @@ REFUSED: dict[str, tuple[Callable[[NDArray[np.float64]], Any], str]] = {
         lambda values: (table := arrow(values)).append_column("mf_biotac_3", table["mf_biotac_3"]),
         "the column mf_biotac_3 more than once",
     ),
+    "uneven columns": (
+        lambda values: columns(values) | {"mf_biotac_3": [2000]},
+        r"the column mf_biotac_3 has shape \(1,\), and others \(\d+,\)",
+    ),
+    "an index of times": (
+        lambda values: pandas(values, "int").set_index(np.arange(len(values)) / 100),
+        "the index of the table is a time",
+    ),
     "not collected": (lambda values: polars(values).lazy(), "LazyFrame has no values yet"),
 }
 
@@ -350,6 +341,7 @@ def test_a_changed_file_is_refused_at_unpickling(tmp_path: Path) -> None:
         ("ff", "no finger is called 'f'"),
         (["ff", "ff"], "a finger is there twice"),
         (["ff", "rf"], "small-session of ff, mf, th> does not judge a hand of ff, rf"),
+        (["th", "ff", "mf"], "ff, mf, th> takes counts in this order, not of th, ff, mf"),
     ],
 )
 def test_fingers_that_do_not_fit_are_refused(fingers: Any, words: str) -> None:  # noqa: ANN401
@@ -369,7 +361,7 @@ def test_a_session_that_does_not_fit_is_refused(
 def test_a_stream_is_judged_as_replay_judges_it() -> None:
     names = "grasp", "judged", "gate", "verdict", "p_slip", "reasons", "motion"
     expected = [{name: each[name] for name in names} for each in messages(DEMO_RECORDING)]
-    judged = prompt(lambda: [msgspec.to_builtins(each) for each in graspd.judge(DEMO_RECORDING)])
+    judged = map(msgspec.to_builtins, graspd.judge(DEMO_RECORDING))
     got = [{name: each[name] for name in names} for each in judged]
     assert {each["verdict"] for each in got} >= {"stable", "unknown"}
     assert got == expected
@@ -408,6 +400,51 @@ def test_what_the_readers_return_is_judged_as_its_file() -> None:
     ]
     assert len(told[0]) == 300
     assert told[0] == told[1] == told[2]
+
+
+TIMES: dict[str, Callable[[NDArray[np.float64]], Any]] = {
+    "float32": lambda t_s: t_s.astype(np.float32),
+    "seconds since 1970": lambda t_s: t_s + 1.7e9,
+    "whole milliseconds": lambda t_s: (1e3 * t_s).round().astype(int),
+    "dates": lambda t_s: (1e9 * t_s).round().astype("datetime64[ns]"),
+    "spans": lambda t_s: (1e3 * t_s).round().astype("timedelta64[ms]"),
+}
+
+
+@pytest.mark.parametrize("times", TIMES.values(), ids=TIMES)
+def test_times_of_any_kind_give_the_same_verdicts(
+    times: Callable[[NDArray[np.float64]], Any],
+) -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    stream = graspd.read_recording(DEMO_RECORDING)[:400]
+    name = "time_us" if times(np.zeros(1)).dtype.kind in "mM" else "t"  # their own unit counts
+    other = stream.drop(columns="t").assign(**{name: times(stream.t.to_numpy())})
+    told = [
+        [(each.verdict, each.p_slip, each.motion) for each in graspd.judge(given)]
+        for given in (stream, other)
+    ]
+    assert {each[0] for each in told[0]} >= {"slip", "unknown"}
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (
+            lambda t_s: np.where(t_s == 0.5, np.nan, t_s),
+            r"^the table, row 50 \(from 0\), column t:",
+        ),
+        (lambda t_s: (t_s + 1e5).astype(np.float32), r"float32 rounds these times to 0\.0078"),
+        (lambda t_s: t_s.astype(int), "^the table, column t: .*read_as=table.*rate_hz="),
+    ],
+)
+def test_times_that_mean_little_are_refused(
+    times: Callable[[NDArray[np.float64]], Any], words: str
+) -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    stream = graspd.read_recording(DEMO_RECORDING)[:100]
+    with pytest.raises(ValueError, match=words):
+        list(graspd.judge(stream.assign(t=times(stream.t.to_numpy()))))
 
 
 @pytest.mark.parametrize(

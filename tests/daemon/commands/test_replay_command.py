@@ -102,7 +102,7 @@ def test_the_published_method_of_the_demo_is_its_network_on_every_grasp() -> Non
 def summary_of(*arguments: object) -> dict[str, Any]:
     result = graspd("replay", *arguments, "--json")
     assert result.returncode == 0, result.stderr
-    summary: dict[str, Any] = json.loads(result.stderr.splitlines()[0])
+    summary: dict[str, Any] = json.loads(result.stderr.splitlines()[-1])
     return summary
 
 

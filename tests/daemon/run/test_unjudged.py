@@ -37,8 +37,8 @@ def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
-        (times(1e-6), "readings are 0.01 us apart: is the time in seconds, with fractions?"),
-        (every(10), "readings are 100 ms apart (10 Hz): a grasp settles from 20 Hz on"),
+        (times(1e-6), "readings are 0 us apart: is the time in seconds, with fractions?"),
+        (every(10), "readings are 100 ms apart (10 Hz): a grasp settles from 20 Hz on, or"),
         (lambda stream: stream[REST_ROWS:], "no 100 readings of an open hand come first (1 s at"),
         (every(4), "no 100 readings of an open hand come first (4 s at"),
         (lambda stream: stream[: REST_ROWS + 5], "no finger touched: the hand was open"),
