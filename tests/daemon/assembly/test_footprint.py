@@ -63,7 +63,7 @@ def buses_but(own: str) -> set[str]:
 FORBIDDEN = {
     # The demo's recording has joints; nothing is kept of a replay.
     "demo": {
-        *(buses_but("replay") | HALL | KEPT | ASK),
+        *(buses_but("replay") | HALL | KEPT),
         "graspd.drivers.datagrams.joints",
     },
     "two-fingers": buses_but("spi") | JOINTS | HALL | ASK,
@@ -139,7 +139,8 @@ def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measur
     assert commands == ["graspd.daemon.commands.run"]
     assert cost["rss_kib"] < MEMORY_MIB[scene.stem] * 1024
     assert cost["threads"] == 1 + ZMQ_THREADS
-    assert cost["descriptors"] == STANDARD + SIGNALS + SOCKET + FILE
+    sockets = SOCKET + ASK_SOCKET * (set(cost["modules"]) >= ASK)
+    assert cost["descriptors"] == STANDARD + SIGNALS + sockets + FILE
     # Three seconds with some grasps, each judged as it settles and then twenty times a second.
     assert len(cost["reading"]) == 300
     assert 5 <= len(cost["judged"]) <= 4 + 60

@@ -20,7 +20,6 @@ from graspd.models.training.data.datasets import (
     read_with_lab_tables,
     unpublished,
 )
-from tests.kit.inside import graspd
 from tests.models.training.samples import (
     separable_counts,
     table,
@@ -218,7 +217,3 @@ def test_a_table_has_the_fingers_of_its_header(tmp_path: Path) -> None:
     np.testing.assert_array_equal(two.counts, counts[:, [0, 2]])
     both = concatenate([read_table(tmp_path / "three.csv"), two])
     assert both.fingers == ("ff", "th")
-    refused = graspd("train", "small-session", "--data", tmp_path / "two.csv")
-    assert refused.returncode == 2
-    assert "small-session judges ff, mf, th, the grasps have ff, th" in refused.stderr
-    assert "small-session-ff-th" in refused.stderr
