@@ -101,7 +101,7 @@ def recorded_kind(options: ReplayTactile) -> Kind:
 def require_bags() -> None:
     """Raise `SceneError`, with advice, without the package of the extra `bag`."""
     try:
-        require("rosbags", "reading a ROS bag", "bag")
+        require("rosbags.rosbag2", "reading a ROS bag", "bag")
     except ModuleNotFoundError as error:
         raise SceneError(str(error)) from error
 

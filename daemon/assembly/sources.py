@@ -12,7 +12,7 @@ from graspd.biotac import FINGERS, Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Parts
-from graspd.daemon.assembly.plan import Plan
+from graspd.daemon.assembly.plan import Plan, require_bags
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
@@ -138,6 +138,7 @@ class Tables(Source):
 
     def _fingers(self, path: Path, judged: Sequence[Finger]) -> Sequence[str]:
         if kind_of(path) in BAGS:
+            require_bags()
             from graspd.drivers.recordings.bag import fingers_of
 
             return fingers_of(path)

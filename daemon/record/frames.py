@@ -85,7 +85,7 @@ def _readings(path: Path, read_as: ReadAs | None, rate_hz: float | None) -> pd.D
     fingers: tuple[str, ...]
     kind = kind_of(path)
     if kind in BAGS:
-        require("rosbags", "reading a ROS bag", "bag")
+        require("rosbags.rosbag2", "reading a ROS bag", "bag")
         from graspd.drivers.recordings.bag import BagDriver, fingers_of
 
         fingers = fingers_of(path)

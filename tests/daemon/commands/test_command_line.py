@@ -87,6 +87,16 @@ def test_a_scene_that_plays_mcap_without_its_reader_is_refused(
     assert done.stderr.startswith("graspd: replaying MCAP needs the package 'mcap': run ")
 
 
+def test_a_bag_without_its_reader_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    (tmp_path / "hand.bag").write_bytes(b"#ROSBAG V2.0\n")
+    done = inside.graspd("replay", tmp_path / "hand.bag")
+    assert done.returncode == 2
+    assert done.stderr.startswith("graspd: reading a ROS bag needs the package 'rosbags': run ")
+
+
 def test_every_argument_of_every_command_has_help() -> None:
     silent = [
         f"{parser.prog} {action.option_strings or action.dest}"
