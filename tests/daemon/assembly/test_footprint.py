@@ -140,7 +140,8 @@ def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measur
     assert cost["rss_kib"] < MEMORY_MIB[scene.stem] * 1024
     assert cost["threads"] == 1 + ZMQ_THREADS
     sockets = SOCKET + ASK_SOCKET * (set(cost["modules"]) >= ASK)
-    assert cost["descriptors"] == STANDARD + SIGNALS + sockets + FILE
+    # Whether the connection of a subscriber has gone by now is a matter of time.
+    assert STANDARD + SIGNALS + sockets + FILE - cost["descriptors"] in {0, 1}
     # Three seconds with some grasps, each judged as it settles and then twenty times a second.
     assert len(cost["reading"]) == 300
     assert 5 <= len(cost["judged"]) <= 4 + 60

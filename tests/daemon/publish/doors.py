@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import time
 from collections.abc import Callable
@@ -229,6 +230,12 @@ def processes() -> list[int]:
         for thread in folder.iterdir()
         for number in (thread / "children").read_text().split()
     ]
+
+
+def halt(process: int) -> None:
+    """Stop a child by SIGSTOP, and return once none of its threads runs."""
+    os.kill(process, signal.SIGSTOP)
+    os.waitid(os.P_PID, process, os.WSTOPPED | os.WNOWAIT)
 
 
 def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[bytes]:

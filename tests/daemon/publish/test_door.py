@@ -23,7 +23,7 @@ from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.porter import QUESTIONS_MAX, Frames, Plan
-from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message, processes
+from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message, halt, processes
 from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
@@ -98,7 +98,7 @@ def test_a_signal_ends_the_wait_for_a_subscriber(tmp_path: Path, number: signal.
 def test_messages_that_its_process_is_too_slow_for_are_dropped(tmp_path: Path) -> None:
     with Publisher(f"ipc://{tmp_path}/v", high_water_mark=5) as publisher:
         (process,) = processes()
-        os.kill(process, signal.SIGSTOP)
+        halt(process)
         sent = [publisher.send(b"verdict.right", bytes(10_000)) for _ in range(2000)]
         os.kill(process, signal.SIGCONT)
     # Five wait at each end, more in the kernel: 208 KiB (net.core.wmem_default).
@@ -274,7 +274,7 @@ def test_the_door_says_when_its_own_subscriber_hears_late(tmp_path: Path) -> Non
             return door.is_late
 
         assert not is_late()
-        os.kill(process, signal.SIGSTOP)
+        halt(process)
         publisher.send(b"status.right", b"first")
         assert not is_late()
         wait_until(is_late)

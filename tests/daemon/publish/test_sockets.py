@@ -20,7 +20,7 @@ from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.trust.lift_book import GraspId
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import USER, Asked, Peers, processes, published
+from tests.daemon.publish.doors import USER, Asked, Peers, halt, processes, published
 from tests.kit.waiting import PATIENCE_S, wait_until
 
 HOSTILE_MESSAGES = 2_000
@@ -99,7 +99,7 @@ def test_subscribers_that_hear_late_are_in_the_health(tmp_path: Path) -> None:
     with Sockets(wanted(tmp_path)) as sockets:
         assert sockets.health == {}
         (process,) = processes()
-        os.kill(process, signal.SIGSTOP)
+        halt(process)
         sockets.send(b"status.right", b"{}")
 
         def is_late() -> bool:
