@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     name = args.name or f"{source.stem}-wrapped"
     if not zoo.is_name(name) or name in zoo.names():
         raise ModelError(f"{name!r} cannot be the name of a model: give another --name")
-    measured, network = _measured(source, grasps)
+    measured, model = _measured(source, grasps)
     contract = ModelContract(
         version=2,
         name=name,
@@ -64,7 +64,6 @@ def run(args: argparse.Namespace) -> int:
         confidence=(),
         seen=seen_counts(grasps.counts),
     )
-    model = _with_ends(network, grasps)
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{name}.onnx"
@@ -87,15 +86,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, bytes]:
-    """Return the error and the ONNX file; a Python file is trained by folds of objects, then on
-    all grasps."""
+def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelProto]:
+    """Return the error and the model; a Python file is trained by folds of objects, then on all
+    grasps."""
     if source.suffix != ".py":
         try:
             network = source.read_bytes()
         except OSError as error:
             raise ModelError(f"{source}: cannot read: {error.strerror}") from error
-        return _error("table", [_scores(network, grasps, np.arange(len(grasps)))]), network
+        model = _with_ends(network, grasps)
+        return _error("table", [_scores(model, grasps, np.arange(len(grasps)))]), model
     train: Train | None = runpy.run_path(str(source)).get("train")
     if train is None:
         raise ModelError(f"{source}: has no function train(counts, slipped)")
@@ -106,16 +106,16 @@ def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, bytes]:
     scores = []
     for fold in range(folds):
         rows = np.flatnonzero(fold_of != fold)
-        network = train(grasps.counts[rows], grasps.slipped[rows])
-        scores.append(_scores(network, grasps, np.flatnonzero(fold_of == fold)))
-    return _error("objects", scores), train(grasps.counts, grasps.slipped)
+        model = _with_ends(train(grasps.counts[rows], grasps.slipped[rows]), grasps)
+        scores.append(_scores(model, grasps, np.flatnonzero(fold_of == fold)))
+    return _error("objects", scores), _with_ends(train(grasps.counts, grasps.slipped), grasps)
 
 
-def _scores(network: bytes, grasps: Grasps, rows: NDArray[np.int64]) -> tuple[float, float]:
+def _scores(model: onnx.ModelProto, grasps: Grasps, rows: NDArray[np.int64]) -> tuple[float, float]:
     """Return F1, slip positive, and accuracy on these rows."""
     from sklearn.metrics import accuracy_score, f1_score
 
-    session = _session(_with_ends(network, grasps).SerializeToString())
+    session = _session(model.SerializeToString())
     given = builder(CountsInput(), len(grasps.fingers))
     inputs = given.build_batch(grasps.counts[rows])[0]
     said = [session.run([OUTPUT_NAME], {given.name: each[np.newaxis]})[0][0, 1] for each in inputs]
