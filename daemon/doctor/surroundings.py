@@ -218,10 +218,8 @@ def _is_reached(path: Path) -> bool:
     """Return False if a folder on the way may not be entered."""
     try:
         path.stat()
-    except PermissionError:
-        return False
-    except OSError:  # not there, which is another finding
-        return True
+    except OSError as error:  # that it is not there is another finding
+        return not isinstance(error, PermissionError)
     return True
 
 
