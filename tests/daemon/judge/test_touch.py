@@ -119,18 +119,18 @@ def test_a_new_touch_falls_from_its_smallest_fall(falls: tuple[float, ...], agai
 
 
 @pytest.mark.parametrize(
-    ("after_ns", "anew"),
+    ("after_ns", "is_lost"),
     [(0, False), (30 * S, False), (30 * S + 1, True)],
 )
-def test_a_finger_alone_for_half_a_minute_is_tared(after_ns: int, anew: bool) -> None:
+def test_a_finger_alone_for_half_a_minute_is_tared(after_ns: int, is_lost: bool) -> None:
     touch = held(100.0)
     assert not touch.has_lost_rest(S, 0.0)
-    assert touch.has_lost_rest(S + after_ns, 0.0) == anew
+    assert touch.has_lost_rest(S + after_ns, 0.0) == is_lost
 
 
-@pytest.mark.parametrize(("middle", "anew"), [(-20.0, False), (-20.01, True), (99.0, False)])
-def test_a_finger_that_rests_a_touch_higher_is_tared_anew(middle: float, anew: bool) -> None:
-    assert Touch(THRESHOLD).has_lost_rest(S, middle) == anew
+@pytest.mark.parametrize(("middle", "is_lost"), [(-20.0, False), (-20.01, True), (99.0, False)])
+def test_a_finger_that_rests_a_touch_higher_is_tared_again(middle: float, is_lost: bool) -> None:
+    assert Touch(THRESHOLD).has_lost_rest(S, middle) == is_lost
 
 
 def test_a_finger_whose_rest_is_not_known_has_no_fall() -> None:

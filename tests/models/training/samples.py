@@ -13,11 +13,6 @@ from numpy.typing import NDArray
 from graspd.models.contract import Dataset
 from graspd.models.training.data.datasets import Grasps, concatenate
 
-HEADER = [
-    "object",
-    "slipped",
-    *(f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)),
-]
 UNKNOWN = ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case",
            "train")  # fmt: skip
 OBJECTS = (*UNKNOWN, *(f"object_{letter}" for letter in "abcdefghijkl"))
@@ -38,12 +33,18 @@ def write_table(
     counts: NDArray[np.uint16],
     slipped: NDArray[np.bool_],
     objects: Sequence[str] | None = None,
+    fingers: Sequence[str] = ("ff", "mf", "th"),
 ) -> None:
-    """Write a grasp table in the published form; without `objects`, of balls."""
+    """Write a grasp table in the published form; without `objects`, of balls.
+
+    `counts`: shape (N, fingers, 24), of these `fingers`.
+    """
+    header = ["object", "slipped"]
+    header += [f"{finger}_biotac_{n}" for finger in fingers for n in range(1, 25)]
     names = ["ball"] * len(counts) if objects is None else objects
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEADER)
+        writer.writerow(header)
         for name, slip, reading in zip(names, slipped, counts, strict=True):
             writer.writerow([name, int(slip), *reading.ravel()])
 
