@@ -91,6 +91,7 @@ class CanBus:
         self.failure = None
         self._idle_ns = self._received_ns = self._clock()
         self._server, self._stamp_s = SenderClock(), 0.0
+        self._newest_ns: int | None = None
         self._bus = bus = open_bus(self._interface, self._channel, **self._options)
         self.descriptor = _fileno(bus)
         if self.descriptor is not None:
@@ -146,7 +147,7 @@ class CanBus:
         for _ in range(FRAMES_PER_DRAIN):
             record, ancillary, _, _ = receive(record_bytes, ANCILLARY_BYTES, flags)
             wall_ns, drops = read_stamps(ancillary)
-            t_ns = now_ns if wall_ns is None else min(wall_ns + ahead_ns, now_ns)
+            t_ns = now_ns if wall_ns is None else self._in_order(wall_ns + ahead_ns, now_ns)
             if drops is not None:
                 self._count_drops(drops, frames)
             frame = unpack(record)
@@ -185,10 +186,20 @@ class CanBus:
             if frame is None:
                 self.counters.malformed_frames += 1
             elif self._stamped:
-                t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
+                t_ns = self._in_order(round(message.timestamp * 1e9) + ahead_ns, now_ns)
                 frames.append((frame, t_ns, t_ns))
             else:
                 frames.append((frame, *self._arrived(message.timestamp, since_ns)))
+
+    def _in_order(self, stamp_ns: int, now_ns: int) -> int:
+        """Return a time not before the last frame's, nor after now.
+
+        The clocks cannot be read at once: where the system pauses between, stamps seem older.
+        """
+        if self._newest_ns is not None:
+            stamp_ns = max(stamp_ns, self._newest_ns)
+        self._newest_ns = min(stamp_ns, now_ns)
+        return self._newest_ns
 
     def _arrived(self, stamp_s: float, since_ns: int) -> tuple[int, int]:
         """Return the earliest and latest time at which a frame arrived, ns."""

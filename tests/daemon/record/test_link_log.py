@@ -176,4 +176,5 @@ def test_candump_text_is_what_other_programs_read(of_can: tuple[Path, Path]) -> 
     assert {frame.arbitration_id for frame in frames} == {can_id(GROUP)}
     stamps = [frame.timestamp for frame in frames]
     assert stamps == sorted(stamps)
-    assert stamps[-1] <= log.stat().st_mtime  # of the wall clock
+    # Of the wall clock; a file's time is that of the kernel's last tick.
+    assert stamps[-1] <= log.stat().st_mtime + 0.02

@@ -228,6 +228,26 @@ def test_a_frame_is_as_old_as_its_stamp_by_the_wall_clock(
     assert bus.drain() == []
 
 
+def test_frames_stay_in_order_where_the_clocks_are_not_read_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The wall clock is read 20 ms late the second time."""
+    scripted, clock, wall_clock = ScriptedBus(), Clock(7_000_000_000), Clock(100_000_000_000)
+    stand_in(monkeypatch, lambda: scripted)
+    bus = CanBus("virtual", "x", None, clock, wall_clock)
+    bus.open()
+    made = []
+    for stamp_s, late_ns in ((100.001, 0), (100.004, 20_000_000), (100.007, 0)):
+        clock.now_ns += 10_000_000
+        wall_clock.now_ns = clock.now_ns + 93_000_000_000 + late_ns
+        received = message(b"\0", 0x7FF)
+        received.timestamp = stamp_s
+        scripted.script.append(received)
+        made += [t_ns for _, t_ns, _ in bus.drain()]
+    assert made == [7_001_000_000, 7_001_000_000, 7_007_000_000]
+    bus.close()
+
+
 def test_a_frame_without_a_stamp_came_since_the_bus_was_last_empty(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
