@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import shutil
 import subprocess
 import sys
 import tarfile
-import tomllib
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
-from functools import cache
-from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 
 from graspd import daemon
 from graspd.drivers.spi.messages import FIRMWARE
@@ -167,115 +162,3 @@ def test_files_that_contributors_are_sent_to_are_there(page: str) -> None:
 def test_the_hooks_need_no_revision_of_their_own() -> None:
     assert found(".pre-commit-config.yaml", r"repo: (\S+)") == ["local"]
     assert found(".pre-commit-config.yaml", r"^\s+(rev|additional_dependencies):") == []
-
-
-TESTS = sorted(ROOT.glob("tests/**/test_*.py"))
-OURS = {"graspd": ROOT / "deploy/package", "tests": ROOT, "deploy": ROOT}
-"""Folder of each package of this source tree."""
-
-
-def brought_by(requirements: Iterable[str]) -> set[str]:
-    """Return the distributions that an installation of these brings, by normalised name."""
-    found: set[str] = set()
-    left = list(map(Requirement, requirements))
-    while left:
-        wanted = left.pop()
-        if (name := canonicalize_name(wanted.name)) in found:
-            continue
-        found.add(name)
-        try:
-            further = list(map(Requirement, requires(name) or ()))
-        except PackageNotFoundError:  # not needed here, such as on another Python
-            continue
-        for extra in wanted.extras or {""}:
-            left += [r for r in further if r.marker is None or r.marker.evaluate({"extra": extra})]
-    return found
-
-
-@cache
-def brought_by_test() -> set[str]:
-    """Return what can be imported where the extra `test` was installed, by its first name."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    brought = brought_by(project["dependencies"] + project["optional-dependencies"]["test"])
-    names = {
-        name
-        for name, distributions in packages_distributions().items()
-        if not brought.isdisjoint(map(canonicalize_name, distributions))
-    }
-    return names | sys.stdlib_module_names | OURS.keys()
-
-
-def skips(node: ast.AST) -> Iterator[ast.Call]:
-    """Find the calls of `pytest.importorskip` for what the extra `test` does not bring."""
-    for call in ast.walk(node):
-        if isinstance(call, ast.Call) and ast.unparse(call.func) == "pytest.importorskip":
-            package = call.args[0]
-            name = str(package.value) if isinstance(package, ast.Constant) else ""  # a variable
-            if name.partition(".")[0] not in brought_by_test():
-                yield call
-
-
-@cache
-def parsed(file: Path) -> ast.Module:
-    return ast.parse(file.read_text())
-
-
-@cache
-def imported_by(file: Path) -> list[str]:
-    """Return the modules that an import of a file imports, up to a skip for want of a package."""
-    modules: list[str] = []
-    for node in parsed(file).body:
-        if isinstance(node, ast.Import):
-            modules += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            modules += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.Expr | ast.Assign) and any(skips(node)):
-            break
-    return modules
-
-
-@cache
-def files_of(module: str) -> list[Path]:
-    """Return our files that an import of a module runs."""
-    first, *others = module.split(".")
-    place = OURS[first] / first
-    found = [place / "__init__.py"]
-    for name in others:
-        place /= name
-        found += [place / "__init__.py", place.with_suffix(".py")]
-    return [path for path in found if path.is_file()]
-
-
-def missing(test: Path) -> set[str]:
-    """Return the packages that an import of a test needs and the extra `test` does not bring."""
-    found: set[str] = set()
-    seen, left = {test}, [test]
-    while left:
-        for module in imported_by(left.pop()):
-            first = module.partition(".")[0]
-            if first not in brought_by_test():
-                found.add(first)
-            for path in files_of(module) if first in OURS else ():
-                if path not in seen:
-                    seen.add(path)
-                    left.append(path)
-    return found
-
-
-def test_no_test_fails_for_want_of_an_extra() -> None:
-    found = {str(path.relative_to(ROOT)): missing(path) for path in TESTS}
-    assert {path: packages for path, packages in found.items() if packages} == {}
-
-
-def test_a_skip_for_want_of_a_package_names_its_extra() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    reasons = {f"needs the extra `{extra}`" for extra in project["optional-dependencies"]}
-    reasons.add("no extra brings polars, of 180 MB")
-    calls = [call for path in TESTS for call in skips(parsed(path))]
-    assert len(calls) > 10
-    unnamed = [
-        ast.unparse(call)
-        for call in calls
-        if not any(ast.unparse(keyword.value).strip("'") in reasons for keyword in call.keywords)
-    ]
-    assert unnamed == []
