@@ -1,3 +1,1 @@
 """The daemon: scene, judge, publisher, service loop, command line."""
-
-__version__ = "0.1.0"

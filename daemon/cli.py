@@ -18,7 +18,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
-from graspd.daemon import __version__
 from graspd.daemon.commands.arguments import Parser, UsageError
 from graspd.daemon.process import logs
 from graspd.daemon.process.files import is_linux
@@ -168,7 +167,8 @@ class _Version(argparse.Action):
         libraries = [f"Python {platform.python_version()}"]
         libraries += [f"{name} {version(name)}" for name in LIBRARIES]
         libraries.append(f"libzmq {zmq.zmq_version()}")
-        sys.stdout.write(f"graspd {__version__}{_commit()}\n{', '.join(libraries)}\n")
+        ours = f"graspd {version('graspd')}{_commit()}"
+        sys.stdout.write(f"{ours}\n{', '.join(libraries)}\n")
         parser.exit()
 
 

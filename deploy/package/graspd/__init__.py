@@ -6,9 +6,8 @@ Names are loaded when they are first used: `import graspd` alone takes no time.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from graspd.daemon import __version__
-
 if TYPE_CHECKING:
+    __version__: str
     from graspd import client
     from graspd.daemon.library import GraspModel, judge, load
     from graspd.daemon.record.frames import read_grasps, read_recording
@@ -44,6 +43,8 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> object:
     """Load the module of a name."""
+    if name == "__version__":
+        return import_module("importlib.metadata").version("graspd")
     if name == "client":
         return import_module("graspd.client")
     if name in _MODULES:
