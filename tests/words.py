@@ -22,7 +22,7 @@ SOURCE = ("daemon", "drivers", "models", "deploy")
 PAGES = ("README.md", "deploy/**/*.md", "models/*.md")
 SUBJECT_MAX = 72
 """Longest subject of a commit, characters. `git log` cuts longer ones off on 80 columns."""
-SUBJECTS_SINCE = "2026-11-24T16:00:00+00:00"
+SUBJECTS_SINCE = "2026-11-27T03:46:00+00:00"
 """Commits before this time are not checked. A time needs no commit that a shallow clone lacks."""
 INSTEAD = {
     "so many": "the number, or the parameter's name",
