@@ -147,9 +147,11 @@ class Assembly:
 def build_recorder(parts: Parts, options: Record, boot_id: str, tap: Tap | None) -> Recorder:
     """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
     require_mcap("[record]")
-    from graspd.daemon.record.recorder import Recorder, ReplayRecorder
+    from graspd.daemon.record.recorder import PATIENCE_S, Recorder, ReplayRecorder
 
-    plays = isinstance(parts.scene.tactile, ReplayTactile)
+    tactile = parts.scene.tactile
+    plays = isinstance(tactile, ReplayTactile)
+    is_fast = isinstance(tactile, ReplayTactile) and tactile.pace == "fast"
     recorder = (ReplayRecorder if plays else Recorder)(
         options,
         parts.scene.hand.name,
@@ -158,6 +160,7 @@ def build_recorder(parts: Parts, options: Record, boot_id: str, tap: Tap | None)
             header_now, parts.pipeline, header_of(parts.plan, parts.model, boot_id)
         ),
         tap=tap,
+        patience_s=PATIENCE_S if is_fast else 0.0,
     )
     parts.pipeline.on_exchange = recorder.exchanged
     return recorder

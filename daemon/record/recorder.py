@@ -55,6 +55,8 @@ FLUSH_AFTER: Final = 0.8
 """Share of the flush interval after which a flush is due; a round and the writing follow."""
 CLOSE_S: Final = 0.5
 """Longest wait of `close` for the thread, s."""
+PATIENCE_S: Final = 60.0
+"""Longest wait for the disk, s, of a run as fast as possible, for which no hand waits."""
 _STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 MakeHeader = Callable[[], RecordingHeader]
@@ -84,7 +86,7 @@ class _Open:
 
 
 class Recorder(Companion):
-    """Record one run of the daemon. Methods never block or raise."""
+    """Record one run of the daemon. Methods never raise, and block only with patience."""
 
     def __init__(
         self,
@@ -94,13 +96,15 @@ class Recorder(Companion):
         *,
         take_header: Callable[[], MakeHeader],
         tap: Tap | None = None,
+        patience_s: float = 0.0,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
         """Start the thread, which creates the first file.
 
         `take_header`: copies session and learning for a file's header. It is called here and after
-        a status, when no reading is being judged.
+        a status, when no reading is being judged. `patience_s`: how long `close` and a run that
+        plays recordings wait for a slow disk.
         """
         self._options = options
         self._hand = hand
@@ -117,6 +121,9 @@ class Recorder(Companion):
         self._dropped = 0
         self._room = QUEUE_MAX
         """Most entries of the queue; 0 after a drop, until that is noted in the recording."""
+        self._patience_s = patience_s
+        self._taken = threading.Event()
+        """Set after the thread has taken the entries of the queue."""
         self._open: _Open | None = None
         self._number = 0
         self._flush_due_ns = clock() + FLUSH_NS
@@ -193,7 +200,7 @@ class Recorder(Companion):
         if self._stopping.is_set():
             return
         self._stopping.set()
-        if not self._worker.close(CLOSE_S):
+        if not self._worker.close(max(CLOSE_S, self._patience_s)):
             log.warning("record: the disk does not answer, the end of the recording is lost")
 
     def _work(self) -> None:
@@ -212,6 +219,7 @@ class Recorder(Companion):
     def go_round(self) -> None:
         """Write the queue; after a failure drop it until the next try is due."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
+        self._taken.set()
         now_ns = self._clock()
         if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
             self._ask_for_turn()
@@ -346,6 +354,14 @@ class ReplayRecorder(Recorder):
         if self._base_ns is not None:
             content, at_ns = partial(_moved, content, self._ahead_ns), self._now_ns
         super()._put(topic, content, at_ns)
+
+    def on_verdict(self, published: PublishedVerdict) -> None:
+        """Record it, and wait for the disk before the next reading is handed over."""
+        super().on_verdict(published)
+        self._taken.clear()
+        is_full = len(self._queue) >= QUEUE_MAX // 2
+        if is_full and self._patience_s and not self._taken.wait(self._patience_s):
+            self._patience_s = 0.0
 
 
 def _moved(content: object, ahead_ns: int) -> dict[str, object]:

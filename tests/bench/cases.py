@@ -41,7 +41,7 @@ class Comes(NamedTuple):
     """Patterns that are not in the output."""
 
 
-TABLE: Final = Comes(0, (r"of [1-9]\d* grasps|[1-9]\d* verdicts",), ("not a label", "Error"))
+TABLE: Final = Comes(0, (r"grasp again +\d+ of [1-9]|[1-9]\d* verdicts",), ("not a label", "Error"))
 """A grasp table was read."""
 STREAM: Final = Comes(0, (r"[1-9]\d* readings", r"[1-9]\d* grasps?, [1-9]\d* judged"))
 """A stream or a link log was read, and a grasp in it was judged."""
@@ -57,7 +57,7 @@ DIFFERS: Final = (
 A_STREAM: Final = r"\b(a|as) stream\b|--as\b"
 NO_TABLE: Final = (
     ONE_GRASP,
-    Comes(2, (A_STREAM,), (r"of 260 grasps", r"260 verdicts")),
+    Comes(2, (A_STREAM,), (r"again +\d+ of 260", r"260 verdicts")),
 )
 CANDUMP: Final = (READ, Comes(2, (r"line 1\b.*candump", r"time")))
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,11 +19,11 @@ from graspd.daemon import scene
 from graspd.daemon.record import recorder as recorder_module
 from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.record.mcap_reader import McapReader
-from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, make_room
+from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, ReplayRecorder, make_room
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.kinds import open_recording
-from tests.daemon.record.recorded import BOOT, NO_STATUS, files, messages, recorder
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, files, messages, recorder
 from tests.kit.waiting import wait_until
 
 TOPIC = b"verdict.right"
@@ -190,6 +191,27 @@ def test_the_end_does_not_wait_for_a_disk_that_never_answers(
     assert "does not answer" in caplog.text
     disk.answers.set()
     wait_until(lambda: threading.active_count() == 1 or not _recording())
+
+
+def test_a_run_that_no_hand_waits_for_waits_for_its_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = StalledDisk(monkeypatch)
+    monkeypatch.setattr(recorder_module, "CLOSE_S", 0.0)
+    monkeypatch.setattr(recorder_module, "QUEUE_MAX", 20)
+    options, silence = Record(directory=tmp_path / "record"), Mock(reading=None)
+    silence.judgement.moment.judged = False
+    writing = ReplayRecorder(
+        options, "right", BOOT, take_header=lambda: lambda: HEADER, patience_s=100.0
+    )
+    assert disk.asked.wait(100)
+    threading.Timer(0.2, disk.answers.set).start()
+    for number in range(100):
+        writing.send(TOPIC, payload(number))
+        writing.on_verdict(silence)
+    writing.close()
+    assert numbers(tmp_path) == list(range(100))
+    assert writing.counters["record"]["dropped"] == 0
 
 
 def _recording() -> bool:
