@@ -192,10 +192,8 @@ class KeyedDoor:
         wait_until(lambda: re.findall(r"(\d+) keys may", self.said())[-1:] == [str(number)])
 
     def is_deaf(self, subscriber: zmq.Socket[bytes]) -> None:
-        """Nothing more comes there than what waits."""
-        while subscriber.poll(100):
-            subscriber.recv_multipart()
-        assert not self.hears(subscriber, QUIET_S)
+        """Wait until nothing comes there: some may be on its way."""
+        wait_until(lambda: not self.hears(subscriber, QUIET_S))
 
     def connect(
         self, keys: Keys | None, kind: int = zmq.SUB, server: bytes | None = None

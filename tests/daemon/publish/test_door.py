@@ -129,13 +129,10 @@ def test_all_messages_before_the_last_status_are_heard(tmp_path: Path, peers: Pe
         for number in range(500):
             publisher.send(b"verdict.right", b"%d" % number)
         publisher.send(b"status.right", b"stopping")
-    heard = []
-    while subscriber.poll(500):
+    heard = [subscriber.recv_multipart()]
+    while heard[-1] != [b"status.right", b"stopping"]:
         heard.append(subscriber.recv_multipart())
-    assert heard[-501:] == [
-        *([b"verdict.right", b"%d" % number] for number in range(500)),
-        [b"status.right", b"stopping"],
-    ]
+    assert heard[-501:-1] == [[b"verdict.right", b"%d" % number] for number in range(500)]
 
 
 def test_a_door_on_a_port_that_is_taken_is_refused(tmp_path: Path) -> None:

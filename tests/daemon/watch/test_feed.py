@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from graspd.daemon.publish.keys import KeysError, make
 from graspd.daemon.watch.feed import Feed, load_keys
 from graspd.daemon.watch.view import View
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import Asked, KeyedDoor, Publisher
+from tests.daemon.publish.doors import Asked, KeyedDoor, Peers, Publisher, first_message
 from tests.daemon.watch.watch_fakes import MS, verdict
 from tests.kit.messages import decode_verdict
 from tests.kit.waiting import PATIENCE_S, wait_until
@@ -41,11 +42,19 @@ def first_of(publisher: Publisher, feed: Feed, seq: int, decision: Decision) -> 
 
 def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
     clock = Clock()
-    with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
+    with (
+        closing(Peers()) as peers,
+        Publisher(endpoint) as publisher,
+        Feed(endpoint, clock=clock) as feed,
+    ):
         first_of(publisher, feed, 0, Decision.STABLE)
+        other = peers.subscribe(endpoint)
+        first_message(publisher, other)
+        last = verdict(49, Decision.STABLE)
         for seq in range(1, 50):
             publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
-        time.sleep(0.1)
+        while other.recv_multipart()[1] != last:  # the daemon has sent them to all
+            pass
         clock.now_ns += 1001 * MS
         assert list(feed.take()) == []
         for payload in first_of(publisher, feed, 50, Decision.SLIP):
