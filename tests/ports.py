@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import socket
 
 from graspd.biotac import FINGERS
 
+PORTS = (10_000 + (211 * os.getpid() + number) % 20_000 for number in itertools.count())
+"""Below those that the system chooses, and apart from those of the process started before."""
+
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     """A port of the loopback that nobody has, of TCP, or of UDP with `SOCK_DGRAM`."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    while True:
+        port = next(PORTS)
+        with socket.socket(socket.AF_INET, kind) as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 def multicast_group() -> str:

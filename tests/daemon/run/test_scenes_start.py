@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import types
 from argparse import Namespace
 from collections.abc import Iterator
@@ -28,6 +27,7 @@ from graspd.drivers.base import LinkError
 from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
 from graspd.models import zoo
 from tests.conftest import ROOT
+from tests.ports import free_port
 
 EXAMPLES = 50
 SHARE = 0.15
@@ -182,13 +182,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]
     make(folder / "keys", "daemon")
     (folder / "a-file").write_text("x")
     (folder / "link").symlink_to(folder)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surroundings, "SERVICE_FOLDER", None)
         patch.setattr("graspd.daemon.scene.scene.STATE_DIRECTORY", folder)
-        yield folder, port
+        yield folder, free_port()
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -18,6 +18,7 @@ from tests.drivers.can.can_standin import sweep_of_frames
 from tests.drivers.can.can_words import truth
 from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
+from tests.ports import free_port
 
 LIMIT_S = 60.0
 QUIET_NS = 2_000_000_000
@@ -157,10 +158,9 @@ def test_a_server_that_ends_is_connected_to_again(server: Server) -> None:
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_server_that_is_absent_or_silent_is_waited_for() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
     clock, silent = Clock(), Server(greets=False)
-    for options in ({"host": "127.0.0.1", "port": port}, silent.options):
+    absent: Options = {"host": "127.0.0.1", "port": free_port()}
+    for options in (absent, silent.options):
         with driver_of(options, clock) as driver:
             assert driver.stream.link.state is LinkState.WAITING
             due_ns = driver.due_ns()
