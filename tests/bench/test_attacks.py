@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.bench.attacks.__main__ import ATTACKS, main
-from tests.bench.attacks.attack import Outcome, Plan
+from tests.bench.attacks.doors import Outcome, Plan
 from tests.conftest import ROOT
 
 

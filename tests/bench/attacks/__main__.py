@@ -17,24 +17,16 @@ from pathlib import Path
 from typing import Final
 
 from graspd.models.training.evaluating.files import markdown_table
-from tests.bench.attacks import doors, hands, hang_ups, rings, standing, who
-from tests.bench.attacks.attack import Outcome, Plan
+from tests.bench.attacks import doors, hang_ups
+from tests.bench.attacks.doors import Outcome, Plan
 from tests.bench.live import end_children_at_sigterm
 from tests.daemon.processes import before_others
 
 ATTACKS: Final[dict[str, Callable[[Plan], Outcome]]] = {
-    "second-palm": hands.second_palm,
-    "ring-spi": rings.ring_over_spi,
-    "joints-frozen": rings.joints_frozen,
-    "drift-early": standing.drifts,
     "connections-curve": doors.connections,
     "noise-ipc": doors.noises,
     "flood": doors.flood,
     "ping-hangup": hang_ups.hang_ups,
-    "misread-serial": hands.misread_serial,
-    "forged-outcomes": doors.forged,
-    "revoked-half-copied": who.removed_key,
-    "other-user": who.other_user,
 }
 """By name, in the order of the page. What one raises counts as not held."""
 HEAD = ("attack", "how often", "what happened", "held")

@@ -1,16 +1,12 @@
-"""Hostile peers: connections by the thousand, noise, floods that keep every rule, lies."""
+"""Hostile peers: connections by the thousand, noise, floods that keep every rule."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import math
-import os
 import random
 import resource
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,11 +14,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import zmq
-
 from graspd.daemon.publish.keys import make
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.live import (
     PATIENCE_S,
     Child,
@@ -49,7 +42,6 @@ ADDED_MAX_MS = 2.0
 the machine; a server in the loop itself took 3.6 to 6.2."""
 HEARD_MIN = 0.95
 """Smallest share of the verdicts given that must be heard in a flood."""
-QUESTIONS = 10
 PATIENCE_MS = 500
 """A question is answered by then."""
 GREETING = bytes.fromhex("ff 00 00 00 00 00 00 00 01 7f 03 01 4e 55 4c 4c") + bytes(48)
@@ -68,6 +60,45 @@ KEEPS_RULES = (
 bytes, questions, malformed outcomes."""
 
 Connect = Callable[[], socket.socket]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What an attack is given."""
+
+    seconds: float
+    """How long it shall go on, s; a round that has begun is ended. It does one at least."""
+    random: random.Random
+    """For all that it draws."""
+    folder: Path
+    """For its files and sockets; removed afterwards."""
+
+    def rounds(self) -> Iterator[int]:
+        """0, 1, 2 ... until the time is over."""
+        end_s = time.monotonic() + self.seconds
+        tried = 0
+        while tried == 0 or time.monotonic() < end_s:
+            yield tried
+            tried += 1
+
+    def folders(self) -> Iterator[Path]:
+        """A new folder for each round."""
+        for number in self.rounds():
+            folder = self.folder / str(number)
+            folder.mkdir()
+            yield folder
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of it."""
+
+    tried: int
+    """How often: readings, connections, bytes or what else the attack counts."""
+    happened: str
+    """In plain words with figures, such as "0 of 995 verdicts `stable`"."""
+    held: bool
+    """Whether graspd did what it must."""
 
 
 @dataclass(slots=True)
@@ -104,7 +135,6 @@ def hand(
     *,
     curve: bool = False,
     tcp: bool = False,
-    publish: str = "",
     high_water_mark: int | None = None,
 ) -> Iterator[Hand]:
     """A daemon at rest: on Unix sockets, or on TCP, with keys; the rest as of `running`."""
@@ -126,7 +156,6 @@ def hand(
     started = running(
         folder,
         sections,
-        publish=publish,
         high_water_mark=high_water_mark,
         endpoint=endpoint,
         keys=keys,
@@ -271,118 +300,3 @@ def _keep_rules(door: Connect, first: bytes, then: bytes, stop: threading.Event)
             with contextlib.suppress(BlockingIOError):
                 while peer.recv(1 << 16):
                     pass
-
-
-NAMES = b"the-controller-1", b"another-program1"
-"""Routing ids of the controller, and of another program of its user."""
-NOBODY = 65534
-"""User and group of nobody (Debian)."""
-AS_NOBODY = """
-import os, socket, sys
-made = socket.socket(socket.AF_UNIX)
-os.setgroups([])
-os.setgid(int(sys.argv[2]))
-os.setuid(int(sys.argv[2]))
-made.connect(sys.argv[1])
-made.settimeout(60)
-def frame():
-    flags = made.recv(1)[0]
-    size = int.from_bytes(made.recv(8 if flags & 2 else 1, socket.MSG_WAITALL), "big")
-    return made.recv(size, socket.MSG_WAITALL)
-made.sendall(bytes.fromhex(sys.argv[3]))
-made.recv(64, socket.MSG_WAITALL)
-made.sendall(bytes.fromhex(sys.argv[4]))
-frame()
-made.settimeout(2)
-for line in sys.stdin:
-    text = line.strip().encode()
-    made.sendall(bytes([0, len(text)]) + text)
-    try:
-        print(frame().decode(), flush=True)
-    except OSError:
-        print("{}", flush=True)
-"""
-"""Speaks ZeroMQ as another user: sends each line, and prints the answer."""
-Tells = Callable[[str], str]
-"""Says something to the daemon; returns the answer, `{}` for none."""
-
-
-@contextlib.contextmanager
-def as_nobody(endpoint: str, name: bytes) -> Iterator[Tells]:
-    """A peer of the user nobody with this routing id. Only root can make one."""
-    identity = b"\x08Identity" + len(name).to_bytes(4, "big") + name
-    body = READY_DEALER[2:] + identity
-    ready = (GREETING.hex(), (b"\x04" + bytes([len(body)]) + body).hex())
-    path = endpoint.removeprefix("ipc://")
-    command = [sys.executable, "-I", "-c", AS_NOBODY, path, str(NOBODY), *ready]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, bufsize=1) as liar:
-        if liar.stdin is None or liar.stdout is None:
-            raise OSError("no pipe to the liar")
-        says, hears = liar.stdin, liar.stdout
-
-        def tell(text: str) -> str:
-            says.write(text + "\n")
-            return hears.readline()
-
-        yield tell
-        says.close()
-
-
-def forged(plan: Plan) -> Outcome:
-    """Outcomes told by others: another user, also with the controller's routing id, and one that
-    asks first; another program of its user; one without a routing id of its own. Of grasps that the
-    controller asked about, before and after it, and of others; and a word that it takes back."""
-    forged_well = lies = told_well = tried = 0
-    plan.folder.chmod(0o755)
-    with (
-        hand(plan.folder, publish='file_mode = "0660"\ngroup = "nogroup"\n') as daemon,
-        zmq.Context() as context,
-        contextlib.ExitStack() as stack,
-    ):
-
-        def peer(name: bytes | None = None) -> Tells:
-            made = stack.enter_context(context.socket(zmq.DEALER))
-            made.linger = 0
-            if name is not None:
-                made.routing_id = name
-            made.connect(daemon.ask)
-
-            def tell(text: str) -> str:
-                made.send(text.encode())
-                return made.recv().decode() if made.poll(2000) else "{}"
-
-            return tell
-
-        controller = peer(NAMES[0] + b"1")
-        liars = [peer(NAMES[1]), peer(b"short"), peer()]
-        if not os.geteuid():
-            strangers = (as_nobody(daemon.ask, name) for name in (NAMES[0], NAMES[1] + b"2"))
-            liars.extend(stack.enter_context(stranger) for stranger in strangers)
-        while json.loads(controller("lift")).get("verdict") != "stable":
-            pass  # from then on its user alone may lift
-        for _ in plan.rounds():
-            for _ in range(QUESTIONS):
-                for liar in liars[1:]:
-                    liar("lift")  # asks first, and looks
-                answer = json.loads(controller("lift"))
-                if not answer.get("judged"):
-                    continue
-                tried += 1
-                right, wrong, before = (
-                    f"outcome {answer['boot_id']} {grasp} {outcome}"
-                    for grasp, outcome in (
-                        (answer["grasp"], "stable"),
-                        (answer["grasp"], "slip"),
-                        (answer["grasp"] - 1, "slip"),
-                    )
-                )
-                told = [liar(wrong) for liar in liars]
-                told_well += json.loads(controller(right)).get("ok", False)
-                told += [liar(lie) for liar in liars for lie in (wrong, before)]
-                told.append(controller(wrong))
-                forged_well += sum(json.loads(each).get("ok", False) for each in told)
-                lies += len(told)
-        well = forged_well == 0 and told_well == tried > 0
-        said = f"{forged_well} of {lies} forged, {told_well} of {tried} true ones taken, "
-        return daemon.outcome(lies + tried, well, said)

@@ -9,13 +9,14 @@ from pathlib import Path
 import zmq
 
 from graspd.daemon.publish.keys import load_pair
-from tests.bench.attacks.attack import Outcome, Plan
 from tests.bench.attacks.doors import (
     AS_DEALER,
     AS_SUB,
     GREETING,
     Connect,
     Hand,
+    Outcome,
+    Plan,
     hand,
 )
 

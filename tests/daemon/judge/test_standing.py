@@ -24,9 +24,9 @@ from graspd.models import zoo
 from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from graspd.models.trust.risk import RiskLimits
-from tests.bench.attacks.standing import drifting
 from tests.daemon.fakes import MS, Clock, sound
 from tests.daemon.judge.felt_hand import HELD, Feel, Flaw, Hand, limits, tared
+from tests.kit.drifting import drifting
 
 PERIOD_NS = 14 * MS
 """Of a palm's electrodes, 71.43 Hz."""
