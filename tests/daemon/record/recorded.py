@@ -12,6 +12,7 @@ from typing import Any, cast
 import zmq
 
 from graspd.daemon.publish.messages import Status, Verdict
+from graspd.daemon.record.link_log import Tap
 from graspd.daemon.record.mcap import RecordingHeader
 from graspd.daemon.record.mcap_reader import McapReader
 from graspd.daemon.record.recorder import MakeHeader, Recorder
@@ -78,11 +79,14 @@ def files(folder: Path) -> list[Path]:
 def recorder(
     folder: Path,
     take_header: Callable[[], MakeHeader] = lambda: lambda: HEADER,
+    *,
+    tap: Tap | None = None,
+    clock: Callable[[], int] = time.monotonic_ns,
     **options: Any,  # noqa: ANN401
 ) -> Recorder:
     """A recorder in a folder."""
     wanted = Record(**{"directory": folder / "record", **options})
-    return Recorder(wanted, "right", BOOT, take_header=take_header)
+    return Recorder(wanted, "right", BOOT, take_header=take_header, tap=tap, clock=clock)
 
 
 def scene(folder: Path, more: str = "", gate: str = "") -> Path:
