@@ -35,6 +35,7 @@ from graspd.daemon.process.text import (
     write_lines,
 )
 from graspd.daemon.scene import drivers as scene_drivers
+from graspd.daemon.scene.drivers import Device, DeviceKind
 from graspd.daemon.scene.endpoints import clash
 from graspd.daemon.scene.scene import Realtime, Record, RiskSection
 from graspd.drivers.base import DriverError
@@ -94,14 +95,16 @@ def _taken(wanted: scene.Scene) -> Iterator[tuple[str, str]]:
     yield "hand.name", wanted.hand.name
     if wanted.keeps_session:
         yield "session.folder", os.path.realpath(wanted.session_path)
-    for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
-        match section:
-            case scene_drivers.SpiTactile(port=port):
-                yield "tactile.port", os.path.realpath(port)
-            case scene_drivers.CanTactile(channel=channel, arbitration_id=identifier):
-                yield "tactile.channel and arbitration_id", f"{channel} {identifier}"
-            case scene_drivers.UdpSection(source=source):
-                yield f"{name}.source", source
+    for table, device in _devices(wanted):
+        name = os.path.realpath(device.name) if device.kind is DeviceKind.SERIAL else device.name
+        yield f"{table}.{device.keys}", f"{name} {device.part}".rstrip()
+
+
+def _devices(wanted: scene.Scene) -> Iterator[tuple[str, Device]]:
+    """Yield each device that a driver of the scene takes, with the name of its section."""
+    for table, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
+        if section is not None and section.device is not None:
+            yield table, section.device
 
 
 def _check(path: Path, *, as_json: bool) -> scene.Scene | None:
@@ -144,39 +147,33 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"  {name:9} {printable(text)}"
 
 
-def _warnings(wanted: scene.Scene) -> list[str]:
-    warnings = [] if (absent := _absent(wanted.tactile)) is None else [absent]
-    for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
-        if not isinstance(section, scene_drivers.UdpSection):
-            continue
-        address = ip_address(Endpoint.parse(section.source).address)
-        if section.only_from is None and address.is_unspecified:
-            warnings.append(
-                f"[{name}] listens to {section.source}, so anybody who can reach this computer is "
-                "taken for the hand: name its sender with only_from, or listen on one address"
-            )
-    return warnings
+def _warnings(wanted: scene.Scene) -> Iterator[str]:
+    for table, device in _devices(wanted):
+        match device.kind:
+            case DeviceKind.UDP if device.only_from is None:
+                if ip_address(Endpoint.parse(device.name).address).is_unspecified:
+                    yield (
+                        f"[{table}] listens to {device.name}, so anybody who can reach this "
+                        "computer is taken for the hand: name its sender with only_from, or listen "
+                        "on one address"
+                    )
+            case DeviceKind.SERIAL if os.path.isabs(device.name):  # else a pyserial URL
+                yield from _unreachable("port", device.name, device.name)
+            case DeviceKind.SOCKETCAN:
+                yield from _unreachable("CAN interface", device.name, str(NETWORK / device.name))
 
 
-def _absent(tactile: scene_drivers.Tactile) -> str | None:
-    """Return which port or interface is not there yet; None if it is, or if that is not known."""
-    match tactile:
-        case (
-            scene_drivers.SpiTactile(port=port)
-            | scene_drivers.CanTactile(interface="slcan", channel=port)
-        ):
-            path, what = Path(port), "port"
-            if not path.is_absolute():  # a pyserial URL
-                return None
-        case scene_drivers.CanTactile(interface="socketcan", channel=port):
-            path, what = NETWORK / port, "CAN interface"
-        case _:
-            return None
-    if os.path.exists(path):
-        return None
-    return (
-        f"the {what} {port} is not there yet; graspd run waits for it, graspd doctor lists others"
-    )
+def _unreachable(what: str, name: str, path: str) -> Iterator[str]:
+    """Yield why a device cannot be opened now."""
+    try:
+        os.stat(path)
+    except PermissionError:
+        yield f"you may not reach the {what} {name}; graspd doctor says why"
+    except OSError:
+        yield (
+            f"the {what} {name} is not there yet; graspd run waits for it, graspd doctor lists "
+            "others"
+        )
 
 
 def _try_drivers(plan: Plan) -> int | None:

@@ -18,7 +18,7 @@ from graspd.daemon.doctor.link import TROUBLES
 from graspd.daemon.publish import PublishError
 from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.scene import Scene
-from graspd.daemon.scene.drivers import CanTactile, Section, SpiTactile, UdpSection
+from graspd.daemon.scene.drivers import CanTactile, Device, DeviceKind, DriverSection
 from graspd.drivers.base import LinkCause
 from graspd.drivers.udp import Endpoint
 from graspd.models.contract import ModelError
@@ -57,34 +57,40 @@ def model_finding(wanted: Scene) -> Finding:
     return fine(f"model {model.contract.name} ({model.sha256[:12]}) fits the hand")
 
 
-def explained(finding: Finding, section: Section) -> list[Finding]:
+def explained(finding: Finding, section: DriverSection) -> list[Finding]:
     """Return a finding on the link of `section` with what this computer knows of its cause."""
-    match section, finding.cause:
-        case CanTactile(interface="socketcan"), cause if cause in NOT_HEARD:
+    device = section.device
+    if device is None:
+        return [finding]
+    match section, device.kind:
+        case CanTactile(), DeviceKind.SOCKETCAN if finding.cause in NOT_HEARD:
             return _on_socketcan(finding, section)
-        case SpiTactile() | CanTactile(), Cause.PORT_MISSING:
-            ports = [fine(str(port)) for port in computer.serial_ports()]
-            return [finding, *(ports or [fine("no serial port")])]
-        case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_DENIED:
-            return [_denied(finding, port)]
-        case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_HELD:
-            return [_held(finding, computer.file_holders(port))]
-        case UdpSection(source=source), Cause.PORT_HELD:
+    match device, finding.cause:
+        case Device(kind=DeviceKind.UDP, name=source), Cause.PORT_HELD:
             number = Endpoint.parse(source).port
             return [_held(finding, computer.port_holders("udp", number))]
-        case UdpSection(source=source), Cause.SILENT if finding.advice == NO_DATA.advice:
+        case Device(kind=DeviceKind.UDP, name=source), Cause.SILENT if (
+            finding.advice == NO_DATA.advice
+        ):
             advice = f"Let its program send to {source}. Another computer cannot send to 127.0.0.1."
             return [replace(finding, advice=advice)]
+        case _, Cause.PORT_MISSING:
+            ports = [fine(str(port)) for port in computer.serial_ports()]
+            return [finding, *(ports or [fine("no serial port")])]
+        case Device(name=port), Cause.PORT_DENIED:
+            return [_denied(finding, port)]
+        case Device(name=port), Cause.PORT_HELD:
+            return [_held(finding, computer.file_holders(port))]
     return [finding]
 
 
-def shared_findings(section: Section) -> list[Finding]:
-    """Warn of another program that has the serial port open. `explained` says which."""
-    match section:
-        case SpiTactile(port=port) | CanTactile(channel=port) if computer.file_holders(port):
-            what = f"{section.driver}: {port} is open in another program, which may take its bytes"
-            return [Finding(Level.WARNING, what, Cause.PORT_HELD, "End it.")]
-    return []
+def shared_findings(section: DriverSection) -> list[Finding]:
+    """Warn of another program that has the port open. `explained` says which."""
+    device = section.device
+    if device is None or device.kind is DeviceKind.UDP or not computer.file_holders(device.name):
+        return []
+    what = f"{device.name} is open in another program, which may take its bytes"
+    return [Finding(Level.WARNING, what, Cause.PORT_HELD, "End it.")]
 
 
 def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:

@@ -36,6 +36,10 @@ DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
 """Number of each decision, for plotting tools, which skip text."""
 
 
+Owner = Literal["you", "another"]
+"""The peer that owns a grasp: the one that asks, or another; or the one that asks may not lift."""
+
+
 class _Message(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """First fields of every message."""
 
@@ -134,6 +138,8 @@ class Verdict(_Message, frozen=True, kw_only=True):
     """Largest motion of each finger that counts as still, in the same units."""
     fingers: Annotated[dict[Finger, FingerState | None], _HAND] | None = None
     """State of each finger; null: not known. Null with a null `gate`."""
+    owner: Owner | msgspec.UnsetType = msgspec.UNSET
+    """Peer that owns the grasp; only in an answer to `lift` by which a hand may lift."""
 
 
 class GateMessage(_Message, frozen=True, kw_only=True):

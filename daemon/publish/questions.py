@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.companion import KEPT, PublishedVerdict, Reply, Requests, Told
-from graspd.daemon.publish.messages import OBJECT_PATTERN, encode, withheld
+from graspd.daemon.publish.messages import OBJECT_PATTERN, Owner, encode, withheld
 from graspd.daemon.publish.porter import Frames
 from graspd.daemon.trust.lift_book import NAME_BYTES, GraspId, LiftBook, Peer, Report
 
@@ -215,8 +215,8 @@ class Questions:
             return published.payload
         is_new = question.offer is None
         if is_new and not (self._may_lift(peer, lifts) and lifts.claim(published.grasp, peer)):
-            looked_at = replace(verdict, supervised=False, early=False)
-            return encode(looked_at) if verdict.supervised else published.payload
+            early = verdict.early and not verdict.supervised
+            return encode(replace(verdict, supervised=False, early=early, owner="another"))
         if is_stable:
             lifts.announce()
         if is_new:
@@ -225,7 +225,10 @@ class Questions:
         if question.kept is False:
             self._withdraw(peer, question)
             return withheld(verdict, Reason.NOT_KEPT)
-        return published.payload if question.kept else None
+        if not question.kept:
+            return None
+        owner: Owner = "you" if lifts.owns(published.grasp, peer) else "another"
+        return encode(replace(verdict, owner=owner))
 
     def _may_lift(self, peer: Peer, lifts: LiftBook) -> bool:
         if self._tells is not None:

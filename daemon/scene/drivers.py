@@ -2,8 +2,10 @@
 
 # Without postponed annotations, which pydantic would evaluate at every start.
 import ipaddress
+from abc import ABC, abstractmethod
+from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
@@ -63,7 +65,44 @@ class Section(BaseModel):
     )
 
 
-class ReplayTactile(Section):
+class DeviceKind(Enum):
+    """Kind of a device of this computer."""
+
+    SERIAL = "serial"
+    SOCKETCAN = "socketcan"
+    BUS = "bus"
+    """A CAN bus at neither a serial port nor an interface of the kernel."""
+    UDP = "udp"
+
+
+BUS_KINDS: Final = {"slcan": DeviceKind.SERIAL, "socketcan": DeviceKind.SOCKETCAN}
+"""Kind of a bus by its python-can interface."""
+
+
+class Device(NamedTuple):
+    """Device of this computer that a driver takes for itself."""
+
+    kind: DeviceKind
+    name: str
+    """Path or pyserial URL of a port, name of a bus, `udp://ADDRESS:PORT`."""
+    keys: str
+    """Keys of the section that name it."""
+    part: str = ""
+    """Part of it that the driver takes; empty: all."""
+    only_from: str | None = None
+    """IP address of the sender over UDP; None: any may send."""
+
+
+class DriverSection(Section, ABC):
+    """Base of the sections that name a driver."""
+
+    @property
+    @abstractmethod
+    def device(self) -> Device | None:
+        """Device that the driver takes for itself; None: it takes none."""
+
+
+class ReplayTactile(DriverSection):
     """`[tactile]` with `driver = "replay"`: recorded files instead of sensors."""
 
     driver: Literal["replay"]
@@ -81,8 +120,12 @@ class ReplayTactile(Section):
     rate_hz: Annotated[float, Field(ge=0.001, le=10_000), unit("1/s")] | None = None
     """Rows a second of a stream without times, and of a table as played."""
 
+    @property
+    def device(self) -> None:
+        """None: it reads files."""
 
-class SpiTactile(Section):
+
+class SpiTactile(DriverSection):
     """`[tactile]` with `driver = "spi"`: a bridge on a serial line (deploy/bridge/PROTOCOL.md)."""
 
     driver: Literal["spi"]
@@ -94,8 +137,13 @@ class SpiTactile(Section):
     baud: Annotated[int, Field(ge=115_200, le=12_000_000), unit("bit/s")] = 921_600
     """Line rate; ports of USB CDC ignore it."""
 
+    @property
+    def device(self) -> Device:
+        """Return the serial port."""
+        return Device(DeviceKind.SERIAL, self.port, "port")
 
-class CanTactile(Section):
+
+class CanTactile(DriverSection):
     """`[tactile]` with `driver = "can"`: sensors behind a CAN board (deploy/can/PROTOCOL.md)."""
 
     driver: Literal["can"]
@@ -117,14 +165,25 @@ class CanTactile(Section):
     options: dict[str, Option] = {}
     """More arguments of the interface, as `{ host = "10.0.0.7", port = 29536 }` of socketcand."""
 
+    @property
+    def device(self) -> Device:
+        """Return the bus; two drivers share it if their frames have other ids."""
+        kind = BUS_KINDS.get(self.interface, DeviceKind.BUS)
+        return Device(kind, self.channel, "channel and arbitration_id", str(self.arbitration_id))
 
-class UdpSection(Section):
+
+class UdpSection(DriverSection):
     """Section of a driver that listens to UDP."""
 
     source: UdpSource
     """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
     """IP address of the sender; without it any may send."""
+
+    @property
+    def device(self) -> Device:
+        """Return the address that it listens on."""
+        return Device(DeviceKind.UDP, self.source, "source", only_from=self.only_from)
 
 
 class PalmTactile(UdpSection):
@@ -150,13 +209,17 @@ Tactile = Annotated[
 """Section of a tactile driver; its key `driver` tells which."""
 
 
-class PalmJoints(Section):
+class PalmJoints(DriverSection):
     """`[joints]` with `driver = "palm"`: Hall sensors in the palm's packets."""
 
     driver: Literal["palm"]
     """Selects this driver."""
     calibration: FilePath
     """Calibration of the hand, as deploy/calibration/example_hand.toml."""
+
+    @property
+    def device(self) -> None:
+        """None: the tactile driver has the packets."""
 
 
 class StreamJoints(UdpSection):

@@ -181,7 +181,7 @@ class LiftBook:
             return False
         if lift.owner is not None and lift.owner.credential != peer.credential:
             return False
-        if lift.owner is None or not lift.announced:
+        if lift.owner is None:
             self._lifts[grasp] = replace(lift, owner=peer)
         self.lifter = peer
         return True
@@ -197,18 +197,20 @@ class LiftBook:
         self.on_announced(True)
 
     def take_back(self, grasp: GraspId | None) -> bool:
-        """Note that no lift of a grasp follows; None: of the one announced last.
+        """Note that no lift of a grasp follows, and that none owns it; None: of the last announced.
 
         False, and nothing changes, if the outcome is known, or the grasp is not.
         """
         awaited = (lift.id for lift in reversed(self._lifts.values()) if lift.is_awaited)
         lift = self._lifts.get(grasp or next(awaited, GraspId("", 0)))
-        if lift is not None and lift.is_awaited:
-            self._lifts[lift.id] = replace(lift, announced=False)
+        if lift is None or lift.slipped is not None:
+            return False
+        self._lifts[lift.id] = replace(lift, announced=False, owner=None)
+        if lift.announced:
             self.announced -= 1
             self._count()
             self.on_announced(False)
-        return lift is not None and lift.slipped is None
+        return True
 
     def offered(self, peer: Peer) -> GraspId | None:
         """Return the last grasp that this connection may lift, if its outcome is out."""
@@ -223,13 +225,18 @@ class LiftBook:
         self.announced = 0
         self._count()
 
+    def owns(self, grasp: GraspId, peer: Peer) -> bool:
+        """True if this peer, by any of its connections, was the first that may lift the grasp."""
+        lift = self._lifts.get(grasp)
+        return lift is not None and lift.owner is not None and lift.owner.name == peer.name
+
     def may_report(self, grasp: GraspId, peer: Peer | None) -> bool:
         """True if this peer may tell the outcome: the owner of the grasp, or the daemon itself.
 
         The last peer that may lift reports for other owners of its credential, and grasps of none.
         """
         lift = self._lifts.get(grasp)
-        if peer is None or lift is None or (lift.owner and lift.owner.name == peer.name):
+        if peer is None or lift is None or self.owns(grasp, peer):
             return True
         is_heir = lift.owner is None or lift.owner.credential == peer.credential
         return is_heir and self.lifter is not None and self.lifter.name == peer.name

@@ -113,6 +113,7 @@ def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
         "motion": draw(st.sampled_from([None, {}, {"ff": 0.5}, {"mf": None, "ff": 3, "": 0.0}])),
         "motion_limits": draw(st.sampled_from([None, {}, {"ff": 1.5, "th": 2}])),
         "fingers": draw(st.sampled_from([None, {}, {"ff": "slide", "th": None}, {"": "free"}])),
+        "owner": draw(st.sampled_from([None, "you", "another", "", 1])),
     }
     if not known:
         reasons = [["moving"], ["unproven"], ["low-confidence"], ["unproven", "moving"]]

@@ -71,6 +71,7 @@ class Told(Former):
     motion: dict[str, Duration | None] | None = None
     motion_limits: dict[str, Duration] | None = None
     fingers: dict[str, Literal["free", "touch", "slide"] | None] | None = None
+    owner: str | None = None
 
     @property
     def teaches(self) -> bool:

@@ -35,7 +35,7 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
                   << risk->slips << ' ' << risk->outstanding << ' '
                   << std::llrint(risk->bound.value_or(-1)) << ' ' << risk->warm_up_left << ' '
                   << risk->announced << ' ' << risk->awaited << ' ';
-    std::cout << verdict.early << ' ' << std::llrint(verdict.still_ms.value_or(-1) * 1e6) << ' ';
+    std::cout << verdict.early << verdict.owner << ' ' << std::llrint(verdict.still_ms.value_or(-1) * 1e6) << ' ';
     for (const auto& [finger, moves] : verdict.motion)
         std::cout << finger << '=' << std::llrint(moves.value_or(-1) * 1e3) << ' ';
     for (const auto& [finger, limit] : verdict.motion_limits)

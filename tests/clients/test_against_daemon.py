@@ -14,6 +14,7 @@ from deploy.clients.python.graspd_client import Client, Keys, Outcome, Verdict
 from graspd.daemon.publish.keys import make
 from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome
 from tests.clients.bench import Daemon, free_endpoint
+from tests.clients.building import asked
 from tests.kit.waiting import wait_until
 
 
@@ -126,6 +127,32 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
     (told,) = heard  # what is told again is not published again
     assert (told.outcome, told.object) == ("slip", "mug")
     assert (told.boot_id, told.grasp) == (lifted_on.boot_id, lifted_on.grasp)
+
+
+@pytest.mark.parametrize("first", ["python", "cpp"])
+def test_the_second_controller_learns_who_owns_the_grasp(
+    lift_gate: Path, tmp_path: Path, first: str
+) -> None:
+    with Daemon(tmp_path, whole_grasps=True) as daemon:
+        places = daemon.endpoint, daemon.ask_endpoint
+
+        def in_cpp() -> tuple[str, str | None]:
+            words = asked(lift_gate, places[0], 1.0, places[1]).stdout.split()
+            return words[words.index("grasp") + 1], words[-1] if "owner:" in words else None
+
+        def in_python() -> tuple[str, str | None]:
+            with Client(places[0], ask_endpoint=places[1]) as graspd:
+                said = graspd.may_i_lift(1.0).verdict
+            return str(said.grasp), said.owner
+
+        def both_ask_for_one() -> bool:
+            asks = [in_python, in_cpp] if first == "python" else [in_cpp, in_python]
+            (grasp, owner), (again, second) = (ask() for ask in asks)
+            # A computer that is slow has lost the grasp by then.
+            assert second in (None, "another" if grasp == again and owner else "you")
+            return (grasp, owner, second) == (again, "you", "another")
+
+        wait_until(both_ask_for_one)
 
 
 def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -> None:

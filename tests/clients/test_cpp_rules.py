@@ -28,7 +28,7 @@ def said(newest: Newest, now_ns: int) -> str:
         words += [fixed(risk.target), risk.lifts, risk.slips, risk.outstanding]
         words += [-1 if risk.bound is None else round(risk.bound), risk.warm_up_left]
         words += [risk.announced, risk.awaited]
-    words += [int(verdict.early)]
+    words += [f"{verdict.early:d}{verdict.owner or ''}"]
     words += [-1000000 if verdict.still_ms is None else round(verdict.still_ms * 1e6)]
     for finger, moves in sorted((verdict.motion or {}).items()):
         words.append(f"{finger}={-1000 if moves is None else round(moves * 1e3)}")

@@ -140,6 +140,9 @@ struct Verdict {
     // What each finger feels, none where that is not known, and always where the reading is older
     // than `max_age_ms`.
     std::map<std::string, std::optional<FingerState>> fingers;
+    // `you` if you report the outcome of the lift, `another` if another controller does, which may
+    // be lifting; empty if the daemon does not say.
+    std::string owner;
 
     explicit operator bool() const { return decision == Decision::stable && !supervised; }
 
@@ -361,6 +364,8 @@ inline void stillness(const json& told, Verdict& found) {
         if (!early->is_boolean()) throw Malformed{};
         found.early = early->get<bool>();
     }
+    const auto owner = told.find("owner");
+    if (owner != told.end() && !owner->is_null()) found.owner = text(*owner);
     if (told.contains("still_ms")) found.still_ms = maybe(told, "still_ms", REAL_MAX);
     const json nothing = json::object();
     const auto by_finger = [&](const char* which) -> const json& {
@@ -852,8 +857,10 @@ public:
         }
         if (answer_ && !is_behind(newest, *answer_)) {
             if (permits(newest) && newest.grasp == answer_->grasp &&
-                newest.supervised == answer_->supervised)
+                newest.supervised == answer_->supervised) {
+                newest.owner = answer_->owner;
                 return newest;
+            }
             answer_.reset();
         }
         if (!asked_ && !answer_) {

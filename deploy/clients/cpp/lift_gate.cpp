@@ -39,7 +39,8 @@ int ask(const graspd::Options& options, double deadline_s, bool supervised,
     const graspd::LiftAnswer answer = client.may_i_lift(deadline_s, supervised, still_ms);
     print(answer.verdict, client.counts());
     std::cout << (answer ? "lift" : "do not lift") << (answer.supervised ? " supervised" : "")
-              << " after " << answer.waited_s << " s\n";
+              << " after " << answer.waited_s << " s"
+              << (answer.verdict.owner.empty() ? "" : ", owner: " + answer.verdict.owner) << '\n';
     return answer ? 0 : 1;
 }
 

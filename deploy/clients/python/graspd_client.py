@@ -161,8 +161,9 @@ class Verdict:
     has been still, ms: from 100 on nothing moves fast, from 240 on nothing slides slowly either.
     `motion` is how each finger moves, in units of its own noise, and None where that is not known;
     `motion_limits` what that is at most while it is still. `fingers` is what each one feels, None
-    where that is not known, and always where the reading is older than `max_age_ms`. None: not
-    known before the first message, or not told by the daemon.
+    where that is not known, and always where the reading is older than `max_age_ms`. `owner`
+    is `you` if you report the outcome of the lift, `another` if another controller does: it may be
+    lifting. None: not known before the first message, or not told by the daemon.
     """
 
     decision: Decision
@@ -181,6 +182,7 @@ class Verdict:
     motion: dict[str, float | None] | None = field(default=None, hash=False)
     motion_limits: dict[str, float] | None = field(default=None, hash=False)
     fingers: dict[str, FingerState | None] | None = field(default=None, hash=False)
+    owner: str | None = None
 
     def __bool__(self) -> bool:
         return self.decision == Decision.STABLE and not self.supervised
@@ -966,7 +968,7 @@ class _Question:
                 self._answer.supervised,
             )
             if same and self.permits(newest):
-                return newest
+                return replace(newest, owner=self._answer.owner)
             self._answer = None
         if not self._asked and self._answer is None:
             if self._may_be_announced:
@@ -1190,8 +1192,8 @@ def _message(told: dict[str, Any]) -> _Message:
 def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
     """With what is told of it; older daemons tell nothing."""
     told = {"early": False, "still_ms": None, "motion": None, "motion_limits": None, **told}
-    told = {"fingers": None, **told}
-    if not isinstance(told["early"], bool):
+    told = {"fingers": None, "owner": None, **told}
+    if not isinstance(told["early"], bool) or not isinstance(told["owner"], (str, type(None))):
         raise ValueError
     return replace(
         said,
@@ -1200,6 +1202,7 @@ def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
         motion=_by_finger(told["motion"], _maybe),
         motion_limits=_by_finger(told["motion_limits"], _real),
         fingers=_by_finger(told["fingers"], _finger_state),
+        owner=told["owner"],
     )
 
 

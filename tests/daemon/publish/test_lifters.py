@@ -104,6 +104,30 @@ def test_the_first_user_that_may_lift_stays_the_only_one(bench: Bench) -> None:
     assert bench.tells()
 
 
+@pytest.mark.parametrize("more", [{}, {"name": "unknown", "supervised": True}], ids=str)
+@pytest.mark.parametrize(
+    ("taken_back", "who", "user", "owner"),
+    [
+        (False, OTHER, ROBOT, "another"),
+        (False, OTHER, STRANGER, "another"),
+        (False, NAME + b"2", ROBOT, "you"),
+        (True, OTHER, ROBOT, "you"),
+        (True, OTHER, STRANGER, "another"),
+    ],
+)
+def test_a_second_controller_learns_who_owns_the_grasp(
+    bench: Bench, more: dict[str, Any], taken_back: bool, who: bytes, user: bytes, owner: str
+) -> None:
+    bench.say(b"lift")
+    bench.verdict(**more)
+    if taken_back:
+        bench.say(b"not-lifting")
+    bench.say(b"lift", who, user)
+    bench.verdict(**more)
+    assert (bench.answers[0]["owner"], bench.answers[-1]["owner"]) == ("you", owner)
+    assert bench.tells(*((who, user) if owner == "you" else (NAME, ROBOT)))
+
+
 def test_a_user_that_only_looks_does_not_take_the_place(bench: Bench) -> None:
     bench.say(b"judge", OTHER, STRANGER)
     bench.verdict()
@@ -135,8 +159,8 @@ def test_a_supervised_lift_is_offered_to_lifters_alone(bench: Bench) -> None:
     for who, user in ((NAME, ROBOT), (OTHER, STRANGER)):
         bench.say(b"lift", who, user)
         bench.verdict("unknown", supervised=True, reasons=["unproven"])
-    assert bench.answers[0] == {"said": "unknown"}
-    assert bench.answers[1]["supervised"] is False
+    said = [(answer["supervised"], answer["owner"]) for answer in bench.answers]
+    assert said == [(True, "you"), (False, "another")]
     assert bench.announced == (0, 0)
     assert bench.tells()
 
@@ -149,7 +173,8 @@ def test_a_lift_is_on_the_disk_before_the_answer(bench: Bench) -> None:
     bench.book.disk[0](KEPT)
     assert bench.sent == []
     bench.verdict(now_ns=0)
-    assert (bench.answers, len(bench.book.disk)) == ([{"said": "stable"}], 1)
+    assert [answer["verdict"] for answer in bench.answers] == ["stable"]
+    assert len(bench.book.disk) == 1
 
 
 def test_a_lift_that_cannot_be_kept_is_unknown(bench: Bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,7 +56,9 @@ def test_a_question_gets_one_answer(
     assert (requests.times, len(questions.waiting)) == (1, 1)
     questions.answer(published(b"{}"))
     questions.answer(published(b"{}"))
-    assert sent == [[b"asker", *delimiter, b"{}"]]
+    ((*envelope, answer),) = sent
+    assert envelope == [b"asker", *delimiter]
+    assert json.loads(answer).get("owner") == ("another" if text == b"lift" else None)
     assert len(questions.waiting) == 0
     short_id = {"not_theirs": 1} if text == b"lift" else {}
     assert questions.counters == {"asked": 1, "answered": 1, "dropped": 0} | short_id

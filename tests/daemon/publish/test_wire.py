@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,15 @@ import pytest
 
 from graspd.daemon.commands.texts import schema_text
 from graspd.daemon.judge.reasons import ADVICE, GateCause, GateState, Reason
-from graspd.daemon.publish.messages import MESSAGES, decode_outcome, encode, schema
+from graspd.daemon.publish.messages import (
+    MESSAGES,
+    LearnerHealth,
+    Lifts,
+    RiskReport,
+    decode_outcome,
+    encode,
+    schema,
+)
 from tests.kit.messages import GOLDEN, decode_verdict, golden
 
 SCHEMA_FILE = Path(__file__).parents[3] / "deploy" / "wire" / "messages.schema.json"
@@ -96,13 +105,27 @@ def test_a_message_that_breaks_the_schema_is_refused_by_both(change: dict[str, A
     assert not validator.is_valid(content)
 
 
+def fields_of(page: str, heading: str) -> set[str]:
+    """Return the names before the colons of a section's list, and those that its text names."""
+    section = page.partition(f"{heading}\n")[2].partition("\n## ")[0]
+    heads = re.findall(r"^- (`[^:]*`):|^(`.*)$", section, re.MULTILINE)
+    return {name for head in heads for name in re.findall(r"`(\w+)`", "".join(head))}
+
+
 def test_the_documentation_names_all_fields_and_reasons() -> None:
     text = (SCHEMA_FILE.parent / "README.md").read_text()
     for reason in Reason:
         assert f"- `{reason}`: {ADVICE[reason]}\n" in text
-    for message in MESSAGES.values():
-        for field in message.__struct_fields__:
-            assert f"`{field}`" in text, field
+    nested: dict[str, list[type[msgspec.Struct]]] = {
+        "verdict": [RiskReport],
+        "status": [Lifts, LearnerHealth],
+    }
+    common = fields_of(text, "## Fields of several messages")
+    for name, message in MESSAGES.items():
+        described = fields_of(text, f"## `{name}.<hand>`")
+        for part in (message, *nested.get(name, [])):
+            known = described | (common if part is message else set())
+            assert set(part.__struct_fields__) - known == set(), part
     gate = text.partition("## `gate.<hand>`")[2].partition("\n## ")[0]
     states, _, causes = gate.partition("Causes:")
     for listed, kind in ((states, GateState), (causes, GateCause)):
