@@ -21,7 +21,6 @@ SOURCES: Final = (BRIDGE / "src", BRIDGE / "pico")
 FOLDER: Final = ROOT / "build" / "pico"
 EMULATOR_FOLDER: Final = ROOT / "build" / "emulated"
 """Everything made here is in these two, which git does not see."""
-CLOCKS_MHZ: Final = (125, 133, 200)
 COMPILER: Final = "arm-none-eabi-gcc"
 NEEDED: Final = {
     COMPILER: "gcc-arm-none-eabi",

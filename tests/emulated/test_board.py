@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from itertools import groupby
-from pathlib import Path
 
 import pytest
 
@@ -76,47 +73,7 @@ def test_the_light_tells_idle_sweeping_and_a_missing_sensor_apart(
     assert blinking(500, turns(board, 2500)), "stopped"
 
 
-def test_an_image_is_built_once(image: Image, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = image()
-    monkeypatch.setattr(build, "_build", lambda *_: pytest.fail("built again"))
-    assert image() == made
-
-
 def test_an_image_leaves_most_of_the_chip_free(image: Image) -> None:
     flash, ram = build.flash_and_ram(image())
     assert 10_000 < flash < 64 * 1024, "of 2 MB"
     assert 4_000 < ram < 64 * 1024, "of 264 kB"
-
-
-def test_picotool_is_fetched_if_the_option_asks_for_it(image: Image, tmp_path: Path) -> None:
-    image()  # or skip: no tools, no SDK
-    nowhere = tmp_path / "nowhere"
-    options = {"PICO_NO_PICOTOOL": 0, "PICOTOOL_GIT_REPOSITORY_URL": nowhere}
-    settings = [f"-D{name}={value}" for name, value in options.items()]
-    settings.append(f"-DPICO_SDK_PATH={build.pico_sdk()}")
-    folders: list[str | Path] = ["-S", build.BRIDGE / "pico", "-B", tmp_path / "build"]
-    done = subprocess.run(
-        ["cmake", *folders, *settings], check=False, capture_output=True, text=True
-    )
-    assert done.returncode != 0, done.stdout
-    assert "Downloading Picotool" in done.stderr
-    assert str(nowhere) in done.stdout + done.stderr
-
-
-@pytest.mark.parametrize("program", build.NEEDED)
-def test_a_missing_program_is_named_with_its_package(
-    program: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shutil, "which", lambda name: None if name == program else f"/{name}")
-    with pytest.raises(
-        build.MissingError, match=f"^no {program}: install {build.NEEDED[program]}$"
-    ):
-        build.image()
-
-
-def test_a_folder_that_is_no_sdk_is_named(
-    image: Image, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PICO_SDK_PATH", str(tmp_path))
-    with pytest.raises(build.MissingError, match=f"^no pico-sdk at PICO_SDK_PATH '{tmp_path}'$"):
-        image()

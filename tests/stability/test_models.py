@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -36,6 +37,15 @@ from graspd.models.training.reports.stability.row import Row
 from tests.kit.inside import graspd
 
 DEFAULT = "small-session"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trust_once() -> Iterator[None]:
+    """What belongs to no model is measured once for all tests of a process."""
+    measure = trust.rows
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trust, "rows", cache(lambda outcomes: list(measure(outcomes))))
+        yield
 
 
 @pytest.mark.parametrize("name", zoo.names())

@@ -89,14 +89,6 @@ def record(path: Path, counts: NDArray[np.uint16]) -> None:
     writer.close()
 
 
-def test_a_row_is_what_was_judged(tmp_path: Path) -> None:
-    (counts,) = sweeps(1)
-    record(tmp_path / "a.mcap", counts)
-    (grasp,) = collect([tmp_path / "a.mcap"]).grasps.values()
-    assert np.array_equal(grasp.counts, counts)
-    assert grasp.slipped
-
-
 def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_are_broken(
     tmp_path: Path,
 ) -> None:
@@ -284,25 +276,6 @@ def test_a_grasp_table_is_what_pandas_itself_reads(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(got, expected[got.columns], check_dtype=False)
     got.to_parquet(tmp_path / "grasps.parquet")
     pd.testing.assert_frame_equal(read_grasps(tmp_path / "grasps.parquet"), got)
-
-
-def test_a_stream_is_what_pandas_itself_reads() -> None:
-    expected = pd.read_csv(DEMO_RECORDING)
-    got = read_recording(DEMO_RECORDING)
-    counts = [name for name in expected.columns if "_biotac_" in name]
-    angles = [name for name in got.columns if name.endswith(("J1", "J2", "J3", "J4", "J5"))]
-    assert len(angles) > 1
-    np.testing.assert_array_equal(got[counts], expected[counts])
-    np.testing.assert_array_equal(got[angles], expected[angles])
-    np.testing.assert_allclose(got["t"] - got["t"][0], expected["t"] - expected["t"][0], atol=1e-9)
-
-
-def test_a_damaged_count_is_nan(tmp_path: Path) -> None:
-    header, row, *_ = DEMO_TABLE.read_text().splitlines()
-    cells = dict(zip(header.split(","), row.split(","), strict=True)) | {"mf_biotac_3": "9999"}
-    (tmp_path / "grasps.csv").write_text(f"{header}\n{','.join(cells.values())}\n")
-    got = read_grasps(tmp_path / "grasps.csv")
-    assert np.argwhere(got.isna().to_numpy()).tolist() == [[0, got.columns.get_loc("mf_biotac_3")]]
 
 
 def test_a_stream_or_a_table_without_outcomes_is_refused(tmp_path: Path) -> None:

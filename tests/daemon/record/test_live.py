@@ -21,7 +21,7 @@ import zmq
 
 from graspd.daemon.record.topics import schemas
 from tests.conftest import ROOT
-from tests.daemon.processes import TIMEOUT_S, graspd, start
+from tests.daemon.processes import TIMEOUT_S, start
 from tests.kit.messages import GOLDEN
 from tests.ports import free_port
 
@@ -183,10 +183,3 @@ def test_no_thread_of_the_library_asks_python_to_log() -> None:
         timeout=TIMEOUT_S,
     )
     assert result.stdout == "[]\n", result.stderr
-
-
-def test_a_port_that_is_taken_is_said(hand: Hand) -> None:
-    with socket.create_server(("127.0.0.1", hand.port)):
-        result = graspd("watch", *hand.arguments)
-    assert result.returncode == 1
-    assert f"cannot serve viewers on port {hand.port}" in result.stderr

@@ -7,40 +7,10 @@ import re
 import pytest
 
 from graspd.daemon.judge.reasons import Decision
-from graspd.daemon.watch.snapshot import Snapshot
-from graspd.daemon.watch.view import View
-from tests.daemon.watch.browser import CHROMIUM, Browser, Page, see, serving_hands, show, text
-from tests.daemon.watch.watch_fakes import Talker, whole_hand
+from tests.daemon.watch.browser import CHROMIUM, Browser, Page, see, show, text
+from tests.daemon.watch.watch_fakes import Talker
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
-
-
-def test_panels_of_two_hands_line_up_whatever_they_say(browser: Browser) -> None:
-    views = [View("ipc:///tmp/left"), View("ipc:///tmp/right-with-a-much-longer-name")]
-    said = [Decision.STABLE, Decision.SLIP]
-
-    def seen(seq: int) -> list[Snapshot]:
-        names = ("left", "right")
-        hands = zip(views, names, said, strict=True)
-        return [whole_hand(view, name, decision, seq) for view, name, decision in hands]
-
-    tops = (
-        "[...document.querySelectorAll('.hand')].map(hand => [...hand.querySelectorAll("
-        "'.banner, .card')].map(e => Math.round(e.getBoundingClientRect().top)).join(' '))"
-    )
-    height = "[...document.querySelectorAll('.banner')].map(e => e.offsetHeight)"
-    with serving_hands(seen) as address:
-        browser.look(1280, 800)
-        browser.go(address)
-        browser.wait_for("document.querySelectorAll('.hand .grasps tr').length >= 16")
-        left, right = browser.value(tops)
-        assert left == right
-        before = browser.value(height)
-        said[1] = Decision.UNKNOWN
-        browser.wait_for("document.querySelectorAll('.banner')[1].dataset.tone == 'trouble'")
-        left, right = browser.value(tops)
-        assert left == right
-        assert browser.value(height) == before
 
 
 def test_a_chosen_grasp_shows_its_image_until_the_page_goes_back(

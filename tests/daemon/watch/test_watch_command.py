@@ -12,7 +12,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import termios
 import time
 from pathlib import Path
@@ -170,24 +169,10 @@ def two_scenes(tmp_path: Path) -> list[str]:
     return paths
 
 
-def test_several_scenes_are_seen_in_one_terminal(tmp_path: Path) -> None:
-    scenes = two_scenes(tmp_path)
-    with Talker(f"ipc://{tmp_path}/right") as talker, Terminal(*scenes) as terminal:
-        talker.decision = Decision.SLIP
-        terminal.read_until(rb"right .*SLIP .*75 %, do not lift.*left .*no message has come")
-        terminal.type(b"\t")
-        terminal.read_until(rb"left .*NO VERDICT YET .*right .*it is judged to slip")
-        terminal.type(b"q")
-        assert terminal.end() == 0
-
-
-def test_several_hands_are_one_page_of_one_process(tmp_path: Path, port: int) -> None:
-    where = [
-        word for hand in ("left", "right") for word in ("--connect", f"ipc://{tmp_path}/{hand}")
-    ]
+def test_several_scenes_are_one_page_of_one_process(tmp_path: Path, port: int) -> None:
     with (
         Talker(f"ipc://{tmp_path}/right") as talker,
-        start("watch", "--web", *where, "--port", port) as page,
+        start("watch", "--web", *two_scenes(tmp_path), "--port", port) as page,
     ):
         talker.decision = Decision.STABLE
         assert page.stdout is not None
@@ -228,27 +213,6 @@ def test_what_is_wrong_is_said_in_a_line(
     result = graspd("watch", *arguments)
     assert result.returncode == 2
     assert said in result.stderr
-
-
-def test_without_rich_the_extra_is_named_and_the_page_still_works(endpoint: str, port: int) -> None:
-    code = (
-        "import sys; sys.modules['rich'] = None; sys.stdout.isatty = lambda: True\n"
-        "from graspd.daemon.cli import main\n"
-        f"assert main(['watch', '--connect', {endpoint!r}]) == 2\n"
-        f"sys.exit(main(['watch', '--connect', {endpoint!r}, '--web', '--port', '{port}']))"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == f"http://127.0.0.1:{port}/ (Ctrl-C ends)\n"
-        process.send_signal(signal.SIGINT)
-        errors = process.communicate(timeout=PATIENCE_S)[1]
-    assert process.returncode == 0
-    assert errors == (
-        f"graspd: watch needs the package 'rich': run {sys.executable} -m pip install '.[watch]' "
-        "in the folder of graspd's source; or watch --web, which needs none\n"
-    )
 
 
 def test_a_port_that_is_taken_is_said(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,6 +63,8 @@ def problems(data: dict[str, object]) -> tuple[str, ...]:
         *(("FFJ1", raw, angle) for raw, angle in FFJ1),
         ("FFJ1", 2891, 11.25),  # half way from 3109 to 2673
         ("FFJ1", 1595, 45 + 22.5 * (1942 - 1595) / (1942 - 1247)),
+        ("FFJ1", 4095, 0 - 22.5 * (4095 - 3109) / (3109 - 2673)),  # beyond, by the first segment
+        ("FFJ1", 100, 90 + 22.5 * (649 - 100) / (1247 - 649)),  # and by the last one
         ("FFJ3", 2487, 0),
         ("FFJ3", 946, 90),
         ("FFJ4", 591, -20),
@@ -79,17 +81,6 @@ def test_the_values_of_a_real_hand_are_met(
     joint: str, raw: int | tuple[int, int], expected_deg: float
 ) -> None:
     assert degrees(load_calibration(EXAMPLE), **{joint: raw})[joint] == pytest.approx(expected_deg)
-
-
-@pytest.mark.parametrize(
-    ("raw", "expected_deg"),
-    [
-        (4095, 0 - 22.5 * (4095 - 3109) / (3109 - 2673)),  # by the first segment
-        (100, 90 + 22.5 * (649 - 100) / (1247 - 649)),  # by the last one
-    ],
-)
-def test_beyond_the_table_the_line_goes_on_without_clamping(raw: int, expected_deg: float) -> None:
-    assert degrees(load_calibration(EXAMPLE), FFJ1=raw)["FFJ1"] == pytest.approx(expected_deg)
 
 
 def test_two_sensors_are_averaged_before_the_table_not_after() -> None:
@@ -228,14 +219,6 @@ def test_the_coupled_table_is_met_at_each_of_its_points() -> None:
         assert angles["THJ2"] == pytest.approx(second)
 
 
-def test_a_coupled_table_is_cut_between_near_points() -> None:
-    """Of a flat kite: along the short diagonal, whose ends are 10 and 20 degrees."""
-    kite = [(1000, 1000, 0, 0), (3000, 1000, 0, 0), (2000, 1400, 10, 1), (2100, 600, 20, 2)]
-    for order in itertools.permutations(kite):
-        first, second = np.degrees(CoupledTable(order).angles_rad(2050, 1000))
-        assert (first, second) == pytest.approx((15, 1.5))
-
-
 def test_the_coupled_table_agrees_with_an_independent_interpolation() -> None:
     interpolate = pytest.importorskip("scipy.interpolate", reason="needs the extra `test`")
     raws = np.random.default_rng(5).uniform(500, 3500, (25, 2))
@@ -263,27 +246,11 @@ def test_a_square_grid_agrees_with_an_independent_interpolation() -> None:
     interpolate = pytest.importorskip("scipy.interpolate", reason="scipy is not installed")
     rows, sheared = np.array(GRID), np.array([[1.0, 1e-5], [0.0, 1.00001618]])
     reference = interpolate.LinearNDInterpolator(rows[:, :2] @ sheared, rows[:, 2:])
-    table = CoupledTable(GRID)
+    tables = [CoupledTable(order) for order in (GRID, GRID[::-1], GRID[4:] + GRID[:4])]
     for pair in np.random.default_rng(8).uniform(1000, 2000, (300, 2)):
         expected = reference(*(pair @ sheared))
-        assert np.degrees(table.angles_rad(*pair)) == pytest.approx(expected, abs=1e-9)
-
-
-@given(order=st.permutations(GRID), turn=st.sampled_from([(500, 0), (400, 300), (350, 350)]))
-def test_angles_are_continuous_on_a_square_grid(
-    order: list[tuple[float, ...]], turn: tuple[float, float]
-) -> None:
-    """Half a count moves an angle by at most half the steepest slope between neighbours."""
-    (along, across), centre = turn, 1500.0
-    rows = []
-    for first, second, *angles in order:
-        i, j = (first - centre) / 500, (second - centre) / 500
-        raws = centre + along * i - across * j, centre + across * i + along * j
-        rows.append((*raws, *angles))
-    table = CoupledTable(rows)
-    for offset in (-300.0, 100.0):
-        steps = np.array([table.angles_rad(1500 + offset, b) for b in np.arange(1200, 1800, 0.5)])
-        assert np.degrees(np.abs(np.diff(steps, axis=0))).max() < 0.5 * 0.06
+        for table in tables:
+            assert np.degrees(table.angles_rad(*pair)) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.biotac import E1, PAC, SEQUENCES, TDC
-from tests.drivers.spi.bridge_bench import T0, greeted, hear, hello, sweep, words
+from tests.drivers.spi.bridge_bench import T0, greeted, hear, hello, opened, sweep, words
 
 
 @pytest.mark.parametrize(
@@ -83,6 +83,9 @@ def test_a_sweep_from_before_stop_is_stale() -> None:
     assert made == [0, 1]
     counters = conversation.counters
     assert (counters.stale_sweeps, counters.missed_readings) == (1, 0)
+    never_started = opened()
+    assert hear(never_started, sweep(0, 51_000), T0) == []
+    assert never_started.counters.stale_sweeps == 1
 
 
 def test_a_sweep_unlike_the_hello_is_bad() -> None:

@@ -24,7 +24,6 @@ from graspd.drivers.recordings.csv_player import (
 from graspd.drivers.twins.grasps.grasp_script import Durations, EndPoint, Timetable
 from graspd.drivers.twins.grasps.whole_grasps import (
     GraspRow,
-    MeasuredNoise,
     WholeGrasps,
     synthetic_grasps,
 )
@@ -97,12 +96,6 @@ def test_held_values_come_at_the_rate_of_recordings_only() -> None:
         WholeGrasps(REST, GRASPS, held=True, rate_hz=50.0)
 
 
-def test_a_looped_stream_goes_on_with_other_numbers() -> None:
-    grasps = WholeGrasps(REST, GRASPS[:2], loop=True)
-    objects = [(t.grasp, t.object_name) for t in itertools.islice(grasps.timetables(), 4)]
-    assert objects == [(1, "thing_0"), (2, "thing_1"), (3, "thing_0"), (4, "thing_1")]
-
-
 def test_the_demo_has_twelve_synthetic_grasps_and_six_slips() -> None:
     assert DEMO_RECORDING.stat().st_size < 1_200_000
     rows = rows_of(DEMO_RECORDING.read_bytes(), strict=True)
@@ -155,13 +148,6 @@ def test_held_values_follow_the_palms_requests() -> None:
             assert (counts[:, list(pair)] == rows[0, 0, 0] + rounds_ago).all()
 
 
-def test_fresh_values_repeat_no_more_than_noise_does() -> None:
-    repeats = np.diff(untouched(), axis=0) == 0.0
-    # Two whole numbers of sigma 3.5 are equal with a chance of 1 / (2 sqrt(pi) 3.5) = 0.0806.
-    assert repeats.mean() == pytest.approx(0.0806, abs=0.003)
-    assert not any(repeats[:, :, pair].all(axis=(1, 2)).any() for pair in PAIRS[1:-1])
-
-
 def test_noise_has_the_measured_width_drift_and_spikes() -> None:
     counts = untouched()
     times = np.arange(len(counts)) * 0.01
@@ -178,23 +164,6 @@ def test_noise_has_the_measured_width_drift_and_spikes() -> None:
     assert not (spikes[1:] & spikes[:-1]).any(), "isolated in time"
 
 
-def test_drift_ends_with_the_warm_up() -> None:
-    noise = MeasuredNoise(3, np.random.default_rng(0))
-    assert np.median(noise.sweep(np.asarray(1e7))) == pytest.approx(210.0, abs=3.0)
-
-
-def test_no_electrode_drifts_out_of_its_range() -> None:
-    rest, after_s = REST.copy(), Durations(first_rest_s=(1e4, 1e4))
-    rest[0, 2] = 3975.0  # where the third electrode of the synthetic first finger rests
-    unpressed = EndPoint(rest.astype(np.uint16), False, "nothing")
-    grasps = WholeGrasps(rest, [unpressed], rate_hz=0.1, durations=after_s)
-    counts = counts_of(list(itertools.islice(grasps, 900)))
-    assert counts.max() < 4094, "cut off"
-    assert counts[100:, 0, 2].std() > 2.9
-    assert np.median(counts[100:, 0, 2]) == pytest.approx(4045.0, abs=1.0)
-    assert np.median(counts[100:, 1]) == pytest.approx(3210.0, abs=1.0)
-
-
 def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Counts (grasps, 72) and labels, read without the code under test."""
     with path.open(newline="") as file:
@@ -206,25 +175,6 @@ def test_the_demos_are_made_again_byte_for_byte(tmp_path: Path) -> None:
     demos.main(tmp_path)
     for demo in (DEMO_TABLE, DEMO_DAY, DEMO_RECORDING, SHOW_RECORDING):
         assert (tmp_path / demo.name).read_bytes() == demo.read_bytes()
-
-
-def test_the_demo_day_is_labelled_and_synthetic() -> None:
-    counts, slipped = load(DEMO_DAY)
-    assert counts.shape == (300, 72)
-    assert slipped.sum() == 150
-    assert counts.min() >= 1
-    assert counts.max() <= 4094
-    with DEMO_DAY.open(newline="") as file:
-        assert all(row["object"].startswith("synthetic") for row in csv.DictReader(file))
-
-
-def test_the_demo_is_small_labelled_and_called_synthetic() -> None:
-    assert DEMO_TABLE.stat().st_size < 120_000
-    with DEMO_TABLE.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 200
-    assert sum(row["slipped"] == "1" for row in rows) == 100
-    assert all(row["object"].startswith("synthetic") for row in rows)
 
 
 def test_no_synthetic_grasp_is_a_real_one(bts3_dir: Path) -> None:
