@@ -69,6 +69,11 @@ class TactileModel:
         p_stable, p_slip = self._probability[0].tolist()
         return p_stable, p_slip
 
+    def metadata(self, key: str) -> str | None:
+        """Return an entry of the file's metadata; None: there is no such entry."""
+        text: str | None = self._session.get_modelmeta().custom_metadata_map.get(key)
+        return text
+
 
 def read(path: Path) -> ModelFile:
     """Return the content of a model file. Raises `ModelError`."""

@@ -248,10 +248,11 @@ def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.Replay
     if refused:
         why = ", ".join(f"{reason} {count}" for reason, count in refused.most_common())
         write_lines(f"  nothing was learned from readings that were not judged: {why}")
-    datasets = trained_on(played.recordings, model)
-    if datasets:
+    known = trained_on(played.recordings, model, played.read_as)
+    if known:
+        which = ", ".join(known.values())
         complain(
-            f"warning: the model was trained on {', '.join(datasets)}: it judges other grasps "
+            f"warning: the model was trained on {which}: it judges other grasps "
             "worse, so what these outcomes taught promises too much; better seed with other grasps"
         )
 

@@ -28,16 +28,16 @@ class DayTable(Companion):
     ) -> None:
         """`published`: network that judges each grasp without session, outcomes or refusal.
 
-        `model`: name of graspd's model. `warnings`: lines to write at the end.
+        `model`: name of graspd's model. `warnings`: lines to write above the figures.
         """
         self._published = GraspJudge.of(published)
-        self._warnings = warnings
         self._part = Tally(), Tally()
         self._whole = Tally(), Tally()
         methods = f"the published method ({PUBLISHED})", f"graspd ({model})"
         heads = "".join(f"{method:>{len(COLUMNS)}}" for method in methods)
         self._write(
             title,
+            *warnings,
             "",
             coloured(f"{'':9}{heads}", Colour.BOLD),
             coloured(f"{'grasps':9}{COLUMNS}{COLUMNS}", Colour.BOLD),
@@ -82,7 +82,7 @@ class DayTable(Companion):
                 self._write(
                     f"At most {most} can slip: {share}, and {report.beyond_share:.2f} more."
                 )
-        self._write(*self._warnings, "Each verdict and all scores: --verbose.")
+        self._write("Each verdict and all scores: --verbose.")
 
     def _figures(self) -> list[str]:
         """Return the three figures that matter."""

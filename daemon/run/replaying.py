@@ -8,9 +8,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.biotac import ELECTRODES, Finger
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
 from graspd.daemon.publish.messages import OBJECT_PATTERN
 from graspd.daemon.trust.lift_book import GraspId, Report
+from graspd.drivers.recordings.csv_rows import read_rows
+from graspd.drivers.recordings.kinds import Kind, kind_of
+from graspd.drivers.recordings.layout import ReadAs, layout_of
+from graspd.models import known_grasps
 from graspd.models.runtime import TactileModel
 
 
@@ -71,13 +79,34 @@ def _sent(object_name: str | None) -> str | None:
     return object_name if re.fullmatch(OBJECT_PATTERN, object_name or "") else None
 
 
-def trained_on(recordings: Sequence[Path], model: TactileModel) -> list[str]:
-    """Return the names of those recordings that the model was trained on."""
+def trained_on(
+    recordings: Sequence[Path], model: TactileModel, read_as: ReadAs | None = None
+) -> dict[str, str]:
+    """Return those recordings that have grasps which the model was trained on.
+
+    The name of each comes with what is known of it, as text. Such a table is known under any name.
+    Raises `RecordingError` and `ModelError`.
+    """
     digests = {dataset.sha256 for dataset in model.contract.datasets}
-    names = []
+    known = known_grasps.of_model(model)
+    found = {}
     for path in recordings:
-        if path.is_file():
-            with path.open("rb") as file:
-                if hashlib.file_digest(file, "sha256").hexdigest() in digests:
-                    names.append(path.name)
-    return names
+        if read_as == "stream" or kind_of(path) is not Kind.TEXT:
+            continue  # sweeps are no grasps
+        counts = _grasps_of(path, model.contract.fingers, read_as)
+        trained = int(known_grasps.are_among(known_grasps.hashes(counts), known).sum())
+        with path.open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() in digests:
+                trained = len(counts)  # an older model has no hashes of its grasps
+        if trained:
+            found[path.name] = f"{trained} of {len(counts)} grasps of {path.name}"
+    return found
+
+
+def _grasps_of(path: Path, fingers: Sequence[Finger], read_as: ReadAs | None) -> NDArray[np.uint16]:
+    """Return the counts of a table, shape (N, fingers, 24); those of a stream are no grasps."""
+    layout = layout_of(path, fingers, read_as)
+    rows = (
+        [] if layout.is_stream else [row.counts for row in read_rows(path, fingers, layout=layout)]
+    )
+    return np.array(rows, np.uint16).reshape(-1, len(fingers), ELECTRODES)

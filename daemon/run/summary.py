@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
@@ -151,7 +151,8 @@ class RunSummary:
 
     def __init__(self) -> None:
         self.tally = Tally()
-        self.trained_on: Sequence[str] = ()
+        self.trained_on: Mapping[str, str] = {}
+        """Recordings that the model was trained on, and the text for people."""
         self._waiting: dict[GraspId, Decision] = {}
         """Decisions on grasps whose outcome may still come, the oldest first."""
         self.repaired = 0
@@ -216,22 +217,23 @@ class RunSummary:
 
     def lines(self, wall_s: float, trust: Trust | None) -> list[str]:
         total = self.tally.decisions.total()
+        lines = []
+        if self.trained_on:
+            lines.append(trained_on_line("the model", self.trained_on.values()))
         if self.readings:
-            lines = [
+            lines += [
                 f"{self.readings} readings in {wall_s:.2f} s: {self.grasps} grasps, "
                 f"{total} judged, {self.again} again after a change",
                 f"first judgements: {self.tally.counts()}",
             ]
         else:
-            lines = [f"{total} verdicts in {wall_s:.2f} s: {self.tally.counts()}"]
+            lines += [f"{total} verdicts in {wall_s:.2f} s: {self.tally.counts()}"]
         lines += self.tally.lines()
         if not self.tally.labelled:
             lines.append("no outcome of a lift is known, so there is no score")
         if self.repaired:
             lines.append(f"{self.repaired} of them with repaired electrodes")
         lines += _learned(trust)
-        if self.trained_on:
-            lines.append(trained_on_line("the model", self.trained_on))
         lines.append(
             f"reading to verdict: p50 {self.latency.quantile_us(0.5):.0f} us, "
             f"p99 {self.latency.quantile_us(0.99):.0f} us, max {self.latency.max_us:.0f} us"
@@ -239,9 +241,9 @@ class RunSummary:
         return lines
 
 
-def trained_on_line(which: str, names: Sequence[str]) -> str:
+def trained_on_line(which: str, known: Iterable[str]) -> str:
     """Return the warning for recordings that a model was trained on."""
-    return f"{which} was trained on {', '.join(names)}: it judges other grasps worse than these"
+    return f"{which} was trained on {', '.join(known)}: it judges other grasps worse than these"
 
 
 def _learned(trust: Trust | None) -> Iterator[str]:

@@ -13,7 +13,7 @@ import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
-from graspd.models import zoo
+from graspd.models import known_grasps, zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from graspd.models.tactile_image import TactileImager
@@ -151,6 +151,19 @@ def test_the_contract_names_the_data_and_its_range(bts3_dir: Path) -> None:
     assert seen["low"] == counts.min(axis=0).tolist()
     assert seen["high"] == counts.max(axis=0).tolist()
     assert seen["margin"] == 100
+
+
+def test_every_model_knows_the_grasps_of_its_training(bts3_dir: Path) -> None:
+    grasps = read_all(bts3_dir)
+    tables = np.array([file.name for file in grasps.files])[grasps.table_of]
+    for name in zoo.names():
+        model = TactileModel(zoo.find(name))
+        counts = grasps.of_fingers(model.contract.fingers).counts
+        known = known_grasps.of_model(model)
+        trained = np.isin(tables, [dataset.name for dataset in model.contract.datasets])
+        assert (known_grasps.are_among(known_grasps.hashes(counts), known) == trained).all()
+        counts[:, 0, 5] ^= 1
+        assert not known_grasps.are_among(known_grasps.hashes(counts), known).any()
 
 
 @pytest.mark.parametrize("name", zoo.names())

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from graspd.drivers.recordings.kinds import files_of
+from graspd.drivers.recordings.layout import ReadAs
 from graspd.models.training.data.datasets import (
     FEWEST_GRASPS,
     DatasetError,
     Grasps,
     lab_table_names,
+    read_table,
     read_with_lab_tables,
     unpublished,
 )
@@ -136,6 +138,12 @@ def read_grasps(command: str, args: argparse.Namespace) -> Grasps:
             text = f"{name}.csv is not the published table; the figures are of this data only"
             say(command, f"warning: {text}")
     return grasps
+
+
+def read_each(paths: Sequence[Path], read_as: ReadAs | None) -> list[Grasps]:
+    """Return the grasps of each table. Raises `DatasetError`."""
+    with files_of(paths) as files:
+        return [read_table(path, read_as) for path in files]
 
 
 def check_fingers(systems: Iterable[System], grasps: Grasps) -> None:

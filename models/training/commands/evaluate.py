@@ -25,6 +25,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         + "; ".join(f"{name}: {text}" for name, text in ABOUT.items()),
     )
     add_shared_arguments(parser)
+    for option, text in (
+        ("--train", "train on this table, and judge the tables of --test"),
+        ("--test", "a table of another day, judged as the daemon does, by --train or --model"),
+    ):
+        parser.add_argument(
+            option, type=Path, action="append", default=[], metavar="FILE", help=text
+        )
+    parser.add_argument(
+        "--model",
+        metavar="NAME",
+        help="with --test: a model, or an .onnx file, in place of --train",
+    )
     parser.add_argument(
         "--out",
         type=Path,

@@ -27,6 +27,7 @@ from graspd.models.training.commands.common import (
     read_grasps,
     say,
 )
+from graspd.models.training.commands.other_day import judge_other_days
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
 from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
@@ -69,6 +70,10 @@ VERDICTS = "verdicts"
 def evaluate(args: argparse.Namespace) -> None:
     """Evaluate what the command line asks for. Raises what `exit_code` knows."""
     systems = _systems(args.names, grid=args.grid)
+    if args.train or args.test or args.model:
+        epochs = QUICK_EPOCHS if args.quick else None
+        judge_other_days(args, systems if args.names else (), epochs)
+        return
     _check_extras(args)
     grasps = read_grasps("evaluate", args)
     check_fingers(systems, grasps)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, compose, helper, numpy_helper
 
 from graspd.biotac import ELECTRODES
-from graspd.models import trial, zoo
+from graspd.models import known_grasps, trial, zoo
 from graspd.models.contract import (
     CLASSES,
     METADATA_KEY,
@@ -64,7 +64,9 @@ def run(args: argparse.Namespace) -> int:
         confidence=(),
         seen=seen_counts(grasps.counts),
     )
-    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+    known = known_grasps.as_text(known_grasps.hashes(grasps.counts))
+    entries = {METADATA_KEY: contract.to_json(), known_grasps.METADATA_KEY: known}
+    helper.set_model_props(model, entries)
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{name}.onnx"
     content: bytes = model.SerializeToString(deterministic=True)

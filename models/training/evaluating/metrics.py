@@ -151,7 +151,8 @@ def interval(some: pd.Series, of: pd.Series, objects: pd.Series) -> tuple[float,
     """
     sums = pd.DataFrame({"some": some, "of": of}).groupby(objects).sum().to_numpy()
     drawn = np.random.default_rng(0).integers(len(sums), size=(DRAWS, len(sums)))
-    shares = np.divide(*sums[drawn].sum(axis=1).T)
+    with np.errstate(invalid="ignore"):  # objects without a slip have no F1
+        shares = np.divide(*sums[drawn].sum(axis=1).T)
     low, high = np.nanquantile(shares, (0.025, 0.975))
     return float(low), float(high)
 

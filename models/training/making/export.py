@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from graspd.models import known_grasps
 from graspd.models.contract import METADATA_KEY, ModelContract
 from graspd.models.inputs import SessionBuilder, builder
 from graspd.models.runtime import TactileModel
@@ -44,14 +45,16 @@ def export(
 ) -> Parity:
     """Write `sigmoid(margin / temperature)` with its contract to `path`, one self-contained file.
 
-    The same system and contract give the same bytes. The file is first run as the daemon runs it
-    on every reading of counts (N, fingers, 24); those of a session model are standardised by
-    `standards` (N, features), or by its contract. Raises `ExportError` if a probability differs by
-    more than `TOLERANCE` or a verdict flips, and leaves `path` as it was; `ModelError` if the
-    contract does not fit.
+    The same system and contract give the same bytes. The file has hashes of the training's counts
+    (N, fingers, 24), and is first run as the daemon runs it on each of them; those of a session
+    model are standardised by `standards` (N, features), or by its contract. Raises `ExportError` if
+    a probability differs by more than `TOLERANCE` or a verdict flips, and leaves `path` as it was;
+    `ModelError` if the contract does not fit.
     """
     model = fitted.to_onnx(temperature, builder(contract.input, len(contract.fingers)).name)
-    onnx.helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+    known = known_grasps.as_text(known_grasps.hashes(counts))
+    entries = {METADATA_KEY: contract.to_json(), known_grasps.METADATA_KEY: known}
+    onnx.helper.set_model_props(model, entries)
     onnx.checker.check_model(model, full_check=True)
     with replacing(path) as part:
         part.write_bytes(model.SerializeToString(deterministic=True))

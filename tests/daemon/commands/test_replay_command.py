@@ -152,11 +152,15 @@ def test_the_outcome_of_a_grasp_in_a_stream_is_told_once_when_it_is_over() -> No
         assert len({v.outcomes for v in verdicts if v.grasp == grasp and v.judged}) == 1
 
 
-def test_a_model_on_its_own_training_is_warned_of(bts3_dir: Path) -> None:
-    table = bts3_dir / "palm_45.csv"
-    assert "the model was trained on palm_45.csv" in graspd("replay", table).stdout
-    assert summary_of(table)["trained_on"] == ["palm_45.csv"]
-    assert summary_of(table, "--model", "cnn1")["trained_on"] == []
+def test_a_renamed_part_of_a_training_table_is_known(bts3_dir: Path, tmp_path: Path) -> None:
+    table = tmp_path / "friday.csv"
+    lines = (bts3_dir / "palm_45.csv").read_text().splitlines(keepends=True)
+    table.write_text("".join([lines[0], *lines[-40:]]))
+    warning = "the model was trained on 40 of 40 grasps of friday.csv"
+    assert graspd("replay", table).stdout.splitlines()[1].startswith(warning)
+    verbose = graspd("replay", table, "--verbose").stdout
+    assert verbose.index(warning) < verbose.index("40 verdicts in")
+    assert summary_of(table)["trained_on"] == ["friday.csv"]
     assert summary_of(DEMO_TABLE)["trained_on"] == []
 
 

@@ -78,7 +78,7 @@ def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3
     with (bts3_dir / "palm_45.csv").open() as lines:
         last = list(csv.reader(lines))[-1][2:74]
     assert document["session"]["statistics"]["last"][-72:] == [float(count) for count in last]
-    assert "warning: the model was trained on palm_45.csv" in seeded.stderr
+    assert "warning: the model was trained on 2133 of 2133 grasps of palm_45.csv" in seeded.stderr
 
 
 def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:

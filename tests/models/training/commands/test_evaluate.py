@@ -65,6 +65,48 @@ def test_a_table_of_ones_own_is_measured_alone(tmp_path: Path) -> None:
     )
 
 
+def test_fridays_grasps_are_judged_by_mondays_model(tmp_path: Path) -> None:
+    monday, friday = tmp_path / "monday.csv", tmp_path / "friday.csv"
+    write(monday, table("monday", 80, 0))
+    write(friday, table("friday", 60, 1))
+    options = "--train", monday, "--test", friday
+    done = graspd("evaluate", "svm-session", *options)
+    assert done.stderr == ""
+    assert done.stdout.startswith("friday by svm-session of monday: ")
+    (figures,) = json.loads(graspd("evaluate", "svm-session", *options, "--json").stdout)
+    # The grasps are separable, and a tenth of the labels is wrong.
+    assert figures["f1"] > 0.8
+    assert (figures["all"], figures["trained_on"]) == (60, 0)
+    refused = graspd("evaluate", *options, "--own", monday)
+    assert (refused.returncode, refused.stderr) == (
+        2,
+        "graspd evaluate: --own does not go with --test\n",
+    )
+
+
+def test_a_renamed_part_of_the_training_is_warned_of(tmp_path: Path) -> None:
+    monday, copy, out = tmp_path / "monday.csv", tmp_path / "copy.csv", tmp_path / "out"
+    write(monday, table("monday", 80, 0))
+    lines = monday.read_text().splitlines(keepends=True)
+    write(copy, table("copy", 40, 1))
+    with copy.open("a") as file:
+        file.writelines(lines[1:13])
+    trained = graspd(
+        "train", "svm", "--own", monday, "--only", "cv", "--folds", "2", "--name", "m", "--out", out
+    )
+    assert trained.returncode == 0
+    for words, name in (
+        (("--model", out / "m.onnx"), "m"),
+        (("svm", "--train", monday), "svm of monday"),
+    ):
+        done = graspd("evaluate", *words, "--test", copy)
+        assert done.stderr == (
+            f"graspd evaluate: warning: {name} was trained on 12 of 52 grasps of copy: "
+            "it judges others worse\n"
+        )
+        assert done.stdout.startswith(f"copy by {name}: ")
+
+
 def test_a_quick_run_writes_summaries_and_table(data: Path, tmp_path: Path) -> None:
     out, table = tmp_path / "out", tmp_path / "tables" / "RESULTS.md"
     options = "--data", data, "--out", out, "--table", table, "--quick"
