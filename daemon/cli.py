@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "report": (
         "graspd.models.training.reports.command",
-        "measure error, time and exactness of the models (extras: train, report)",
+        "measure error, time and exactness of the models (extras: train, report; stability: none)",
     ),
     "manual": (".texts", "print the manual page: graspd manual | man -l -"),
 }

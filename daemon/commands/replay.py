@@ -139,7 +139,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="with --publish: wait up to S seconds for a subscriber, else fail",
     )
     parser.add_argument(
-        "--json", action="store_true", help="verdict messages on stdout, summary on stderr"
+        "--json",
+        action="store_true",
+        help="verdict messages on stdout, summary in the last line on stderr",
     )
     parser.add_argument(
         "--verbose",

@@ -35,6 +35,8 @@ class Systemd(Companion):
         self._period_ns = (watchdog_us or 0) * NS_PER_US // FEEDINGS_PER_TIMEOUT
         self._due_ns = clock()
         self._warned = False
+        self._late = 0
+        """Late readings until the last status."""
         kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
         self._socket = socket.socket(socket.AF_UNIX, kind)
 
@@ -57,7 +59,8 @@ class Systemd(Companion):
 
     def on_status(self, status: Status) -> None:
         """Show the status in `systemctl status`."""
-        self._send(f"STATUS={in_a_line(status)}")
+        late, self._late = status.late_readings - self._late, status.late_readings
+        self._send(f"STATUS={in_a_line(status, late)}")
 
     def before_wait(self, requests: Requests) -> int | None:
         """Return the time of the next feeding, monotonic ns; None without a watchdog."""
@@ -81,16 +84,16 @@ class Systemd(Companion):
             self._warned = True
 
 
-def in_a_line(status: Status) -> str:
-    """Return a status in one line, for people."""
+def in_a_line(status: Status, late: int) -> str:
+    """Return a status in one line, for people. `late`: late readings since the last status."""
     parts = [f"{status.state}: {status.readings_hz:.1f} readings/s"]
     parts += [f"{number} {outcome}" for outcome, number in status.verdicts.items() if number]
     if status.gate is not None:
         parts.append(f"gate {status.gate}")
     if status.overloaded:
         parts.append(f"overloaded, {status.skipped_readings} readings left out")
-    if status.late_readings:
-        parts.append(f"{status.late_readings} late")
+    if late:
+        parts.append(f"{late} late just now")
     not_well = parts_to_act_on(status.health)
     parts += [f"{' and '.join(names)} {reason}" for reason, names in not_well.items()]
     return ", ".join(parts)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -126,13 +127,12 @@ def test_the_status_line_names_state_rate_verdicts_and_troubles() -> None:
     assert status.verdicts[Decision.SLIP] == 1
     assert status.gate is GateState.IDLE
     assert status.health["ff_7"] is Reason.SATURATED
-    assert in_a_line(status) == (
-        "running: 100.0 readings/s, 1 stable, 1 slip, 1 unknown, gate idle, 3 late, "
+    assert in_a_line(status, late=2) == (
+        "running: 100.0 readings/s, 1 stable, 1 slip, 1 unknown, gate idle, 2 late just now, "
         "ff_7 saturated, mf not-tared"
     )
-    assert "1 unknown, gate idle, overloaded, 4 readings left out, 3 late" in in_a_line(
-        msgspec.structs.replace(status, overloaded=True)
-    )
+    overloaded = msgspec.structs.replace(status, overloaded=True)
+    assert "gate idle, overloaded, 4 readings left out, ff_7" in in_a_line(overloaded, late=0)
 
 
 UNPLUGGED = dict.fromkeys((f"mf_{n}" for n in range(1, 25)), Reason.SENSOR_MISSING)
@@ -153,5 +153,18 @@ NOT_TARED = dict.fromkeys(("ff", "mf", "th"), Reason.NOT_TARED)
 def test_what_to_do_comes_first_and_what_follows_never(
     health: dict[str, Reason], shown: str
 ) -> None:
-    line = in_a_line(msgspec.structs.replace(GOLDEN_STATUS, health=health))
-    assert line.endswith(f", 3 late, {shown}")
+    line = in_a_line(msgspec.structs.replace(GOLDEN_STATUS, health=health), late=0)
+    assert line.endswith(f", gate idle, {shown}")
+
+
+def test_late_readings_of_before_are_not_shown(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ears:
+        ears.bind(str(tmp_path / "notify"))
+        ears.settimeout(100.0)
+        manager = Systemd(str(tmp_path / "notify"))
+        for count in (3, 3, 5):
+            manager.on_status(msgspec.structs.replace(GOLDEN_STATUS, late_readings=count))
+        told = [ears.recv(4096).decode() for _ in range(3)]
+        manager.close()
+    late = [re.findall(r"(\d+) late", line) for line in told]
+    assert late == [["3"], [], ["2"]]
