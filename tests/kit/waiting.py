@@ -9,9 +9,11 @@ PATIENCE_S = 100.0
 """Longest wait, s: a computer that runs many tests is slow."""
 
 
-def wait_until(condition: Callable[[], object], step_s: float = 0.002) -> None:
-    """Call `condition` until it is true; fail after `PATIENCE_S`."""
+def wait_until(
+    condition: Callable[[], object], step_s: float = 0.002, says: str = "it did not happen"
+) -> None:
+    """Call `condition` until it is true; fail after `PATIENCE_S`, and say why."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < deadline_s, "it did not happen"
+        assert time.monotonic() < deadline_s, says
         time.sleep(step_s)

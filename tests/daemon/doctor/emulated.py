@@ -17,7 +17,7 @@ from subprocess import CompletedProcess
 
 from graspd.daemon.commands.doctor import examine
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
-from graspd.daemon.doctor.finding import Finding, Level
+from graspd.daemon.doctor.finding import Cause, Finding, Level
 from graspd.drivers.base import Driver, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.datagrams.joints import JointStreamDriver
@@ -177,12 +177,12 @@ def scene_of(folder: Path, text: str) -> Path:
 
 def asked(folder: Path, text: str, *options: str) -> CompletedProcess[str]:
     """What a doctor says that listens for a moment."""
-    return graspd("doctor", scene_of(folder, text), "--listen", 0.2, *options)
+    return graspd("doctor", scene_of(folder, text), "--listen", 0.6, *options)
 
 
 def look(folder: Path, text: str) -> list[dict[str, str]]:
-    """What the doctor says is wrong."""
+    """What the doctor says is wrong, but for a twin that is slow, as on a busy computer."""
     result = asked(folder, text, "--json")
     told = [f for f in json.loads(result.stdout)["findings"] if f["level"] != "ok"]
     assert result.returncode == int("error" in {finding["level"] for finding in told})
-    return told
+    return [finding for finding in told if finding["cause"] != Cause.SLOW]
