@@ -1,4 +1,4 @@
-"""The README's code is run as it stands there."""
+"""The code of the README and of the clients' page is run as it stands there."""
 
 from __future__ import annotations
 
@@ -8,25 +8,33 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import zmq
 
+from graspd.daemon import scene
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from tests.clients.building import skip_unless_it_can_be_compiled
-from tests.kit.messages import GOLDEN, decode_verdict
+from tests.clients.bench import Daemon
+from tests.clients.building import CPP, skip_unless_it_can_be_compiled
+from tests.kit.messages import GOLDEN
 from tests.kit.waiting import wait_until
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-AGE_LIMIT = r"200e6|200'000'000"
+AGE_LIMIT = "200e6"
 ENDPOINT = "ipc:///tmp/graspd-demo.ipc"
 
 
-def block(language: str) -> str:
-    """The one code block of the README in this language."""
-    (code,) = re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
-    return str(code)
+CLIENTS = (ROOT / "deploy/clients/README.md").read_text()
+BESIDE = {"OUT": "ipc:///run/graspd/right.ipc", "ASK": "ipc:///run/graspd/right.ask.ipc"}
+"""Endpoints in the programs of the clients' page: those of a scene that names none."""
+
+
+def block(language: str, page: str = README) -> str:
+    """The first code block of a page in this language."""
+    return str(re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)[0])
 
 
 def run_subscriber(command: list[str], endpoint: str) -> list[str]:
@@ -47,9 +55,9 @@ def run_subscriber(command: list[str], endpoint: str) -> list[str]:
             subscriber.kill()
 
 
-def program(language: str, endpoint: str) -> str:
+def program(endpoint: str) -> str:
     """The README's, for an endpoint, and with less patience until the first message."""
-    code = block(language)
+    code = block("python")
     assert ENDPOINT in code
     assert code.count("2000") == 1
     return code.replace(ENDPOINT, endpoint).replace("2000", "200")
@@ -88,7 +96,7 @@ def heard_of_old_and_new(command: list[str], endpoint: str, output: Path) -> str
 
 def test_the_python_subscriber_prints_verdicts_and_unknown_on_silence(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/graspd"
-    command = [sys.executable, "-Wignore", "-u", "-c", patient(program("python", endpoint))]
+    command = [sys.executable, "-Wignore", "-u", "-c", patient(program(endpoint))]
     first, *lines, last = run_subscriber(command, endpoint)
     said = [ast.literal_eval(line) for line in lines if line != "unknown"]
     assert [each["seq"] for each in said] == list(range(200))
@@ -97,34 +105,54 @@ def test_the_python_subscriber_prints_verdicts_and_unknown_on_silence(tmp_path: 
 
 def test_the_python_subscriber_takes_old_readings_for_unknown(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/graspd"
-    command = [sys.executable, "-Wignore", "-u", "-c", program("python", endpoint)]
+    command = [sys.executable, "-Wignore", "-u", "-c", program(endpoint)]
     heard = heard_of_old_and_new(command, endpoint, tmp_path / "heard")
     assert "'seq': 2" in heard
     assert "'seq': 1," not in heard
 
 
-def compiled(code: str, folder: Path) -> str:
-    source, binary = folder / "subscriber.cpp", folder / "subscriber"
-    source.write_text(code)
-    warnings = ["-Wall", "-Wextra", "-Werror"]
-    subprocess.run(["g++", "-std=c++17", *warnings, source, "-o", binary, "-lzmq"], check=True)
-    return str(binary)
+def test_pages_name_the_endpoints_of_their_scenes() -> None:
+    scenes = [scene.load(ROOT / f"deploy/{name}.toml") for name in ("scenes/demo", "clients/loop")]
+    default = {"tactile": {"driver": "spi", "port": "/dev/ttyACM0"}, "ask": {}}
+    scenes.append(scene.parse(default, Path("right.toml")))
+    known = {end for wanted in scenes for end in (wanted.endpoint, wanted.ask_endpoint)}
+    assert set(re.findall(r"ipc:///[\w./-]+", README + CLIENTS)) - known == {
+        "ipc:///tmp/graspd.ipc"  # of the user's own scene
+    }
+    assert set(BESIDE.values()) <= known
 
 
-def test_the_cpp_subscriber_prints_verdicts_and_unknown_on_silence(tmp_path: Path) -> None:
+def python_client(code: str, folder: Path) -> list[str]:
+    (folder / "client.py").write_text(
+        f"def lift():\n    print('lifted')\n    return True\n\n{code}"
+    )
+    (folder / "graspd_client.py").symlink_to(ROOT / "deploy/clients/python/graspd_client.py")
+    return [sys.executable, "-Wignore", str(folder / "client.py")]
+
+
+def cpp_client(code: str, folder: Path) -> list[str]:
     skip_unless_it_can_be_compiled()
-    endpoint = f"ipc://{tmp_path}/graspd"
-    binary = compiled(patient(program("cpp", endpoint)), tmp_path)
-    first, *lines, last = run_subscriber([binary], endpoint)
-    said = [decode_verdict(line.encode()) for line in lines if line != "unknown"]
-    assert [each.seq for each in said] == list(range(200))
-    assert first == last == "unknown"
+    source, binary = folder / "client.cpp", folder / "client"
+    source.write_text(f'{code}\nbool lift() {{ std::cout << "lifted"; return true; }}\n')
+    flags = ["-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror", f"-I{CPP}"]
+    subprocess.run(["g++", *flags, source, "-o", binary, "-lzmq"], check=True)
+    return [str(binary)]
 
 
-def test_the_cpp_subscriber_takes_old_readings_for_unknown(tmp_path: Path) -> None:
-    skip_unless_it_can_be_compiled()
-    endpoint = f"ipc://{tmp_path}/graspd"
-    binary = compiled(program("cpp", endpoint), tmp_path)
-    heard = heard_of_old_and_new([binary], endpoint, tmp_path / "heard")
-    assert '"seq":2' in heard
-    assert '"seq":1,' not in heard
+@pytest.mark.parametrize(("language", "made"), [("python", python_client), ("cpp", cpp_client)])
+def test_the_program_of_the_clients_page_lifts(
+    language: str, made: Callable[[str, Path], list[str]], tmp_path: Path
+) -> None:
+    with Daemon(tmp_path, whole_grasps=True) as daemon:
+        code = block(language, CLIENTS)
+        for name, place in (("OUT", daemon.endpoint), ("ASK", daemon.ask_endpoint)):
+            assert code.count(f'"{BESIDE[name]}"') == 1
+            code = code.replace(f'"{BESIDE[name]}"', f'"{place}"')
+        command = made(code, tmp_path)
+
+        def lifts() -> bool:
+            said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+            assert "lifted" in said or said.startswith("do not lift: ")
+            return "lifted" in said
+
+        wait_until(lifts)
