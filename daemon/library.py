@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,8 +28,8 @@ from graspd.daemon.scene import SceneError
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading, RecordingError
 from graspd.drivers.recordings.columns import time_column
-from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all
-from graspd.drivers.recordings.layout import ReadAs
+from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all, refuse_options
+from graspd.drivers.recordings.layout import BLOCK_ROWS, ReadAs, problem_of_sweeps
 from graspd.models import trial, zoo
 from graspd.models.contract import CLASSES, ModelError, SessionInput
 from graspd.models.counts import check_fingers, column_names, counts_of, write_csv
@@ -74,15 +74,23 @@ class GraspModel:
         return type(self), self._file
 
     def predict(
-        self, counts: ArrayLike, *, session: str | os.PathLike[str] | ArrayLike | None = None
+        self,
+        counts: ArrayLike,
+        *,
+        session: str | os.PathLike[str] | ArrayLike | None = None,
+        read_as: Literal["table"] | None = None,
     ) -> NDArray[np.str_]:
         """Return `stable`, `slip` or `unknown` for each grasp, shape (n,), by `predict_proba`."""
-        p_slip = self._probabilities(counts, session)[:, 1]
+        p_slip = self._probabilities(counts, session, read_as)[:, 1]
         stable = p_slip < Limits.slip_threshold
         return np.where(np.isnan(p_slip), "unknown", np.where(stable, *CLASSES))
 
     def predict_proba(
-        self, counts: ArrayLike, *, session: str | os.PathLike[str] | ArrayLike | None = None
+        self,
+        counts: ArrayLike,
+        *,
+        session: str | os.PathLike[str] | ArrayLike | None = None,
+        read_as: Literal["table"] | None = None,
     ) -> NDArray[np.float64]:
         """Return the probabilities of `classes_`, shape (n, 2), for each of n held grasps.
 
@@ -92,18 +100,22 @@ class GraspModel:
 
         `session`, for models that need one: grasps of the same sensors on the same day, like
         `counts` and without outcomes, or the file of a session that a daemon has kept.
+        `read_as="table"` decides for a table of which many rows nearly repeat each other.
         Raises `ValueError`, `ModelError` or `SessionFileError` for what does not fit, and
         `RuntimeError` in a process that was forked while a thread judged.
         """
-        return self._probabilities(counts, session)
+        return self._probabilities(counts, session, read_as)
 
     def _probabilities(
-        self, counts: ArrayLike, session: str | os.PathLike[str] | ArrayLike | None
+        self,
+        counts: ArrayLike,
+        session: str | os.PathLike[str] | ArrayLike | None,
+        read_as: ReadAs | None,
     ) -> NDArray[np.float64]:
-        judged = _grasps(counts, self.fingers)
+        judged = _grasps(counts, self.fingers, read_as)
         probabilities = np.full((len(judged), 2), np.nan)
         with self._turn():
-            self._begin(session)
+            self._begin(session, read_as)
             for row, values in enumerate(judged):
                 p_slip = self._judge.judge(self._examine(values)).p_slip
                 if p_slip is not None:
@@ -124,7 +136,9 @@ class GraspModel:
         broken = at_rail(counts)  # as is a NaN, which is 0 there
         return self._judge.examine(counts, broken if broken.any() else None)
 
-    def _begin(self, session: str | os.PathLike[str] | ArrayLike | None) -> None:
+    def _begin(
+        self, session: str | os.PathLike[str] | ArrayLike | None, read_as: ReadAs | None
+    ) -> None:
         """Begin a session of today's sensors."""
         calibration = self._judge.session
         if calibration is None or not isinstance(self._takes, SessionInput):
@@ -135,7 +149,7 @@ class GraspModel:
         if isinstance(session, str | os.PathLike):
             session_file.restore(Path(session), self.fingers, calibration)
         elif session is not None:
-            for values in _grasps(session, self.fingers):
+            for values in _grasps(session, self.fingers, read_as):
                 examined = self._examine(values)
                 self._judge.observe(examined, self._judge.judge(examined))
         if not calibration.calibrated:
@@ -148,15 +162,25 @@ class GraspModel:
             )
 
 
-def _grasps(given: ArrayLike, fingers: Sequence[Finger]) -> NDArray[np.float64]:
-    """Return the counts of grasps. Raises `ValueError`, also for a table with times, a stream."""
+def _grasps(
+    given: ArrayLike, fingers: Sequence[Finger], read_as: ReadAs | None
+) -> NDArray[np.float64]:
+    """Return the counts of grasps. Raises `ValueError`, also for a table of sweeps."""
     time_of_sweeps = _time_of(given)
     if time_of_sweeps is not None:
         raise ValueError(
             f"the table is a stream, by its column {time_of_sweeps}: its rows are sweeps and "
             "not grasps; graspd.judge(table) judges it"
         )
-    return counts_of(given, fingers)
+    counts = counts_of(given, fingers)
+    if column_names(given):
+        blocks = np.array_split(
+            counts.reshape(len(counts), -1), range(BLOCK_ROWS, len(counts), BLOCK_ROWS)
+        )
+        problem = problem_of_sweeps(blocks, read_as)
+        if problem is not None:
+            raise ValueError(f"the table: {_in_arguments(problem)}; graspd.judge judges sweeps")
+    return counts
 
 
 def _time_of(table: Any) -> str | None:  # noqa: ANN401
@@ -239,7 +263,7 @@ def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
         recordings = [recordings]
     try:
         paths = [Path(path) for path in recordings]
-    except TypeError as error:
+    except (TypeError, NotImplementedError) as error:  # NotImplementedError: of a memoryview
         given = type(recordings).__name__
         raise ValueError(
             f"it judges files and tables, not {given}: GraspModel.predict takes counts"
@@ -271,16 +295,23 @@ def _named_as_given(path: Path) -> Iterator[None]:
         said = str(error).replace(str(path), "the table")
         said = said.replace(", line 1:", ":")
         said = re.sub(r", line (\d+)", lambda found: f", row {int(found[1]) - 2} (from 0)", said)
-        for option, argument in ARGUMENTS.items():
-            said = said.replace(option, argument)
-        raise ValueError(said) from None
+        raise ValueError(_in_arguments(said)) from None
+
+
+def _in_arguments(said: str) -> str:
+    """Return an error with arguments in place of the options of the command line."""
+    for option, argument in ARGUMENTS.items():
+        said = said.replace(option, argument)
+    return said
 
 
 def _parts(
     paths: Sequence[Path], model: dict[str, Any], read_as: ReadAs | None, rate_hz: float | None
 ) -> Parts:
     source: Source
-    if kind_of_all(paths) is not Kind.MCAP:
+    kind = kind_of_all(paths)
+    refuse_options(paths[0], kind, {"read_as": read_as, "rate_hz": rate_hz})
+    if kind is not Kind.MCAP:
         source = Tables(paths, {}, read_as=read_as, rate_hz=rate_hz)
     else:
         require_mcap("judging MCAP")

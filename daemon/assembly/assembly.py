@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from graspd.daemon.assembly.plan import NO_SWEEPS, Plan, recorded_kind
 from graspd.daemon.judge.decision import Limits
@@ -30,6 +31,11 @@ from graspd.models import trial, zoo
 from graspd.models.contract import ModelError, SessionInput
 from graspd.models.runtime import TactileModel
 from graspd.models.trust.risk import RiskLimits
+
+if TYPE_CHECKING:
+    from graspd.daemon.record.player import McapReplayDriver
+    from graspd.drivers.recordings.bag import BagDriver
+    from graspd.drivers.recordings.csv_player import ReplayDriver
 
 DEFAULT_MODEL = "small-session"
 RECORDED_MAX_AGE_MS = 1000.0
@@ -188,7 +194,7 @@ def _tactile(plan: Plan) -> Driver:
     arguments = options.model_dump(exclude={"driver"})
     match options:
         case ReplayTactile():
-            return _replay(plan, options)
+            return player(plan, options, 1.0 if options.pace == "realtime" else None)
         case SpiTactile():
             from graspd.drivers.spi.driver import SpiBridgeDriver
 
@@ -208,11 +214,14 @@ def _tactile(plan: Plan) -> Driver:
             return TactileStreamDriver(fingers=fingers, hand=plan.scene.hand.name, **arguments)
 
 
-def _replay(plan: Plan, options: ReplayTactile) -> Driver:
-    fingers, speed = plan.scene.hand.fingers, 1.0 if options.pace == "realtime" else None
-    kind = recorded_kind(options)
-    if kind is not Kind.TEXT and (options.loop or options.outcomes):
-        raise ValueError(f"{kind.value} is replayed as it is: no loop or outcomes")
+def player(
+    plan: Plan, options: ReplayTactile, speed: float | None, *, strict: bool = False
+) -> ReplayDriver | BagDriver | McapReplayDriver:
+    """Make the driver that plays a scene's recordings; `speed` None: fast. Raises `ValueError`.
+
+    `strict`: a value that is not a count ends a table.
+    """
+    fingers, kind = plan.scene.hand.fingers, recorded_kind(options)
     if kind in BAGS:
         from graspd.drivers.recordings.bag import BagDriver
 
@@ -231,8 +240,9 @@ def _replay(plan: Plan, options: ReplayTactile) -> Driver:
     return ReplayDriver(
         options.recordings,
         fingers,
+        layouts=plan.layouts,
         speed=speed,
-        loop=options.loop,
-        read_as=options.read_as,
         rate_hz=options.rate_hz,
+        loop=options.loop,
+        strict=strict,
     )

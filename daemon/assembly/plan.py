@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from graspd.daemon.judge.decision import GateLimits, HandLimits
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.scene import GateMode
-from graspd.drivers.recordings.kinds import BAGS, Kind, kind_of_all
+from graspd.drivers.recordings.kinds import BAGS, Kind, kind_of_all, refuse_options
+from graspd.drivers.recordings.layout import Layout, layout_of
 from graspd.extras import require
 
 NO_SWEEPS = "gate mode `every` judges each row of a grasp table; a sweep of a stream is no grasp"
@@ -26,6 +28,8 @@ class Plan:
     """True if joint angles come, from their own source or in a recording."""
     without_outcomes: tuple[Path, ...] = ()
     """Grasp tables and streams that do not say how the lifts ended."""
+    layouts: Mapping[Path, Layout] = field(default_factory=dict)
+    """Layouts of the scene's tables and streams."""
 
     @classmethod
     def of(cls, scene: Scene) -> Plan:
@@ -46,8 +50,6 @@ class Plan:
 
             recorded = [header_of(path).joints for path in options.recordings]
             return cls(scene, mode or "settled", joints or any(recorded))
-        from graspd.drivers.recordings.layout import layout_of
-
         layouts = {
             path: layout_of(path, scene.hand.fingers, options.read_as, options.rate_hz)
             for path in options.recordings
@@ -61,7 +63,7 @@ class Plan:
             raise SceneError(f"{streams[0]}: {NO_SWEEPS}")
         joints = joints or any(each.joints for each in layouts.values())
         unknown = (path for path, each in layouts.items() if each.columns.slipped is None)
-        return cls(scene, mode, joints, tuple(unknown))
+        return cls(scene, mode, joints, tuple(unknown), layouts)
 
     @property
     def hand(self) -> HandLimits | None:
@@ -84,26 +86,17 @@ class Plan:
 def recorded_kind(options: ReplayTactile) -> Kind:
     """Return what the recordings are: MCAP, bags, or `Kind.TEXT` for tables and streams.
 
-    Raises `RecordingError` for files of two kinds, `SceneError` for those of another kind, or if
-    the package that reads them is missing.
+    Raises `RecordingError` for files of two kinds, and keys that are for tables alone; `SceneError`
+    for files of another kind, or without the package that reads them.
     """
-    kind = kind_of_all(options.recordings)
+    kind, first = kind_of_all(options.recordings), options.recordings[0]
     if kind is Kind.MCAP:
         require_mcap("replaying MCAP")
-    elif kind in BAGS:
-        require_bags()
-    elif kind is not Kind.TEXT:
-        first = options.recordings[0]
+    elif kind is not Kind.TEXT and kind not in BAGS:
         raise SceneError(f"tactile.recordings: {first} is {kind.value}: `graspd replay` plays it")
+    only_tables = options.model_dump(include={"loop", "outcomes", "read_as", "rate_hz"})
+    refuse_options(first, kind, only_tables)
     return kind
-
-
-def require_bags() -> None:
-    """Raise `SceneError`, with advice, without the package of the extra `bag`."""
-    try:
-        require("rosbags.rosbag2", "reading a ROS bag", "bag")
-    except ModuleNotFoundError as error:
-        raise SceneError(str(error)) from error
 
 
 def require_mcap(what: str) -> None:

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from graspd.biotac import FINGERS, Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Parts
-from graspd.daemon.assembly.plan import Plan, require_bags
+from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
-from graspd.daemon.scene.drivers import CanTactile, SpiTactile
+from graspd.daemon.scene.drivers import CanTactile, ReplayTactile, SpiTactile
 from graspd.daemon.scene.scene import Hand
-from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.kinds import BAGS, CAN_LOGS, Kind, kind_of, kind_of_all
 from graspd.drivers.recordings.layout import ReadAs, fingers_in_header
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from graspd.drivers.recordings.bag import BagDriver
     from graspd.drivers.recordings.player import LinkLogDriver
 
 DRAWS = "replay"
@@ -92,15 +89,8 @@ class Tables(Source):
         `read_as`, `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags.
         """
         self._paths = [path.absolute() for path in paths]
-        self._driver = partial(
-            ReplayDriver,
-            self._paths,
-            read_as=read_as,
-            rate_hz=rate_hz,
-            loop=loop,
-            strict=strict,
-        )
-        tactile = {"driver": "replay", "recordings": self._paths}
+        self._strict = strict
+        tactile = {"driver": "replay", "recordings": self._paths, "loop": loop}
         changes: dict[str, dict[str, Any]] = {
             "tactile": {**tactile, "read_as": read_as, "rate_hz": rate_hz},
             "gate": {"max_age_ms": assembly.RECORDED_MAX_AGE_MS},
@@ -113,16 +103,10 @@ class Tables(Source):
         for path in self._paths:
             self._refuse_other_fingers(path, model)
         plan = Plan.of(replayed.model_copy(update={"hand": hand}))
-        driver = self._player(hand.fingers, speed)
+        options = cast(ReplayTactile, replayed.tactile)
+        driver = assembly.player(plan, options, speed, strict=self._strict)
         parts = Parts.of(plan, model, driver, lambda: driver.handed_over_ns)
         return replace(parts, boot_id=DRAWS)
-
-    def _player(self, fingers: Sequence[Finger], speed: float | None) -> ReplayDriver | BagDriver:
-        if kind_of_all(self._paths) not in BAGS:
-            return self._driver(fingers, speed=speed)
-        from graspd.drivers.recordings.bag import BagDriver
-
-        return BagDriver(self._paths, fingers, speed=speed)
 
     def _refuse_other_fingers(self, path: Path, model: TactileModel) -> None:
         """Raise `SceneError`, with models that fit, if a file lacks fingers of the model."""
@@ -138,7 +122,6 @@ class Tables(Source):
 
     def _fingers(self, path: Path, judged: Sequence[Finger]) -> Sequence[str]:
         if kind_of(path) in BAGS:
-            require_bags()
             from graspd.drivers.recordings.bag import fingers_of
 
             return fingers_of(path)

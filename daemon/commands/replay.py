@@ -33,7 +33,7 @@ from graspd.daemon.session import file as session_file
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import SLIPPED
 from graspd.drivers.recordings.csv_player import DEMO_DAY
-from graspd.drivers.recordings.kinds import BAGS, Kind, files_of, kind_of_all
+from graspd.drivers.recordings.kinds import BAGS, Kind, files_of, kind_of_all, refuse_options
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError
@@ -57,9 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="RECORDING",
         help="grasp tables or streams (CSV, Parquet); what `graspd run` has recorded (MCAP); ROS "
-        "bags; what came over a link (a CAN log, serial bytes); each packed by gzip or not, "
-        "known by its content; - is standard input; without any, the demo: a synthetic day, with "
-        "--outcomes, --only-lifted and --max-slip-when-stable 0.05",
+        "bags; what came over a link (a CAN log, serial bytes); known by their content; all except "
+        "bags may be packed by gzip; - is standard input; without any, the demo: a synthetic day, "
+        "with --outcomes, --only-lifted and --max-slip-when-stable 0.05",
     )
     parser.add_argument(
         "--scene", type=Path, help="of a link log: the scene that says how to decode it"
@@ -246,6 +246,8 @@ def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
 def _source(args: argparse.Namespace) -> Source:
     """Return what plays the recordings. Imports only what this kind of them needs."""
     kind = kind_of_all(args.recordings)
+    given = {"--loop": args.loop, "--strict": args.strict, "--as": args.read_as}
+    refuse_options(args.recordings[0], kind, given | {"--rate-hz": args.rate_hz})
     if kind is Kind.TEXT or kind in BAGS:
         return _tables(args)
     if args.outcomes or args.min_confidence is not None or _risk(args):
@@ -253,8 +255,6 @@ def _source(args: argparse.Namespace) -> Source:
             "what graspd has recorded is judged under its own risk: no --outcomes, "
             "--max-slip-when-stable, --warm-up, --explore or --min-confidence"
         )
-    if args.loop or args.strict:
-        raise UsageError("what graspd has recorded is played as it is: no --loop or --strict")
     if kind in LINK_LOGS:
         return LinkLogs(args.recordings, args.scene)
     require_mcap("replaying MCAP")
@@ -267,8 +267,6 @@ def _tables(args: argparse.Namespace) -> Tables:
     """Return tables that are judged as the command line says."""
     if args.scene is not None:
         raise UsageError("--scene is for what came over a link")
-    if (args.loop or args.strict) and kind_of_all(args.recordings) in BAGS:
-        raise UsageError("a ROS bag is played as it is: no --loop or --strict")
     sections: dict[str, dict[str, Any]] = {}
     if args.min_confidence is not None:
         sections["model"] = {"min_confidence": args.min_confidence}

@@ -17,7 +17,7 @@ from graspd.drivers.base import JointReading, RecordingError, TactileReading
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED, TIME
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.csv_rows import Row, read_rows
-from graspd.drivers.recordings.kinds import BAGS, TABLES, Kind, files_of, kind_of
+from graspd.drivers.recordings.kinds import BAGS, TABLES, Kind, files_of, kind_of, refuse_options
 from graspd.drivers.recordings.layout import ReadAs, fingers_in_header, layout_of
 from graspd.extras import require
 
@@ -40,6 +40,7 @@ def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) 
 
 def _grasps(path: Path, read_as: ReadAs | None) -> pd.DataFrame:
     kind = kind_of(path)
+    refuse_options(path, kind, {"read_as": read_as})
     if kind is Kind.MCAP:
         require("mcap", "read_grasps of MCAP", "record")
         from graspd.daemon.record.export import collect
@@ -84,8 +85,8 @@ def _readings(path: Path, read_as: ReadAs | None, rate_hz: float | None) -> pd.D
     driver: ReplayDriver | McapReplayDriver | BagDriver
     fingers: tuple[str, ...]
     kind = kind_of(path)
+    refuse_options(path, kind, {"read_as": read_as, "rate_hz": rate_hz})
     if kind in BAGS:
-        require("rosbags.rosbag2", "reading a ROS bag", "bag")
         from graspd.drivers.recordings.bag import BagDriver, fingers_of
 
         fingers = fingers_of(path)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspd.drivers.base import (
     DriverCounters,
@@ -20,7 +20,7 @@ from graspd.drivers.base import (
 )
 from graspd.drivers.recordings.csv_rows import Row, read_rows
 from graspd.drivers.recordings.layout import Layout, ReadAs, layout_of
-from graspd.drivers.recordings.player import RecordedDriver
+from graspd.drivers.recordings.player import ReadingsDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Table of synthetic grasps. `python -m tests.kit.demos` makes all four demos again."""
@@ -52,22 +52,24 @@ class ReplayCounters(DriverCounters):
     bad_angles: int = 0
 
 
-class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
+class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     """Play one or more tables and streams, at most one row per call of `read_ready`.
 
-    A row gives a `TactileReading` of `fingers`, after a `JointReading` if the file has joints. With
-    a `speed`, `t_ns` is when the row was due, else when it is handed over. `recorded_ns` is the
-    file's own time. No reading is skipped.
+    A row gives a `TactileReading` of `fingers`, after a `JointReading` if the file has joints.
+    `recorded_ns` is the file's own time. No reading is skipped.
 
     `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
     no counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
     """
+
+    counters: ReplayCounters
 
     def __init__(
         self,
         paths: Sequence[Path],
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
+        layouts: Mapping[Path, Layout] | None = None,
         speed: float | None = 1.0,
         rate_hz: float | None = None,
         read_as: ReadAs | None = None,
@@ -75,32 +77,29 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         strict: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`speed`: factor of real time; None: fast. `rate_hz`: rows per second where there are no
-        times; a table has 100. `read_as` and `rate_hz` are also as of `layout_of`."""
-        super().__init__(paths, speed, clock)
-        self._fingers = tuple(fingers)
+        """`layouts`: of the files, if they are known. `speed`: factor of real time; None: fast.
+
+        `rate_hz`: rows per second where there are no times; a table has 100. `read_as` and
+        `rate_hz` are also as of `layout_of`.
+        """
+        super().__init__(paths, fingers, speed=speed, clock=clock)
         self._table_period_ns = _NS_PER_S / (rate_hz or TABLE_RATE_HZ)
-        self._read_as: ReadAs | None = read_as
-        self._rate_hz = rate_hz
-        self._layouts: dict[Path, Layout] = {}
+        self._find = partial(layout_of, fingers=self._fingers, read_as=read_as, rate_hz=rate_hz)
+        self._layouts = dict(layouts or {})
         self._loop = loop
         self._strict = strict
-        self._reset()
 
-    def _reset(self) -> None:
+    def reset(self) -> None:
+        super().reset()
         self.counters = ReplayCounters()
-        self.period_ns: int | None = None
-        """Time between readings as played, ns; for a stream the shortest step so far."""
-        self._row_index = 0
-        self._interrupted = False
 
     def open(self) -> None:
         """Check the header of each file, then start from the first file."""
         self.close()
-        self._reset()
+        self.reset()
         ignored: dict[str, None] = {}
         for path in self.paths:
-            layout = layout_of(path, self._fingers, self._read_as, self._rate_hz)
+            layout = self._layouts.get(path) or self._find(path)
             self._layouts[path] = layout
             ignored.update(dict.fromkeys(layout.columns.ignored))
             if layout.unit_s != 1.0 and layout.columns.time is not None:
@@ -113,18 +112,16 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
 
     def read_ready(self) -> Sequence[Reading]:
         """Return the readings of one row if it is due. Raises `RecordingError` for a bad row."""
-        due = self.take()
-        if due is None:
+        taken = self.take()
+        if taken is None:
             return ()
-        at_ns, (row, recorded_period_ns) = due
-        self._interrupted |= recorded_period_ns is None and at_ns > 0  # another stream begins
-        if recorded_period_ns is not None:
-            self.period_ns = round(recorded_period_ns / (self.speed or 1.0))
-        self.handed_over_ns = self._clock() if self.speed is None else self.played_ns(at_ns)
-        return self._readings(row, self.handed_over_ns, at_ns)
+        at_ns, (row, interrupted) = taken
+        self.follow(at_ns)
+        made = self._readings(row, at_ns, interrupted)
+        return [self.hand_over(reading, at_ns) for reading in made]
 
-    def _items(self) -> Generator[tuple[int, tuple[Row, int | None]], None, None]:
-        """Yield the rows of all files on one time axis, with the recorded period."""
+    def _items(self) -> Generator[tuple[int, tuple[Row, bool]], None, None]:
+        """Yield the rows of all files on one time axis; True: another stream begins."""
         start_ns = 0
         while True:
             for path in self.paths:
@@ -134,44 +131,34 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
 
     def _items_of(
         self, path: Path, start_ns: int
-    ) -> Generator[tuple[int, tuple[Row, int | None]], None, int]:
+    ) -> Generator[tuple[int, tuple[Row, bool]], None, int]:
         """Yield the rows of one file; return the start time of the next file."""
-        at_ns, first_s = start_ns, None
-        period_ns: int | None = None
+        at_ns, first_s, period_ns = start_ns, None, 0
         rows = read_rows(path, self._fingers, strict=self._strict, layout=self._layouts[path])
         for index, row in enumerate(rows):
+            before_ns = at_ns
             if row.t_s is None:
-                period_ns = round(self._table_period_ns)
                 at_ns = start_ns + round(index * self._table_period_ns)
-            elif first_s is None:
-                first_s = row.t_s
             else:
-                before_ns = at_ns
+                first_s = row.t_s if first_s is None else first_s
                 # A float of seconds since 1970 is no finer than a microsecond.
                 at_ns = start_ns + 1000 * round((row.t_s - first_s) * 1e6)
-                if at_ns > before_ns:  # the shortest step, so that a gap is noticed
-                    period_ns = min(at_ns - before_ns, period_ns or at_ns)
-            yield at_ns, (row, period_ns)
+            if at_ns > before_ns:
+                period_ns = min(at_ns - before_ns, period_ns or at_ns)
+            yield at_ns, (row, index == 0 < start_ns and row.t_s is not None)
         return at_ns + (period_ns or round(self._table_period_ns))
 
-    def _readings(self, row: Row, t_ns: int, recorded_ns: int) -> Sequence[Reading]:
-        index = self._row_index
-        self._row_index += 1
-        readings: list[Reading] = []
+    def _readings(self, row: Row, at_ns: int, interrupted: bool) -> Iterator[Reading]:
+        """Yield joints, then counts of a row."""
+        index, faults = self.counters.readings, row.faults
         if row.joint_names:
-            angles = row.position_rad
-            readings.append(JointReading(t_ns, index, row.joint_names, angles, recorded_ns))
-            self.counters.bad_angles += int(np.isnan(angles).sum())
-        interrupted, self._interrupted = self._interrupted, False
-        counts, faults, note = row.counts, row.faults, row.annotation
-        readings.append(TactileReading(t_ns, index, counts, faults, note, recorded_ns, interrupted))
-        self._count(faults)
-        return readings
-
-    def _count(self, faults: NDArray[np.uint8]) -> None:
+            yield JointReading(at_ns, index, row.joint_names, row.position_rad)
+            self.counters.bad_angles += int(np.isnan(row.position_rad).sum())
+        yield TactileReading(
+            at_ns, index, row.counts, faults, row.annotation, interrupted=interrupted
+        )
         self.counters.readings += 1
         if faults.any():
             self.counters.faulty_readings += 1
-            not_counts = faults & np.uint8(ElectrodeFault.NOT_A_COUNT) != 0
-            self.counters.not_counts += int(not_counts.sum())
-            self.counters.cut_off += bool((faults & np.uint8(ElectrodeFault.CUT_OFF)).any())
+            self.counters.not_counts += int((faults & ElectrodeFault.NOT_A_COUNT != 0).sum())
+            self.counters.cut_off += bool((faults & ElectrodeFault.CUT_OFF).any())

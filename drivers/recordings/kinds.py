@@ -13,7 +13,7 @@ import re
 import stat
 import sys
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import BinaryIO, Final, cast
 
 from graspd.drivers.base import RecordingError
+from graspd.extras import require
 
 STANDARD_INPUT: Final = Path("-")
 """Name of standard input on a command line."""
@@ -116,11 +117,21 @@ _OTHERS: Final = {
 
 
 def kind_of(path: Path) -> Kind:
-    """Return what a file or folder holds. Raises `RecordingError` for what graspd does not read."""
+    """Return what a file or folder holds.
+
+    Raises `RecordingError` for what graspd does not read, and for a bag without the extra `bag`.
+    """
     if os.path.isfile(path / "metadata.yaml"):  # False too where it may not look
-        return Kind.ROS2_BAG
-    with open_recording(path) as file:
-        return kind_of_open(path, file)
+        kind = Kind.ROS2_BAG
+    else:
+        with open_recording(path) as file:
+            kind = kind_of_open(path, file)
+    if kind in BAGS:
+        try:
+            require("rosbags.rosbag2", "reading a ROS bag", "bag")
+        except ModuleNotFoundError as error:
+            raise RecordingError(path, str(error)) from error
+    return kind
 
 
 def kind_of_open(path: Path, file: BinaryIO) -> Kind:
@@ -152,6 +163,14 @@ def kind_of_all(paths: Sequence[Path]) -> Kind:
             problem = f"is {kind.value}, {paths[0]} is {kinds[0].value}: they are not one recording"
             raise RecordingError(path, problem)
     return kinds[0]
+
+
+def refuse_options(path: Path, kind: Kind, options: Mapping[str, object]) -> None:
+    """Raise `RecordingError` if options of tables, by name, are given for what is not one."""
+    given = [name for name, value in options.items() if value]
+    if kind not in TABLES and given:
+        problem = f"is {kind.value}, which is played as it is: no {', '.join(given)}"
+        raise RecordingError(path, problem)
 
 
 def _kind_of(head: bytes) -> Kind | None:

@@ -5,7 +5,6 @@ A sweep of a stream is never judged as a grasp, so doubt is refused.
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,31 +31,30 @@ from graspd.drivers.recordings.values import (
 ReadAs = Literal["table", "stream"]
 BLOCK_ROWS: Final = 512
 """Rows that are compared with each other, and rows at the begin whose values are checked."""
+CLIP_COUNTS: Final = 64.0
+"""Most by which one electrode counts: a broken one may have any value."""
 NEAR_COUNTS: Final = 8.0
 """Root of the mean square by which rows differ that nearly repeat each other, counts.
 
 Sweeps of a hand at rest differ by 3 to 6. At most 5 % of the published grasps are as near to
-another one, and 12 % of those of ten objects; 29 to 65 % of the sweeps of streams at 4 to 100 Hz
-are.
+another one, and 20 % of ten of one object; 33 to 61 % of the sweeps of streams at 4 to 100 Hz are.
 """
 STEP_COUNTS: Final = 25.0
-"""The same of rows that may be sweeps in a row: 75 to 99 % of streams, 8 to 20 % of tables."""
-CLIP_COUNTS: Final = 64.0
-"""Most by which one electrode counts for a clipped step: a broken one may have any value."""
-ALIKE_SHARE_MAX: Final = 0.7
-"""Largest share of clipped steps up to `STEP_COUNTS` in a table, and of rows that have such another
-row: streams have 80 to 95 %, the published tables 13 to 30 %."""
-BETWEEN_SHARE_MAX: Final = 0.6
-"""Largest share of those up to `STEP_COUNTS` among those that are not near, in a table: streams
-have 68 to 95 %, the published tables 15 to 40 %."""
-FEW_ROWS: Final = 10
-"""Fewest rows whose shares mean something."""
+"""The same of rows that may be sweeps in a row: 74 to 97 % of streams, 13 to 44 % of tables."""
 NEAR_SHARE_MAX: Final = 0.2
-"""Largest share of near rows in a grasp table."""
-MIDDLE_SHARE_MAX: Final = 0.25
-"""Largest share of steps between near and `STEP_COUNTS` in a table; streams have 40 to 60 %."""
+"""Largest share of rows up to `NEAR_COUNTS` from another in a grasp table."""
+ALIKE_SHARE_MAX: Final = 0.75
+"""Largest share of rows up to `STEP_COUNTS` from another: of sweeps with broken electrodes, or of
+much noise, up to 100 % are, and not one of them is near."""
+FEW_ROWS: Final = 10
+"""Fewest rows whose shares can refuse a table for good."""
+MIDDLE_SHARE_MAX: Final = 0.1
+"""Largest share of rows that are neither near nor far, in a table of several readings of each
+grasp, which has up to 5 %; streams have 35 to 45 %."""
+BETWEEN_SHARE_MAX: Final = 0.6
+"""Largest share of them among those that are not near: streams have 63 to 95 %."""
 JUMP_SHARE_MIN: Final = 0.02
-"""Least share of larger steps in a table of several readings of each grasp: 50 readings."""
+"""Least share of rows that are far from the row before, in such a table: 50 readings."""
 STEP_S: Final = (0.002, 0.5)
 """Shortest and longest usual time between sweeps, s. In each unit other numbers are usual."""
 SLOWEST_S: Final = 1.0
@@ -127,7 +125,9 @@ def survey(
         else:
             layout = _timed(rows, columns.time, read_as)
     else:
-        _refuse_sweeps(rows, read_as)
+        repeats = problem_of_sweeps(rows.blocks(), read_as)
+        if repeats is not None:
+            raise RecordingError(path, repeats)
         layout = Layout(columns, is_stream=False)
     file.seek(0)
     return layout
@@ -186,42 +186,26 @@ class _Rows:
     def is_clock(self, column: TimeColumn) -> bool:
         return is_clock(self.first[0][column.places[0]])
 
-    def likeness(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return how far each row is from its nearest of a block, and from the row before, counts.
-
-        Shapes (rows,) and (rows - 1,), of the whole file; the steps twice, the second are clipped.
-        """
-        nearest, steps, clipped = [], [], []
-        last = np.empty((0, len(self.columns.electrodes)), dtype=np.float32)
+    def blocks(self) -> Iterator[NDArray[np.float32]]:
+        """Yield the counts of the whole file, shape (rows, electrodes); a missing one is NaN."""
         rows: Iterable[list[str]] = chain(self.first, self._others)
         while cells := list(islice(rows, BLOCK_ROWS)):
-            block = self._counts(cells)
-            nearest.append(_nearest(block))
-            block = np.concatenate((last, block))
-            steps.append(_steps(block))
-            clipped.append(_steps(block, CLIP_COUNTS))
-            last = block[-1:]
-        return np.concatenate(nearest), np.concatenate(steps), np.concatenate(clipped)
+            yield self._counts(cells)
 
     def follow_each_other(self) -> bool:
         """Return True if most of the first rows are a small step from the row before."""
-        steps = _steps(self._counts(self.first))
+        counts = _without_gaps(self._counts(self.first))
+        steps = _apart(counts[1:], counts[:-1])
         return 2 * int((steps <= STEP_COUNTS).sum()) > len(steps)
 
     def _counts(self, rows: Sequence[Sequence[str]]) -> NDArray[np.float32]:
-        """Return counts, shape (rows, electrodes); a missing one is the median of its electrode."""
-        counts = np.array(
+        return np.array(
             [
                 [count_of(cell, decimal_comma=self._comma) for cell in self._electrodes(row)]
                 for row in rows
             ],
             dtype=np.float32,
         )
-        missing = np.isnan(counts)
-        if missing.any():
-            usual = np.nanmedian(np.where(missing.all(axis=0), 0.0, counts), axis=0)
-            counts = np.where(missing, usual, counts)
-        return counts
 
 
 def time_value(
@@ -279,61 +263,66 @@ def _timed(rows: _Rows, column: TimeColumn, read_as: ReadAs | None) -> Layout:
     return layout
 
 
-def _refuse_sweeps(rows: _Rows, read_as: ReadAs | None) -> None:
-    """Raise if rows of a table nearly repeat each other, as the sweeps of a stream do."""
-    nearest, steps, clipped = rows.likeness()
-    number, near = len(nearest), int((nearest <= NEAR_COUNTS).sum())
+def problem_of_sweeps(blocks: Iterable[NDArray[np.floating]], read_as: ReadAs | None) -> str | None:
+    """Return why rows are not grasps: many nearly repeat another, as sweeps do. None: they are.
+
+    `blocks`: counts, shape (rows, electrodes), NaN where one is missing. With
+    `read_as="table"` rows may be several readings of each grasp.
+    """
+    nearest, jumps = [], 0
+    last: NDArray[np.floating] | None = None
+    for block in map(_without_gaps, blocks):
+        nearest.append(_nearest(block))
+        before = block[:1] if last is None else last
+        rows = np.concatenate((before, block))
+        jumps += int((_apart(rows[1:], rows[:-1]) > STEP_COUNTS).sum())
+        last = block[-1:]
+    apart = np.concatenate(nearest)
+    number, near = len(apart), int((apart <= NEAR_COUNTS).sum())
+    far = int((apart > STEP_COUNTS).sum())
+    between = number - near - far
     if near > NEAR_SHARE_MAX * number:
-        problem = f"{near} of {number} rows nearly repeat another: "
-    elif _are_alike(clipped) or (number >= FEW_ROWS and _are_alike(nearest)):
-        problem = f"most of {number} rows are much like another: "
+        problem = f"{near} of {number} rows nearly repeat another"
+    elif near + between > ALIKE_SHARE_MAX * number:
+        problem = f"most of {number} rows are much like another"
     else:
-        return
+        return None
     if read_as is None:
-        problem += (
-            "sweeps of a stream (--as stream, and --rate-hz if it has no times), or several "
-            "readings of each grasp (--as table)?"
+        return (
+            f"{problem}: sweeps of a stream (--as stream, and --rate-hz if it has no times), or "
+            "several readings of each grasp (--as table)?"
         )
-        raise RecordingError(rows.path, problem)
-    is_repeated = near > NEAR_SHARE_MAX * number and (
-        _between(steps) > MIDDLE_SHARE_MAX * number
-        or int((steps > STEP_COUNTS).sum()) < JUMP_SHARE_MIN * number
-    )
-    if is_repeated or (number >= FEW_ROWS and (_is_continuous(nearest) or _is_continuous(clipped))):
-        problem += "they change as sweeps of a stream do, and are not grasps of a table"
-        raise RecordingError(rows.path, problem)
+    middle = max(MIDDLE_SHARE_MAX * number, BETWEEN_SHARE_MAX * (between + far))
+    if number >= FEW_ROWS and (between > middle or jumps < JUMP_SHARE_MIN * number):
+        return f"{problem}: they change as sweeps of a stream do, and are not grasps of a table"
+    return None
 
 
-def _are_alike(apart: NDArray[np.float32]) -> bool:
-    return int((apart <= STEP_COUNTS).sum()) > ALIKE_SHARE_MAX * len(apart)
+def _apart(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return by how much rows differ, counts; shape (rows,)."""
+    clipped = np.minimum(np.abs(one - other), CLIP_COUNTS)
+    apart: NDArray[np.floating] = np.sqrt(np.square(clipped).mean(axis=1))
+    return apart
 
 
-def _between(apart: NDArray[np.float32]) -> int:
-    """Return how many rows are neither near nor far, as sweeps of a moving hand are."""
-    return int(((apart > NEAR_COUNTS) & (apart <= STEP_COUNTS)).sum())
-
-
-def _is_continuous(apart: NDArray[np.float32]) -> bool:
-    """Return True if many rows are neither near nor far, and few are far."""
-    between, far = _between(apart), int((apart > STEP_COUNTS).sum())
-    return between > max(MIDDLE_SHARE_MAX * len(apart), BETWEEN_SHARE_MAX * (between + far))
-
-
-def _nearest(block: NDArray[np.float32]) -> NDArray[np.float32]:
+def _nearest(block: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return by how much each row differs from the row most like it, counts; shape (rows,)."""
-    nearest = np.full(len(block), np.inf, dtype=np.float32)
+    nearest = np.full(len(block), np.inf)
     for place in range(len(block) - 1):
-        apart = np.square(block[place + 1 :] - block[place]).mean(axis=1)
+        apart = _apart(block[place + 1 :], block[place])
         np.minimum(nearest[place + 1 :], apart, out=nearest[place + 1 :])
         nearest[place] = min(nearest[place], apart.min())
-    return np.sqrt(nearest)
+    return nearest
 
 
-def _steps(block: NDArray[np.float32], clip: float = math.inf) -> NDArray[np.float32]:
-    """Return by how much each row differs from the row before, counts; shape (rows - 1,)."""
-    apart = np.minimum(np.abs(np.diff(block, axis=0)), clip)
-    squares: NDArray[np.float32] = np.square(apart).mean(axis=1)
-    return np.sqrt(squares)
+def _without_gaps(counts: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return counts with the median of its electrode in place of a missing one."""
+    missing = np.isnan(counts)
+    if not missing.any():
+        return counts
+    usual = np.nanmedian(np.where(missing.all(axis=0), 0.0, counts), axis=0)
+    filled: NDArray[np.floating] = np.where(missing, usual, counts)
+    return filled
 
 
 def _median_step(times: Sequence[float]) -> float:

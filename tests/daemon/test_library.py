@@ -447,11 +447,25 @@ def test_times_that_mean_little_are_refused(
         list(graspd.judge(stream.assign(t=times(stream.t.to_numpy()))))
 
 
+def test_sweeps_without_times_are_never_grasps() -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    sweeps = graspd.read_recording(DEMO_RECORDING)[:260].drop(columns="t")
+    model = graspd.load("mlp")
+    for judge in (graspd.judge, model.predict, model.predict_proba):
+        with pytest.raises(ValueError, match=r"nearly repeat another: sweeps .*read_as=stream"):
+            list(judge(sweeps))
+        with pytest.raises(ValueError, match="they change as sweeps of a stream do"):
+            list(judge(sweeps, read_as="table"))
+    again = sweeps[:1].loc[[0, 0]]
+    assert len(model.predict(again, read_as="table")) == 2
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
         (np.zeros((1, 3, 24)), "files and tables, not ndarray: GraspModel.predict takes counts"),
         ([[2000]], "files and tables, not list"),
+        (memoryview(bytes(6)).cast("B", (2, 3)), "files and tables, not memoryview"),
         ([], "no recording was given"),
     ],
 )

@@ -7,18 +7,20 @@ import re
 import tomllib
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from msgspec.structs import replace
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.plan import Plan
-from graspd.daemon.judge.reasons import Decision
+from graspd.daemon.assembly.sources import Tables
+from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.scene import Scene, SceneError, parse
-from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError
+from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError, TactileReading
 from graspd.drivers.palm.calibration import CalibrationError
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from graspd.models.contract import ModelError
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
@@ -65,6 +67,19 @@ def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
     assert judgement.decision is (Decision.SLIP if threshold < 0.5 else Decision.STABLE)
     clock.now_ns += 2_000_000
     assert pipeline.judge(reading(clock() - 1_500_000)).decision is Decision.UNKNOWN
+
+
+def test_a_table_is_judged_by_when_its_readings_are_handed_over() -> None:
+    """By this computer's clock the reading is as old as the computer's start."""
+    source = Tables([DEMO_TABLE], {})
+    scene = source.scene({}, {}, None)
+    parts = source.parts(scene, assembly.load_model(scene), None)
+    with cast(ReplayDriver, parts.drivers[0]) as driver:
+        (first,) = driver.read_ready()
+        driver.handed_over_ns = 2_000_000
+        for t_ns, is_stale in ((1_000_000, False), (-(10**10), True)):
+            judged = parts.pipeline.judge(replace(cast(TactileReading, first), t_ns=t_ns))
+            assert (Reason.STALE in judged.reasons) is is_stale
 
 
 OTHERS = "cnn1, cnn1-session, mlp, rf, small-electrodes, small-session, svm"

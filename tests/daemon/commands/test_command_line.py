@@ -91,10 +91,13 @@ def test_a_bag_without_its_reader_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    (tmp_path / "hand.bag").write_bytes(b"#ROSBAG V2.0\n")
-    done = inside.graspd("replay", tmp_path / "hand.bag")
+    path = tmp_path / "hand.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n")
+    done = inside.graspd("replay", path)
     assert done.returncode == 2
-    assert done.stderr.startswith("graspd: reading a ROS bag needs the package 'rosbags': run ")
+    assert done.stderr.startswith(
+        f"graspd: {path}: reading a ROS bag needs the package 'rosbags': run "
+    )
 
 
 def test_every_argument_of_every_command_has_help() -> None:

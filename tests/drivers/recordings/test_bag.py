@@ -200,6 +200,20 @@ def test_a_packed_bag_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
         read_grasps(path)
 
 
+def test_options_of_tables_are_never_ignored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
+    said = "is a ROS 1 bag, which is played as it is: no "
+    for options in (["--as", "table"], ["--rate-hz", "50"], ["--loop"], ["--strict"]):
+        assert main(["replay", str(path), *options]) == 2
+        assert f"{said}{options[0]}" in capsys.readouterr().err
+    with pytest.raises(RecordingError, match=f"{said}read_as"):
+        list(judge(path, read_as="table"))
+    with pytest.raises(RecordingError, match=f"{said}rate_hz"):
+        read_recording(path, rate_hz=50.0)
+
+
 def test_joints_in_degrees_are_named(tmp_path: Path) -> None:
     sweeps = [
         sweep._replace(angles={name: 57.29578 * angle for name, angle in sweep.angles.items()})
