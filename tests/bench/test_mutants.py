@@ -62,7 +62,7 @@ def test_the_first_is_found():
 """
 
 
-def test_numbers_operators_and_conditions_are_changed_and_nothing_that_is_only_said() -> None:
+def test_what_runs_is_changed_and_no_text_alone() -> None:
     found = [each for each in mutants(SOURCE) if each.kind in bench.KINDS]
     assert sorted(f"{each.line}: {each.what}" for each in found) == sorted(CHANGES)
     assert len({marshal.dumps(each.code()) for each in found}) == len(CHANGES)
@@ -79,7 +79,7 @@ def test_what_no_test_tells_apart_is_found(tmp_path: Path, monkeypatch: pytest.M
     assert "LIMIT = 5" in (tmp_path / "speeds/limit.py").read_text()
 
 
-def test_a_run_that_is_cut_off_is_not_taken_for_noticed(
+def test_a_run_that_is_cut_off_counts_as_unnoticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(bench, "RUN_S", 1.0)

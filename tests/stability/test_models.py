@@ -179,9 +179,7 @@ def loaded(name: str) -> tuple[TactileModel, Reference]:
 @pytest.mark.parametrize("name", HANDS)
 @settings(max_examples=200)
 @given(counts=HAND)
-def test_inputs_and_probabilities_keep_their_bounds_over_the_12_bit_space(
-    name: str, counts: Raw
-) -> None:
+def test_inputs_and_probabilities_keep_their_bounds_over_12_bits(name: str, counts: Raw) -> None:
     model, reference = loaded(name)
     counts = counts[: len(model.contract.fingers)]
     inputs = builder(model.contract.input, len(counts))

@@ -61,7 +61,7 @@ def test_batch_norm_is_folded_whatever_its_variances() -> None:
     assert error < P_SLIP_ERROR_MAX
 
 
-def test_extreme_logits_give_a_probability_and_the_verdict_of_their_sign(tmp_path: Path) -> None:
+def test_extreme_logits_give_the_verdict_of_their_sign(tmp_path: Path) -> None:
     path = tmp_path / "logits.onnx"
     path.write_bytes(logit_model(TactileModel(zoo.find("mlp")).contract))
     model, limits = TactileModel(path), Limits(max_age_ns=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -20,7 +20,7 @@ from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.lift_book import NAME_BYTES
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.drivers.recordings.kinds import open_recording
-from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_verdict
 
 BOOT = "0123456789abcdef" * 2
@@ -108,10 +108,10 @@ def messages(path: Path) -> list[tuple[str, dict[str, Any]]]:
         return [(message.kind, json.loads(message.payload)) for message in recording]
 
 
-def work(folder: Path, grasps: int, more: str = "", program: Sequence[str] = GRASPD) -> Lab:
+def work(folder: Path, grasps: int, more: str = "") -> Lab:
     """Run until so many grasps were judged, telling of each but the first."""
     lab = Lab(folder)
-    running = start("run", scene(folder, more), program=program)
+    running = start("run", scene(folder, more))
     with running as daemon, zmq.Context() as context:
         wait_for(folder / "ask")
         with context.socket(zmq.SUB) as listener, context.socket(zmq.REQ) as controller:

@@ -89,7 +89,7 @@ def record(path: Path, counts: NDArray[np.uint16]) -> None:
     writer.close()
 
 
-def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_are_broken(
+def test_a_row_is_judged_unless_electrodes_are_broken(
     tmp_path: Path,
 ) -> None:
     wanted = scene.load(demo_scene(tmp_path, sections='[model]\nname = "cnn1"'))
@@ -144,7 +144,7 @@ def test_of_grasps_with_the_same_counts_the_first_is_kept(tmp_path: Path) -> Non
     assert len(read_table(tmp_path / "a.csv").slipped) == 2
 
 
-def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
+def test_a_row_has_the_reported_object_or_the_options(
     tmp_path: Path,
 ) -> None:
     writer = Writer(tmp_path / "a.mcap")
@@ -202,7 +202,7 @@ def test_without_pandas_the_option_names_its_extra(
     assert not (tmp_path / "t.parquet").exists()
 
 
-def test_a_table_that_is_there_is_replaced_only_when_that_is_said(tmp_path: Path) -> None:
+def test_a_table_is_replaced_only_by_force(tmp_path: Path) -> None:
     record(tmp_path / "a.mcap", sweeps(1)[0])
     out = tmp_path / "t.csv"
     out.write_text("of another day")
@@ -216,9 +216,7 @@ def test_a_table_that_is_there_is_replaced_only_when_that_is_said(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ["=HYPERLINK(0)", "-1+1", "@SUM(1)", "mug\n=1", "a,b"])
-def test_no_name_that_a_spreadsheet_would_calculate_gets_into_a_table(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_name_that_a_spreadsheet_calculates_is_refused(tmp_path: Path, name: str) -> None:
     writer = Writer(tmp_path / "a.mcap")
     writer.judged(1, sweeps(1)[0])
     writer.outcome(1, "slip", name)

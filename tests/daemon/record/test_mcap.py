@@ -179,7 +179,7 @@ def test_a_finger_that_was_not_recorded_is_refused(tmp_path: Path) -> None:
 
 @given(st.integers(0, len(WHOLE) - 1))
 @settings(max_examples=200, deadline=None)
-def test_a_file_that_is_cut_anywhere_gives_what_was_flushed_before(at: int) -> None:
+def test_a_file_cut_anywhere_gives_what_was_flushed_before(at: int) -> None:
     try:
         found = read(WHOLE[:at])
     except RecordingError:

@@ -196,7 +196,7 @@ def lines(*kinds: str) -> list[tuple[str, bytes]]:
         (("tactile", "stale", "dropped", "tactile", "stable"), False, [True, False]),
     ],
 )
-def test_a_reading_before_a_loss_is_late_unless_its_verdict_denies_it(
+def test_a_reading_before_a_loss_is_late_without_a_verdict(
     tmp_path: Path, recorded: tuple[str, ...], is_cut: bool, called_late: list[bool]
 ) -> None:
     path = tmp_path / "a.mcap"

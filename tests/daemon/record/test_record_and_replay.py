@@ -14,7 +14,6 @@ import jsonschema
 import jsonschema.validators
 import msgspec
 import pytest
-import zmq
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from msgspec.structs import replace
@@ -26,9 +25,8 @@ from graspd.daemon.publish.messages import encode
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.models.training.data.datasets import read_table
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, graspd_with, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, start
 from tests.daemon.record.recorded import (
-    NAME,
     Lab,
     compared,
     files,
@@ -39,6 +37,8 @@ from tests.daemon.record.recorded import (
 )
 from tests.kit.inside import graspd
 from tests.kit.messages import decode_verdict
+from tests.process_replay.judging import Case, run
+from tests.process_replay.streams import demo
 
 GRASPS = 4
 FLUSH_S, STALL_S = 1.0, 0.5
@@ -50,7 +50,8 @@ LIFE_S = 1.6
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     """Twelve seconds in a lab, judged by the network that knows no session."""
-    return work(tmp_path_factory.mktemp("lab"), GRASPS, '[model]\nname = "cnn1"\n')
+    more = '[model]\nname = "cnn1"\n[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 0\n'
+    return work(tmp_path_factory.mktemp("lab"), GRASPS, more)
 
 
 def of_kind(path: Path, kind: str) -> list[dict[str, Any]]:
@@ -181,13 +182,16 @@ def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:
 @pytest.fixture(scope="module")
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     """A session model at work, and files that end after three seconds, whatever is held then."""
-    soon = {"ROTATE_NS": 3_000_000_000, "FLUSH_NS": 200_000_000}
-    program = graspd_with("graspd.daemon.record.recorder", **soon)
-    risk = "[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 2\n"
-    return work(tmp_path_factory.mktemp("rotated"), GRASPS, risk, program)
+    folder = tmp_path_factory.mktemp("rotated")
+    risk = {"risk": {"max_slip_when_stable": 0.5, "warm_up": 2}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("graspd.daemon.record.recorder.ROTATE_NS", 3_000_000_000)
+        patch.setattr("graspd.daemon.record.recorder.FLUSH_NS", 100_000_000)
+        run(Case(readings=demo, joints=True, tells=True, sections=risk), folder / "record")
+    return Lab(folder)
 
 
-def test_session_and_learning_go_on_in_the_replay_where_they_were(rotated: Lab) -> None:
+def test_session_and_learning_continue_in_a_replay(rotated: Lab) -> None:
     assert len(rotated.files) > 2
     before = [verdict for path in rotated.files for verdict in of_readings(path)]
     now = again(*rotated.files)
@@ -213,10 +217,11 @@ def test_the_library_reads_counts_and_angles_of_a_recording(lab: Lab) -> None:
     assert ((table["t"] - table["t"][0]) * 1e9).tolist() == pytest.approx(steps, abs=1000)
 
 
-def test_the_summary_of_a_replay_counts_the_outcomes_in_the_recording(rotated: Lab) -> None:
+def test_the_summary_of_a_replay_counts_recorded_outcomes(rotated: Lab) -> None:
     result = graspd("replay", "--json", *rotated.files)
     summary = json.loads(result.stderr)
-    assert summary["labelled"] == len(rotated.told) > 0
+    told = [each for path in rotated.files for each in of_kind(path, "outcome")]
+    assert summary["labelled"] == len(told) > 0
     assert summary["outcomes"] == max(v["outcomes"] for v in again(*rotated.files))
     assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
 
@@ -237,7 +242,7 @@ def test_files_that_do_not_follow_each_other_are_named(
     assert f"{third}: does not go on where the file before it ends" in caplog.text
 
 
-def test_what_another_graspd_had_learned_is_left_out_with_a_warning(
+def test_learning_of_another_graspd_is_left_out_with_a_warning(
     rotated: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = RecordedRun(rotated.files[1:2])
@@ -252,34 +257,7 @@ def test_what_another_graspd_had_learned_is_left_out_with_a_warning(
     assert "what was learned is of format 1; this graspd reads only 2" in caplog.text
 
 
-def test_questions_and_announcements_are_in_the_recording_and_repeated(tmp_path: Path) -> None:
-    risk = "[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 0\noutstanding_max = 1\n"
-    with (
-        start("run", scene(tmp_path, more=risk, gate='mode = "request"\n')) as daemon,
-        zmq.Context() as context,
-        context.socket(zmq.REQ) as asker,
-    ):
-        wait_for(tmp_path / "ask")
-        asker.linger = 0
-        asker.routing_id = NAME
-        asker.connect(f"ipc://{tmp_path}/ask")
-        for _ in range(1000):
-            asker.send(b"lift")
-            assert asker.poll(100_000)
-            answer = json.loads(asker.recv())
-            if answer["risk"]["awaited"]:
-                break
-        daemon.terminate()
-        daemon.communicate(timeout=200)
-    (path,) = files(tmp_path)
-    before = of_readings(path)
-    assert before[-1]["risk"]["announced"] == before[-1]["risk"]["awaited"] == 1
-    assert [compared(v) for v in again(path)] == [compared(v) for v in before]
-
-
-def test_grasps_with_an_outcome_become_a_table_with_the_probability_of_then(
-    lab: Lab, tmp_path: Path
-) -> None:
+def test_exported_grasps_are_judged_as_then(lab: Lab, tmp_path: Path) -> None:
     table = tmp_path / "lab.csv"
     result = graspd("export-grasps", *lab.files, "--out", table, "--object", "mug")
     assert result.returncode == 0, result.stderr
@@ -300,7 +278,7 @@ def test_grasps_with_an_outcome_become_a_table_with_the_probability_of_then(
     assert found == wanted
 
 
-def test_a_file_that_was_cut_anywhere_is_played_as_far_as_it_goes(lab: Lab, tmp_path: Path) -> None:
+def test_a_file_cut_anywhere_is_played_to_its_end(lab: Lab, tmp_path: Path) -> None:
     whole = lab.files[0].read_bytes()
     before = of_readings(lab.files[0])
     for part in (0.3, 0.61803, 0.99):

@@ -75,9 +75,7 @@ def pass_time(clock: Clock, writing: Recorder) -> dict[str, int]:
     return writing.counters["record"]
 
 
-def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(
-    tmp_path: Path, clock: Clock
-) -> None:
+def test_the_next_file_begins_with_what_was_known(tmp_path: Path, clock: Clock) -> None:
     loop = Loop()
     loop.sent = 7
     writing = recorder(tmp_path, loop.header, clock=clock)
@@ -110,7 +108,7 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path, clock: Cloc
     assert header_of(files(tmp_path)[1]).grasps == loop.sent
 
 
-def test_a_disk_that_refuses_is_told_once_and_recorded_on_when_it_takes_files_again(
+def test_a_refusing_disk_is_warned_of_once_and_tried_again(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -229,7 +227,7 @@ def judged_grasps(judgements: list[Judgement]) -> list[tuple[int, Decision]]:
     return [(each.moment.grasp, each.decision) for each in judgements if each.moment.judged]
 
 
-def test_a_later_file_judges_as_then_from_its_first_rest_on(
+def test_a_later_file_judges_as_then_after_a_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon = Daemon(tmp_path, monkeypatch)

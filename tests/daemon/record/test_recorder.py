@@ -72,9 +72,7 @@ def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: 
     }
 
 
-def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
-    tmp_path: Path, make: Make
-) -> None:
+def test_a_file_has_the_daemons_header_and_clock(tmp_path: Path, make: Make) -> None:
     # The header compares the two clocks between these times.
     wall_made_ns, made_ns = time.time_ns(), time.monotonic_ns()
     writing = make()
@@ -95,7 +93,7 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
     assert path.stat().st_mode & 0o777 == 0o640
 
 
-def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
+def test_files_follow_each_other_by_size_without_a_loss(
     tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_module, "ROTATE_BYTES", 100_000)
@@ -159,7 +157,7 @@ class StalledDisk:
         monkeypatch.setattr("os.fdatasync", stall)
 
 
-def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
+def test_entries_are_dropped_and_counted_while_a_disk_stalls(
     tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = StalledDisk(monkeypatch)
@@ -180,7 +178,7 @@ def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
     assert (loss.kind, last.kind) == ("dropped", before[-1].kind)
 
 
-def test_the_end_does_not_wait_for_a_disk_that_never_answers(
+def test_the_end_waits_for_no_disk_that_never_answers(
     make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     disk = StalledDisk(monkeypatch)
@@ -192,7 +190,7 @@ def test_the_end_does_not_wait_for_a_disk_that_never_answers(
     disk.answers.set()
 
 
-def test_a_run_that_no_hand_waits_for_waits_for_its_disk(
+def test_a_run_without_a_hand_waits_for_its_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = StalledDisk(monkeypatch)
@@ -213,7 +211,7 @@ def test_a_run_that_no_hand_waits_for_waits_for_its_disk(
     assert writing.counters["record"]["dropped"] == 0
 
 
-def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
+def test_a_full_disk_counts_what_it_does_not_keep(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten entries wait for a flush; of the twenty that follow the disk refuses the fifth.
@@ -258,7 +256,7 @@ def test_a_wrong_record_section_is_named(tmp_path: Path, text: str, mistake: str
         scene.load(path)
 
 
-def test_recordings_stand_beside_the_scene_or_with_the_state_of_the_service(tmp_path: Path) -> None:
+def test_recordings_stand_beside_the_scene_or_with_the_state(tmp_path: Path) -> None:
     tactile = {"driver": "palm", "source": "udp://127.0.0.1:1"}
     for record, folder in (
         ({"directory": "kept"}, tmp_path / "kept"),

@@ -110,7 +110,7 @@ def test_null_is_left_out_and_a_table_is_one_list() -> None:
     assert flat(content) == {"b": {"d": 0}, "e": [1, 2, 3, 4], "f": [], "g": False}
 
 
-def test_a_finger_that_is_not_known_is_a_state_of_its_own() -> None:
+def test_an_unknown_finger_is_a_state_of_its_own() -> None:
     felt = {"ff": "slide", "mf": None}
     told = {"fingers": {"ff": "slide", "mf": "unknown"}, "motion": {}}
     assert flat({"fingers": felt, "motion": {"ff": None}}) == told
@@ -162,7 +162,7 @@ REST = np.full((2, 24), 2000)
 DARK, YELLOW, CYAN, BLACK = (38, 44, 54), (252, 255, 190), (0, 220, 220), (0, 0, 0)
 
 
-def test_a_pressed_electrode_shines_where_it_is_and_nothing_else_does() -> None:
+def test_a_pressed_electrode_alone_shines_in_its_place() -> None:
     viewer = Viewer(10.0)
     said(viewer, "verdict", open_hand())
     for number in range(1, 30):

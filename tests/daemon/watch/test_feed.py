@@ -61,7 +61,7 @@ def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
             assert decode_verdict(payload).seq == 50
 
 
-def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoint: str) -> None:
+def test_a_message_is_as_old_as_the_last_empty_queue(endpoint: str) -> None:
     clock = Clock()
     with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
         first_of(publisher, feed, 0, Decision.STABLE)
@@ -130,9 +130,7 @@ def test_whoever_is_turned_away_is_told_why(
         assert said in feed.link
 
 
-def test_who_was_turned_away_is_let_in_when_its_key_is_known(
-    tmp_path: Path, door: KeyedDoor
-) -> None:
+def test_a_refused_viewer_is_let_in_with_a_known_key(tmp_path: Path, door: KeyedDoor) -> None:
     clock = Clock()
     with Feed(door.endpoint, keys_of(tmp_path, "stranger"), clock) as feed:
         hears(door, feed, lambda _: feed.link.is_turned_away)

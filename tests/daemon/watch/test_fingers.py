@@ -38,7 +38,7 @@ def images(view: View, *counts: list[int], faulty: tuple[int, ...] = ()) -> list
 @pytest.mark.parametrize(
     ("fall", "level"), [(0, 0), (16, 10), (400, 50), (1600, 100), (3000, 100), (-400, -50)]
 )
-def test_a_pixel_shows_the_root_of_the_fall_below_the_rest(fall: int, level: int) -> None:
+def test_a_pixel_shows_the_root_of_its_fall(fall: int, level: int) -> None:
     """Root of the share of 1600 counts, in %: 16 / 1600 = 0.1 squared."""
     first, second = images(rested(), [3000 - fall] * 24, RESTING)
     assert (first.name, first.from_rest, first.deepest) == ("ff", True, fall)
@@ -153,7 +153,7 @@ def test_unknown_motion_of_a_finger_is_not_zero(
 
 
 @pytest.mark.parametrize("told", [{"ff": "slide", "th": None}, {"ff": "slide"}, None])
-def test_a_finger_has_its_word_and_none_where_none_is_told(told: dict[str, Any] | None) -> None:
+def test_a_finger_has_its_word_or_none(told: dict[str, Any] | None) -> None:
     view = after(
         (b"tactile.right", tactile(0, RESTING, RESTING)),
         (b"verdict.right", verdict(0, fingers=told)),

@@ -13,7 +13,7 @@ from tests.daemon.watch.watch_fakes import Talker
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
 
 
-def test_a_chosen_grasp_shows_its_image_until_the_page_goes_back(
+def test_a_chosen_grasp_shows_its_image_until_left(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     show(browser, page, talker, Decision.STABLE)

@@ -91,7 +91,7 @@ def test_a_bar_of_motion_has_the_limit_in_its_middle(now: float | None, bar: str
     assert row.split(maxsplit=1)[1].startswith(bar)
 
 
-def test_a_finger_is_shown_in_a_word_if_one_is_known() -> None:
+def test_a_finger_is_shown_in_a_known_word() -> None:
     seen = a_full_hand()
     for state in (FingerState.SLIDE, None):
         first = structs.replace(seen.fingers[0], state=state)
@@ -103,7 +103,7 @@ def test_a_finger_is_shown_in_a_word_if_one_is_known() -> None:
 
 
 @pytest.mark.parametrize("width", [60, 80, 200])
-def test_the_figures_of_a_dead_daemon_have_their_time_and_are_dim(width: int) -> None:
+def test_figures_of_a_dead_daemon_are_dim_and_dated(width: int) -> None:
     view = after((b"status.right", status(0)), (b"verdict.right", verdict(0, Decision.STABLE)))
     alive, dead = view.snapshot(0), view.snapshot(12_000 * MS)
     assert (alive.last_t, dead.last_t) == (1790000000.0, 1789999988.0)  # 12 s before the wall clock
@@ -144,7 +144,7 @@ def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     assert r"\x1b[2J" in text
 
 
-def test_lines_that_do_not_fit_are_counted_and_shown_by_space() -> None:
+def test_lines_that_do_not_fit_are_shown_by_space() -> None:
     places = [f"{finger}_{place}" for finger in ("ff", "mf", "th") for place in range(1, 25)]
     health = dict(zip(places, [*Reason, *Reason, *Reason], strict=False))
     view = after((b"status.right", status(0, health=health)), (b"verdict.right", verdict(0)))

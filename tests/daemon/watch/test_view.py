@@ -59,7 +59,7 @@ def test_before_the_first_message_it_is_unknown_and_says_why() -> None:
     ("outcome", "tone", "p_slip"),
     [(Decision.STABLE, Tone.STABLE, 0.25), (Decision.SLIP, Tone.SLIP, 0.75)],
 )
-def test_a_verdict_stands_until_the_silence_is_longer_than_it_says(
+def test_a_verdict_stands_until_its_silence_is_over(
     outcome: Decision, tone: Tone, p_slip: float
 ) -> None:
     view = after((b"verdict.right", verdict(0, outcome)))
@@ -91,7 +91,7 @@ def test_gaps_are_counted_as_lost_but_not_over_a_restart() -> None:
     "payload",
     [b"", b"{", b"\xff\xfe", b"[]", verdict(1, Decision.STABLE).replace(b'"v":1', b'"v":2')],
 )
-def test_a_malformed_message_is_counted_and_is_no_sign_of_life(payload: bytes) -> None:
+def test_a_malformed_message_is_counted_and_shows_no_life(payload: bytes) -> None:
     view = after((b"verdict.right", verdict(0, Decision.STABLE)))
     view.take(b"verdict.right", payload, 90 * MS)
     seen = view.snapshot(101 * MS)
@@ -287,7 +287,7 @@ def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
     assert [last.ago_s for last in seen.grasps[:3]] == [0.0, 1.0, 2.0]
 
 
-def test_a_grasp_whose_verdict_turns_is_listed_with_the_last_one() -> None:
+def test_a_grasp_is_listed_with_its_last_verdict() -> None:
     view = after((b"verdict.right", verdict(0, Decision.STABLE, grasp=41)))
     turned = verdict(1, Decision.SLIP, grasp=41, judged=False, gate=GateState.JUDGED)
     view.take(b"verdict.right", turned, 0)
@@ -313,7 +313,7 @@ def test_a_judged_grasp_is_past_once_it_is_released(gate: GateState, held: bool)
     ],
     ids=["one", "both", "next", "gap", "hour"],
 )
-def test_a_second_keeps_all_its_tones_and_a_missed_one_none(
+def test_a_second_keeps_all_its_tones(
     moments: list[tuple[int, Tone, float | None]], seconds: list[tuple[str, int]]
 ) -> None:
     history = History()

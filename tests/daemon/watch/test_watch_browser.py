@@ -77,7 +77,7 @@ def test_the_page_shows_verdict_images_and_advice(
     browser.wait_for(f"document.querySelector('.clock').innerText > '{first}'")
 
 
-def test_before_the_first_verdict_the_page_says_that_there_is_none(
+def test_the_page_says_that_no_verdict_has_come(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     talker.decision = None
@@ -85,17 +85,9 @@ def test_before_the_first_verdict_the_page_says_that_there_is_none(
     page.start()
     browser.look(1280, 800)
     browser.go(page.address)
-    lines = (
-        "(word => Math.round(word.clientHeight / parseFloat(getComputedStyle(word).lineHeight)))"
-        "(document.querySelector('.verdict'))"
-    )
     browser.wait_for("document.querySelector('.why').innerText.startsWith('silent: no message')")
     see(browser, "silent")
     assert text(browser, "verdict") == "NO VERDICT YET"
-    for width in (1280, 400):
-        browser.look(width, 800)
-        assert browser.value(lines) == 1, width
-        assert browser.value(f"{BANNER}.offsetTop <= document.querySelector('.verdict').offsetTop")
     page.stop()
     browser.wait_for("document.querySelector('.why').innerText.startsWith('no connection')")
     assert text(browser, "verdict") == "NO VERDICT YET"
@@ -131,9 +123,7 @@ def test_a_stable_that_lifts_have_not_earned_is_hollow(
     )
 
 
-def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
-    page: Page, talker: Talker, browser: Browser
-) -> None:
+def test_unknown_motion_is_not_a_bar_of_zero(page: Page, talker: Talker, browser: Browser) -> None:
     def bars(*wanted: list[object]) -> str:
         """Return a script: are these the bars? Each has motion, share and text; or the text."""
         parts = ["bar.nextSibling.innerText"]
@@ -174,20 +164,13 @@ def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
             ["moving", "100%", "motion 9.0 / 1.0 \u03c3"],
         ),
     )
-    talker.more |= {"fingers": {"ff": "slide", "th": None}}
-    see(
-        browser,
-        "stable",
-        words(["slide", ""]),
-        bars(["motion 2.0 / 1.3 \u03c3"], ["motion 9.0 / 1.0 \u03c3"]),
-    )
     talker.more |= {"motion": {"ff": None, "th": 0.5}, "fingers": {"ff": "free", "th": "touch"}}
     see(browser, "stable", words(["free", "touch"]), bars(["motion 0.5 / 1.0 \u03c3"]))
     talker.decision = None
     see(browser, "silent", reads("still", "-"), bars())
 
 
-def test_the_last_verdict_stays_until_the_next_grasp_and_then_in_the_list(
+def test_the_last_verdict_stays_then_is_listed(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     show(browser, page, talker, Decision.STABLE)
@@ -240,15 +223,9 @@ def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
     browser.complaints.clear()  # the browser says that there was no server
 
 
-@pytest.mark.parametrize(
-    ("names", "width", "fits", "theme"),
-    [
-        (["right"], 1280, True, "light"),
-        (["left", "right"], 400, False, "dark"),
-    ],
-)
+@pytest.mark.parametrize("names", [["right"], ["left", "right"]])
 def test_a_whole_hand_fits_one_window_and_several_one_page(
-    browser: Browser, names: list[str], width: int, fits: bool, theme: Theme
+    browser: Browser, names: list[str]
 ) -> None:
     views = [View(f"ipc:///tmp/{name}") for name in names]
 
@@ -256,16 +233,15 @@ def test_a_whole_hand_fits_one_window_and_several_one_page(
         hands = zip(views, names, (Decision.STABLE, Decision.SLIP), strict=False)
         return [whole_hand(view, name, said, seq) for view, name, said in hands]
 
+    title, tones = {
+        1: ("stable - graspd", "stable"),
+        2: ("left stable, right slip - graspd", "stable slip"),
+    }[len(names)]
     with serving_hands(seen) as address:
-        browser.look(width, 800, theme)
+        browser.look(400 if len(names) > 1 else 1280, 800)
         browser.go(address)
         browser.wait_for("document.querySelectorAll('.grasps tr').length >= 8")
-        browser.wait_for(f"document.querySelectorAll('.hand').length == {len(names)}")
         assert browser.value("document.documentElement.scrollWidth <= innerWidth")
-        inside = browser.value("document.documentElement.scrollHeight <= innerHeight")
-        assert inside or not fits
-        tones = {1: "stable", 2: "stable slip"}[len(names)]
-        title = {1: "stable - graspd", 2: "left stable, right slip - graspd"}[len(names)]
         # Both at one time: while a busy computer stands still, the page says that it hears nothing.
         browser.wait_for(
             f"document.title == '{title}' && [...document.querySelectorAll('.banner')]"
@@ -277,20 +253,9 @@ def test_a_whole_hand_fits_one_window_and_several_one_page(
             assert browser.value(strip) == (
                 f"left\nSTABLE\nlift\n{dead} right\nSLIP\ndo not lift\n{dead}"
             )
+        else:
+            assert browser.value("document.documentElement.scrollHeight <= innerHeight")
         assert browser.value("document.getElementById('strip').hidden") == (len(names) == 1)
-        assert (
-            browser.value(
-                "scrollTo(0, 1e6), document.getElementById('strip').getBoundingClientRect().top"
-            )
-            == 0
-            or len(names) == 1
-        )
-        cut = (
-            "[...document.querySelectorAll('.verdict, td, .why li, figure span, .joints div,"
-            " h2')].filter(e => e.scrollWidth > e.clientWidth + 1 && e.clientWidth)"
-            ".map(e => e.innerText)"
-        )
-        assert browser.value(cut) == []
 
 
 def note_tones(browser: Browser) -> None:
@@ -324,7 +289,7 @@ def test_a_frozen_page_shows_unknown_and_nothing_that_waited(
     assert browser.value("tones.slice(0, 2)") == ["silent", "slip"]
 
 
-def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
+def test_after_a_sleep_the_page_shows_unknown_first(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     """Only the wall clock has gone on meanwhile."""

@@ -142,7 +142,7 @@ def test_a_page_gets_nothing_old_and_all_that_follows(server: Server) -> None:
             assert next(coming) == {"n": number}
 
 
-def test_a_browser_that_does_not_read_misses_snapshots_and_holds_up_nobody(server: Server) -> None:
+def test_a_browser_that_does_not_read_misses_snapshots(server: Server) -> None:
     with ExitStack() as stack:
         slow, quick = opened(server, stack), events(opened(server, stack))
         for number in range(2000):
@@ -164,7 +164,7 @@ def test_a_browser_that_does_not_read_misses_snapshots_and_holds_up_nobody(serve
 
 
 @pytest.mark.parametrize("begin", [b"", b"GET / HTTP/1.0\r\nHost: localhost\r\nX: "])
-def test_a_browser_that_goes_silent_within_a_request_is_cut_off(
+def test_a_browser_silent_within_a_request_is_cut_off(
     server: Server, monkeypatch: pytest.MonkeyPatch, begin: bytes
 ) -> None:
     monkeypatch.setattr("graspd.daemon.watch.web._Handler.timeout", 0.2)
