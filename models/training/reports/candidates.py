@@ -24,6 +24,7 @@ from graspd.biotac import TABLE_FINGERS
 from graspd.models.contract import ModelError
 from graspd.models.layout import D1
 from graspd.models.runtime import TactileModel
+from graspd.models.training.commands.common import say
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.estimators.configs import CNN1
 
@@ -50,6 +51,7 @@ def candidates(folders: Sequence[Path], grasps: Grasps) -> list[Candidate]:
     paths = [path for folder in folders for path in sorted(folder.glob("*.onnx"))]
     models = [_model(path, grasps) for path in paths]
     if find_spec("keras") is None:
+        say("report", "keras is not installed: the published code is left out (extra: report)")
         return models
     published: Row = {
         "name": "published: loops, Keras predict",

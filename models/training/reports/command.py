@@ -49,6 +49,12 @@ def _error_vs_time(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the table, the picture and the figures",
     )
+    parser.add_argument(
+        "--page",
+        type=Path,
+        metavar="FILE",
+        help="also put the table into this page, and the picture beside it (deploy/MEASURED.md)",
+    )
     parser.add_argument("--quick", action="store_true", help="few readings: does it run?")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
 

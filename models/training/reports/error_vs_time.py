@@ -1,15 +1,17 @@
 """`graspd report error-vs-time`: error of each model against its run time on this computer.
 
-Errors are those of the models' cards. Times are measured now, all candidates in turns: machines are
-noisy, so compare ratios.
+Errors are those of the models' cards. Times are measured now, all candidates in turns, in several
+runs: figures are medians of the runs. Machines are noisy, so compare ratios.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
+import statistics
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from graspd.models import zoo
-from graspd.models.training.commands.common import say
+from graspd.models.training.commands.common import WrongInputError, say
 from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.training.evaluating.style import (
@@ -29,10 +31,12 @@ from graspd.models.training.evaluating.style import (
     style,
     to_svg,
 )
-from graspd.models.training.reports.candidates import Row, candidates, measure
+from graspd.models.training.reports.candidates import Row, Times, candidates, measure
 from graspd.models.training.reports.machine import described, machine
 
+RUNS = 3
 READINGS, PACED = 2000, 300
+"""Readings of each candidate in a run."""
 QUICK_READINGS, QUICK_PACED = 100, 5
 COLUMNS = (
     "model",
@@ -43,9 +47,16 @@ COLUMNS = (
     "Brier",
     "ECE",
     "hot p50 / p99 / p99.9, us",
-    "paced p50 / p99, us",
+    "paced p50 (lowest..highest run) / p99, us",
     "CPU at 100 Hz",
 )
+ON_PAGE = {
+    "model, F1 in %": 0,
+    "known objects": 2,
+    **{COLUMNS[place]: place for place in (3, 4, 8, 9)},
+}
+"""Titles of the table on a page, and the place of each in `COLUMNS`."""
+PAGE_TABLE = re.compile(r"^\| model, F1 in %.*\n(?:\|.*\n)+(?:\nprocessor .*\n)?", re.MULTILINE)
 DEFAULT = "small-session"
 PANELS = (
     (("cv",), "known objects"),
@@ -74,6 +85,9 @@ Report = dict[str, Any]
 def run(args: argparse.Namespace) -> int:
     """Measure models' error and time, write and print. Raises `DatasetError` or `ModelError`."""
     grasps = read_all(args.data)
+    page = None if args.page is None else args.page.read_text()
+    if page is not None and len(PAGE_TABLE.findall(page)) != 1:
+        raise WrongInputError(f"{args.page}: has not the one table that begins `model, F1 in %`")
     say("report", "measuring, one candidate after the other: some minutes")
     measured = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -83,6 +97,10 @@ def run(args: argparse.Namespace) -> int:
     base.with_suffix(".json").write_text(figures + "\n")
     base.with_suffix(".md").write_text(text + "\n")
     base.with_suffix(".svg").write_text(draw(measured, lines))
+    if page is not None:
+        put = "\n".join(page_table(measured)) + "\n"
+        args.page.write_text(PAGE_TABLE.sub(lambda _: put, page))
+        (args.page.parent / "error-vs-time.svg").write_text(draw(measured, lines))
     sys.stdout.write(f"{figures if args.json else text}\n")
     return 0
 
@@ -93,13 +111,23 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> R
         grasps = grasps.few()
     several = candidates(folders, grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
-    times = measure({row["name"]: step for row, step in several}, readings, paced)
-    rows = [{**row, "time": times[row["name"]]} for row, _ in several]
+    steps = {row["name"]: step for row, step in several}
+    runs = [measure(steps, readings, paced) for _ in range(RUNS)]
+    rows = [{**row, **_over_runs([run[row["name"]] for run in runs])} for row, _ in several]
     return {
         "machine": machine(),
         "quick": quick,
-        "readings": {"hot": readings, "paced": paced},
+        "readings": {"hot": readings, "paced": paced, "runs": RUNS},
         "rows": sorted(rows, key=_rank),
+    }
+
+
+def _over_runs(runs: Sequence[Times]) -> Row:
+    """Return the median of each time, and its lowest and highest run."""
+    several = {name: [run[name] for run in runs] for name in runs[0]}
+    return {
+        "time": {name: statistics.median(values) for name, values in several.items()},
+        "time_of_runs": {name: [min(values), max(values)] for name, values in several.items()},
     }
 
 
@@ -110,19 +138,33 @@ def _rank(row: Row) -> tuple[str, float]:
 
 def table(measured: Report) -> list[str]:
     """Return the lines of a Markdown table of all rows, with a line on how it was made."""
-    machine = described(measured["machine"])
+    return _with_origin(measured, markdown_table(COLUMNS, map(_cells, measured["rows"])))
+
+
+def page_table(measured: Report) -> list[str]:
+    """Return the same for a page: models of the whole hand, the fastest first, without hot times
+    and intervals."""
+    rows = []
+    for row in whole_hand(measured["rows"]):
+        cells = _cells(row)
+        cells[2] = _percent(error_of(row, PANELS[0][0]))
+        rows.append([cells[place] for place in ON_PAGE.values()])
+    return _with_origin(measured, markdown_table(tuple(ON_PAGE), rows))
+
+
+def _with_origin(measured: Report, lines: Iterable[str]) -> list[str]:
+    number = measured["readings"]
     made = (
-        f"{machine}; {measured['readings']['hot']} readings hot, {measured['readings']['paced']} "
-        f"paced; `graspd report error-vs-time`"
+        f"{described(measured['machine'])}; {number['runs']} runs of {number['hot']} readings hot "
+        f"and {number['paced']} paced; `graspd report error-vs-time`"
     )
-    rows = (_cells(row) for row in measured["rows"])
     mark = [f"**{QUICK}**", ""] if measured["quick"] else []
-    return [*mark, *markdown_table(COLUMNS, rows), "", made]
+    return [*mark, *lines, "", made]
 
 
 def _cells(row: Row) -> list[str]:
     known, other, day = (error_of(row, protocols) for protocols, _ in PANELS)
-    took = row["time"]
+    took, (low, high) = row["time"], row["time_of_runs"][TIME]
     name = f"`{row['name']}`" if row["kind"] == "model" else row["name"]
     return [
         f"{name}, the default" if row["name"] == DEFAULT else name,
@@ -133,7 +175,7 @@ def _cells(row: Row) -> list[str]:
         _score(known, "brier"),
         _score(known, "ece"),
         f"{took['hot_p50_us']:.0f} / {took['hot_p99_us']:.0f} / {took['hot_p99.9_us']:.0f}",
-        f"{took['paced_p50_us']:.0f} / {took['paced_p99_us']:.0f}",
+        f"{took[TIME]:.0f} ({low:.0f}..{high:.0f}) / {took['paced_p99_us']:.0f}",
         f"{took['cpu_percent_at_100_hz']:.1f} %",
     ]
 

@@ -45,7 +45,9 @@ def fonts() -> None:
 @pytest.fixture(scope="module")
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report")
-    made = graspd("report", "error-vs-time", "--data", bts3_dir, "--out", out, "--quick")
+    (out / "page.md").write_text("Above.\n\n| model, F1 in % | old |\n|---|---|\n| x |\n\nBelow.\n")
+    options = "--data", bts3_dir, "--out", out, "--page", out / "page.md", "--quick"
+    made = graspd("report", "error-vs-time", *options)
     assert made.returncode == 0
     assert made.stdout == (out / "error-vs-time.md").read_text()
     return out
@@ -68,6 +70,8 @@ def test_the_report_has_error_and_time_of_every_model(
         assert row["error"]["cv"]["f1"] == cv["f1_mean"]
         assert row["error"]["cv"]["low"] < cv["f1_mean"] < row["error"]["cv"]["high"]
         assert 0 < row["time"]["hot_p50_us"] <= row["time"]["hot_p99_us"]
+        low, high = row["time_of_runs"]["paced_p50_us"]
+        assert 0 < low <= row["time"]["paced_p50_us"] <= high
     assert {row["kind"] for row in found["rows"]} == {"model", "peer"}
 
 
@@ -79,6 +83,16 @@ def test_each_model_of_the_whole_hand_has_a_row(folder: Path, found: dict[str, A
         assert drawn.count(f"<!-- {label} -->") == 1
     assert not any(f"<!-- {row['name']} -->" in drawn for row in found["rows"] if row not in whole)
     assert all(f"<!-- {asked}" in drawn for _, asked in error_vs_time.PANELS)
+
+
+def test_a_page_has_the_table_of_the_whole_hand(folder: Path, found: dict[str, Any]) -> None:
+    page = (folder / "page.md").read_text()
+    assert page.startswith("Above.\n\n**made with --quick")
+    assert page.endswith("`graspd report error-vs-time`\n\nBelow.\n")
+    told = [line.split("`")[1] for line in page.splitlines() if line.startswith("| `")]
+    models = [row for row in found["rows"] if len(row["fingers"]) == 3 and row["kind"] == "model"]
+    fastest = sorted(models, key=lambda row: row["time"]["paced_p50_us"])
+    assert told == [row["name"] for row in fastest]
 
 
 def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[str, Any]) -> None:
