@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from graspd.biotac import COUNT_MAX
 from graspd.daemon.process.files import read_regular, write_atomically
-from graspd.daemon.trust.trust import VERSION, TrustState
+from graspd.daemon.trust.trust import TrustState, of_this_format
 from graspd.models.session_statistics import SessionState
 
 if TYPE_CHECKING:
@@ -78,11 +78,11 @@ def load(path: Path) -> KeptSession:
     try:
         plain = zlib.decompressobj().decompress(content, MAX_BYTES)
         kept = msgspec.msgpack.decode(plain, type=KeptSession)
+        return kept if kept.trust is None else replace(kept, trust=of_this_format(kept.trust))
     except (zlib.error, msgspec.DecodeError, RecursionError) as error:
         raise SessionFileError(f"{path}: not a session: {error}") from error
-    if kept.trust is not None and kept.trust.version != VERSION:
-        raise SessionFileError(f"{path}: not a session of this graspd")
-    return kept
+    except ValueError as error:
+        raise SessionFileError(f"{path}: not a session of this graspd: {error}") from error
 
 
 def write(path: Path, kept: KeptSession) -> None:

@@ -22,11 +22,11 @@ from graspd.daemon.trust.lift_book import (
 )
 from graspd.models.judge.grasp_judge import Opinion
 from graspd.models.trust.assessment import Assessment, assess
-from graspd.models.trust.learner import Learner, LearnerState
+from graspd.models.trust.learner import Learner, LearnerState, of_format_2
 from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskOutcomes, RiskState
 
-VERSION: Final = 2
-"""Format of a state. In format 1 the learner had no residual."""
+VERSION: Final = 3
+"""Format of a state. In format 2 a learner held what `at_told` returns, in 1 it had no residual."""
 MAX_BYTES: Final = 1 << 20
 """Largest uncompressed state, bytes; three fingers with all outcomes still out take 620 kB."""
 DIGEST_BYTES: Final = 32
@@ -178,9 +178,20 @@ def decode(data: bytes) -> TrustState:
         raise ValueError("is damaged, or nothing that was learned")
     try:
         plain = zlib.decompressobj().decompress(content, MAX_BYTES)
-        version = msgspec.msgpack.decode(plain, type=_Versioned).version
-        if version != VERSION:
-            raise FormatError(f"is of format {version}; this graspd reads only {VERSION}")
-        return msgspec.msgpack.decode(plain, type=TrustState)
+        _check(msgspec.msgpack.decode(plain, type=_Versioned).version)
+        return of_this_format(msgspec.msgpack.decode(plain, type=TrustState))
     except (zlib.error, msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"is nothing that was learned: {error}") from error
+
+
+def of_this_format(state: TrustState) -> TrustState:
+    """Return a state in the format of now. Raises `ValueError`, or `FormatError`."""
+    _check(state.version)
+    if state.version == VERSION:
+        return state
+    return replace(state, version=VERSION, learner=of_format_2(state.learner))
+
+
+def _check(version: int) -> None:
+    if version not in (2, VERSION):
+        raise FormatError(f"is of format {version}; this graspd reads 2 and {VERSION}")

@@ -38,6 +38,8 @@ within some hundred lifts."""
 MEAN_MAX: Final = 25.0
 """Largest mean of a weight, and of the residual in log-odds, whatever is told: 50 times the
 margin's standard deviation, 8 times the residual's."""
+ROUNDING: Final = 1.0 + 1e-9
+"""Factor by which a kept mean or variance may be above its limit."""
 
 MOVE_MAX, WEIGHTS_MOVE_MAX = 1.25, 0.5
 """Standard deviations by which one outcome moves the mean log-odds of its own grasp at most, all of
@@ -46,13 +48,13 @@ without these limits one false outcome turns slips of unlike grasps `stable`."""
 
 
 class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """State of a learner; arrays are float64, little-endian, row by row."""
+    """State of a learner, as in `Residual`; arrays are float64, little-endian, row by row."""
 
     outcomes: Annotated[int, msgspec.Meta(ge=0)]
     mean: bytes
     covariance: bytes
     grasps: bytes = b""
-    """Inputs of the told grasps whose residual is in the state; former recordings have none."""
+    """Inputs of the told grasps whose residual is in the state."""
 
 
 class Learner:
@@ -71,28 +73,25 @@ class Learner:
         """Number of features of the model."""
         self.scale = SCALE if inputs else TEMPERATURE
         """Factor on the moderated log-odds. Without a residual the model's own are the start."""
-        spread = np.full(inputs + 2, FEATURE_SPREAD)
-        spread[:2] = MARGIN_SPREAD, BIAS_SPREAD
-        self._weights_prior = np.diag(spread**2)
+        prior = np.full(inputs + 2, FEATURE_SPREAD)
+        prior[:2] = MARGIN_SPREAD, BIAS_SPREAD
+        self._prior: Vector = prior**2
+        """Variances of the weights before any outcome."""
         self.reset()
 
     def reset(self) -> None:
         """Forget all outcomes: a sensor was exchanged."""
         self.outcomes = 0
         """Number of outcomes learned since the start or the last reset."""
-        mean = np.zeros(self.inputs + 2)
-        mean[0] = 1.0
-        self._set(Residual(np.empty((0, self.inputs))), mean, self._weights_prior)
-
-    def _set(self, residual: Residual, mean: Vector, covariance: Matrix) -> None:
-        self._residual, self._mean, self._covariance = residual, mean, covariance
-        self._projected = residual.projected(mean, covariance)
+        self._residual = Residual(np.empty((0, self.inputs)))
+        self._mean, self._spread = np.zeros(self.inputs + 2), np.diag(self._prior)
+        self._mean[0] = 1.0
 
     @property
     def uncertainty(self) -> float:
         """Mean ratio of the weights' variances to the prior's, from 1 at first towards 0."""
-        prior = self._weights_prior.diagonal()
-        return min(float((self._covariance.diagonal()[: len(prior)] / prior).mean()), 1.0)
+        variances = self._spread.diagonal()[: len(self._prior)]
+        return min(float((variances / self._prior).mean()), 1.0)
 
     def judge(self, margin: float, inputs: NDArray[np.floating]) -> tuple[float, Vector]:
         """Return log-odds of slip, nearer to 0 the less is known of such grasps, and features.
@@ -109,45 +108,49 @@ class Learner:
             raise ValueError("margin or inputs are not finite, or too large")
         limited = min(max(margin, -MARGIN_MAX), MARGIN_MAX)
         features = np.concatenate(([limited / TEMPERATURE, 1.0], inputs))
-        known = np.concatenate((features, self._residual.shared(features[2:])))
-        mean, covariance = self._projected
-        variance = float(known @ (covariance @ known)) + self._residual.variance
+        known = self._known(features)
+        variance = float(known @ (self._spread @ known)) + self._residual.variance
         moderation = math.sqrt(1.0 + math.pi / 8.0 * variance)  # MacKay's moderated output
-        return self.scale * float(known @ mean) / moderation, features
+        return self.scale * float(known @ self._mean) / moderation, features
+
+    def _known(self, features: Vector) -> Vector:
+        return np.concatenate((features, self._residual.shared(features[2:])))
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
-        """Take in how the lift of a grasp with these features ended."""
-        residual, mean, covariance = self._residual, self._mean, self._covariance
-        observed = features
+        """Take in how the lift of a grasp with these features ended; takes 0.3 ms."""
+        residual, weights = self._residual, slice(len(features))
+        mean, spread, known = self._mean, self._spread, self._known(features)
+        seen = spread @ known
+        log_odds, variance = float(known @ mean), float(known @ seen) + residual.variance
         if self.inputs:
-            residual, mean, covariance = residual.told(features[2:], mean, covariance)
-            others = np.zeros(len(mean) - len(features) - 1)
-            observed = np.concatenate((features, others, [1.0]))
-        seen = covariance @ observed
-        log_odds, variance = float(observed @ mean), float(observed @ seen)
+            residual.add(features[2:])
+            mean, seen = np.append(mean, 0.0), np.append(seen, 1.0)
+            spread = np.pad(spread, (0, 1))
         p_slip = sigmoid(log_odds)
         weight = p_slip * (1.0 - p_slip)
         gain = 1.0 / (1.0 + weight * variance)
         step = gain * (slipped - p_slip)
         limit = MOVE_MAX / math.sqrt(variance)
         step = min(max(step, -limit), limit)
-        move, weights = step * seen, slice(len(features))
-        spread = math.sqrt(float(features @ (covariance[weights, weights] @ features)))
-        move[weights] /= max(abs(step) * spread / WEIGHTS_MOVE_MAX, 1.0)
-        mean = np.clip(mean + move, -MEAN_MAX, MEAN_MAX)
-        covariance = covariance - weight * gain * np.outer(seen, seen)
-        covariance = (1.0 - DRIFT) * covariance + DRIFT * self._prior(residual)
-        self._set(residual, mean, covariance)
+        move = step * seen
+        by_weights = math.sqrt(float(features @ (spread[weights, weights] @ features)))
+        move[weights] /= max(abs(step) * by_weights / WEIGHTS_MOVE_MAX, 1.0)
+        known_now = math.sqrt(weight * gain) * seen
+        spread = (1.0 - DRIFT) * (spread - np.outer(known_now, known_now))
+        np.einsum("ii->i", spread)[weights] += DRIFT * self._prior
+        mean = mean + move
+        if len(residual.grasps) > GRASPS_MAX:
+            mean, spread = residual.drop(mean, spread)
+        self._mean, self._spread = residual.limited(mean, MEAN_MAX), spread
         self.outcomes += 1
 
-    def _prior(self, residual: Residual) -> Matrix:
-        """Return the covariance of weights and residual before any outcome."""
-        apart = np.zeros((self.inputs + 2, len(residual.grasps)))
-        return np.block([[self._weights_prior, apart], [apart.T, residual.prior]])
+    def at_told(self) -> tuple[Vector, Matrix]:
+        """Return mean and covariance of the weights, then of the residual at the told grasps."""
+        return self._residual.at_told(self._mean, self._spread)
 
     def state(self) -> LearnerState:
         """Return the state for `restore`."""
-        arrays = self._mean, self._covariance, self._residual.grasps
+        arrays = self._mean, self._spread, self._residual.grasps
         return LearnerState(self.outcomes, *(each.astype("<f8").tobytes() for each in arrays))
 
     def restore(self, state: LearnerState) -> None:
@@ -155,18 +158,31 @@ class Learner:
         count = min(state.outcomes, GRASPS_MAX) if self.inputs else 0
         size = self.inputs + 2 + count
         grasps = vector(state.grasps, count * self.inputs, INPUT_MAX).reshape(count, self.inputs)
-        mean = vector(state.mean, size, MEAN_MAX)
-        covariance = vector(state.covariance, size**2).reshape(size, size)
+        mean = vector(state.mean, size)
+        spread = vector(state.covariance, size**2, INPUT_MAX).reshape(size, size)
         residual = Residual(grasps)
-        highest = self._prior(residual).diagonal() * (1.0 + 1e-9)
-        if (covariance != covariance.T).any() or (covariance.diagonal() > highest).any():
+        means, covariance = residual.at_told(mean, spread)
+        if (np.abs(means) > MEAN_MAX * ROUNDING).any():
+            raise ValueError("holds means that are too large")
+        highest = np.append(self._prior, np.full(count, residual.variance)) * ROUNDING
+        if (spread != spread.T).any() or (covariance.diagonal() > highest).any():
             raise ValueError("holds a matrix that is no covariance, or knows less than the prior")
         try:
             np.linalg.cholesky(covariance)
         except np.linalg.LinAlgError as error:
             raise ValueError("holds a matrix that is no covariance") from error
         self.outcomes = state.outcomes
-        self._set(residual, mean, covariance)
+        self._residual, self._mean, self._spread = residual, mean, spread
+
+
+def of_format_2(state: LearnerState) -> LearnerState:
+    """Return a state that holds what `at_told` returns. Raises `ValueError` if it holds none."""
+    mean, grasps = (np.frombuffer(each, "<f8") for each in (state.mean, state.grasps))
+    size, count = len(mean), min(state.outcomes, GRASPS_MAX) if state.grasps else 0
+    residual = Residual(grasps.reshape(count, -1) if count else np.empty((0, size - 2)))
+    covariance = np.frombuffer(state.covariance, "<f8").reshape(size, size)
+    mean, spread = residual.from_others(mean, covariance)
+    return LearnerState(state.outcomes, mean.tobytes(), spread.tobytes(), state.grasps)
 
 
 def sigmoid(log_odds: float) -> float:

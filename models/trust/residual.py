@@ -26,24 +26,81 @@ Matrix = NDArray[np.float64]
 
 
 class Residual:
-    """Prior of the residual at N told grasps, and what follows for other grasps.
+    """Prior of the residual at N told grasps, oldest first, and what follows for other grasps.
 
-    A state is a mean (W + N,) and a covariance (W + N, W + N) of W weights, then of the residual at
-    the told grasps, oldest first.
+    A state is of W weights, then of the residual at the told grasps, as seen from other grasps: a
+    mean m (W + N,) and a spread S (W + N, W + N). With g, the features of the weights and then
+    `shared`, the mean log-odds of a grasp are g @ m. Their variance is g @ S @ g plus `variance`,
+    their covariance with those of another grasp g @ S @ g' plus the kernel. No inverse is needed:
+    an outcome adds to S a product of one vector.
     """
 
     def __init__(self, grasps: Matrix) -> None:
         """`grasps`: inputs of the told grasps, shape (N, inputs)."""
-        self.grasps = grasps
-        self.variance = SHARED_VARIANCE + OWN_VARIANCE if grasps.shape[1] else 0.0
+        inputs = grasps.shape[1]
+        self.variance = SHARED_VARIANCE + OWN_VARIANCE if inputs else 0.0
         """Prior variance of the residual at any grasp; 0 without inputs: there is none."""
-        self._scale = -0.5 / (max(grasps.shape[1], 1) * REACH**2)
-        self._squares = np.einsum("ij,ij->i", grasps, grasps)
-        products = grasps @ grasps.T
-        self.prior = self._shared(self._squares[:, None] + self._squares - 2.0 * products)
+        self._scale = -0.5 / (max(inputs, 1) * REACH**2)
+        self.grasps, self._squares = np.empty((0, inputs)), np.empty(0)
+        self.prior = np.empty((0, 0))
         """Covariance (N, N)."""
-        np.fill_diagonal(self.prior, self.variance)
-        self._inverse = np.linalg.inv(self.prior)
+        for each in grasps:
+            self.add(each)
+
+    def add(self, inputs: Vector) -> None:
+        """Tell one more grasp, the last one; the residual at it is as it is seen from the others.
+
+        In a state its mean and its spread are zeros.
+        """
+        # Not a product of matrices: that rounds otherwise among other rows.
+        squares = np.square(self.grasps - inputs).sum(axis=1, keepdims=True)
+        shared = self._shared(squares)
+        self.prior = np.block([[self.prior, shared], [shared.T, self.variance]])
+        self.grasps = np.vstack((self.grasps, inputs))
+        self._squares = np.append(self._squares, inputs @ inputs)
+
+    def drop(self, mean: Vector, spread: Matrix) -> tuple[Vector, Matrix]:
+        """Forget the oldest grasp; return the state without it. Others keep its lesson."""
+        links = solve(self.prior[1:, 1:], self.prior[1:, 0])
+        self.grasps, self._squares = self.grasps[1:], self._squares[1:]
+        self.prior = self.prior[1:, 1:]
+        oldest = len(mean) - len(links) - 1
+        along = np.concatenate((np.zeros(oldest), links))
+        row = np.delete(spread[oldest], oldest)
+        crossed = np.outer(along, row + spread[oldest, oldest] / 2.0 * along)
+        spread = np.delete(np.delete(spread, oldest, axis=0), oldest, axis=1)
+        return np.delete(mean, oldest) + mean[oldest] * along, spread + (crossed + crossed.T)
+
+    def limited(self, mean: Vector, limit: float) -> Vector:
+        """Move the mean of a state until all weights and told residuals are within +-`limit`."""
+        weights = len(mean) - len(self.grasps)
+        values = self.prior @ mean[weights:]
+        if (np.abs(values) > limit).any():
+            mean[weights:] = solve(self.prior, values.clip(-limit, limit))
+        mean[:weights] = mean[:weights].clip(-limit, limit)
+        return mean
+
+    def at_told(self, mean: Vector, spread: Matrix) -> tuple[Vector, Matrix]:
+        """Return mean and covariance of a state's weights and of its residual at the told."""
+        links = self._links(len(mean))
+        covariance = links @ spread @ links
+        weights = len(mean) - len(self.grasps)
+        covariance[weights:, weights:] += self.prior
+        return links @ mean, (covariance + covariance.T) / 2.0
+
+    def from_others(self, mean: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
+        """Reverse `at_told`."""
+        back, covariance = np.linalg.inv(self._links(len(mean))), covariance.copy()
+        weights = len(mean) - len(self.grasps)
+        covariance[weights:, weights:] -= self.prior
+        spread = back @ covariance @ back
+        return back @ mean, (spread + spread.T) / 2.0
+
+    def _links(self, size: int) -> Matrix:
+        """Return the factors of a state's columns in the residual at the told grasps."""
+        links, weights = np.eye(size), size - len(self.grasps)
+        links[weights:, weights:] = self.prior
+        return links
 
     def shared(self, inputs: Vector) -> Vector:
         """Return the covariances (N,) of the residual at another grasp with those at the told."""
@@ -55,36 +112,15 @@ class Residual:
         covariances: NDArray[np.float64] = np.exp(self._scale * np.maximum(squares, 0.0))
         return SHARED_VARIANCE * covariances
 
-    def projected(self, mean: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
-        """Return m and S, from which the log-odds of any grasp follow.
 
-        With g, the features of the weights and then `shared`, their mean is g @ m. Their variance
-        is g @ S @ g plus the residual's prior variance.
-        """
-        weights = len(mean) - len(self.grasps)
-        mean, spread = mean.copy(), covariance.copy()
-        mean[weights:] = self._inverse @ mean[weights:]
-        spread[:, weights:] = spread[:, weights:] @ self._inverse
-        spread[weights:] = self._inverse @ spread[weights:]
-        spread[weights:, weights:] -= self._inverse
-        return mean, spread
+def solve(matrix: Matrix, values: Vector) -> Vector:
+    """Return x (N,) of `matrix` @ x = `values`, positive definite, N up to 128.
 
-    def told(
-        self, inputs: Vector, mean: Vector, covariance: Matrix
-    ) -> tuple[Residual, Vector, Matrix]:
-        """Return residual and state with the residual at one more grasp, as the last one.
-
-        The oldest is dropped beyond `GRASPS_MAX`.
-        """
-        weights = len(mean) - len(self.grasps)
-        shared = self.shared(inputs)
-        links = self._inverse @ shared
-        row = covariance[:, weights:] @ links
-        own = self.variance - shared @ links + row[weights:] @ links
-        mean = np.append(mean, mean[weights:] @ links)
-        covariance = np.block([[covariance, row[:, None]], [row, own]])
-        grasps = np.vstack((self.grasps, inputs))
-        if len(grasps) > GRASPS_MAX:
-            kept = np.delete(np.arange(len(mean)), weights)
-            grasps, mean, covariance = grasps[1:], mean[kept], covariance[np.ix_(kept, kept)]
-        return Residual(grasps), mean, covariance
+    It is solved in halves, of which BLAS makes no threads: those may wait 100 ms for a processor.
+    """
+    half = len(matrix) // 2
+    links, rest = matrix[:half, half:], matrix[half:, half:]
+    first = np.linalg.solve(matrix[:half, :half], np.column_stack((links, values[:half])))
+    products = links.T @ first
+    second = np.linalg.solve(rest - products[:, :-1], values[half:] - products[:, -1])
+    return np.concatenate((first[:, -1] - first[:, :-1] @ second, second))

@@ -254,7 +254,7 @@ def test_learning_of_another_graspd_is_left_out_with_a_warning(
     run.restore(pipeline)
     assert pipeline.trust is not None
     assert pipeline.trust.learner.outcomes == 0
-    assert "what was learned is of format 1; this graspd reads only 2" in caplog.text
+    assert "what was learned is of format 1; this graspd reads 2 and 3" in caplog.text
 
 
 def test_exported_grasps_are_judged_as_then(lab: Lab, tmp_path: Path) -> None:

@@ -266,13 +266,24 @@ def test_what_is_whole_and_no_state_is_refused() -> None:
 
 
 def test_what_another_graspd_kept_is_refused_by_its_format() -> None:
-    for version in (1, 3):
+    for version in (1, 4):
         state = msgspec.to_builtins(full().state(), builtin_types=(bytes,))
         state["version"] = version
         del state["learner"]["grasps"]
         content = zlib.compress(msgspec.msgpack.encode(state))
-        with pytest.raises(ValueError, match=f"^is of format {version}; this graspd reads only 2$"):
+        with pytest.raises(
+            ValueError, match=f"^is of format {version}; this graspd reads 2 and 3$"
+        ):
             decode(hashlib.sha256(content).digest() + content)
+
+
+def test_a_state_of_format_2_teaches_the_same() -> None:
+    part, later = full(), trust()
+    state = part.state()
+    mean, covariance = (each.tobytes() for each in part.learner.at_told())
+    learner = msgspec.structs.replace(state.learner, mean=mean, covariance=covariance)
+    later.restore(decode(encode(msgspec.structs.replace(state, version=2, learner=learner))))
+    assert p_slip(later) == pytest.approx(p_slip(part), abs=1e-9)
 
 
 def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:

@@ -66,12 +66,15 @@ class Reference:
 
     def keep(self, told: list[int]) -> None:
         """Keep the weights and the residual at these grasps; what they say of others is left."""
+        self.go_on(told, *self.state(told))
+
+    def go_on(self, told: list[int], mean: Exact, covariance: Exact) -> None:
+        """Go on from what `state` of another one returned for these grasps."""
         kept = [*self.weights, *(len(self.weights) + grasp for grasp in told)]
-        here = np.ix_(kept, kept)
-        links = self.prior[:, kept] @ inverse(self.prior[here])
+        links = self.prior[:, kept] @ inverse(self.prior[np.ix_(kept, kept)])
         left = self.prior - links @ self.prior[kept]
-        self.mean = links @ self.mean[kept]
-        self.covariance = links @ self.covariance[here] @ links.T + left
+        self.mean = links @ mean
+        self.covariance = links @ covariance @ links.T + left
 
     def state(self, told: list[int]) -> tuple[Exact, Exact]:
         """Mean and covariance of the weights and of the residual at these grasps."""

@@ -7,9 +7,9 @@ import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from graspd.models.trust import residual as module
+from graspd.models.trust import learner as learner_module
 from graspd.models.trust.learner import Learner
-from graspd.models.trust.residual import Residual
+from graspd.models.trust.residual import GRASPS_MAX, Residual
 from tests.models.trust.reference import Reference
 from tests.models.trust.streams import learn, lifts
 
@@ -41,20 +41,24 @@ def test_a_new_grasp_is_judged_as_by_a_gaussian_process() -> None:
     told, new = grasps(30)[:-1], grasps(30)[-1]
     values = np.sin(told).sum(axis=1)
     expected = process().fit(told, values)
-    mean, variance = expected.predict(new[None], return_cov=True)
+    right, variance = expected.predict(new[None], return_cov=True)
     certain = np.zeros((len(told), len(told)))
-    residual, means, covariance = Residual(told).told(new, values, certain)
+    residual = Residual(told)
+    mean, spread = residual.from_others(values, certain)
+    residual.add(new)
+    means, covariance = residual.at_told(np.append(mean, 0.0), np.pad(spread, (0, 1)))
     np.testing.assert_array_equal(residual.grasps, grasps(30))
-    np.testing.assert_allclose(means, [*values, mean[0]], rtol=1e-9)
+    np.testing.assert_allclose(means, [*values, right[0]], rtol=1e-9)
     assert covariance[-1, -1] == pytest.approx(variance[0, 0], rel=1e-9)
 
 
-@pytest.mark.parametrize("kept", [128, 7])
+@pytest.mark.parametrize(("kept", "spread"), [(128, 0.5), (7, 0.5), (7, 1e-6), (7, 100.0)])
 def test_learning_is_that_of_all_grasps_known_from_the_start(
-    kept: int, monkeypatch: pytest.MonkeyPatch
+    kept: int, spread: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "GRASPS_MAX", kept)
-    stream = list(lifts(60, INPUTS, spread=0.5))
+    """Grasps nearly equal make a kernel that is nearly singular."""
+    monkeypatch.setattr(learner_module, "GRASPS_MAX", kept)
+    stream = list(lifts(60, INPUTS, spread=spread))
     learner = Learner(INPUTS)
     reference = Reference([m for m, *_ in stream], np.array([x for _, x, _ in stream]))
     for grasp, (margin, x, slipped) in enumerate(stream[:40]):
@@ -65,6 +69,26 @@ def test_learning_is_that_of_all_grasps_known_from_the_start(
         for other in range(grasp + 1, len(stream), 5):
             found = learner.judge(*stream[other][:2])[0]
             assert found == pytest.approx(reference.log_odds(other), abs=1e-9)
+
+
+def test_rounding_of_many_outcomes_does_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By turns nearly equal grasps and others; outcomes depend on neither."""
+    kept, number, random = 5, 1500, np.random.default_rng(3)
+    monkeypatch.setattr(learner_module, "GRASPS_MAX", kept)
+    spreads = np.where(np.arange(number) // 20 % 2, 1e-5, 0.5)[:, None]
+    rows = (0.3 + spreads * random.normal(size=(number, 2))).astype(np.float32)
+    learner, told = Learner(2), list[int]()
+    state = Reference([], rows[:0]).state([])
+    for grasp, slipped in enumerate((random.random(number) < 0.5).tolist()):
+        window = [*told, grasp]
+        reference = Reference([1.0] * len(window), rows[window])
+        reference.go_on(list(range(len(told))), *state)
+        found, features = learner.judge(1.0, rows[grasp])
+        assert found == pytest.approx(reference.log_odds(len(told)), abs=1e-9)
+        learner.learn(features, slipped=slipped)
+        reference.learn(len(told), slipped)
+        told = window[-kept:]
+        state = reference.state(list(range(len(window)))[-kept:])
 
 
 def test_outcomes_of_grasps_alike_say_what_linear_weights_cannot() -> None:
@@ -84,7 +108,7 @@ def test_outcomes_of_grasps_alike_say_what_linear_weights_cannot() -> None:
 def test_a_thousandfold_repeated_grasp_leaves_a_covariance() -> None:
     learner = Learner(INPUTS)
     x = grasps(1)[0]
-    for index in range(3 * module.GRASPS_MAX):
+    for index in range(3 * GRASPS_MAX):
         learner.learn(learner.judge(0.0, x)[1], slipped=index % 2 == 0)
     Learner(INPUTS).restore(learner.state())
     assert abs(learner.judge(0.0, x)[0]) < 1.0

@@ -127,13 +127,13 @@ def learner_row(outcomes: int) -> Row:
     for check in range(CHECKS):
         for margin, inputs, slipped in islice(streams[check % len(streams)], outcomes // CHECKS):
             learner.learn(learner.judge(margin, inputs)[1], slipped=slipped)
-        state = learner.state()
-        size = len(state.mean) // 8
-        covariance = np.frombuffer(state.covariance, "<f8").reshape(size, size)
-        asymmetric += not (covariance == covariance.T).all()
+        mean, covariance = learner.at_told()
+        size = len(mean)
+        kept = np.frombuffer(learner.state().covariance, "<f8").reshape(size, size)
+        asymmetric += not (kept == kept.T).all()
         eigenvalues.append(float(np.linalg.eigvalsh(covariance)[0]))
         variances.append(float((covariance.diagonal() / PRIOR[:size]).max()))
-        means.append(float(np.abs(np.frombuffer(state.mean, "<f8")).max()))
+        means.append(float(np.abs(mean).max()))
     # NaN must not get lost in `min` and `max`.
     figures = {
         "asymmetric": float(asymmetric),
