@@ -35,8 +35,10 @@ def test_a_lift_is_allowed_and_told_once(tmp_path: Path) -> None:
             assert answer
             assert (await graspd.verdict()).decision is Decision.STABLE
             assert await graspd.tell(answer.verdict, "slipped", "mug", HOURS_S)
-            again = await graspd.may_i_lift(1.0, supervised=True)
-            assert (bool(again), again.verdict.reasons) == (False, ("outcome-told",))
+            again = answer
+            while again.verdict.reasons != ("outcome-told",):  # on a busy machine one may be old
+                again = await graspd.may_i_lift(DEADLINE_S, supervised=True)
+                assert not again
             assert graspd.unreported == 0
         assert (await graspd.verdict()).reasons == ("closed",)
 
@@ -78,17 +80,15 @@ def test_it_waits_without_looking_again_and_again(
 
 
 def test_other_tasks_go_on_while_it_waits(tmp_path: Path) -> None:
-    async def counts() -> int:
-        turns = 0
+    async def waits() -> None:
         async with made(tmp_path, ask=False) as graspd:
-            waiting = asyncio.create_task(graspd.wait_for_grasp(DEADLINE_S))
-            while not waiting.done():
-                turns += 1
+            waiting = asyncio.create_task(graspd.wait_for_grasp(60.0))
+            for _ in range(20):
                 await asyncio.sleep(DEADLINE_S / 100)
-        return turns
+                assert not waiting.done()
 
     with false_daemon(tmp_path, told(), "unknown"):
-        assert asyncio.run(counts()) >= 5
+        asyncio.run(waits())
 
 
 def test_a_call_meanwhile_is_refused_and_a_cancelled_one_ends(tmp_path: Path) -> None:

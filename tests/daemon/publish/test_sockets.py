@@ -66,7 +66,7 @@ def test_questions_and_outcomes_reach_the_loop_and_are_answered(
     requests = Asked()
     with Sockets(wanted(tmp_path)) as sockets:
         asker = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask")
-        asker.send(b"lift")
+        asker.send(b"judge")
         asker.send(b"outcome " + b"0" * 32 + b" 7 slip")
 
         def has_come() -> bool:
