@@ -92,8 +92,8 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
     line: int = 0
 
 
-IMAGES_HZ: Final = 10.0
-"""Rate of tactile images, 1/s: fast enough to watch, a tenth of the readings."""
+IMAGE_PERIOD_NS: Final = 100_000_000
+"""Time between two tactile images, ns: fast enough to watch, a tenth of the readings."""
 
 
 class Viewer:
@@ -102,9 +102,7 @@ class Viewer:
     Images are relative to the resting counts of each finger, which it learns.
     """
 
-    def __init__(self, images_hz: float = IMAGES_HZ) -> None:
-        """Draw at most `images_hz` images a second; 0 draws none."""
-        self._period_ns = round(1e9 / images_hz) if images_hz else None
+    def __init__(self) -> None:
         self._due_ns = 0
         self._gate: GateState | None = None
         self._rest = RestCounts()
@@ -170,14 +168,14 @@ class Viewer:
 
     def _image_if_due(self, message: Message, wall_ns: int) -> RawImage | None:
         """Return the image of a reading if one is due. Raises `ValueError`."""
-        if not isinstance(message, Tactile) or self._period_ns is None:
+        if not isinstance(message, Tactile):
             return None
         late_ns = wall_ns - self._due_ns
-        if -self._period_ns <= late_ns < 0:
+        if -IMAGE_PERIOD_NS <= late_ns < 0:
             return None
         image = self._image(message, wall_ns)
-        is_on_time = late_ns < self._period_ns and late_ns >= 0
-        self._due_ns = (self._due_ns if is_on_time else wall_ns) + self._period_ns
+        is_on_time = 0 <= late_ns < IMAGE_PERIOD_NS
+        self._due_ns = (self._due_ns if is_on_time else wall_ns) + IMAGE_PERIOD_NS
         return image
 
     def _image(self, reading: Tactile, wall_ns: int) -> RawImage:

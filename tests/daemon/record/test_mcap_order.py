@@ -219,4 +219,5 @@ def test_a_reading_before_a_loss_is_late_without_a_verdict(
             for _ in driver.read_ready():
                 found.append(late)
                 late = False
+        assert driver.counters.cut_off == is_cut
     assert found == called_late

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import time
 import zlib
@@ -123,7 +124,10 @@ def test_a_run_of_recorded_data_replays_the_same(tmp_path: Path) -> None:
     path.write_text(played.replace(str(DEMO_RECORDING), str(three_seconds(tmp_path))))
     assert graspd("run", path).returncode == 0
     (recorded,) = files(tmp_path)
-    said = [compared(verdict) for verdict in of_kind(recorded, "verdict")]
+    verdicts = of_kind(recorded, "verdict")
+    times_ns = [verdict["t_mono_ns"] for verdict in verdicts]
+    assert {later - former for former, later in itertools.pairwise(times_ns)} == {10_000_000}
+    said = [compared(verdict) for verdict in verdicts]
     assert [compared(verdict) for verdict in again(recorded)] == said
     assert sum(verdict["judged"] for verdict in said) == 1
 

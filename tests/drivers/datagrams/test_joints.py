@@ -207,32 +207,6 @@ def test_a_message_is_a_reading_and_a_gap_a_loss(driver: JointStreamDriver) -> N
     assert driver.stream.counters.missed_readings == 2
 
 
-@pytest.mark.parametrize("by", ["seq", "t_s"])
-def test_late_and_doubled_messages_are_dropped(driver: JointStreamDriver, by: str) -> None:
-    stream = [message(**{by: number}, FFJ3=number / 100) for number in (1, 2, 2, 4, 3, 5)]
-    angles = [reading.position_rad[0] for reading in taken(driver, *stream)]
-    assert angles == [0.01, 0.02, 0.04, 0.05]
-    assert driver.stream.counters.old_messages == 2
-
-
-def test_without_number_and_time_every_message_counts(driver: JointStreamDriver) -> None:
-    assert len(taken(driver, *[message()] * 5)) == 5
-
-
-def test_a_restarted_sender_is_heard_at_its_eleventh_message(
-    driver: JointStreamDriver,
-) -> None:
-    stream = [message(seq) for seq in (*range(500, 510), *range(20))]
-    assert len(taken(driver, *stream)) == 10 + 10
-    assert driver.stream.counters.old_messages == 10
-    assert driver.stream.counters.restarts == 1
-
-
-def test_a_sender_that_repeats_itself_is_never_taken(driver: JointStreamDriver) -> None:
-    assert len(taken(driver, *[message(5)] * 100)) == 1
-    assert driver.stream.counters.old_messages == 99
-
-
 def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:
     assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
     assert driver.link.state is LinkState.UP

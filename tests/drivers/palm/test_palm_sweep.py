@@ -13,7 +13,6 @@ from graspd.drivers.base import ElectrodeFault, Reading
 from graspd.drivers.palm.packet import PalmPacket
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.twins.datagrams import PalmTwin
-from graspd.drivers.twins.faults import LinkFaults
 from tests.drivers.one_sweep import tactile
 from tests.drivers.palm.palm_stream import (
     FINGERS,
@@ -261,29 +260,6 @@ def test_how_long_no_round_can_end() -> None:
         sweeps.push(packet, at * MS)
         left.append(sweeps.cycles_to_go)
     assert left == [0, *range(13, -1, -1), *range(13, -1, -1)]
-
-
-def injected(faults: LinkFaults) -> tuple[Played, int]:
-    """What 300 rounds with faults become, and how many faults there were."""
-    twin = PalmTwin(rows(300), faults=faults)
-    played, truth = play(list(twin.cycles())), rows(300)
-    for reading in played.readings:
-        assert row_of(reading, truth[reading.seq : reading.seq + 1]) == 0
-    return played, twin.injected.total()
-
-
-def test_doubled_packets_are_dropped_and_counted_one_by_one() -> None:
-    played, doubled = injected(LinkFaults(duplicate_probability=0.2))
-    assert played.counters.duplicate_packets == doubled > 100
-    assert len(played.sound()) == 300
-
-
-def test_swapped_packets_find_their_place_or_are_counted_as_late() -> None:
-    played, swapped = injected(LinkFaults(reorder_probability=0.1))
-    counters = played.counters
-    assert counters.reordered_packets + counters.late_packets == swapped > 100
-    assert counters.lost_packets == counters.late_packets  # swapped over the end of a round
-    assert counters.conflicting_packets == counters.duplicate_packets == 0
 
 
 @pytest.mark.parametrize("copies", [1, 2])
