@@ -10,9 +10,7 @@ import os
 from collections.abc import Iterator, Mapping
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, get_args
 
 from graspd.biotac import Finger
 from graspd.daemon import scene
@@ -23,9 +21,7 @@ from graspd.daemon.doctor.computer import NETWORK
 from graspd.daemon.doctor.finding import Level
 from graspd.daemon.doctor.surroundings import key_findings, socket_findings
 from graspd.daemon.judge.joint_motion import RAD_PER_S
-from graspd.daemon.judge.motion_limits import MotionLimits, SlowNoise, Tails
-from graspd.daemon.judge.stillness import centred
-from graspd.daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
+from graspd.daemon.judge.windows import LONG_NS, SHORT_NS, STEP_NS, STEPS_MIN
 from graspd.daemon.process.text import (
     Colour,
     coloured,
@@ -53,9 +49,6 @@ USUAL_PERIOD_NS = 10_000_000
 """Time between readings where only the device knows it, ns."""
 COIN = 0.5
 """Lowest possible confidence: a smaller `min_confidence` has no effect."""
-TYPICAL_COUNTS, TYPICAL_CORRELATIONS = 3.5 / math.sqrt(1.0 - 0.32), (0.32, 0.03)
-"""Standard deviation of a held touch's electrode, and its correlation at one and two sweeps.
-Measured from differences of sweeps, which correlation makes smaller: 3.5 counts (2.9 to 4.2)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -255,59 +248,20 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
 
 
 def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
-    """Say after what time which motion is excluded, and when a grasp is judged."""
-    tails = Tails.of(len(wanted.hand.fingers), gate.false_alarms, early=gate.early)
+    """Say after what time a grasp is judged."""
     usual = ", as usual" if period_ns is None else ""
     period_ns = period_ns or USUAL_PERIOD_NS
-    soon, sure = operating_points(tails, period_ns)
-    after, again = f"{soon.after_ns / 1e6:.0f} ms", f"{sure.after_ns / 1e6:.0f} ms"
-    judged = (
-        f"judged early after {after}, again after {again}"
-        if gate.early
-        else f"judged after {again}"
+    step_ns = max(math.ceil(STEP_NS / period_ns), 1) * period_ns
+    soon_ms, sure_ms = (
+        max(math.ceil(window_ns / step_ns), STEPS_MIN) * step_ns / 1e6
+        for window_ns in (SHORT_NS, LONG_NS)
     )
+    early = f"early after {soon_ms:.0f} ms, again " if gate.early else ""
     return (
-        f"after {after} fast motion is excluded, {soon.counts_per_s:.0f} counts/s and more, after "
-        f"{again} slow slides, {sure.counts_per_s:.0f} and more (mean of the electrodes that is "
-        f"seen in half of the readings; {1e9 / period_ns:.0f}/s{usual}, "
-        f"typical noise); a settled hand that holds may be said to move "
-        f"{100 * gate.false_alarms:g} % of the time; {judged}"
+        f"judged {early}after {sure_ms:.0f} ms without motion ({1e9 / period_ns:.0f} readings"
+        f"/s{usual}); a settled hand that holds may be said to move {100 * gate.false_alarms:g} % "
+        "of the time"
     )
-
-
-class OperatingPoint(NamedTuple):
-    """Figures of one window of the gate."""
-
-    after_ns: int
-    """Length of the window, ns."""
-    counts_per_s: float
-    """Steady motion, mean of a finger's electrodes, that is seen in every other sweep."""
-
-
-def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, OperatingPoint]:
-    """Return what the short and the long window tell of a finger of typical noise."""
-    sweeps = max(math.ceil(STEP_NS / period_ns), 1)
-    step_ns = sweeps * period_ns
-    short = max(math.ceil(SHORT_NS / step_ns), STEPS_MIN)
-    long = max(math.ceil(LONG_NS / step_ns), STEPS_MIN)
-    variance, correlations = np.full(1, TYPICAL_COUNTS**2 / sweeps), np.array(TYPICAL_CORRELATIONS)
-    noise = Noise.of(variance, correlations[:, np.newaxis])
-    # The squares of noise and motion add up: how much motion brings the sum to the limit?
-    slope = noise.slope[short].item() / math.sqrt(_extent(short, step_ns))
-    square, extent = noise.variance[long].item() * (long - 1), _extent(long, step_ns)
-    limits = MotionLimits(1, tails)
-    limits.lay([0.0], [slope], [0.0], SlowNoise(extent, [square], noise.spread[long].tolist()))
-    fast = slope * math.sqrt(limits.fast[0] ** 2 - 1.0)
-    slow = MEAN_ABS * math.sqrt((limits.slow[0] ** 2 - 1.0) * square / extent)
-    return (
-        OperatingPoint(max(SHORT_NS, short * step_ns), fast),
-        OperatingPoint(max(LONG_NS, long * step_ns), slow),
-    )
-
-
-def _extent(steps: int, step_ns: int) -> float:
-    times_s = centred(np.arange(steps) * step_ns / 1e9)
-    return float(times_s @ times_s)
 
 
 def _risk(wanted: RiskSection) -> str:

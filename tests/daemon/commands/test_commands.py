@@ -100,27 +100,24 @@ def test_check_says_what_is_written_without_a_recording(
     assert checked(tmp_path, f"{CAN}{sections}\n")["left_out"]["record"] == says
 
 
-EARLY = "judged early after 100 ms, again after 240 ms"
+PALM_HERE = f'{PALM}source = "udp://127.0.0.1:9870"\n'
 
 
 @pytest.mark.parametrize(
-    ("gate", "judged", "share"),
-    [("", "judged after 240 ms", "3 %"), ("early = true\nfalse_alarms = 0.01", EARLY, "1 %")],
+    ("text", "said"),
+    [
+        (CAN, "after 240 ms without motion (100 readings/s, as usual); a settled hand 3 %"),
+        (PALM_HERE, "after 252 ms without motion (71 readings/s); a settled hand 3 %"),
+        (
+            f"{CAN}[gate]\nearly = true\nfalse_alarms = 0.01\n",
+            "early after 100 ms, again after 240 ms without motion (100 readings/s, as usual); "
+            "a settled hand 1 %",
+        ),
+    ],
 )
-def test_check_says_what_is_known_of_motion_and_when(
-    tmp_path: Path, gate: str, judged: str, share: str
-) -> None:
-    said = checked(tmp_path, f"{CAN}[gate]\n{gate}\n")["in"]["still"]
-    assert said.endswith(f"said to move {share} of the time; {judged}")
-    found = re.match(
-        r"after 100 ms fast motion is excluded, (\d+) counts/s and more, after 240 ms slow slides,"
-        r" (\d+) and more .*100/s, as usual",
-        said,
-    )
-    assert found is not None
-    fast, slow = map(int, found.groups())
-    # Half of the slides of real sensors have a mean slope of 39 counts/s in 240 ms, 62 in 120 ms.
-    assert 15 < slow < 39 < fast < 2 * 62
+def test_check_says_when_a_grasp_is_judged(tmp_path: Path, text: str, said: str) -> None:
+    still = checked(tmp_path, text)["in"]["still"]
+    assert still.replace(" that holds may be said to move", "") == f"judged {said} of the time"
 
 
 def test_run_names_the_process_that_has_the_port(tmp_path: Path) -> None:
