@@ -174,12 +174,11 @@ def _grasps(
         )
     counts = counts_of(given, fingers)
     if column_names(given):
-        blocks = np.array_split(
-            counts.reshape(len(counts), -1), range(BLOCK_ROWS, len(counts), BLOCK_ROWS)
-        )
+        rows = counts.reshape(-1, counts.shape[1] * counts.shape[2])
+        blocks = np.array_split(rows, range(BLOCK_ROWS, len(rows), BLOCK_ROWS))
         problem = problem_of_sweeps(blocks, read_as)
         if problem is not None:
-            raise ValueError(f"the table: {_in_arguments(problem)}; graspd.judge judges sweeps")
+            raise ValueError(f"the table: {_in_arguments(problem)} (graspd.judge judges sweeps)")
     return counts
 
 

@@ -236,7 +236,9 @@ def player(
     from graspd.drivers.recordings.csv_player import ReplayDriver
 
     if options.outcomes and plan.without_outcomes:
-        raise ValueError(f"outcomes needs the column `{SLIPPED}` in every recording")
+        raise ValueError(
+            f"outcomes needs the column `{SLIPPED}` in every recording, with some in it"
+        )
     return ReplayDriver(
         options.recordings,
         fingers,

@@ -62,7 +62,7 @@ class Plan:
         if mode == "every" and streams:
             raise SceneError(f"{streams[0]}: {NO_SWEEPS}")
         joints = joints or any(each.joints for each in layouts.values())
-        unknown = (path for path, each in layouts.items() if each.columns.slipped is None)
+        unknown = (path for path, each in layouts.items() if not each.has_outcomes)
         return cls(scene, mode, joints, tuple(unknown), layouts)
 
     @property

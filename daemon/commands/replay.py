@@ -33,7 +33,15 @@ from graspd.daemon.session import file as session_file
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import SLIPPED
 from graspd.drivers.recordings.csv_player import DEMO_DAY
-from graspd.drivers.recordings.kinds import BAGS, Kind, files_of, kind_of_all, refuse_options
+from graspd.drivers.recordings.kinds import (
+    BAGS,
+    PAGE,
+    Kind,
+    files_of,
+    kind_of,
+    kind_of_all,
+    refuse_options,
+)
 from graspd.models import zoo
 from graspd.models.bts3 import TABLES
 from graspd.models.contract import ModelError
@@ -266,7 +274,9 @@ def _source(args: argparse.Namespace) -> Source:
 def _tables(args: argparse.Namespace) -> Tables:
     """Return tables that are judged as the command line says."""
     if args.scene is not None:
-        raise UsageError("--scene is for what came over a link")
+        first = args.recordings[0]
+        problem = f"is {kind_of(first).value}: --scene is for what came over a link"
+        raise UsageError(f"{first}: {problem}; {PAGE} lists the CAN logs that are read")
     sections: dict[str, dict[str, Any]] = {}
     if args.min_confidence is not None:
         sections["model"] = {"min_confidence": args.min_confidence}
@@ -301,7 +311,7 @@ def _parts(args: argparse.Namespace, source: Source) -> Parts:
     wanted = wanted.model_copy(update={"session": session})
     parts = source.parts(wanted, assembly.load_model(wanted), args.speed)
     for path in parts.plan.without_outcomes if args.outcomes else ():
-        raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
+        raise SceneError(f"{path}: no outcomes to tell: none is known in a column `{SLIPPED}`")
     if args.session not in (RUNNING, OFF) and parts.pipeline.session is None:
         raise ModelError(f"the model {parts.model.contract.name} keeps no session")
     _restore_session(args, source, parts.pipeline, wanted.hand.fingers)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice, pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -23,6 +23,7 @@ from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.values import (
     count_of,
     is_clock,
+    is_outcome,
     number_of,
     problem_with,
     time_of,
@@ -43,9 +44,9 @@ STEP_COUNTS: Final = 25.0
 """The same of rows that may be sweeps in a row: 74 to 97 % of streams, 13 to 44 % of tables."""
 NEAR_SHARE_MAX: Final = 0.2
 """Largest share of rows up to `NEAR_COUNTS` from another in a grasp table."""
-ALIKE_SHARE_MAX: Final = 0.75
-"""Largest share of rows up to `STEP_COUNTS` from another: of sweeps with broken electrodes, or of
-much noise, up to 100 % are, and not one of them is near."""
+ALIKE_SHARE_MAX: Final = 0.85
+"""Largest share of rows up to `STEP_COUNTS` from another, where near ones count twice: of sweeps
+with broken electrodes, or of much noise, up to 100 % are, and not one of them is near."""
 FEW_ROWS: Final = 10
 """Fewest rows whose shares can refuse a table for good."""
 MIDDLE_SHARE_MAX: Final = 0.1
@@ -75,6 +76,9 @@ class Layout:
     """Unit of the column of times, s."""
     rate_hz: float | None = None
     """Sweeps per second, in place of times."""
+
+    has_outcomes: bool = False
+    """True if the lifts' outcomes are known; of a table, of some of its first rows."""
 
     @property
     def joints(self) -> Mapping[str, int]:
@@ -130,7 +134,7 @@ def survey(
             raise RecordingError(path, repeats)
         layout = Layout(columns, is_stream=False)
     file.seek(0)
-    return layout
+    return replace(layout, has_outcomes=rows.has_outcomes(layout))
 
 
 def _until_damage(rows: Iterator[list[str]]) -> Iterator[list[str]]:
@@ -177,6 +181,12 @@ class _Rows:
         if read_as == "stream" and self.columns.time is None and rate_hz is None:
             raise RecordingError(self.path, "has no column of times: give --rate-hz too")
         return read_as == "stream" or (read_as is None and self.columns.time is not None)
+
+    def has_outcomes(self, layout: Layout) -> bool:
+        place = self.columns.slipped
+        if place is None or layout.is_stream:  # which may begin with an open hand
+            return place is not None
+        return any(is_outcome(row[place]) for row in self.first)
 
     def times(self, column: TimeColumn) -> list[float]:
         """Return the times of the first rows in the unit of the column."""
@@ -283,7 +293,7 @@ def problem_of_sweeps(blocks: Iterable[NDArray[np.floating]], read_as: ReadAs | 
     between = number - near - far
     if near > NEAR_SHARE_MAX * number:
         problem = f"{near} of {number} rows nearly repeat another"
-    elif near + between > ALIKE_SHARE_MAX * number:
+    elif 2 * near + between > ALIKE_SHARE_MAX * number:
         problem = f"most of {number} rows are much like another"
     else:
         return None

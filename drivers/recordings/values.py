@@ -93,6 +93,11 @@ def outcome_of(cell: str) -> bool | None:
     return _OUTCOMES[text]
 
 
+def is_outcome(cell: str) -> bool:
+    """Return True for an outcome that is known."""
+    return _OUTCOMES.get(cell.strip().lower()) is not None
+
+
 def problem_with(cells: Sequence[str], *, decimal_comma: bool) -> str | None:
     """Return why values of electrodes are no counts, as a whole; None: most of them are.
 

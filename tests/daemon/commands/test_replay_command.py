@@ -165,11 +165,15 @@ def test_a_renamed_part_of_a_training_table_is_known(bts3_dir: Path, tmp_path: P
 
 
 def test_outcomes_of_a_table_that_has_none_are_one_line(tmp_path: Path) -> None:
-    bare = unlabelled_demo(tmp_path)
-    assert graspd("replay", bare).returncode == 0
-    result = graspd("replay", bare, "--outcomes")
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr == f"graspd: {bare}: no column `slipped`: there are no outcomes to tell\n"
+    other = tmp_path / "held.csv"
+    other.write_text(re.sub(r"(?m)^(\w+),[01],", r"\1,held,", DEMO_TABLE.read_text()))
+    for path in (unlabelled_demo(tmp_path), other):
+        played = graspd("replay", path)
+        assert (played.returncode, "no outcome of a lift is known" in played.stdout) == (0, True)
+        result = graspd("replay", path, "--outcomes")
+        assert (result.returncode, result.stdout) == (2, "")
+        problem = "no outcomes to tell: none is known in a column `slipped`"
+        assert result.stderr == f"graspd: {path}: {problem}\n"
 
 
 def test_replay_json_gives_one_valid_verdict_per_real_grasp(bts3_dir: Path) -> None:

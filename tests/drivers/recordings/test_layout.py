@@ -304,6 +304,13 @@ def test_sweeps_without_times_are_never_a_table(tmp_path: Path, every: int, mixe
             layout(content, tmp_path, "table")
 
 
+def test_few_slow_sweeps_are_never_a_table(tmp_path: Path) -> None:
+    names, cells = sweeps(400)
+    names[names.index("t")] = "number"
+    with pytest.raises(RecordingError, match="most of 16 rows are much like another: sweeps"):
+        layout(written(names, cells[::25]), tmp_path)
+
+
 def any_value(cells: NDArray[np.str_], random: np.random.Generator) -> None:
     for place in (5, 30, 60):
         cells[:, place] = random.integers(0, 4096, len(cells))
