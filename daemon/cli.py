@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
+from graspd.daemon import version
 from graspd.daemon.commands.arguments import Parser, UsageError
 from graspd.daemon.process import logs
 from graspd.daemon.process.files import is_linux
@@ -160,14 +161,14 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
         # Imported here, as only `--version` needs them.
         import platform
-        from importlib.metadata import version
+        from importlib import metadata
 
         import zmq
 
         libraries = [f"Python {platform.python_version()}"]
-        libraries += [f"{name} {version(name)}" for name in LIBRARIES]
+        libraries += [f"{name} {metadata.version(name)}" for name in LIBRARIES]
         libraries.append(f"libzmq {zmq.zmq_version()}")
-        ours = f"graspd {version('graspd')}{_commit()}"
+        ours = f"graspd {version()}{_commit()}"
         sys.stdout.write(f"{ours}\n{', '.join(libraries)}\n")
         parser.exit()
 

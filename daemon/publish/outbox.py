@@ -8,12 +8,12 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import onnxruntime
 
 from graspd.biotac import Finger
+from graspd.daemon import version
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateChange, Moment, Reason
 from graspd.daemon.publish.messages import (
@@ -151,7 +151,7 @@ class Outbox:
         self._wall_clock = wall_clock
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
         self._versions = {
-            "graspd": version("graspd"),
+            "graspd": version(),
             "onnxruntime": onnxruntime.__version__,
             "python": sys.version.split()[0],
         }

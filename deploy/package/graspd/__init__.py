@@ -44,7 +44,7 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> object:
     """Load the module of a name."""
     if name == "__version__":
-        return import_module("importlib.metadata").version("graspd")
+        return import_module("graspd.daemon").version()
     if name == "client":
         return import_module("graspd.client")
     if name in _MODULES:
