@@ -239,36 +239,18 @@ def _read_lab_table(path: Path, read_as: ReadAs | None) -> Grasps:
 
 
 def first_readings(counts: NDArray[np.uint16]) -> Ints:
-    """Return for each row the first one of its grasp, shape (N,): they nearly repeat each other.
+    """Return for each row the first one of its grasp, shape (N,): they nearly repeat each other."""
+    from sklearn.cluster import DBSCAN
 
-    Near rows have near means of each finger, so only those of near means are compared.
-    """
-    number, fingers, electrodes = counts.shape
-    values = counts.astype(np.float32).reshape(number, fingers * electrodes)
-    means = counts.mean(axis=2)
-    apart_max = NEAR_COUNTS * math.sqrt(fingers)
-    sorted_by = means[:, -1]
-    left = np.argsort(sorted_by)
-    places = sorted_by[left]
-    first = np.full(number, -1)
-    known = 0
-    for row in range(number):
-        reached = [row] if first[row] < 0 else []
-        while reached:
-            at = reached.pop()
-            first[at] = row
-            known += 1
-            if 2 * known > len(left):  # those that are known need not be looked at
-                left = left[first[left] < 0]
-                places, known = sorted_by[left], 0
-            begin, end = sorted_by[at] - apart_max, sorted_by[at] + apart_max
-            others = left[slice(*np.searchsorted(places, (begin, end)))]
-            others = others[first[others] < 0]
-            others = others[(np.abs(means[others] - means[at]) <= apart_max).all(axis=1)]
-            near = np.square(values[others] - values[at]).mean(axis=1) <= NEAR_COUNTS**2
-            first[others[near]] = row
-            reached += others[near].tolist()
-    return first
+    if not len(counts):
+        return np.empty(0, dtype=np.int64)
+    rows = counts.reshape(len(counts), -1).astype(np.float64)
+    apart_max = NEAR_COUNTS * math.sqrt(rows.shape[1])
+    # Groups that are linked by near rows; the tree compares only rows of near places.
+    linked = DBSCAN(apart_max, min_samples=1, algorithm="kd_tree").fit_predict(rows)
+    _, first, of = np.unique(linked, return_index=True, return_inverse=True)
+    found: Ints = first[of]
+    return found
 
 
 def _check_once(grasps: Grasps, lab: dict[str, Path]) -> None:
