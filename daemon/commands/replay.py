@@ -196,7 +196,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     else:
         shown = Printer(as_json=args.json)
         if isinstance(source, Tables):
-            shown.result.trained_on = trained_on(args.recordings, model, args.read_as)
+            (shown.result.trained_on,) = trained_on(args.recordings, [model], args.read_as)
         told = [shown]
     why = Unjudged(complain)
     controller = Controller(only_lifted=args.only_lifted)
@@ -245,9 +245,10 @@ def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
     names = ", ".join(path.name for path in args.recordings)
     title = DEMO_TITLE if args.recordings == [DEMO_DAY] else f"Grasps of {printable(names)}."
     warnings = []
-    for which, judge in (("the model", model), ("the published network", published)):
-        if known := trained_on(args.recordings, judge, args.read_as):
-            warnings.append(trained_on_line(which, known.values()))
+    known = trained_on(args.recordings, [model, published], args.read_as)
+    for which, tables in zip(("the model", "the published network"), known, strict=True):
+        if tables:
+            warnings.append(trained_on_line(which, tables.values()))
     return DayTable(title, published, model.contract.name, warnings)
 
 

@@ -80,26 +80,28 @@ def _sent(object_name: str | None) -> str | None:
 
 
 def trained_on(
-    recordings: Sequence[Path], model: TactileModel, read_as: ReadAs | None = None
-) -> dict[str, str]:
-    """Return those recordings that have grasps which the model was trained on.
+    recordings: Sequence[Path], models: Sequence[TactileModel], read_as: ReadAs | None = None
+) -> list[dict[str, str]]:
+    """Return for each model those recordings that have grasps which it was trained on.
 
     The name of each comes with what is known of it, as text. Such a table is known under any name.
-    Raises `RecordingError` and `ModelError`.
+    All models judge the same fingers. Raises `RecordingError` and `ModelError`.
     """
-    digests = {dataset.sha256 for dataset in model.contract.datasets}
-    known = known_grasps.of_model(model)
-    found = {}
+    known = [known_grasps.of_model(model) for model in models]
+    found: list[dict[str, str]] = [{} for _ in models]
     for path in recordings:
         if read_as == "stream" or kind_of(path) is not Kind.TEXT:
             continue  # sweeps are no grasps
-        counts = _grasps_of(path, model.contract.fingers, read_as)
-        trained = int(known_grasps.are_among(known_grasps.hashes(counts), known).sum())
+        counts = _grasps_of(path, models[0].contract.fingers, read_as)
+        grasps = known_grasps.hashes(counts)
         with path.open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() in digests:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        for model, hashes, of_model in zip(models, known, found, strict=True):
+            trained = int(known_grasps.are_among(grasps, hashes).sum())
+            if digest in {dataset.sha256 for dataset in model.contract.datasets}:
                 trained = len(counts)  # an older model has no hashes of its grasps
-        if trained:
-            found[path.name] = f"{trained} of {len(counts)} grasps of {path.name}"
+            if trained:
+                of_model[path.name] = f"{trained} of {len(counts)} grasps of {path.name}"
     return found
 
 

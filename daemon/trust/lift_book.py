@@ -165,13 +165,15 @@ class LiftBook:
             stable = stable or lift.stable
         former = lift or Lift(grasp, stable, features)
         self._lifts[grasp] = replace(former, stable=stable, features=features)
-        is_abandoned = False
+        is_counted, is_abandoned = stable, False
         if len(self._lifts) > LIFTS_MAX:
             oldest = self._lifts.pop(next(iter(self._lifts)))
             self._unkept.discard(oldest.id)
             self.unreported += oldest.is_outstanding
+            is_counted |= oldest.is_outstanding
             is_abandoned = oldest.is_awaited
-        self._count()
+        if is_counted:
+            self._count()
         return is_abandoned
 
     def claim(self, grasp: GraspId, peer: Peer) -> bool:
@@ -250,7 +252,8 @@ class LiftBook:
             status = OutcomeStatus.TAKEN
             self._lifts[grasp] = replace(lift, features=None, slipped=slipped)
             self._unkept.add(grasp)
-            self._count()
+            if lift.is_outstanding:
+                self._count()
         elif lift.slipped == slipped:
             status = OutcomeStatus.REPEATED
         else:
