@@ -121,14 +121,6 @@ def test_the_figures_of_contract_and_card_are_the_same(name: str) -> None:
         assert figures["spreads"]["accuracy"]["mean"] == pytest.approx(accuracy, abs=near)
 
 
-def test_the_small_model_is_small() -> None:
-    assert zoo.card("small-session")["parameters"] <= 100_000
-
-
-def test_the_zoo_stays_small() -> None:
-    assert sum(path.stat().st_size for path in zoo.ZOO.iterdir() if path.is_file()) < 40e6
-
-
 @pytest.mark.parametrize("name", zoo.names())
 def test_noticed_and_repaired_electrodes_cost_less_than_two_points(name: str) -> None:
     study = zoo.card(name)["broken"]

@@ -58,9 +58,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--quick", action="store_true", help="few grasps, folds and epochs: does it run?"
     )
     parser.add_argument(
-        "--grid", action="store_true", help="try the grids of classical systems and name the best"
-    )
-    parser.add_argument(
         "--table",
         type=Path,
         metavar="FILE",
@@ -72,7 +69,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="say of each system what it is, which row of the paper it answers, and the command "
         "that makes that row",
     )
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="draw them into this folder")
     parser.add_argument("--json", action="store_true", help="print figures of each fold as JSON")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import difflib
 import itertools
 import shlex
@@ -16,7 +15,6 @@ from importlib.util import find_spec
 import joblib
 import numpy as np
 import pandas as pd
-from sklearn.model_selection import ParameterGrid
 
 from graspd.extras import needs
 from graspd.models.runtime import one_line
@@ -30,7 +28,6 @@ from graspd.models.training.commands.common import (
 from graspd.models.training.commands.other_day import judge_other_days
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
-from graspd.models.training.estimators.configs import GRIDS, NetworkConfig
 from graspd.models.training.evaluating.figures import (
     Figures,
     made_with,
@@ -38,7 +35,7 @@ from graspd.models.training.evaluating.figures import (
     with_probability,
     write,
 )
-from graspd.models.training.evaluating.files import to_json, write_whole
+from graspd.models.training.evaluating.files import write_whole
 from graspd.models.training.evaluating.frame import (
     Job,
     LostWorkerError,
@@ -50,7 +47,6 @@ from graspd.models.training.evaluating.results_table import results_table
 from graspd.models.training.making.plan import TrainingPlan, with_enough_folds
 from graspd.models.training.systems.registry import (
     SYSTEMS,
-    BlendConfig,
     System,
     digest,
     with_recipes,
@@ -69,7 +65,7 @@ VERDICTS = "verdicts"
 
 def evaluate(args: argparse.Namespace) -> None:
     """Evaluate what the command line asks for. Raises what `exit_code` knows."""
-    systems = _systems(args.names, grid=args.grid)
+    systems = _systems(args.names)
     if args.train or args.test or args.model:
         epochs = QUICK_EPOCHS if args.quick else None
         judge_other_days(args, systems if args.names else (), epochs)
@@ -81,21 +77,18 @@ def evaluate(args: argparse.Namespace) -> None:
         systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
         chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]
         grasps = grasps.rows(np.sort(chosen).astype(np.int64))
-    tried = [point for system in systems for point in grid_of(system)] if args.grid else systems
     protocols = _protocols(args, grasps)
     folds = QUICK_FOLDS if args.quick else FOLDS
     if args.data is None:
-        folds = _enough_folds(tried, protocols, folds, grasps, _seeds(args))
+        folds = _enough_folds(systems, protocols, folds, grasps, _seeds(args))
     with _cluster(args.dask) if args.dask else processes(args.jobs):
-        made = _evaluated(tried, protocols, folds, grasps, args)
+        made = _evaluated(systems, protocols, folds, grasps, args)
     if args.json:
         scores = pd.concat(
             one.scores.assign(system=one.system, protocol=one.protocol) for one in made
         )
         sys.stdout.write(scores.reset_index().to_json(orient="records", indent=2) + "\n")
-    if args.grid:
-        _report_grids(systems, made, args)
-    if args.table or args.plots:
+    if args.table:
         _report(grasps, args)
 
 
@@ -115,48 +108,22 @@ def _cluster(address: str) -> Iterator[None]:
         raise LostWorkerError(f"the cluster lost a training: {one_line(error)}") from error
 
 
-def grid_of(system: System) -> list[System]:
-    """Return a system for each configuration of a classical estimator's grid, else nothing."""
-    estimator = system.estimator
-    if isinstance(estimator, NetworkConfig | BlendConfig):
-        return []
-    points = []
-    for values in ParameterGrid(GRIDS[type(estimator)]):
-        config = dataclasses.replace(estimator, **values)
-        fields = dataclasses.asdict(config).items()
-        # A file may have this name: svm-c=3.0-gamma=0.01.
-        words = [f"{name}={value}".replace(" ", "") for name, value in fields]
-        name = "-".join((system.name, *words))
-        points.append(dataclasses.replace(system, name=name, estimator=config))
-    return points
-
-
-def _systems(names: Sequence[str], *, grid: bool) -> list[System]:
+def _systems(names: Sequence[str]) -> list[System]:
     unknown = [name for name in names if name not in SYSTEMS]
     if unknown:
         near = difflib.get_close_matches(unknown[0], SYSTEMS, n=1)
         meant = f"; did you mean {near[0]}?" if near else ""
         raise WrongInputError(f"no system {unknown[0]!r}: there are {', '.join(SYSTEMS)}{meant}")
-    systems = [SYSTEMS[name] for name in dict.fromkeys(names)] or list(SYSTEMS.values())
-    if not grid:
-        return systems
-    with_grid = [system for system in systems if grid_of(system)]
-    if not with_grid:
-        raise WrongInputError("these systems have no grid")
-    return with_grid
+    return [SYSTEMS[name] for name in dict.fromkeys(names)] or list(SYSTEMS.values())
 
 
 def _check_extras(args: argparse.Namespace) -> None:
     """Now, not after hours of training."""
     if args.table and args.data is None:
         raise WrongInputError("--table compares with the paper's figures: it needs --data")
-    for option, given, package, extra in (
-        ("--dask", args.dask, "distributed", "cluster"),
-        ("--plots", args.plots, "matplotlib", "report"),
-    ):
-        if given and find_spec(package) is None:
-            absent = ModuleNotFoundError(name=package)
-            raise WrongInputError(needs(option, extra, absent))
+    if args.dask and find_spec("distributed") is None:
+        absent = ModuleNotFoundError(name="distributed")
+        raise WrongInputError(needs("--dask", "cluster", absent))
 
 
 def _protocols(args: argparse.Namespace, grasps: Grasps) -> list[EvalProtocol]:
@@ -219,8 +186,6 @@ def _evaluated(
 
 
 def _show(one: Figures, args: argparse.Namespace) -> None:
-    if args.grid:
-        return
     write(one, args.out / VERDICTS)
     if args.json:
         return
@@ -235,21 +200,16 @@ def _show(one: Figures, args: argparse.Namespace) -> None:
 
 
 def _report(grasps: Grasps, args: argparse.Namespace) -> None:
-    """Write table and plots of all that the folder has of these grasps."""
+    """Write the table of all that the folder has of these grasps."""
     digests = {
         name: digest(with_recipes(system, epochs=QUICK_EPOCHS) if args.quick else system)
         for name, system in SYSTEMS.items()
     }
     several = read(args.out / VERDICTS, grasps.digest(), digests)
-    if args.table:
-        command = "graspd " + " ".join(_command(args))
-        text = results_table(several, grasps, command, made_with(), quick=args.quick)
-        args.table.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(args.table, text.encode())
-    if args.plots:
-        from graspd.models.training.evaluating.plots import draw
-
-        draw(several, args.plots, quick=args.quick)
+    command = "graspd " + " ".join(_command(args))
+    text = results_table(several, grasps, command, made_with(), quick=args.quick)
+    args.table.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(args.table, text.encode())
 
 
 def _command(args: argparse.Namespace) -> Iterator[str]:
@@ -272,23 +232,3 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
     if args.dask:
         yield "--dask ADDRESS"
     yield "--table FILE"
-
-
-def _report_grids(
-    systems: Sequence[System], several: Sequence[Figures], args: argparse.Namespace
-) -> None:
-    """Write all points of each grid, the best F1 first, and name the best."""
-    for system in systems:
-        names = {point.name for point in grid_of(system)}
-        for protocol in dict.fromkeys(one.protocol for one in several):
-            points = [one for one in several if one.system in names and one.protocol == protocol]
-            points.sort(key=lambda one: -one.spread().mean)
-            report = [
-                {"name": point.system} | {name: point.spread(name) for name in ("f1", "accuracy")}
-                for point in points
-            ]
-            write_whole(args.out / f"{system.name}.{protocol}.grid.json", to_json(report))
-            if not args.json:
-                best, f1 = points[0].system, points[0].spread()
-                score = f"F1 {100 * f1.mean:.2f} +- {100 * f1.std:.1f} %"
-                sys.stdout.write(f"{best} {protocol}: best of {len(points)}, {score}\n")

@@ -187,7 +187,7 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
     """
     vectors = model.support_vectors_
     features = vectors.shape[1]
-    gamma = 1.0 / features if model.gamma == "auto" else float(model.gamma)
+    gamma = float(model.gamma)
     # -gamma * |x - v|**2 = 2 gamma x.v - gamma |v|**2 - gamma |x|**2
     constants = [
         # The support vectors are readings, float32 as the input is: nothing is lost here.

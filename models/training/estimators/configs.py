@@ -5,9 +5,7 @@ No library of the training is imported here, so that the help lists every system
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 THREADS = 1
 """Threads of a training. Sums over more threads round differently, and cores are busy."""
@@ -18,8 +16,8 @@ class SvmConfig:
     """Support vector machine with a radial kernel, classes weighted to balance."""
 
     c: float
-    gamma: float | Literal["auto"]
-    """Gamma of the kernel exp(-gamma * distance**2); auto: 1 / number of features."""
+    gamma: float
+    """Gamma of the kernel exp(-gamma * distance**2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,29 +57,6 @@ class BoostingConfig:
 
 
 ClassicalConfig = SvmConfig | ForestConfig | MlpConfig | BoostingConfig
-
-_TREES: dict[str, Sequence[object]] = {"leaves": (8, 15, 31), "features": (0.3, 1.0)}
-GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
-    SvmConfig: [
-        {
-            "c": (0.01, 0.1, 1.0, 3.0, 10.0, 100.0, 1000.0, 5000.0),
-            "gamma": ("auto", 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1),
-        }
-    ],
-    # Odd numbers of trees cannot tie.
-    ForestConfig: [{"trees": (11, 25, 51, 101, 199), "depth": (None, 5, 10, 15, 20, 30)}],
-    MlpConfig: [
-        {"hidden": ((32,), (100,), (300,), (64, 32), (100, 100)), "alpha": (1e-4, 0.1, 1.0)}
-    ],
-    BoostingConfig: [
-        {"iterations": (150,), "learning_rate": (0.1,), **_TREES},
-        {"iterations": (400,), "learning_rate": (0.05,), **_TREES},
-    ],
-}
-"""Grids of the grid search, for scikit-learn's `ParameterGrid`.
-
-The paper gives the first two. It gives no grid for perceptrons, and has no boosting.
-"""
 
 
 @dataclass(frozen=True, slots=True)

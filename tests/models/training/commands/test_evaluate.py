@@ -18,9 +18,7 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `train`")
 
 from graspd.models.training.commands import evaluation
-from graspd.models.training.commands.evaluation import grid_of
 from graspd.models.training.data.datasets import Grasps, read_all
-from graspd.models.training.estimators.configs import GRIDS, ForestConfig, SvmConfig
 from graspd.models.training.evaluating import frame
 from graspd.models.training.evaluating.frame import Job, evaluated, jobs_of, judged
 from graspd.models.training.systems.registry import SYSTEMS
@@ -148,41 +146,10 @@ def test_what_is_finished_is_not_run_again(
     assert all(0.5 < one["f1"] <= 1.0 for one in first)
 
 
-def test_a_grid_names_the_best_of_all_its_points(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(GRIDS, SvmConfig, [{"c": (0.01, 3.0), "gamma": (1e-4, 0.01)}])
-    options = "--grid", "--protocol", "cv", "--quick", "--data", data, "--out", tmp_path
-    done = graspd("evaluate", "svm", "cnn1", *options)
-    report = json.loads((tmp_path / "svm.cv.grid.json").read_text())
-    assert len(report) == 4
-    figures = [point["f1"]["mean"] for point in report]
-    assert figures == sorted(figures, reverse=True)
-    assert done.stdout.startswith(f"{report[0]['name']} cv: best of 4, F1 ")
-    assert not (tmp_path / "verdicts").exists()
-
-
-def test_grids_are_the_papers() -> None:
-    points = grid_of(SYSTEMS["svm"])
-    machines = [point.estimator for point in points if isinstance(point.estimator, SvmConfig)]
-    costs, gammas = {one.c for one in machines}, {one.gamma for one in machines}
-    assert (min(costs), max(costs)) == (0.01, 5000.0)
-    assert {"auto", 1e-4, 0.1} < gammas
-    forests = [point.estimator for point in grid_of(SYSTEMS["rf"])]
-    depths = {forest.depth for forest in forests if isinstance(forest, ForestConfig)}
-    assert {None, 5, 30} < depths
-    names = {point.name for point in points}
-    assert len(names) == len(points) == 8 * 7
-    assert "svm-c=3.0-gamma=0.1" in names
-    assert not any("/" in name or " " in name for name in names)
-    assert grid_of(SYSTEMS["cnn1"]) == grid_of(SYSTEMS["blend-electrodes"]) == []
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["svn"], "no system 'svn': there are cnn0, "),
-        (["cnn1", "--grid"], "these systems have no grid"),
         (["svm", "--data", "nowhere"], "nowhere: no such folder"),
     ],
 )
@@ -226,16 +193,12 @@ def test_what_is_not_installed_is_said_before_any_training(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evaluation, "find_spec", lambda _: None)
-    for option, package, extra in (
-        ("--plots", "matplotlib", "report"),
-        ("--dask", "distributed", "cluster"),
-    ):
-        done = graspd("evaluate", "svm", "--data", data, "--out", tmp_path, option, "anything")
-        assert done.returncode == 2
-        assert done.stderr == (
-            f"graspd evaluate: {option} needs the package '{package}': run {sys.executable} "
-            f"-m pip install '.[{extra}]' in the folder of graspd's source\n"
-        )
+    done = graspd("evaluate", "svm", "--data", data, "--out", tmp_path, "--dask", "anything")
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"graspd evaluate: --dask needs the package 'distributed': run {sys.executable} "
+        "-m pip install '.[cluster]' in the folder of graspd's source\n"
+    )
 
 
 def test_ctrl_c_ends_processes_with_130_and_leaves_results_of_one_process(

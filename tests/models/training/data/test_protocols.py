@@ -136,10 +136,6 @@ def test_objects_are_dealt_evenly_and_differently_by_each_seed() -> None:
     assert not np.array_equal(fold_of, object_folds(names, 4, seed=1))
 
 
-def test_the_order_of_the_rows_does_not_move_an_object_to_another_fold() -> None:
-    assert np.array_equal(object_folds(OBJECTS, 4, 0)[::-1], object_folds(OBJECTS[::-1], 4, 0))
-
-
 def test_more_folds_than_objects_are_refused() -> None:
     with pytest.raises(TooFewGraspsError, match="21 folds need 21 objects, there are 20"):
         splits("objects-whole", sessions(100), seed=0, folds=21)

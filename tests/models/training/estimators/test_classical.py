@@ -22,7 +22,6 @@ COUNTS, SLIPPED = separable_counts(120)
 VECTORS = VectorBuilder(3).build_batch(COUNTS)[0]
 KINDS: list[ClassicalConfig] = [
     SvmConfig(3.0, 0.01),
-    SvmConfig(3.0, "auto"),
     ForestConfig(11, None),
     ForestConfig(11, 2),
     MlpConfig((8,), epochs=40),
@@ -42,7 +41,7 @@ def test_a_positive_margin_says_slip(config: ClassicalConfig) -> None:
 
 
 def test_an_svm_decides_by_the_radial_kernel() -> None:
-    fitted = fit_classical(SvmConfig(3.0, "auto"), VECTORS, SLIPPED, seed=0)
+    fitted = fit_classical(SvmConfig(3.0, 1.0 / 72.0), VECTORS, SLIPPED, seed=0)
     vectors = fitted.model.support_vectors_
     weights, bias = fitted.model.dual_coef_[0], fitted.model.intercept_[0]
     for reading, margin in zip(VECTORS[:10], fitted.margins(VECTORS[:10]), strict=True):

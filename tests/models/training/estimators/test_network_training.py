@@ -170,14 +170,6 @@ def test_label_smoothing_bounds_the_margin() -> None:
     assert margins[~SLIPPED].mean() == pytest.approx(-np.log(9.0), rel=0.05)
 
 
-@pytest.mark.usefixtures("dense")
-def test_input_noise_is_drawn_from_the_seed() -> None:
-    noisy = Recipe(epochs=2, input_noise=0.3)
-    first = _weights(train_network(TINY, VECTORS, SLIPPED, noisy, seed=1))
-    assert first == _weights(train_network(TINY, VECTORS, SLIPPED, noisy, seed=1))
-    assert first != _weights(train_network(TINY, VECTORS, SLIPPED, Recipe(epochs=2), seed=1))
-
-
 def test_days_are_drawn_from_the_seed_and_change_what_is_learned(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

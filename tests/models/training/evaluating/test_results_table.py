@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
-from sklearn.metrics import log_loss
 
 pytest.importorskip("torch", reason="needs the extra `train`")
 
@@ -24,15 +23,13 @@ from graspd.models.training.evaluating.figures import (
     by_age,
     by_day,
     read,
-    temperature,
     with_probability,
     write,
 )
 from graspd.models.training.evaluating.findings import HOW_SURE
 from graspd.models.training.evaluating.frame import Job, evaluated, jobs_of
-from graspd.models.training.evaluating.metrics import confusion, fit_temperature
+from graspd.models.training.evaluating.metrics import confusion
 from graspd.models.training.evaluating.results_table import ONE_ROW, difference, results_table
-from graspd.models.training.fitting.standards import SESSION_VARIANTS
 from graspd.models.training.systems.registry import SYSTEMS, digest
 from tests.models.training.samples import sessions
 
@@ -84,26 +81,6 @@ def test_figures_count_every_grasp() -> None:
     assert set(made.trainings["train_grasps"]) == {300}
     low, high = made.f1_interval()
     assert low < made.spread().mean < high
-
-
-def test_probabilities_are_calibrated_by_the_other_folds() -> None:
-    made = figures_of("cnn1", "cv", wrong=0.1)
-    # Margins of +-2, right nine times in ten: log-odds of 0.9 are 2.2, so T is about 2 / 2.2.
-    assert temperature(made.of_variant()) == pytest.approx(2.0 / np.log(9.0), rel=0.2)
-    assert made.spread("ece").mean < 0.06
-    first, *others = (split.test for split in splits("cv", GRASPS, 0, 4))
-    rest, margins = np.concatenate(others), margins_of("cnn1", wrong=0.1)
-    of_rest = fit_temperature(margins[rest], GRASPS.slipped[rest])
-    probability = 1.0 / (1.0 + np.exp(-margins[first] / of_rest))
-    expected = log_loss(GRASPS.slipped[first], probability)
-    assert made.folds_of("log_loss").loc[0, 0] == pytest.approx(expected)
-
-
-def test_a_single_split_is_calibrated_by_its_other_objects() -> None:
-    made = figures_of("cnn1", "unknown", wrong=0.1)
-    assert made.folds == 1
-    assert made.spread("ece").mean < 0.06
-    assert made.rows["object"].nunique() == 8
 
 
 def test_fifty_grasps_speak_for_a_calibrated_session() -> None:
@@ -298,33 +275,3 @@ def test_every_row_has_as_many_cells_as_its_header() -> None:
         if line.startswith("|"):
             width = line.count("|") if not before.startswith("|") else width
             assert line.count("|") == width
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Plots of two protocols. Matplotlib keeps fonts open for the life of the process."""
-    pytest.importorskip("matplotlib", reason="needs the extra `report`")
-    from graspd.models.training.evaluating import plots
-
-    session = figures_of("svm-session", "session", 0.2)
-    of_n50 = session.of_variant("n50")
-    every = [of_n50.assign(variant=str(variant)) for variant in SESSION_VARIANTS]
-    made = [
-        figures_of("cnn1", "cv", 0.1),
-        figures_of("cnn2", "cv", 0.0),
-        Figures.of(pd.concat(every, ignore_index=True)),
-    ]
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(plots, "DPI", 20)
-        return plots.draw(made, tmp_path_factory.mktemp("plots"), quick=True)
-
-
-def test_plots_of_everything_are_drawn(drawn: list[Path]) -> None:
-    stems = {"cnn1.cv", "cnn2.cv", "svm-session.session", "coverage.cv", "session-calibration"}
-    assert {path.name for path in drawn} == {
-        f"{stem}.{suffix}" for stem in stems for suffix in ("png", "svg")
-    }
-    for path in drawn:
-        start = path.read_bytes()[:8]
-        assert start.startswith(b"<?xml" if path.suffix == ".svg" else b"\x89PNG")
-        assert path.suffix == ".png" or "-quick: the figures mean nothing -->" in path.read_text()

@@ -93,7 +93,7 @@ CASES = {
     ),
     "session network": system(SESSION, replace(TINY, dropout=0.3), QUICK),
     "svm": system(VECTOR, SvmConfig(3.0, 0.1)),
-    "hard svm": system(SESSION, SvmConfig(5000.0, "auto")),
+    "hard svm": system(SESSION, SvmConfig(5000.0, 0.013)),
     "mlp": system(VECTOR, MlpConfig((8, 8), epochs=30)),
     "forest": system(VECTOR, ForestConfig(199, None)),
     "shallow forest": system(SESSION, ForestConfig(11, 2)),
