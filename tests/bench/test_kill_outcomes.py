@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import random
 import threading
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -28,7 +27,7 @@ from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
 from tests.bench.live import Subscriber
-from tests.daemon.fakes import sound
+from tests.daemon.fakes import Clock, sound
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.session.learning import last_kept
 from tests.kit.messages import decode_tactile, decode_verdict
@@ -59,10 +58,11 @@ class Reference:
 
         With a judge of its own: to the one before it a row that it has had is an old one.
         """
-        pipeline = assembly.build_pipeline(Plan.of(self._scene), self._model, learns=False)
+        plan, clock = Plan.of(self._scene), Clock()
+        pipeline = assembly.build_pipeline(plan, self._model, clock, learns=False)
         assert pipeline.session is not None
         pipeline.session.restore(self._statistics)
-        assessment = pipeline.judge(sound(counts, time.monotonic_ns())).assessment
+        assessment = pipeline.judge(sound(counts, clock())).assessment
         if assessment is not None:
             self.trust.lifts.note(grasp, assessment.features, stable=stable)
 
@@ -106,9 +106,10 @@ class Bench:
 
     def _seed_session(self) -> None:
         """Statistics that stay what they are: a grasp is then the same whenever it is judged."""
-        pipeline = assembly.build_pipeline(Plan.of(self._scene), assembly.load_model(self._scene))
+        plan, model, clock = Plan.of(self._scene), assembly.load_model(self._scene), Clock()
+        pipeline = assembly.build_pipeline(plan, model, clock)
         for row in read_rows(DEMO_TABLE, self._scene.hand.fingers):
-            pipeline.judge(sound(row.counts, time.monotonic_ns()))
+            pipeline.judge(sound(row.counts, clock()))
         assert pipeline.session is not None
         with SessionFolder(self._scene.session_path) as folder:
             folder.save([KeptSession(pipeline.session.state(), self._scene.hand.fingers, {})])
