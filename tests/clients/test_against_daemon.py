@@ -27,6 +27,7 @@ def test_a_python_client_lifts_a_settled_grasp_either_way(tmp_path: Path) -> Non
     ):
         wait_until(lambda: bool(asking.may_i_lift(0.5)))
         wait_until(lambda: bool(listening.verdict(0.1)))
+        wait_until(lambda: bool(unanswered.verdict(0.1)))
         answer = unanswered.may_i_lift(0.2)
         # Before it, what the hand does by now on a slow machine.
         assert (bool(answer), answer.verdict.reasons[-1]) == (False, "no-answer")
