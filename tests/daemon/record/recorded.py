@@ -155,8 +155,8 @@ def _tell(lab: Lab, seen: list[Verdict], controller: zmq.Socket[bytes]) -> None:
 
 
 def is_offer(verdict: Verdict) -> bool:
-    """Whether a hand may lift on it: the peer that is answered so may tell outcomes."""
-    return verdict.verdict == "stable" or verdict.supervised
+    """Whether a hand may lift on it unwatched: the peer that is answered so may tell outcomes."""
+    return verdict.verdict == "stable"
 
 
 def answer_to(text: bytes, controller: zmq.Socket[bytes]) -> bytes:
