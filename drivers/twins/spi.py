@@ -102,6 +102,7 @@ class SpiTwin(Opened):
         self.injected_in_sweeps: Counter[str] = Counter()
         """Number of faults that hit sweeps, by name."""
         self._clock = clock
+        self._tick_hz = TICK_HZ
         self._tap = tap
         self._parser = FrameParser(DIGEST)
         self._master: int | None = None
@@ -265,7 +266,7 @@ class SpiTwin(Opened):
     def _tick(self, host_ns: int) -> int:
         if self._faults.stuck_clock:
             return 0
-        return max((host_ns - self._boot_ns) * TICK_HZ // 1_000_000_000, 0)
+        return max((host_ns - self._boot_ns) * self._tick_hz // 1_000_000_000, 0)
 
     def _hello(self, nonce: int) -> Hello:
         return Hello(

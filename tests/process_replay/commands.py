@@ -124,7 +124,8 @@ _MASKS: Final = (
     (r'"boot_id": ?"[0-9a-f]{32}"', '"boot_id": *'),
     (r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d, \d+ minutes ago", "*"),
     (
-        r"\b(graspd|Python|libzmq|onnxruntime|numpy|pyzmq|python-can|pyserial) [0-9.]+( at \S+)?",
+        r"\b(graspd|Python|libzmq|onnxruntime|numpy|pyzmq|python-can|pyserial)"
+        r" [0-9][\w.+]*( at \S+)?",
         r"\1 *",
     ),
     (r"(?<=  arm  )\S{40}", "*"),

@@ -154,7 +154,7 @@ def test_a_value_may_look_like_an_option_behind_two_dashes() -> None:
 
 def test_the_version_tells_what_graspd_stands_on() -> None:
     first, second = graspd("--version").stdout.splitlines()
-    assert re.fullmatch(rf"graspd {version('graspd')}( at \S+)?", first)
+    assert re.fullmatch(rf"graspd {re.escape(version('graspd'))}( at \S+)?", first)
     told = dict(part.rsplit(" ", 1) for part in second.split(", "))
     assert told.pop("Python") == ".".join(map(str, sys.version_info[:3]))
     assert told.pop("libzmq") == zmq.zmq_version()
