@@ -92,7 +92,7 @@ Told = tuple[str, str, Spread | None]
 
 
 def told_of_models(page: str) -> Iterator[Told]:
-    """Yield F1 of each model in the tables of a page, but for means over seeds, as in RESULTS."""
+    """Yield F1 of each model in a page's tables, without means over seeds, which RESULTS has."""
     of_seeds = {row["`cv`"].partition(" (s.e.")[0] for row in section(2)[0]}
     for table in tables(PAGES[page]):
         for row in table:

@@ -191,12 +191,12 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     model, pipeline = parts.model, parts.pipeline
     shown: Printer | DayTable
     if _shows_table(args, source, parts):
-        shown = _day_table(args, model)
+        shown = _day_table(args, parts)
         told: list[Companion] = [shown]
     else:
         shown = Printer(as_json=args.json)
         if isinstance(source, Tables):
-            (shown.result.trained_on,) = trained_on(args.recordings, [model], args.read_as)
+            (shown.result.trained_on,) = trained_on(parts.plan.layouts, [model])
         told = [shown]
     why = Unjudged(complain)
     controller = Controller(only_lifted=args.only_lifted)
@@ -240,12 +240,12 @@ def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool
     return parts.plan.mode == "every" and not parts.plan.without_outcomes
 
 
-def _day_table(args: argparse.Namespace, model: TactileModel) -> DayTable:
-    published = TactileModel(zoo.find(PUBLISHED))
+def _day_table(args: argparse.Namespace, parts: Parts) -> DayTable:
+    model, published = parts.model, TactileModel(zoo.find(PUBLISHED))
     names = ", ".join(path.name for path in args.recordings)
     title = DEMO_TITLE if args.recordings == [DEMO_DAY] else f"Grasps of {printable(names)}."
     warnings = []
-    known = trained_on(args.recordings, [model, published], args.read_as)
+    known = trained_on(parts.plan.layouts, [model, published])
     for which, tables in zip(("the model", "the published network"), known, strict=True):
         if tables:
             warnings.append(trained_on_line(which, tables.values()))

@@ -248,7 +248,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.Replay
     if refused:
         why = ", ".join(f"{reason} {count}" for reason, count in refused.most_common())
         write_lines(f"  nothing was learned from readings that were not judged: {why}")
-    (known,) = trained_on(played.recordings, [model], played.read_as)
+    (known,) = trained_on(plan.layouts, [model])
     if known:
         which = ", ".join(known.values())
         complain(

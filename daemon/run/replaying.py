@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graspd.biotac import ELECTRODES, Finger
+from graspd.biotac import ELECTRODES
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
 from graspd.daemon.publish.messages import OBJECT_PATTERN
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.drivers.recordings.csv_rows import read_rows
-from graspd.drivers.recordings.kinds import Kind, kind_of
-from graspd.drivers.recordings.layout import ReadAs, layout_of
+from graspd.drivers.recordings.layout import Layout
 from graspd.models import known_grasps
 from graspd.models.runtime import TactileModel
 
@@ -80,19 +78,22 @@ def _sent(object_name: str | None) -> str | None:
 
 
 def trained_on(
-    recordings: Sequence[Path], models: Sequence[TactileModel], read_as: ReadAs | None = None
+    layouts: Mapping[Path, Layout], models: Sequence[TactileModel]
 ) -> list[dict[str, str]]:
     """Return for each model those recordings that have grasps which it was trained on.
 
-    The name of each comes with what is known of it, as text. Such a table is known under any name.
-    All models judge the same fingers. Raises `RecordingError` and `ModelError`.
+    `layouts`: of the recordings, as of a `Plan`. The name of each recording comes with what is
+    known of it, as text. A table is known under any name. All models judge the same fingers.
+    Raises `RecordingError` and `ModelError`.
     """
     known = [known_grasps.of_model(model) for model in models]
     found: list[dict[str, str]] = [{} for _ in models]
-    for path in recordings:
-        if read_as == "stream" or kind_of(path) is not Kind.TEXT:
+    fingers = models[0].contract.fingers
+    for path, layout in layouts.items():
+        if layout.is_stream:
             continue  # sweeps are no grasps
-        counts = _grasps_of(path, models[0].contract.fingers, read_as)
+        rows = [row.counts for row in read_rows(path, fingers, layout=layout)]
+        counts = np.array(rows, np.uint16).reshape(-1, len(fingers), ELECTRODES)
         grasps = known_grasps.hashes(counts)
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -103,12 +104,3 @@ def trained_on(
             if trained:
                 of_model[path.name] = f"{trained} of {len(counts)} grasps of {path.name}"
     return found
-
-
-def _grasps_of(path: Path, fingers: Sequence[Finger], read_as: ReadAs | None) -> NDArray[np.uint16]:
-    """Return the counts of a table, shape (N, fingers, 24); those of a stream are no grasps."""
-    layout = layout_of(path, fingers, read_as)
-    rows = (
-        [] if layout.is_stream else [row.counts for row in read_rows(path, fingers, layout=layout)]
-    )
-    return np.array(rows, np.uint16).reshape(-1, len(fingers), ELECTRODES)

@@ -181,7 +181,7 @@ def asked(folder: Path, text: str, *options: str) -> CompletedProcess[str]:
 
 
 def look(folder: Path, text: str) -> list[dict[str, str]]:
-    """What the doctor says is wrong, but for a twin that is slow, as on a busy computer."""
+    """Return the doctor's findings without `slow`: a busy computer slows the twin."""
     result = asked(folder, text, "--json")
     told = [f for f in json.loads(result.stdout)["findings"] if f["level"] != "ok"]
     assert result.returncode == int("error" in {finding["level"] for finding in told})

@@ -231,7 +231,7 @@ def processes() -> list[int]:
 
 
 def halt(process: int) -> None:
-    """Stop a child by SIGSTOP, and return once none of its threads runs."""
+    """Send SIGSTOP to a child, and wait until all its threads have stopped."""
     os.kill(process, signal.SIGSTOP)
     os.waitid(os.P_PID, process, os.WSTOPPED | os.WNOWAIT)
 
