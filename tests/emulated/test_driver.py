@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
@@ -47,35 +48,56 @@ def write_counts(path: Path, rows: Sequence[Counts]) -> Path:
     return path
 
 
+class ListeningTwin(SpiTwin):
+    """Counts what it hears: a pseudo-terminal hands bytes over when the kernel has time for it."""
+
+    heard = 0
+
+    def _hear(self, data: bytes) -> None:
+        self.heard += len(data)
+        super()._hear(data)
+
+
+def wait_for_greeting(path: Path) -> None:
+    """Until the greeting has arrived: one that comes after the driver opens is counted twice."""
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    assert select.select([descriptor], [], [], PATIENCE_S)[0]
+    os.close(descriptor)
+
+
 def read_from_a_twin(path: Path, rows: Sequence[Counts]) -> list[TactileReading]:
     """What the driver makes of a twin on this computer, whose time passes as fast as it can."""
     clock = Clock(EPOCH_NS)
     readings: list[TactileReading] = []
     sent: list[int] = []
-    said: list[bytes] = []
+    said: list[int] = []
 
     def note(event: LineEvent, data: bytes) -> None:
         if event is LineEvent.OPENED:
             sent.clear()  # opening throws away what had come before
         elif event is LineEvent.SENT:
-            said.append(data)
+            said.append(len(data))
 
-    twin = SpiTwin(path, rows, clock=clock, tap=lambda data: sent.append(len(data)))
+    twin = ListeningTwin(path, rows, clock=clock, tap=lambda data: sent.append(len(data)))
     driver = SpiBridgeDriver(str(path), FINGERS, clock=clock)
     driver.tap(note)
-    with twin, driver:
-        while len(readings) < SWEEPS:
-            twin.run_once(PATIENCE_S if said else 0.0)
-            said.clear()
-            readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
-            while driver.counters.bytes < sum(sent):
-                descriptor = driver.fileno()
-                assert descriptor is not None
-                assert select.select([descriptor], [], [], PATIENCE_S)[0]
+    with twin:
+        wait_for_greeting(path)
+        with driver:
+            while len(readings) < SWEEPS:
+                twin.run_once()
+                while twin.heard < sum(said):
+                    twin.run_once(PATIENCE_S)
+                answered = len(said)
                 readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
-            if not said:
-                due_ns = [due for due in (twin.due_ns(), driver.due_ns()) if due is not None]
-                clock.now_ns = max(min(due_ns), clock.now_ns)
+                while driver.counters.bytes < sum(sent):
+                    descriptor = driver.fileno()
+                    assert descriptor is not None
+                    assert select.select([descriptor], [], [], PATIENCE_S)[0]
+                    readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
+                if len(said) == answered:
+                    due_ns = [due for due in (twin.due_ns(), driver.due_ns()) if due is not None]
+                    clock.now_ns = max(min(due_ns), clock.now_ns)
     return readings
 
 
