@@ -10,6 +10,7 @@ from __future__ import annotations
 import random
 import threading
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -97,6 +98,8 @@ class Bench:
         }
         self._counts: dict[int, NDArray[np.uint16]] = {}
         self._known: dict[GraspId, tuple[NDArray[np.uint16], bool]] = {}
+        self._not_lifted: list[GraspId] = []
+        """Offers that were on the disk when the daemon was killed."""
         self._client = stack.enter_context(
             Client(f"ipc://{folder}/graspd", ask_endpoint=f"ipc://{folder}/ask", max_age_ms=1e4)
         )
@@ -122,6 +125,7 @@ class Bench:
             said = self._client.verdict(0.05)
             self._hear()
             grasp = GraspId(said.boot_id or "", said.grasp or 0)
+            self._leave_lifts(said)
             if grasp == former or grasp not in self._known:
                 if self._process.poll() is not None:
                     self._look_and_start_again()
@@ -167,7 +171,20 @@ class Bench:
             # It counts, however long the next start takes, and whether it is known then.
             self._reference.trust.restore(more.trust.state())
         self._process.communicate(timeout=TIMEOUT_S)
+        self._not_lifted = [lift.id for lift in kept.lifts.records if lift.is_awaited]
         self._start()
+
+    def _leave_lifts(self, said: Verdict) -> None:
+        """Report that no lift followed an offer which a kill cut off.
+
+        Without an outcome it would count as a slip once it leaves the book.
+        """
+        while self._not_lifted and self._process.poll() is None:
+            boot_id, grasp = self._not_lifted[0]
+            offer = replace(said, boot_id=boot_id, grasp=grasp)
+            answer = self._client.tell(offer, Outcome.NOT_LIFTED, wait_s=ANSWER_S)
+            if answer or answer.why.startswith("unknown"):
+                del self._not_lifted[0]
 
     def _differs(self, kept: TrustState) -> str:
         mine = self._reference.trust.state()
