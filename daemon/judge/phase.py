@@ -33,7 +33,7 @@ GAP = Transition((SETTLED, JUDGED), "readings are missing", CLOSING, Cause.GAP)
 OPENED = Transition((CLOSING, SETTLED, JUDGED), "nothing touches", RELEASED, Cause.CONTACT_LOST)
 FORGOTTEN = Transition((RELEASED,), "nothing touches for 100 ms", IDLE, Cause.TIME)
 TRANSITIONS = TOUCHED, STILL, ANSWERED, SURE, MOVED, CHANGED, LET_GO, GAP, OPENED, FORGOTTEN
-"""All of them, as deploy/JUDGING.md shows them."""
+"""All of them, as deploy/wire/README.md shows them."""
 
 
 class Phase:
@@ -57,7 +57,7 @@ class Phase:
 
 
 def lines() -> Iterator[str]:
-    """Yield the transitions as a table of Markdown, for deploy/JUDGING.md."""
+    """Yield the transitions as a table of Markdown, for deploy/wire/README.md."""
     yield "| from | when | to | `cause` |"
     yield "|---|---|---|---|"
     for states, when, to, cause in TRANSITIONS:

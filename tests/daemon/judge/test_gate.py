@@ -353,8 +353,8 @@ def check_chain(changes: list[GateChange]) -> None:
         state = change.state
 
 
-def test_the_page_on_judging_has_all_transitions() -> None:
-    page = (ROOT / "deploy" / "JUDGING.md").read_text()
+def test_the_wire_page_has_all_transitions() -> None:
+    page = (ROOT / "deploy" / "wire" / "README.md").read_text()
     assert "\n".join(phase.lines()) in page
 
 
