@@ -139,6 +139,7 @@ def cpp_client(code: str, folder: Path) -> list[str]:
     return [str(binary)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("language", "made"), [("python", python_client), ("cpp", cpp_client)])
 def test_the_program_of_the_clients_page_lifts(
     language: str, made: Callable[[str, Path], list[str]], tmp_path: Path

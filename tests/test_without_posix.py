@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from graspd.drivers.recordings.csv_player import DEMO_DAY
-from tests.daemon.processes import GRASPD, TIMEOUT_S, start
+from tests.daemon.processes import TIMEOUT_S, start
+from tests.kit.inside import graspd
 from tests.ports import free_port
 
 WITHOUT = (sys.executable, str(Path(__file__).with_name("without_posix.py")))
@@ -25,6 +26,22 @@ grasps = graspd.read_grasps({str(GRASPS)!r})
 model = graspd.load("small-session")
 print(model.predict_proba(grasps, session=grasps).tolist())
 print(sum(verdict.judged for verdict in graspd.judge({str(GRASPS)!r})))
+"""
+SAID_OF = """
+import contextlib, io, json, logging
+from graspd.daemon import cli
+
+said = []
+for line in lines:
+    logging.getLogger().handlers = []
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = cli.main(line.split())
+        except SystemExit as left:
+            code = left.code
+    said.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(said))
 """
 TIMES = re.compile(r"in [0-9.]+ s| +[0-9]+ us")
 """What differs from run to run."""
@@ -46,16 +63,23 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def without(*arguments: object, program: Sequence[str] = WITHOUT) -> tuple[int, str, str]:
+def without(*arguments: object) -> tuple[int, str, str]:
     """Run graspd without POSIX; return exit code, stdout without times, and stderr."""
     done = subprocess.run(
-        [*program, *map(str, arguments)],
+        [*WITHOUT, *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=TIMEOUT_S,
         check=False,
     )
     return done.returncode, TIMES.sub("", done.stdout), done.stderr
+
+
+def said_of(*lines: str) -> list[tuple[int, str, str]]:
+    """Return exit code, stdout without times, and stderr of each command without POSIX."""
+    _, out, _ = without("-c", f"lines = {lines!r}\n{SAID_OF}")
+    found: list[tuple[int, str, str]] = json.loads(out)
+    return found
 
 
 def test_only_what_needs_linux_is_not_imported() -> None:
@@ -66,46 +90,40 @@ def test_only_what_needs_linux_is_not_imported() -> None:
     assert set(refused.split()) == expected
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
+def test_commands_print_the_same(short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(short)
+    lines = (
         f"replay {GRASPS.name} --verbose",
         f"replay {STREAM.name}",
         "models",
         "models small-session",
         f"check {SCENES / 'demo.toml'}",
         "scene --example can",
-    ],
-)
-def test_commands_print_the_same(line: str, short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(short)
-    code, out, problem = without(*line.split())
-    assert code == 0, problem
-    assert out == without(*line.split(), program=GRASPD)[1]
+    )
+    for line, (code, out, problem) in zip(lines, said_of(*lines), strict=True):
+        assert code == 0, problem
+        assert out == TIMES.sub("", graspd(*line.split()).stdout)
 
 
-def test_library_judges_the_same() -> None:
+def test_library_judges_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, problem = without("-c", JUDGE)
     assert code == 0, problem
-    assert out == without("-c", JUDGE, program=(sys.executable,))[1]
+    exec(JUDGE, {})
+    assert out == capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
+def test_what_needs_linux_says_so() -> None:
+    for code, out, problem in said_of(
         "run demo.toml",
         "doctor demo.toml",
         "keys --help",
         "replay --publish tcp://127.0.0.1:1",
         f"session reset {SCENES / 'spi.toml'}",
-    ],
-)
-def test_what_needs_linux_says_so(line: str) -> None:
-    code, out, problem = without(*line.split())
-    assert (code, out) == (2, "")
-    assert problem.startswith("graspd: ")
-    assert problem.endswith(" needs Linux\n")
-    assert problem.count("\n") == 1
+    ):
+        assert (code, out) == (2, "")
+        assert problem.startswith("graspd: ")
+        assert problem.endswith(" needs Linux\n")
+        assert problem.count("\n") == 1
 
 
 def test_page_is_served_until_interrupted() -> None:
@@ -118,6 +136,7 @@ def test_page_is_served_until_interrupted() -> None:
         assert watch.wait(TIMEOUT_S) == 0
 
 
+@pytest.mark.slow
 def test_model_is_trained_and_tried(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the extra `train`")
     words = ("--own", GRASPS, "--folds", 2, "--only", "cv", "--quiet", "--out", tmp_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 
 import pytest
 
@@ -12,30 +11,8 @@ from tests.bench.attacks.doors import Outcome, Plan
 from tests.conftest import ROOT
 
 
-def attack(*, held: bool) -> Callable[[Plan], Outcome]:
-    def run(plan: Plan) -> Outcome:
-        rounds = sum(1 for _ in plan.rounds())
-        assert plan.folder.is_dir()
-        return Outcome(rounds, "nothing", held)
-
-    return run
-
-
 def raises(_plan: Plan) -> Outcome:
     raise OSError("the door is gone")
-
-
-@pytest.mark.parametrize("held", [True, False])
-def test_what_does_not_hold_is_said(
-    held: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(ATTACKS, "one", attack(held=True))
-    monkeypatch.setitem(ATTACKS, "two", attack(held=held))
-    only = ["--only", "one", "--only", "two"]
-    assert main([*only, "--minutes", "0"]) == (0 if held else 1)
-    printed = capsys.readouterr().out
-    assert "| `one` | 1 | nothing | yes |" in printed
-    assert ("**no**" in printed) is not held
 
 
 def test_an_attack_that_cannot_be_made_has_not_held(

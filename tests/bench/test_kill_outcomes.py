@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from deploy.clients.python.graspd_client import Client, Outcome, Verdict
@@ -225,6 +226,7 @@ class Bench:
         self._process.communicate(timeout=TIMEOUT_S)
 
 
+@pytest.mark.slow
 def test_no_acknowledged_outcome_is_lost_by_a_kill(tmp_path: Path) -> None:
     with ExitStack() as stack:
         bench = Bench(tmp_path, 7, stack)

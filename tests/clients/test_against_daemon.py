@@ -17,6 +17,8 @@ from tests.clients.bench import Daemon, free_endpoint
 from tests.clients.building import asked
 from tests.kit.waiting import wait_until
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_python_client_lifts_a_settled_grasp_either_way(tmp_path: Path) -> None:
     with (

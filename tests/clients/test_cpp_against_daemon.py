@@ -17,6 +17,8 @@ from tests.clients.bench import Daemon, free_endpoint
 from tests.clients.building import asked, sleep_at_will
 from tests.clients.messages import frames, verdict
 
+pytestmark = pytest.mark.slow
+
 MAY, MAY_NOT, WRONG = 0, 1, 2
 """Exit codes of `lift_gate`."""
 

@@ -13,6 +13,8 @@ import pytest
 
 from tests.clients.building import CPP, asked, skip_unless_it_can_be_compiled
 
+pytestmark = pytest.mark.slow
+
 README = (CPP.parent / "README.md").read_text()
 PROGRAM = "lift_gate"
 

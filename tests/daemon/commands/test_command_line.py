@@ -16,8 +16,8 @@ import zmq
 from graspd.daemon.cli import COMMANDS, LIBRARIES, whole_parser
 from tests.conftest import ROOT
 from tests.daemon.commands.shell_files import parsers
-from tests.daemon.processes import GRASPD, graspd
-from tests.kit import inside
+from tests.daemon.processes import GRASPD
+from tests.kit.inside import graspd
 from tests.kit.scenes import written
 
 EXTRAS = (
@@ -82,7 +82,7 @@ def test_a_scene_that_plays_mcap_without_its_reader_is_refused(
     monkeypatch.setitem(sys.modules, "mcap", None)
     (tmp_path / "run").write_bytes(b"\x89MCAP0\r\n")
     scene = written(tmp_path, '[tactile]\ndriver = "replay"\nrecordings = ["run"]\n')
-    done = inside.graspd(command, scene)
+    done = graspd(command, scene)
     assert done.returncode == 2
     assert done.stderr.startswith("graspd: replaying MCAP needs the package 'mcap': run ")
 
@@ -93,7 +93,7 @@ def test_a_bag_without_its_reader_is_refused(
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     path = tmp_path / "hand.bag"
     path.write_bytes(b"#ROSBAG V2.0\n")
-    done = inside.graspd("replay", path)
+    done = graspd("replay", path)
     assert done.returncode == 2
     assert done.stderr.startswith(
         f"graspd: {path}: reading a ROS bag needs the package 'rosbags': run "

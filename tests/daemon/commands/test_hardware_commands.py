@@ -22,6 +22,8 @@ from tests.kit.messages import decode_tactile, decode_verdict
 from tests.kit.scenes import written
 from tests.ports import can_id, free_port, multicast_group
 
+pytestmark = pytest.mark.slow
+
 WANTED = 150
 """Readings to wait for, of the 200 rows of the recording."""
 

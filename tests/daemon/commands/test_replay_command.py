@@ -23,7 +23,8 @@ from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.clients.building import sleep_at_will
-from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, start, wait_for
+from tests.kit.inside import graspd
 from tests.kit.messages import decode_verdict
 from tests.kit.scenes import unlabelled_demo
 
@@ -236,7 +237,7 @@ def test_memory_does_not_grow_with_the_length_of_the_file(tmp_path: Path) -> Non
     header, *rows = DEMO_TABLE.read_text().splitlines(keepends=True)
     short, long = tmp_path / "short.csv", tmp_path / "long.csv"
     short.write_text(header + "".join(rows))
-    long.write_text(header + "".join(rows) * 50)  # 10,000 grasps, 3.7 MB
+    long.write_text(header + "".join(rows) * 15)  # 3,000 grasps, 1.1 MB
     assert peak_memory_kib(long) - peak_memory_kib(short) < 2048
 
 
