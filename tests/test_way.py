@@ -51,7 +51,7 @@ def told() -> list[str]:
     """The files that the page names, in its order."""
     page = (ROOT / "deploy" / "ARCHITECTURE.md").read_text()
     section = page.split("## The way of a reading")[1].split("\n## ")[0]
-    return re.findall(r"^\| `([a-z0-9_/]+\.py)` \|", section, re.MULTILINE)
+    return re.findall(r"^- `([a-z0-9_/]+\.py)`: ", section, re.MULTILINE)
 
 
 def rounds_of(file: Path) -> list[list[Call]]:

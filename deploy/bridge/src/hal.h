@@ -12,13 +12,14 @@
 extern "C" {
 #endif
 
-/* Microseconds since reset. Never goes back, never wraps. */
+/* Microseconds since reset, by a crystal. Never goes back, never wraps. */
 uint64_t hal_ticks_us(void);
 
 /* Wait at least this long; a little longer does no harm. */
 void hal_delay_us(uint32_t us);
 
-/* Pull low the chip selects of the sensors whose bits are set, let go of all others. */
+/* Pull low the chip selects of the sensors whose bits are set, let go of all others: all at once,
+ * so that the sensors sample together. */
 void hal_select(uint8_t sensors);
 
 /* Send one byte, give the byte that came back. SPI mode 0, most significant bit first, 0.5 to 10
