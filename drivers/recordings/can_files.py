@@ -85,6 +85,16 @@ def read_trc(lines: Iterable[str]) -> Iterator[Line]:
             yield number, text, _logged(message, text, first_channel=1)
 
 
+def read_csv(lines: Iterable[str]) -> Iterator[Line]:
+    """Yield frames of a CSV file of python-can, which has one bus, and strange lines."""
+    for number, text in enumerate(lines, 1):
+        if number > 1 and text.strip():
+            message = _message(can.CSVReader, ["", text])
+            if message is not None:
+                message.channel = 0
+            yield number, text, _logged(message, "")
+
+
 def read_blf(stream: BinaryIO) -> Iterator[Line]:
     """Yield frames of a BLF file, and where it is damaged; what follows cannot be found."""
     number = 0
@@ -147,6 +157,9 @@ class _Lines:
 
     def __iter__(self) -> Iterator[str]:
         return self._lines
+
+    def __next__(self) -> str:
+        return next(self._lines)
 
     def close(self) -> None:
         """Do nothing; the file is closed by its owner."""

@@ -15,14 +15,15 @@ from graspd.drivers.base import Reading, RecordingError
 from graspd.drivers.can.frames import ERR_FLAG, ERROR, EXTENDED, LOST, REMOTE, CanFrame, Stamped
 from graspd.drivers.can.stream import BoardOptions, CanStream
 from graspd.drivers.link import LinkState
-from graspd.drivers.recordings.can_files import read_asc, read_blf, read_trc
+from graspd.drivers.recordings.can_files import read_asc, read_blf, read_csv, read_trc
 from graspd.drivers.recordings.candump import ANY_BUS, NO_BUS, NS_PER_S, Line, read_candump
 from graspd.drivers.recordings.kinds import (
+    HEAD_BYTES,
     LINE_LENGTH_MAX,
     PAGE,
     Kind,
+    encoding_of,
     kind_of,
-    marked_encoding,
     open_recording,
     reason,
 )
@@ -40,7 +41,12 @@ SET_BACK_NS: Final = 1_000_000_000
 STEPS_SHARE: Final = 0.5
 """Falls of the time for each rise, from which on times are steps, which fall as often as rise."""
 
-_TEXTS: Final = {Kind.CANDUMP: read_candump, Kind.ASC: read_asc, Kind.TRC: read_trc}
+_TEXTS: Final = {
+    Kind.CANDUMP: read_candump,
+    Kind.ASC: read_asc,
+    Kind.TRC: read_trc,
+    Kind.CSV: read_csv,
+}
 
 _log = logging.getLogger(__name__)
 
@@ -89,7 +95,7 @@ def read_log(path: Path) -> Iterator[Line]:
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
     """Yield lines of text in any encoding; a line that is too long comes in pieces."""
-    encoding = marked_encoding(stream.read(3)) or "latin-1"
+    encoding = encoding_of(stream.read(HEAD_BYTES)) or "latin-1"
     stream.seek(0)
     with io.TextIOWrapper(stream, encoding, errors="replace") as text:
         while line := text.readline(LINE_LENGTH_MAX):

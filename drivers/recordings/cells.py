@@ -5,19 +5,21 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator
-from itertools import chain
+from collections.abc import Iterator, Sequence
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from graspd.biotac import FINGERS
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.columns import has_electrodes
+from graspd.drivers.recordings.columns import has_electrodes, with_units
 from graspd.drivers.recordings.kinds import (
+    HEAD_BYTES,
     LINE_LENGTH_MAX,
     TABLES,
     Kind,
+    encoding_of,
     kind_of_open,
-    marked_encoding,
     reason,
 )
 from graspd.extras import needs
@@ -25,13 +27,16 @@ from graspd.extras import needs
 _SEPARATORS: Final = ",;\t|"
 _SEPARATOR_LINE: Final = re.compile(r"sep=(.)", re.IGNORECASE)
 """First line by which a spreadsheet tells the separator."""
+TITLE_LINES_MAX: Final = 30
+"""Most lines above the header, blank ones apart."""
 
 
 class Cells:
     """The header of a file, and its rows. Iterate once.
 
     Lines that are blank or begin with `#` are no rows, and empty cells after those of the header
-    are left out. A header may stand in the last comment. The constructor and iterating raise
+    are left out. Above the header may be titles and comments, of which it may be the last; fingers
+    may stand above their electrodes, and units below. The constructor and iterating raise
     `RecordingError`.
     """
 
@@ -49,10 +54,10 @@ class Cells:
         kind = kind_of_open(path, file)
         if kind not in TABLES:
             raise RecordingError(path, f"is {kind.value}, not a table or stream")
+        self.header_line = 1
         self._rows = self._parquet(file) if kind is Kind.PARQUET else self._text(file)
         self.names = [name.strip() for name in next(self._rows)]
         """The header."""
-        self.header_line = self.line
         while self.names and not self.names[-1]:
             self.names.pop()
 
@@ -77,36 +82,60 @@ class Cells:
 
     def _text(self, file: BinaryIO) -> Iterator[list[str]]:
         lines = self._lines(file)
-        comment, separator, first = "", None, ""
-        for line in lines:
-            text = line.strip()
-            if text.startswith("#"):
-                comment = text.lstrip("# ")
-            elif self.line == 1 and (match := _SEPARATOR_LINE.fullmatch(text)):
-                separator = match[1]
-            elif text:
-                first = line
-                break
-        if not first:
-            raise RecordingError(self._path, "the file is empty")
-        if comment and has_electrodes(_split(comment)) and not has_electrodes(_split(first)):
-            lines = chain([first], lines)
-            first = comment
-        separator = separator or _separator(first)
+        separator, header, below = self._header(lines)
         self.decimal_comma = separator != ","
         self._length = 0
         rows = csv.reader(
-            chain([first], self._row_lines(lines, separator, first.count(separator))),
+            chain(header, self._row_lines(below, separator, header[-1].count(separator))),
             delimiter=separator,
             skipinitialspace=True,
             strict=True,
         )
         try:
+            names = next(rows)
+            if len(header) > 1:
+                names = _merged(names, next(rows))
+            first = next(rows, [])
+            units = with_units(names, first)
+            self._length = 0
+            yield units or names
+            if units is None:
+                yield first
             for cells in rows:
                 self._length = 0
                 yield cells
         except csv.Error as error:
             raise self.error(f"this is not CSV: {error}") from error
+
+    def _header(self, lines: Iterator[str]) -> tuple[str, list[str], Iterator[str]]:
+        """Return the separator, one line of the header or two, and the lines below.
+
+        Without electrodes in one of the first lines it is the first.
+        """
+        separator, comment, above, titles = "", "", "", list[tuple[int, str]]()
+        header, below = list[str](), list[str]()
+        while not header and len(titles) < TITLE_LINES_MAX and (line := next(lines, "")):
+            text = line.strip()
+            if self.line == 1 and (match := _SEPARATOR_LINE.fullmatch(text)):
+                separator = match[1]
+            elif text.startswith("#"):
+                comment = text.lstrip("# ")
+            elif text:
+                if _names_fingers(above) and has_electrodes(_merged(_split(above), _split(text))):
+                    header = [above, line]
+                elif has_electrodes(_split(text)):
+                    header = [line]
+                elif has_electrodes(_split(comment)):
+                    header, below = [comment], [line]
+                titles.append((self.line, line))
+                above = line
+        if not titles:
+            raise RecordingError(self._path, "the file is empty")
+        self.header_line = self.line
+        if not header:
+            self.header_line, first = titles[0]
+            header = [first]
+        return separator or _separator(header[-1]), header, chain(below, lines)
 
     def _row_lines(self, lines: Iterator[str], separator: str, number: int) -> Iterator[str]:
         """Yield lines without comments; a row of several lines is as long as a line may be.
@@ -129,10 +158,10 @@ class Cells:
 
     def _lines(self, file: BinaryIO) -> Iterator[str]:
         """Yield the lines of text with their ends: line feed, carriage return or both."""
-        encoding = marked_encoding(file.read(3)) or "utf-8"
+        encoding = encoding_of(file.read(HEAD_BYTES)) or "utf-8"
         file.seek(0)
         # A byte that is not UTF-8 becomes a surrogate, so that its line is known.
-        errors = "strict" if encoding == "utf-16" else "surrogateescape"
+        errors = "surrogateescape" if encoding.startswith("utf-8") else "strict"
         text = io.TextIOWrapper(file, encoding, errors, newline="")
         try:
             while line := text.readline(LINE_LENGTH_MAX + 1):
@@ -178,3 +207,17 @@ def _separator(header: str) -> str:
 
 def _split(text: str) -> list[str]:
     return [cell.strip(' "') for cell in text.strip().split(_separator(text))]
+
+
+def _names_fingers(line: str) -> bool:
+    return not {cell.lower() for cell in _split(line)}.isdisjoint(FINGERS)
+
+
+def _merged(above: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return names with the finger above them; one counts until the next."""
+    merged, finger = list[str](), ""
+    for top, name in zip_longest(above, names, fillvalue=""):
+        finger = top.strip() or finger
+        both = f"{finger}_{name.strip()}"
+        merged.append(both if has_electrodes([both]) else name or top)
+    return merged

@@ -18,35 +18,54 @@ TIME: Final = "t"
 OBJECT: Final = "object"
 SLIPPED: Final = "slipped"
 
-_HAND: Final = r"(?:[rl]h_)?(?P<finger>ff|mf|rf|lf|th)"
+_BETWEEN: Final = r"[_ ./\[-]*"
+_HAND: Final = rf"(?:.*[./])?(?:[rl]h_)?(?P<finger>ff|mf|rf|lf|th){_BETWEEN}"
+_ELECTRODE: Final = rf"e(?:le(?:c(?:trode)?)?)?{_BETWEEN}"
+_NUMBER: Final = r"(?P<number>\d+)[\]_]?"
 SCHEMES: Final[Mapping[str, re.Pattern[str]]] = {
     example: re.compile(pattern, re.IGNORECASE)
     for example, pattern in {
-        "ff_biotac_1": rf"{_HAND}_biotac_(?P<number>\d+)",
-        "ff_e1": rf"{_HAND}_?e(?P<number>\d+)",
-        "ff_1": rf"{_HAND}_?(?P<number>\d+)",
+        "ff_biotac_1": rf"{_HAND}biotac{_BETWEEN}e?{_NUMBER}",
+        "ff_e1": rf"{_HAND}{_ELECTRODE}{_NUMBER}",
+        "ff_1": rf"{_HAND}{_NUMBER}",
         "field.tactiles0.electrodes0": (
-            r".*tactiles[_\[]?(?P<place>[0-4])\]?[./_]electrodes[_\[]?(?P<number>\d+)\]?"
+            rf".*tactiles{_BETWEEN}(?P<place>[0-4])\]?{_BETWEEN}electrodes{_BETWEEN}{_NUMBER}"
         ),
-        "E1": r"(?:e|electrode_?)(?P<number>\d+)",
+        "field.bt_data0.electrode_data0": (
+            rf".*(?P<sensor>bt_data{_BETWEEN}\d+)\]?{_BETWEEN}electrode_data{_BETWEEN}{_NUMBER}"
+        ),
+        "E1": rf"{_ELECTRODE}{_NUMBER}",
     }.items()
 }
 """Names of electrodes, each scheme by an example; the first that a file has is read. The fourth is
-that of Shadow's message BiotacAll, of ff, mf, rf, lf, th. The last one is of a single finger."""
+that of Shadow's message BiotacAll, of ff, mf, rf, lf, th. The fifth, of BioTacHand, names no
+finger, and the last one is of a single finger."""
 
 _PLACES: Final[Mapping[str, int]] = {finger: place for place, finger in enumerate(FINGERS)}
 _UNIT_S: Final = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec", "msecs", "millis", "milliseconds"), 1e-3),
-    **dict.fromkeys(("us", "usec", "usecs", "micros", "microseconds"), 1e-6),
+    **dict.fromkeys(("us", "\u00b5s", "\u03bcs", "usec", "usecs", "micros", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds"), 1e-9),
 }
 _UNITS: Final = "|".join(sorted(_UNIT_S, key=len, reverse=True))
+_CLOCKS: Final = (
+    "abs|absolute|elapsed|epoch|gps|host|local|log|msg|pc|publish|receive|received|record|recorded"
+    "|recv|rel|relative|ros|rosbag|sample|sensor|sim|sys|system|unix|utc|wall"
+)
+_TIMES: Final = (
+    "t|times?|time[_ ]?stamp|stamp|date[_ ]?time|epoch|elapsed|clock|(?:receiv|record)ed_at"
+    "|zeit|zeitstempel|tiempo|temps"
+)
 _TIME_NAME: Final = re.compile(
-    rf"(?P<before>(?:.*[./])?[%_]*(?:rosbag|log_?)?(?:t|times?|time_?stamp|stamp|date_?time)"
-    rf"[ _./(\[]*)?(?P<unit>{_UNITS})?[)\]]?",
+    rf"(?P<before>(?:.*[./])?[%_]*(?:(?:{_CLOCKS})[._ ]*)?(?:{_TIMES})(?:_utc)?[ _./(\[]*)?"
+    rf"(?P<unit>{_UNITS})?(?:[)\]]|\(\))?",
     re.IGNORECASE,
 )
+_IN_UNIT: Final = re.compile(rf"(?P<before>.*)[(\[](?P<unit>{_UNITS})[)\]]", re.IGNORECASE)
+_UNIT: Final = re.compile(r"\s*[(\[]([^\W\d][^)\]]*|-)[)\]]")
+"""A unit behind the name of a column."""
+UNITS: Final = frozenset((*_UNIT_S, "counts", "count", "raw", "adc", "lsb", "bits", "rad", "deg"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +101,14 @@ class Columns:
         `names`: the header, of this line. Raises `RecordingError` for what is missing or there
         twice.
         """
-        found = _electrodes(path, names, fingers, line)
+        plain = [_UNIT.sub("", name) for name in names]
+        found = _electrodes(path, plain, fingers, line)
         joints: dict[str, int] = {}
-        for place, name in enumerate(names):
+        for place, name in enumerate(plain):
             if joint := joint_name(name):
+                if "deg" in names[place] or "\N{DEGREE SIGN}" in names[place]:
+                    problem = "angles are in degrees: write radians"
+                    raise RecordingError(path, problem, line=line, column=names[place])
                 _refuse_twice(path, names, line, joints.get(joint), place)
                 joints[joint] = place
         time = time_column(names)
@@ -116,7 +139,17 @@ class Columns:
 
 def has_electrodes(names: Sequence[str]) -> bool:
     """Return True for a header with electrodes of some scheme."""
-    return any(scheme.fullmatch(name) for scheme in SCHEMES.values() for name in names)
+    plain = [_UNIT.sub("", name) for name in names]
+    return any(scheme.fullmatch(name) for scheme in SCHEMES.values() for name in plain)
+
+
+def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
+    """Return names with the units of the row below; None if that is a row of something else."""
+    units = [cell.strip("[]()- ") for cell in cells]
+    given = {unit.lower() for unit in units} - {""}
+    if not given or not given <= UNITS:
+        return None
+    return [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=False)]
 
 
 def _electrodes(
@@ -146,8 +179,8 @@ def _finger(match: re.Match[str], fingers: Sequence[str]) -> str:
     groups = match.groupdict()
     if "place" in groups:
         return FINGERS[int(groups["place"])]
-    if "finger" in groups:
-        return groups["finger"].lower()
+    if named := groups.get("finger") or groups.get("sensor"):
+        return named.lower()
     return fingers[0] if len(fingers) == 1 else ""
 
 
@@ -159,22 +192,23 @@ def _whole(
     line: int,
 ) -> dict[str, dict[int, int]]:
     """Return the electrodes by number from 0; raise if a finger that is asked for lacks some."""
-    if "" in found:
+    base = min(1, *(min(numbers) for numbers in found.values()))
+    is_named = found.keys() <= _PLACES.keys()
+    for finger in fingers if fingers and is_named else found:
+        if set(found.get(finger, ())) == set(range(base, base + FORMER_ELECTRODES)):
+            problem = (
+                f"{finger or 'it'} has {FORMER_ELECTRODES} electrodes: a BioTac, which is another "
+                f"sensor than the BioTac SP with {ELECTRODES}; no model of graspd judges it"
+            )
+            raise RecordingError(path, problem, line=line)
+    if not is_named:
         asked = f"{len(fingers)} are" if fingers else "none is"
         problem = f"{example} and so on name no finger, and {asked} asked for: name it, as ff_e1"
         raise RecordingError(path, problem, line=line)
-    base = min(min(numbers) for numbers in found.values())
-    base = min(base, 1)
     there = ", ".join(finger for finger in FINGERS if finger in found)
+    expected = range(base, base + ELECTRODES)
     for finger in fingers or found:
         numbers = found.get(finger, {})
-        expected = range(base, base + ELECTRODES)
-        if set(numbers) == set(range(base, base + FORMER_ELECTRODES)):
-            problem = (
-                f"{finger} has {FORMER_ELECTRODES} electrodes: a BioTac, which is another sensor "
-                f"than the BioTac SP with {ELECTRODES}; no model of graspd judges it"
-            )
-            raise RecordingError(path, problem, line=line)
         missing = [number for number in expected if number not in numbers]
         if missing:
             column = re.sub(r"^ff|(?<=tactiles)0", _written(example, finger), example)
@@ -213,8 +247,11 @@ def _nearest(names: Sequence[str]) -> str:
 
 
 def time_column(names: Sequence[str]) -> TimeColumn | None:
-    """Return the column of times: `t`, else the first with a usual name."""
+    """Return the column of times: `t`, else the first with a usual name, or in a unit of time."""
     found = [(place, match) for place, name in enumerate(names) if (match := _is_time(name))]
+    found = found or [
+        (place, match) for place, name in enumerate(names) if (match := _IN_UNIT.fullmatch(name))
+    ]
     found.sort(key=lambda each: names[each[0]] != TIME)
     if not found:
         return None

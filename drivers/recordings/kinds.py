@@ -31,6 +31,8 @@ LINE_LENGTH_MAX: Final = 65_536
 """Longest line, characters; a full row has 1,200. A disk image may have no line end at all."""
 HEAD_BYTES: Final = 65_536
 """Bytes of a file that decide what it is."""
+HEADER_BYTES: Final = 64
+"""Bytes whose zeros tell UTF-16 without a mark."""
 PAGE: Final = "deploy/RECORDING.md"
 
 
@@ -46,11 +48,12 @@ class Kind(Enum):
     ASC = "a CAN log of Vector (ASC)"
     BLF = "a CAN log of Vector (BLF)"
     TRC = "a CAN log of PEAK (TRC)"
+    CSV = "a CAN log of python-can (CSV)"
     SERIAL = "a serial link log of graspd"
 
 
 TABLES: Final = frozenset((Kind.TEXT, Kind.PARQUET))
-CAN_LOGS: Final = frozenset((Kind.CANDUMP, Kind.ASC, Kind.BLF, Kind.TRC))
+CAN_LOGS: Final = frozenset((Kind.CANDUMP, Kind.ASC, Kind.BLF, Kind.TRC, Kind.CSV))
 BAGS: Final = frozenset((Kind.ROS1_BAG, Kind.ROS2_BAG))
 
 _GZIP: Final = b"\x1f\x8b\x08"
@@ -64,8 +67,14 @@ _MAGIC: Final = {
     b"LOGG": Kind.BLF,
     b";$FILEVERSION": Kind.TRC,
     b";#########": Kind.TRC,  # version 1.0
+    b"timestamp,arbitration_id,": Kind.CSV,
 }
-_MARKS: Final = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
+_MARKS: Final = {
+    b"\xff\xfe\0\0": "utf-32",
+    b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+    b"\xef\xbb\xbf": "utf-8-sig",
+}
 """Encodings by their byte order marks."""
 _SPACE: Final = rb"(?:[ \t]|\x1b\[[0-9;]*m)"
 """A blank, or the code of a colour."""
@@ -90,7 +99,7 @@ _OTHERS: Final = {
     b"\x89PNG": "a PNG image",
     b"\xff\xd8\xff": "a JPEG image",
     b"%PDF": "a PDF document",
-    b"PK\x03\x04": "a zip archive or an Excel workbook: save the sheet as CSV",
+    b"PK\x03\x04": "a zip archive or an Excel workbook: unpack it, or save the sheet as CSV",
     b"\xd0\xcf\x11\xe0": "an old Excel workbook: save the sheet as CSV",
     b"\x89HDF": "HDF5: write the table as CSV or Parquet",
     b"MATLAB": "a MATLAB file: write the table as CSV",
@@ -100,6 +109,7 @@ _OTHERS: Final = {
     b"\x80\x04": "a Python pickle: write the table as CSV or Parquet",
     b"\x80\x05": "a Python pickle: write the table as CSV or Parquet",
     b"ARROW1": "Arrow or Feather: write the table as Parquet",
+    b"\xff\xff\xff\xff": "a stream of Arrow: write the table as Parquet",
     b"\x28\xb5\x2f\xfd": "packed with zstd: unpack it first",
     b"BZh": "packed with bzip2: unpack it first",
     b"\xfd7zXZ": "packed with xz: unpack it first",
@@ -107,7 +117,11 @@ _OTHERS: Final = {
     b"\x7fELF": "a program",
     b"\xd4\xc3\xb2\xa1": "a network capture (pcap)",
     b"\x0a\x0d\x0d\x0a": "a network capture (pcapng)",
-    SQLITE: "an SQLite database without the tables of a ROS 2 bag",
+    SQLITE: "an SQLite database without the tables of a ROS 2 bag; `can_logconvert` makes ASC of "
+    "one of python-can",
+    b"Timestamp: ": "what `can_logger` shows: take `can_logger -f log.asc`",
+    b"version https://git-lfs": "a pointer of Git LFS: `git lfs pull` brings the file",
+    b"<": "a web page, or another text of HTML or XML",
     b"{": "JSON: write the table as CSV",
     b"[{": "JSON: write the table as CSV",
     b"header:": "what `rostopic echo` shows: take `rostopic echo -p`, or a bag",
@@ -181,8 +195,9 @@ def _kind_of(head: bytes) -> Kind | None:
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return kind
-    if marked_encoding(head) == "utf-16":
-        head = head.decode("utf-16", "replace").encode()
+    encoding = encoding_of(head)
+    if encoding is not None:
+        head = head.decode(encoding, "replace").encode()
     if any(head.startswith(magic) for magic in _OTHERS):
         return None
     if _ASC_LINE.search(head):
@@ -197,9 +212,16 @@ def _kind_of(head: bytes) -> Kind | None:
     return Kind.TEXT
 
 
-def marked_encoding(head: bytes) -> str | None:
-    """Return the encoding of text that begins with a byte order mark; None without one."""
-    return next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
+def encoding_of(head: bytes) -> str | None:
+    """Return the encoding of text, by its byte order mark or every other byte; None: UTF-8."""
+    for mark, name in _MARKS.items():
+        if head.startswith(mark):
+            return name
+    even, odd = head[:HEADER_BYTES:2], head[1:HEADER_BYTES:2]
+    for zeros, others, name in ((odd, even, "utf-16-le"), (even, odd, "utf-16-be")):
+        if zeros and not any(zeros) and all(others):
+            return name
+    return None
 
 
 def open_recording(path: Path) -> BinaryIO:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime, time
+from datetime import UTC, datetime
 from typing import Final
 
 from graspd.biotac import COUNT_MAX
@@ -17,12 +17,18 @@ VOLTS_MAX: Final = 5.5
 
 # ASCII digits only: float() also takes `1_000`, `nan` and digits of other scripts.
 _NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
-_THOUSANDS: Final = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+")
+_THOUSANDS: Final = re.compile(r"[+-]?[0-9]{1,3}([ ,'\u2019\u00a0\u202f][0-9]{3})+")
+_POINTED: Final = re.compile(r"[1-9][0-9]{0,2}\.[0-9]{3}")
+_HEXADECIMAL: Final = re.compile(r"(0x)?[0-9a-f]{1,4}", re.IGNORECASE)
+_CLOCK: Final = re.compile(
+    r"((?P<days>[0-9]+) days?,? )?(?P<hours>[0-9]{1,3}):(?P<minutes>[0-5][0-9])"
+    r":(?P<seconds>[0-5][0-9]([.,][0-9]+)?)"
+)
 COUNT_OF_TEXT: Final = {str(count): count for count in range(COUNT_MAX + 1)}
 """Counts by their usual text: a look-up is ten times as fast as parsing."""
 _OUTCOMES: Final = {
-    **dict.fromkeys(("0", "0.0", "false", "stable"), False),
-    **dict.fromkeys(("1", "1.0", "true", "slip"), True),
+    **dict.fromkeys(("0", "0.0", "0,0", "false", "stable"), False),
+    **dict.fromkeys(("1", "1.0", "1,0", "true", "slip"), True),
     **dict.fromkeys(("", "nan", "none", "null", "na", "n/a", "<na>"), None),
 }
 BLANK: Final = frozenset(text for text, slipped in _OUTCOMES.items() if slipped is None)
@@ -68,20 +74,17 @@ def is_clock(cell: str) -> bool:
 
 
 def _clock_s(text: str) -> float | None:
-    """Return seconds since 1970, or since midnight for a time of day. No zone means UTC."""
+    """Return seconds since 1970, or of a time of day or a span. No zone means UTC."""
     if not text.isascii():
         return None
+    if clock := _CLOCK.fullmatch(text):
+        minutes = 60 * (24 * int(clock["days"] or 0) + int(clock["hours"])) + int(clock["minutes"])
+        return 60 * minutes + float(clock["seconds"].replace(",", "."))
     try:
-        day = datetime.fromisoformat(text)
-    except ValueError:
-        pass
-    else:
-        return (day if day.tzinfo else day.replace(tzinfo=UTC)).timestamp()
-    try:
-        clock = time.fromisoformat(text)
+        day = datetime.fromisoformat(text.removesuffix(" UTC").removesuffix(" GMT"))
     except ValueError:
         return None
-    return clock.hour * 3600 + clock.minute * 60 + clock.second + clock.microsecond * 1e-6
+    return (day if day.tzinfo else day.replace(tzinfo=UTC)).timestamp()
 
 
 def outcome_of(cell: str) -> bool | None:
@@ -132,6 +135,10 @@ def are_texts(cells: Sequence[str]) -> bool:
 def _looks_like(wrong: Sequence[str], *, decimal_comma: bool) -> str:
     if any(_THOUSANDS.fullmatch(cell.strip()) for cell in wrong):
         return "write them without a separator of thousands"
+    if all(_POINTED.fullmatch(cell.strip()) for cell in wrong):
+        return "thousands with a point, or volts? write 2820 for 2.820; volts are not counts"
+    if all(_HEXADECIMAL.fullmatch(cell.strip()) for cell in wrong):
+        return "hexadecimal? write decimal numbers"
     numbers = [number_of(cell, decimal_comma=decimal_comma) for cell in wrong]
     values = [abs(number) for number in numbers if number is not None]
     if 2 * len(values) < len(wrong):
@@ -144,6 +151,8 @@ def _looks_like(wrong: Sequence[str], *, decimal_comma: bool) -> str:
         return "volts? graspd takes the counts of the sensor"
     if max(values) > COUNT_MAX:
         return "another sensor, or another scale?"
+    if max(values) <= 100.0:
+        return "percent, or another scale?"
     return "means of several readings? graspd takes single readings"
 
 

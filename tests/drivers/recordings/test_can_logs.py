@@ -221,7 +221,7 @@ def played(paths: Sequence[Path], channel: str = "can0") -> tuple[list[TactileRe
     return readings, log
 
 
-@pytest.mark.parametrize("ending", ["asc", "blf", "trc", "log"])
+@pytest.mark.parametrize("ending", ["asc", "blf", "csv", "trc", "log"])
 def test_what_python_can_writes_plays_as_it_was(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"bus.{ending}"
     writer = can.Logger(path)

@@ -118,11 +118,15 @@ def array(path: Path) -> None:
 
 OTHERS: dict[str, tuple[bytes | Callable[[Path], None], str]] = {
     "PNG": (b"\x89PNG\r\n\x1a\n\0", "looks like a PNG image"),
-    "xlsx": (workbook, "a zip archive or an Excel workbook: save the sheet as CSV"),
+    "xlsx": (workbook, "a zip archive or an Excel workbook: unpack it, or save"),
     "npy": (array, "a NumPy array"),
     "pickle": (pickle.dumps([1, 2]), "a Python pickle"),
     "HDF5": (b"\x89HDF\r\n\x1a\n", "HDF5: write the table as CSV or Parquet"),
     "other SQLite": (bag2("create table x (y integer);"), "an SQLite database without"),
+    "a stream of Arrow": (b"\xff" * 4 + b"\x10\0\0\0", "a stream of Arrow: write"),
+    "can_logger": (b"Timestamp:     1.500000    ID: 5A1\n", "take `can_logger -f log.asc`"),
+    "Git LFS": (b"version https://git-lfs.github.com/spec/v1\n", "`git lfs pull`"),
+    "HTML": (b"<!DOCTYPE html>\n<html>\n", "a web page"),
     "JSON": (b'{"t": 0}\n', "JSON: write the table as CSV"),
     "rostopic echo": (b"header: \n  seq: 1\n", "what `rostopic echo` shows"),
     "old bag": (b"#ROSBAG V1.2\n", "an old ROS 1 bag"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -45,6 +46,15 @@ DIALECTS = {
     "byte order mark": b"\xef\xbb\xbf" + PLAIN,
     "UTF-16 of Windows": PLAIN.decode().encode("utf-16"),
     "UTF-16, big end": b"\xfe\xff" + PLAIN.decode().encode("utf-16-be"),
+    "UTF-16 without a mark": PLAIN.decode().encode("utf-16-le"),
+    "UTF-16 without a mark, big end": PLAIN.decode().encode("utf-16-be"),
+    "UTF-32": PLAIN.decode().encode("utf-32"),
+    "titles": b"Lab A; run 3\n\nDate:,2026-05-04\n" + PLAIN,
+    "comments of MATLAB": b"% lab A\n" + PLAIN,
+    "units below": PLAIN.replace(b"24\n", b"24\n,-" + b",counts" * 72 + b"\n", 1),
+    "fingers above": text(
+        lambda it: f",,ff{',' * 24}mf{',' * 24}th\n" + re.sub("(ff|mf|th)_biotac_", "e", it)
+    ),
     "CRLF": PLAIN.replace(b"\n", b"\r\n"),
     "mark and CRLF": b"\xef\xbb\xbf" + PLAIN.replace(b"\n", b"\r\n"),
     "blank lines": b"\n\r\n" + PLAIN.replace(b"\n", b"\n \t\n\n"),
@@ -145,9 +155,16 @@ SCHEMES: dict[str, Callable[[str, int], str]] = {
     "BioTacSP-DoS": lambda finger, number: f"{finger}_e{number}",
     "capital letters": lambda finger, number: f"{finger.upper()}_E{number}",
     "from 0": lambda finger, number: f"{finger}_biotac_{number - 1}",
+    "a full stop": lambda finger, number: f"/hand/{finger}.e{number:02}",
+    "a space": lambda finger, number: f"{finger.upper()} E{number}",
+    "brackets": lambda finger, number: f"{finger}[{number - 1}]",
+    "a word": lambda finger, number: f"{finger}_electrode_{number}",
+    "a unit": lambda finger, number: f"{finger}_biotac_{number} (counts)",
     "messages of graspd": lambda finger, number: f"{finger}_{number}",
     "with the hand": lambda finger, number: f"rh_{finger}_biotac_{number}",
     "rostopic echo -p": lambda f, number: f"field.tactiles{PLACES[f]}.electrodes{number - 1}",
+    "mcap cat --csv": lambda f, number: f"tactiles.{PLACES[f]}.electrodes.{number - 1}",
+    "MATLAB": lambda finger, number: f"tactiles_{PLACES[finger]}_electrodes_{number - 1}_",
     "PlotJuggler": lambda f, number: f"/rh/tactile/tactiles[{PLACES[f]}]/electrodes[{number - 1}]",
 }
 
@@ -173,6 +190,12 @@ def test_one_finger_needs_no_name() -> None:
         (lambda f, n: f"{f}_taxels_{n}", "is nearest to ff_"),
         (lambda f, n: f"{f}_e{n}" if n < 20 else f"x{f}{n}", "ff has 19 electrodes: a BioTac"),
         (lambda f, n: f"{f}_e{n - 1}" if n < 20 else f"x{f}{n}", "another sensor than the BioTac"),
+        (lambda f, n: f"ele{n}" if f == "ff" and n < 20 else f"x{f}{n}", "19 electrodes: a BioTac"),
+        (
+            lambda f, n: f"bt_data{PLACES[f]}.electrode_data{n - 1}" if n < 20 else f"{f}x{n}",
+            "bt_data0 has 19 electrodes: a BioTac",
+        ),
+        (lambda f, n: f"field.bt_data{PLACES[f]}.electrode_data{n - 1}", "so on name no finger"),
         (lambda f, n: f"{f}_e{n}" if (f, n) != ("mf", 7) else "x", "column mf_e7: this column is"),
         (lambda f, n: f"{f}_e{n - (f == 'ff')}", "column mf_e0: this column is missing"),
         (lambda f, n: f"{f}_e{n}" if f != "th" else f"x{n}", "the file has the fingers ff, mf"),
@@ -194,7 +217,10 @@ def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
     ("name", "cells"),
     [
         ("t", TIMES), ("time", TIMES), ("Timestamp", TIMES), ("stamp", TIMES), ("secs", TIMES),
-        ("Time (s)", TIMES), ("__time", TIMES),
+        ("Time (s)", TIMES), ("__time", TIMES), ("epoch", TIMES), ("t_sec", TIMES),
+        ("Rel. Time", TIMES), ("ros_time", TIMES), ("Zeit [s]", TIMES), ("Czas (s)", TIMES),
+        ("Elapsed Time (ms)", ["0", "10", "20", "30"]), ("millis()", ["0", "10", "20", "30"]),
+        ("Time (\u00b5s)", ["0", "10000", "20000", "30000"]),
         ("field.header.stamp", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
         ("%time", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
         ("time_ms", ["5", "15", "25", "35"]), ("t_ns", ["0", "10000000", "20000000", "30000000"]),
@@ -202,6 +228,9 @@ def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
         ("time", [f"2023-11-14T22:13:20.{n}Z" for n in ("00", "01", "02", "03")]),
         ("time", [f"2023-11-14 22:13:20.{n}0000000" for n in ("00", "01", "02", "03")]),
         ("time", [f"22:13:20.{n}" for n in ("00", "01", "02", "03")]),
+        ("time", [f"9:05:20.{n}" for n in ("00", "01", "02", "03")]),
+        ("time", [f"1 days 00:00:20.{n}" for n in ("00", "01", "02", "03")]),
+        ("datetime_utc", [f"2023-11-14 22:13:20.{n}0 UTC" for n in ("00", "01", "02", "03")]),
         ("secs,nsecs", [f"1700000000,{n}0000000" for n in range(4)]),
         ("header.stamp.sec,header.stamp.nanosec", [f"5,{n}0000000" for n in range(4)]),
     ],
@@ -378,6 +407,10 @@ def scaled(change: Callable[[int], str], separator: str = ",") -> bytes:
         (scaled(lambda n: str(n * 16)), "another sensor, or another scale?"),
         (scaled(lambda n: f'"{n // 1000},{n % 1000:03}"'), "without a separator of thousands"),
         (scaled(lambda n: f"{n // 1000},{n % 1000:03}", ";"), "without a separator of thousands"),
+        (scaled(lambda n: f"{n // 1000} {n % 1000:03}", ";"), "without a separator of thousands"),
+        (scaled(lambda n: f"{n / 1000:.3f}", ";"), "thousands with a point, or volts?"),
+        (scaled(lambda n: f"{n / 40.95:.2f}"), "percent, or another scale?"),
+        (scaled(hex), "hexadecimal?"),
         (scaled(lambda _: "high"), "text in place of numbers?"),
     ],
 )
@@ -389,7 +422,10 @@ def test_values_that_are_no_counts_are_refused_once(content: bytes, said: str) -
 
 def test_joints_in_degrees_are_named() -> None:
     degrees = {"FFJ1": ["1", "2", "3", "1"], "rh_FFJ3": ["45.8", "46.1", "46.0", "3"]}
-    assert "FFJ3 = 45.8 rad is beyond every joint: degrees?" in refusal(stream(TIMES, degrees))
+    content = stream(TIMES, degrees)
+    assert "FFJ3 = 45.8 rad is beyond every joint: degrees?" in refusal(content)
+    named = content.replace(b"FFJ1", b"FFJ1 [deg]")
+    assert "FFJ1 [deg]: angles are in degrees: write radians" in refusal(named)
 
 
 def test_a_single_large_angle_is_bad() -> None:
@@ -404,12 +440,13 @@ def test_a_single_large_angle_is_bad() -> None:
         (["0", "1", "0", "1"], [False, True, False, True]),
         (["0.0", "1.0", "", "1.0"], [False, True, None, True]),
         (["False", "True", "nan", "TRUE"], [False, True, None, True]),
+        (["0,0", "1,0", "NA", "1,0"], [False, True, None, True]),
         (["stable", "slip", "None", " Slip "], [False, True, None, True]),
     ],
 )
 def test_outcomes_are_read_as_tools_write_them(
     cells: Sequence[str], expected: Sequence[bool | None]
 ) -> None:
-    content = table(4, {row: {"slipped": cell} for row, cell in enumerate(cells)})
+    content = table(4, {row: {"slipped": f'"{cell}"'} for row, cell in enumerate(cells)})
     rows = rows_of(content, outcomes=True)
     assert [row.annotation.slipped for row in rows] == expected
