@@ -39,6 +39,7 @@ BACKOFF = "/usr/local/lib/systemd/system/graspd@.service.d/backoff.conf"
 NETWORK = "/usr/local/lib/systemd/network/80-graspd-can.network"
 """Installed on demand."""
 
+pytestmark = pytest.mark.slow
 pytest.importorskip("ensurepip", reason="no venv: apt install python3-venv")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from graspd.models import zoo
-from tests.daemon.processes import graspd
+from tests.kit.inside import graspd
 from tests.kit.scenes import demo_scene
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.processes import graspd
+from tests.kit.inside import graspd
 from tests.kit.scenes import demo_scene, written
 
 ABSENT = os.sysconf("SC_NPROCESSORS_CONF")

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from graspd.models.runtime import read
-from tests.daemon.processes import graspd
+from tests.kit.inside import graspd
 from tests.models.training.samples import table, write
 
 
+@pytest.mark.slow
 def test_a_table_becomes_a_model_that_a_scene_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

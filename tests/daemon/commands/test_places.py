@@ -68,6 +68,7 @@ COMMANDS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", PLACES)
 def test_no_command_ends_in_a_traceback(tmp_path: Path, place: str) -> None:
     can_lose = os.geteuid() == 0 and shutil.which(WITHOUT_RIGHTS[0])

@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+from functools import cache
 from itertools import pairwise
 from operator import and_
 from pathlib import Path
@@ -24,10 +25,12 @@ from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, start, wait_for
-from tests.kit.inside import graspd
+from tests.kit import inside
 from tests.kit.messages import decode_verdict
 from tests.kit.scenes import unlabelled_demo
 
+graspd = cache(inside.graspd)
+"""Run a command; the same command on the same files runs once."""
 DEMO_LINE = re.compile(
     r"(?P<grasps>\S+) +(?P<stable>\d+) +(?P<slips>\d+) +(?:\d+ %|-) +\d+ %"
     r" +(?P<own_stable>\d+) +(?P<own_slips>\d+) +(?:\d+ %|-) +(?P<kept>\d+) %"

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
     assert document["session"]["statistics"]["grasps"] == grasps
     assert f"{grasps} grasps, not calibrated yet" in graspd("session", "show", scene).stdout
     kept = ("--session", scene.parent / "right" / "1.session")
-    replayed = graspd("replay", recording, "--model", "cnn1-session", *kept, "--json")
+    replayed = graspd("replay", DEMO_TABLE, "--model", "cnn1-session", *kept, "--json")
     assert replayed.returncode == 0, replayed.stderr
     first = json.loads(replayed.stdout.splitlines()[0])
     assert first["session_calibrated"] is True
@@ -133,16 +134,25 @@ def test_a_broken_session_file_is_one_line_in_a_replay(tmp_path: Path) -> None:
     assert result.stderr == "graspd: the kept session is of 10 values, not of 150\n"
 
 
-def test_replay_shows_the_collapse_on_another_day_and_the_repair(bts3_dir: Path) -> None:
-    """cnn1-session has seen palm_down and palm_side only; palm_45 was recorded later."""
-    command = ("replay", bts3_dir / "palm_45.csv", "--model", "cnn1-session", "--json")
-    result = graspd(*command)
+NOT_SEEN = ("replay", "--model", "cnn1-session", "--json")
+"""cnn1-session has seen palm_down and palm_side only; palm_45 was recorded later."""
+
+
+@pytest.fixture(scope="module")
+def without_session(bts3_dir: Path) -> CompletedProcess[str]:
+    return graspd(*NOT_SEEN, bts3_dir / "palm_45.csv", "--session", "off")
+
+
+def test_replay_shows_the_collapse_on_another_day_and_the_repair(
+    bts3_dir: Path, without_session: CompletedProcess[str]
+) -> None:
+    result = graspd(*NOT_SEEN, bts3_dir / "palm_45.csv")
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stderr)
     verdicts = [json.loads(line) for line in result.stdout.splitlines()]
     assert [verdict["session_calibrated"] for verdict in verdicts[:20]] == [False] * 20
     assert verdicts[-1]["session_calibrated"] is True
-    without = json.loads(graspd(*command, "--session", "off").stderr)
+    without = json.loads(without_session.stderr)
     # Measured once by others on this data: F1 7 without, 77 to 85 with running calibration.
     collapsed = without["scores"] is None or without["scores"].get("f1", 0.0) < 0.5
     refused = without["verdicts"]["unknown"] > 0.9 * 2133
@@ -151,11 +161,11 @@ def test_replay_shows_the_collapse_on_another_day_and_the_repair(bts3_dir: Path)
     assert summary["verdicts"]["unknown"] < 0.2 * 2133
 
 
-def test_a_young_session_is_hardly_ever_sure_and_then_right(bts3_dir: Path) -> None:
-    table = bts3_dir / "palm_45.csv"
-    result = graspd("replay", table, "--model", "cnn1-session", "--session", "off", "--json")
-    verdicts = [json.loads(line) for line in result.stdout.splitlines()]
-    with table.open(encoding="utf-8") as lines:
+def test_a_young_session_is_hardly_ever_sure_and_then_right(
+    bts3_dir: Path, without_session: CompletedProcess[str]
+) -> None:
+    verdicts = [json.loads(line) for line in without_session.stdout.splitlines()]
+    with (bts3_dir / "palm_45.csv").open(encoding="utf-8") as lines:
         slipped = [row["slipped"] == "1" for row in csv.DictReader(lines)]
     assert len(verdicts) == len(slipped) == 2133
     sure = [

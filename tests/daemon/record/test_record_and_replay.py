@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import time
 import zlib
 from functools import cache
 from pathlib import Path
@@ -25,8 +24,6 @@ from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.models.training.data.datasets import read_table
-from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, start
 from tests.daemon.record.recorded import (
     Lab,
     compared,
@@ -37,15 +34,10 @@ from tests.daemon.record.recorded import (
     work,
 )
 from tests.kit.inside import graspd
-from tests.kit.messages import decode_verdict
 from tests.process_replay.judging import Case, run
 from tests.process_replay.streams import demo
 
 GRASPS = 4
-FLUSH_S, STALL_S = 1.0, 0.5
-"""The daemon's own, and how long a computer may stand still, s."""
-LIFE_S = 1.6
-"""Of a daemon that is killed, from its first verdict on."""
 
 
 @pytest.fixture(scope="module")
@@ -296,26 +288,3 @@ def test_a_file_cut_anywhere_is_played_to_its_end(lab: Lab, tmp_path: Path) -> N
     played = [compared(verdict) for verdict in again(path)]
     assert played[: len(now)] == [compared(verdict) for verdict in before[: len(now)]]
     assert len(played) - len(now) in {0, 1}  # cut between a reading and its verdict
-
-
-def test_a_killed_daemon_loses_no_more_than_the_flush_interval(tmp_path: Path) -> None:
-    published: dict[int, float] = {}
-    with (
-        start("run", scene(tmp_path)) as daemon,
-        Subscriber(f"ipc://{tmp_path}/graspd") as subscriber,
-    ):
-        end_s, wait_s = None, float(TIMEOUT_S)
-        while (message := subscriber.take(wait_s)) is not None:
-            verdict = decode_verdict(message[1])
-            published[verdict.seq] = verdict.t
-            end_s = time.monotonic() + LIFE_S if end_s is None else end_s
-            if time.monotonic() > end_s:
-                daemon.kill()
-                wait_s = 0.2
-        daemon.communicate(timeout=TIMEOUT_S)
-    (path,) = files(tmp_path)
-    recorded = [content["seq"] for kind, content in messages(path) if kind == "verdict"]
-    assert recorded == list(range(len(recorded)))
-    lost = [t for seq, t in published.items() if seq >= len(recorded)]
-    newest = max(published.values())
-    assert newest - min(lost, default=newest) <= FLUSH_S + STALL_S

@@ -26,7 +26,10 @@ from tests.daemon.watch.browser import (
 )
 from tests.daemon.watch.watch_fakes import Talker, verdict, whole_hand
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium"),
+]
 
 Theme = Literal["light", "dark"]
 COLOURS = {
