@@ -49,16 +49,6 @@ def test_running_statistics_are_those_of_all_grasps_and_the_prior(
     np.testing.assert_allclose(session.spread, np.sqrt(variance), rtol=1e-12)
 
 
-def test_a_grasp_that_is_held_counts_once() -> None:
-    session = statistics()
-    observe(session, grasps(50))
-    held = np.full(WIDTH, 520.0)
-    random = np.random.default_rng(1)
-    counted = [session.observe(held + random.normal(0.0, 0.3, WIDTH)) for _ in range(1000)]
-    assert counted == [True] + [False] * 999
-    assert session.grasps == 51
-
-
 def test_one_object_handled_for_hours_is_forgotten_within_the_horizon() -> None:
     session = statistics()
     observe(session, grasps(20_000, mean=900.0))

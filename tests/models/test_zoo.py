@@ -9,75 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
 from graspd.models import known_grasps, zoo
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
-from graspd.models.tactile_image import TactileImager
-from graspd.models.training.data.datasets import Grasps, read_all
+from graspd.models.training.data.datasets import read_all
 
 CARD: dict[str, Any] = json.loads((zoo.ZOO / "cnn1.json").read_text())
-
-
-@pytest.fixture(scope="module")
-def whole(bts3_dir: Path) -> Grasps:
-    grasps = read_all(bts3_dir)
-    return grasps.rows(grasps.rows_of(("palm_down", "palm_side")))
-
-
-@pytest.fixture(scope="module")
-def images(whole: Grasps) -> NDArray[np.float32]:
-    return TactileImager(3).build_batch(whole.counts)[0]
-
-
-@pytest.fixture(scope="module")
-def probability(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    session = ort.InferenceSession(zoo.find("cnn1"), providers=["CPUExecutionProvider"])
-    (result,) = session.run(["probability"], {"tactile_image": images})
-    return np.asarray(result)
-
-
-def plain_forward(path: Path, images: NDArray[np.float32]) -> NDArray[np.float64]:
-    """CNN1 by its definition in float64, from nothing of the file but its six weight arrays."""
-    onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
-    arrays = [onnx.numpy_helper.to_array(item) for item in onnx.load(path).graph.initializer]
-    weights = {item.shape: item.astype(np.float64) for item in arrays if item.dtype == np.float32}
-    assert set(weights) == {(32, 3, 3, 3), (32,), (1024, 2880), (1024,), (2, 1024), (2,)}
-    probability = np.empty((len(images), 2))
-    for index, image in enumerate(images.astype(np.float64)):
-        features = np.zeros((32, 10, 9))
-        for row in range(3):
-            for column in range(3):
-                window = image[row : row + 10, column : column + 9]
-                kernel = weights[32, 3, 3, 3][:, :, row, column]
-                features += np.einsum("oc,hwc->ohw", kernel, window)
-        features = np.maximum(features + weights[32,][:, None, None], 0.0)
-        hidden = np.maximum(weights[1024, 2880] @ features.ravel() + weights[1024,], 0.0)
-        stable, slip = weights[2, 1024] @ hidden + weights[2,]
-        probability[index, 1] = 1.0 / (1.0 + np.exp(stable - slip))
-        probability[index, 0] = 1.0 / (1.0 + np.exp(slip - stable))
-    return probability
-
-
-def test_cnn1_judges_every_fifth_real_grasp_as_its_weights_say(
-    images: NDArray[np.float32], probability: NDArray[np.float32]
-) -> None:
-    assert len(images) == 2549
-    expected, judged = plain_forward(zoo.find("cnn1"), images[::5]), probability[::5]
-    assert np.abs(judged - expected).max() <= 1e-5
-    assert np.array_equal(judged.argmax(axis=1), expected.argmax(axis=1))
-
-
-def test_one_reading_at_a_time_is_judged_as_all_together(
-    whole: Grasps, probability: NDArray[np.float32]
-) -> None:
-    model = TactileModel(zoo.find("cnn1"))
-    for reading, expected in zip(whole.counts[::5], probability[::5], strict=True):
-        model.inputs.build(reading, model.input)
-        assert model.run() == pytest.approx(tuple(expected), abs=1e-6)
 
 
 def test_cnn1_reaches_the_published_f1_within_its_spread() -> None:

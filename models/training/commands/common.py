@@ -72,7 +72,6 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="trainings at once on this machine (default: 1)",
     )
-    parser.add_argument("--quiet", action="store_true", help="show no progress bar")
 
 
 class _Data(argparse.Action):
@@ -164,7 +163,7 @@ def say(command: str, text: str) -> None:
 
 
 @contextmanager
-def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
+def progress_bar(first: str, total: int) -> Iterator[Callable[[str], None]]:
     """Show on stderr, if it is a terminal, how many of `total` trainings are done.
 
     Yields a function to call after each training, with the bar's next text.
@@ -174,7 +173,8 @@ def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[
 
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    hidden = hidden or not console.is_terminal
-    with Progress(*columns, console=console, disable=hidden, transient=True) as bar:
+    with Progress(
+        *columns, console=console, disable=not console.is_terminal, transient=True
+    ) as bar:
         task = bar.add_task(first, total=total)
         yield lambda name: bar.update(task, advance=1, description=name)

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--protocol",
         action="append",
         choices=PROTOCOLS,
-        help="may be repeated (default: the first six, of own tables alone cv and objects). "
+        help="may be repeated (default: all, of own tables alone cv and objects). "
         + "; ".join(f"{name}: {text}" for name, text in ABOUT.items()),
     )
     add_shared_arguments(parser)

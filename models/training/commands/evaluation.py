@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from importlib.util import find_spec
 
 import joblib
 import numpy as np
@@ -27,7 +26,7 @@ from graspd.models.training.commands.common import (
 )
 from graspd.models.training.commands.other_day import judge_other_days
 from graspd.models.training.data.datasets import Grasps
-from graspd.models.training.data.protocols import FOLDS, STANDARD, EvalProtocol
+from graspd.models.training.data.protocols import FOLDS, PROTOCOLS, EvalProtocol
 from graspd.models.training.evaluating.figures import (
     Figures,
     made_with,
@@ -70,7 +69,8 @@ def evaluate(args: argparse.Namespace) -> None:
         epochs = QUICK_EPOCHS if args.quick else None
         judge_other_days(args, systems if args.names else (), epochs)
         return
-    _check_extras(args)
+    if args.table and args.data is None:
+        raise WrongInputError("--table compares with the paper's figures: it needs --data")
     grasps = read_grasps("evaluate", args)
     check_fingers(systems, grasps)
     if args.quick:
@@ -95,8 +95,10 @@ def evaluate(args: argparse.Namespace) -> None:
 @contextmanager
 def _cluster(address: str) -> Iterator[None]:
     """Run trainings on the cluster of the Dask scheduler at this address."""
-    from distributed import Client, KilledWorker
-
+    try:
+        from distributed import Client, KilledWorker
+    except ModuleNotFoundError as error:
+        raise WrongInputError(needs("--dask", "cluster", error)) from error
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
@@ -117,19 +119,10 @@ def _systems(names: Sequence[str]) -> list[System]:
     return [SYSTEMS[name] for name in dict.fromkeys(names)] or list(SYSTEMS.values())
 
 
-def _check_extras(args: argparse.Namespace) -> None:
-    """Now, not after hours of training."""
-    if args.table and args.data is None:
-        raise WrongInputError("--table compares with the paper's figures: it needs --data")
-    if args.dask and find_spec("distributed") is None:
-        absent = ModuleNotFoundError(name="distributed")
-        raise WrongInputError(needs("--dask", "cluster", absent))
-
-
 def _protocols(args: argparse.Namespace, grasps: Grasps) -> list[EvalProtocol]:
     """Return those that are asked for, or those that the tables are there for."""
     if args.protocol or args.data is not None:
-        return list(dict.fromkeys(args.protocol or STANDARD))
+        return list(dict.fromkeys(args.protocol or PROTOCOLS))
     if len(set(grasps.objects)) > 1:
         return ["cv", "objects"]
     say("evaluate", "all grasps are of one object: measured by cv, of known objects, alone")
@@ -173,7 +166,7 @@ def _evaluated(
     wanted = [job for group in groups.values() for job in group]
     found: dict[Job, pd.DataFrame] = {}
     made: dict[tuple[str, str], Figures] = {}
-    with progress_bar("starting", len(wanted), hidden=args.quiet) as on_job:
+    with progress_bar("starting", len(wanted)) as on_job:
         for job, rows in evaluated(wanted, grasps, args.out / "jobs"):
             found[job] = rows
             on_job(f"{job.system.name} {job.protocol}")

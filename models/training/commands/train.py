@@ -7,7 +7,6 @@ import dataclasses
 import json
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +21,7 @@ from graspd.models.training.commands.common import (
     say,
     whole,
 )
-from graspd.models.training.data.datasets import DatasetError, Grasps
+from graspd.models.training.data.datasets import DatasetError
 from graspd.models.training.data.protocols import FOLDS, TooFewGraspsError
 from graspd.models.training.systems.registry import SYSTEMS
 
@@ -47,13 +46,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the result (default: runs/NAME)"
-    )
-    parser.add_argument(
-        "--results",
-        type=Path,
-        metavar="DIR",
-        help="folder of finished trainings, which are not run again; `graspd evaluate` shares it "
-        "(default: trainings in --out)",
     )
     parser.add_argument(
         "--seed", type=whole(0, MAX_SEED), default=0, metavar="N", help="default: 0"
@@ -112,12 +104,10 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
             preflight(plan, grasps)
         # Now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
-        results = args.results or out / "trainings"
         total = len(plan.jobs(grasps)) + EXTRA_TRAININGS
-        with progress_bar(args.model, total, hidden=args.quiet) as on_job:
-            contract = make_model(plan, grasps, out, results, lambda: on_job(args.model))
+        with progress_bar(args.model, total) as on_job:
+            contract = make_model(plan, grasps, out, lambda: on_job(args.model))
     except TooFewGraspsError as error:
-        _propose(plan, grasps)
         raise WrongInputError(f"{error} (see --folds and --only)") from error
     seconds, file = time.monotonic() - started_s, out / f"{plan.model}.onnx"
     figures = ", ".join(
@@ -127,18 +117,6 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
     sys.stdout.write(f"{file}: {figures}, {seconds:.0f} s\n")
     if plan.lab_files or plan.name:
         say("train", f"for a scene, below [model]: path = {json.dumps(str(file.absolute()))}")
-
-
-def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
-    """Say with which options these grasps are enough, if there are such."""
-    from graspd.models.training.making.plan import with_enough_folds
-
-    for only in (plan.only, "cv"):
-        with suppress(TooFewGraspsError):
-            other, _ = with_enough_folds(dataclasses.replace(plan, only=only), grasps)
-            words = "" if only is None else f" --only {only}"
-            say("train", f"these grasps are enough for --folds {other.folds}{words}")
-            return
 
 
 def _plan(args: argparse.Namespace) -> TrainingPlan:

@@ -17,12 +17,8 @@ from graspd.models.bts3 import NEW_SESSION, WHOLE
 from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps, first_readings, lab_table_names
 
-EvalProtocol = Literal[
-    "cv", "unknown", "objects", "objects-whole", "session", "days", "cv-palm-down", "cv-palm-side"
-]
+EvalProtocol = Literal["cv", "unknown", "objects", "objects-whole", "session", "days"]
 PROTOCOLS: tuple[EvalProtocol, ...] = get_args(EvalProtocol)
-STANDARD = PROTOCOLS[:6]
-"""Protocols that `graspd evaluate` runs by default."""
 ABOUT: dict[EvalProtocol, str] = {
     "cv": "known objects: stratified folds of palm_down + palm_side (the paper's)",
     "unknown": "the paper's 8 objects left out of palm_down + palm_side",
@@ -31,8 +27,6 @@ ABOUT: dict[EvalProtocol, str] = {
     "session": "palm_45 by palm_down + palm_side, its objects left out in groups",
     "days": "tables by others (A: palm_45 by palm_down + palm_side; B: palm_down and palm_side by "
     "palm_45; C: each of these by the other and palm_45), their objects left out in groups",
-    "cv-palm-down": "stratified folds of palm_down alone",
-    "cv-palm-side": "stratified folds of palm_side alone",
 }
 UNKNOWN_OBJECTS = frozenset(
     ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case", "train")
@@ -146,10 +140,8 @@ def object_folds(objects: Sequence[str], folds: int, seed: int) -> Ints:
     return np.array([fold_of_object[name] for name in objects], dtype=np.int64)
 
 
-def _stratified(
-    tables: tuple[str, ...], with_lab: bool, grasps: Grasps, seed: int, folds: int
-) -> list[Split]:
-    rows = _rows(grasps, *tables, with_lab=with_lab)
+def _stratified(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+    rows = _rows(grasps, *WHOLE, with_lab=True)
     return _leave_out(rows, folds_of(grasps.rows(rows), folds, seed), folds)
 
 
@@ -199,14 +191,12 @@ def _days(grasps: Grasps, seed: int, folds: int) -> list[Split]:
 
 
 _MAKERS: dict[EvalProtocol, Callable[[Grasps, int, int], list[Split]]] = {
-    "cv": partial(_stratified, WHOLE, True),
+    "cv": _stratified,
     "unknown": _unknown,
     "objects": partial(_grouped, (*WHOLE, NEW_SESSION)),
     "objects-whole": partial(_grouped, WHOLE),
     "session": _session,
     "days": _days,
-    "cv-palm-down": partial(_stratified, WHOLE[:1], False),
-    "cv-palm-side": partial(_stratified, WHOLE[1:], False),
 }
 
 

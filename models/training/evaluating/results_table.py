@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
 from graspd.models.training.data.datasets import Grasps
-from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
+from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, EvalProtocol
 from graspd.models.training.evaluating.figures import GROUPS, Figures, by_age, by_day
 from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.training.evaluating.findings import FINDINGS, HOW_SURE, SEALED
@@ -46,7 +46,7 @@ def results_table(
     """
     by_group: ByGroup = {(one.system, one.protocol): one for one in several}
     sections = (
-        _head(several, quick=quick),
+        _head(quick=quick),
         _findings(by_group),
         _paper(by_group),
         _systems(by_group),
@@ -61,7 +61,7 @@ def results_table(
     return "\n\n".join(paragraph for section in sections for paragraph in section) + "\n"
 
 
-def _head(several: Sequence[Figures], *, quick: bool) -> Iterator[str]:
+def _head(*, quick: bool) -> Iterator[str]:
     yield "# Results"
     yield (
         "This page is for those who compare models. Figures are F1 in %, slip positive, unless a "
@@ -71,8 +71,7 @@ def _head(several: Sequence[Figures], *, quick: bool) -> Iterator[str]:
     )
     if quick:
         yield "**Made with `--quick`: hardly trained, on few grasps. The figures mean nothing.**"
-    shown = {*STANDARD, *(one.protocol for one in several)}
-    yield "\n".join(f"- `{name}`: {ABOUT[name]}" for name in PROTOCOLS if name in shown)
+    yield "\n".join(f"- `{name}`: {text}" for name, text in ABOUT.items())
 
 
 def _findings(by_group: ByGroup) -> Iterator[str]:
@@ -146,11 +145,11 @@ def _systems(by_group: ByGroup) -> Iterator[str]:
     )
     rows = []
     for name in SYSTEMS:
-        row = [by_group.get((name, protocol)) for protocol in STANDARD]
+        row = [by_group.get((name, protocol)) for protocol in PROTOCOLS]
         if any(row):
             size = max(one.parameters for one in row if one)
             rows.append((f"`{name}`", f"{size:,}", *map(_with_error, row)))
-    yield _table(("system", "parameters", *(f"`{protocol}`" for protocol in STANDARD)), rows)
+    yield _table(("system", "parameters", *(f"`{protocol}`" for protocol in PROTOCOLS)), rows)
 
 
 def _sessions(by_group: ByGroup) -> Iterator[str]:

@@ -64,9 +64,9 @@ OWN_LICENCE = "whatever the owner of the tables says"
 
 
 def make_model(
-    plan: TrainingPlan, grasps: Grasps, out: Path, results: Path, on_done: Callable[[], None]
+    plan: TrainingPlan, grasps: Grasps, out: Path, on_done: Callable[[], None]
 ) -> ModelContract:
-    """Write `NAME.onnx` and its card `NAME.json` into `out`; trainings are kept in `results`.
+    """Write `NAME.onnx` and its card `NAME.json` into `out`, which keeps the trainings too.
 
     `grasps` are those of all tables that there are. `on_done` is called after each of the plan's
     jobs and of the `EXTRA_TRAININGS`. Raises `TooFewGraspsError` if the grasps are too few for the
@@ -76,7 +76,7 @@ def make_model(
     wanted = plan.jobs(grasps)
     found = {}
     with processes(plan.processes):
-        for job, rows in evaluated(wanted, grasps, results):
+        for job, rows in evaluated(wanted, grasps, out / "trainings"):
             found[job] = rows
             on_done()
     every = pd.concat([found[job] for job in wanted], ignore_index=True)

@@ -7,13 +7,11 @@ are timed in a hot loop and paced, one candidate after the other in every round.
 from __future__ import annotations
 
 import gc
-import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from graspd.biotac import TABLE_FINGERS
+from graspd.models import zoo
 from graspd.models.contract import ModelError
 from graspd.models.layout import D1
 from graspd.models.runtime import TactileModel
@@ -46,10 +45,10 @@ Candidate = tuple[Row, Step]
 """Name, kind, fingers and error of a model or a peer, and what is timed."""
 
 
-def candidates(folders: Sequence[Path], grasps: Grasps) -> list[Candidate]:
-    """Return the models, and the published code if Keras is installed. Raises `ModelError`."""
-    paths = [path for folder in folders for path in sorted(folder.glob("*.onnx"))]
-    models = [_model(path, grasps) for path in paths]
+def candidates(grasps: Grasps) -> list[Candidate]:
+    """Return the models of the zoo, and the published code if Keras is installed.
+    Raises `ModelError`."""
+    models = [_model(name, grasps) for name in zoo.names()]
     if find_spec("keras") is None:
         say("report", "keras is not installed: the published code is left out (extra: report)")
         return models
@@ -62,15 +61,10 @@ def candidates(folders: Sequence[Path], grasps: Grasps) -> list[Candidate]:
     return [*models, (published, _published(grasps.counts))]
 
 
-def _model(path: Path, grasps: Grasps) -> Candidate:
-    model, card_path = TactileModel(path), path.with_suffix(".json")
-    contract = model.contract
-    try:
-        card: dict[str, Any] = json.loads(card_path.read_bytes())
-        error = {name: errors(figures) for name, figures in card["protocols"].items()}
-    except (OSError, ValueError, KeyError) as problem:
-        raise ModelError(f"{card_path}: cannot read the card: {problem}") from problem
-    row = {"name": contract.name, "kind": "model", "fingers": contract.fingers, "error": error}
+def _model(name: str, grasps: Grasps) -> Candidate:
+    model, protocols = TactileModel(zoo.find(name)), zoo.card(name)["protocols"]
+    error = {protocol: errors(figures) for protocol, figures in protocols.items()}
+    row = {"name": name, "kind": "model", "fingers": model.contract.fingers, "error": error}
     return row, model_step(model, grasps)
 
 

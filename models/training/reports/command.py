@@ -35,14 +35,6 @@ def _error_vs_time(parser: argparse.ArgumentParser) -> None:
         "--data", type=Path, required=True, metavar="DIR", help="folder with the grasp tables"
     )
     parser.add_argument(
-        "--models",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="further models with their cards, as `graspd train --out DIR` writes them",
-    )
-    parser.add_argument(
         "--out",
         type=Path,
         default=Path("runs/error-vs-time"),

@@ -12,13 +12,11 @@ import re
 import statistics
 import sys
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from graspd.models import zoo
 from graspd.models.training.commands.common import WrongInputError, say
 from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.evaluating.files import markdown_table
@@ -89,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     if page is not None and len(PAGE_TABLE.findall(page)) != 1:
         raise WrongInputError(f"{args.page}: has not the one table that begins `model, F1 in %`")
     say("report", "measuring, one candidate after the other: some minutes")
-    measured = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
+    measured = report(grasps, quick=args.quick)
     args.out.mkdir(parents=True, exist_ok=True)
     lines, figures = table(measured), json.dumps(measured)
     text = "\n".join(lines)
@@ -105,11 +103,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> Report:
-    """Return the figures of all models in these folders. Raises `ModelError`."""
+def report(grasps: Grasps, *, quick: bool) -> Report:
+    """Return the figures of all models of the zoo. Raises `ModelError`."""
     if quick:
         grasps = grasps.few()
-    several = candidates(folders, grasps)
+    several = candidates(grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
     steps = {row["name"]: step for row, step in several}
     runs = [measure(steps, readings, paced) for _ in range(RUNS)]

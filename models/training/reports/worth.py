@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, draw and print. Raises `DatasetError`, `ModelError` or `OSError`."""
     grasps = read_all(args.data)
     args.out.mkdir(parents=True, exist_ok=True)
-    with progress_bar("trainings", args.seeds * DAYS_FOLDS * len(DAYS), hidden=False) as on_day:
+    with progress_bar("trainings", args.seeds * DAYS_FOLDS * len(DAYS)) as on_day:
         if args.quick:
             several = list(streams(grasps.few(), seeds=1, folds=1, epochs=1))
         else:

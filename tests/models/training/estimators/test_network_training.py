@@ -160,16 +160,6 @@ def test_an_epoch_sees_each_grasp_at_most_once(
     assert len(rows) == sum(map(len, batches)) == seen
 
 
-@pytest.mark.usefixtures("dense")
-def test_label_smoothing_bounds_the_margin() -> None:
-    """Smoothed by 0.2 the targets are 0.9 and 0.1: margins of log(9)."""
-    recipe = Recipe(epochs=60, weight_decay=0.0, peak_learning_rate=0.01, label_smoothing=0.2)
-    values = logits(train_network(TINY, VECTORS, SLIPPED, recipe, seed=0), VECTORS)
-    margins = values[:, 1] - values[:, 0]
-    assert margins[SLIPPED].mean() == pytest.approx(np.log(9.0), rel=0.05)
-    assert margins[~SLIPPED].mean() == pytest.approx(-np.log(9.0), rel=0.05)
-
-
 def test_days_are_drawn_from_the_seed_and_change_what_is_learned(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -265,13 +265,3 @@ def test_the_table_says_how_it_was_made() -> None:
     assert f"- `palm_down.csv` {GRASPS.files[0].sha256}, 200" in text
     assert "--quick" not in text
     assert "mean nothing" in results_table([], GRASPS, *MADE, quick=True)
-
-
-def test_every_row_has_as_many_cells_as_its_header() -> None:
-    made = [figures_of("cnn1", "cv", 0.1), figures_of("svm-session", "session", 0.2)]
-    text = results_table(made, GRASPS, *MADE)
-    width = 0
-    for before, line in zip(["", *text.splitlines()], text.splitlines(), strict=False):
-        if line.startswith("|"):
-            width = line.count("|") if not before.startswith("|") else width
-            assert line.count("|") == width

@@ -11,9 +11,7 @@ from scipy.ndimage import rotate
 
 pytest.importorskip("torch", reason="needs the extra `train`")
 
-from graspd.models.contract import VectorInput
 from graspd.models.inputs import SessionBuilder, builder, raw_features
-from graspd.models.tactile_image import TactileImager
 from graspd.models.training.estimators.configs import (
     Augmentation,
     BoostingConfig,
@@ -24,7 +22,7 @@ from graspd.models.training.estimators.configs import (
 )
 from graspd.models.training.estimators.graphs import Fitted
 from graspd.models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
-from graspd.models.training.fitting.trained import FittedBlend, FittedNetwork, augment, fit, train
+from graspd.models.training.fitting.trained import FittedBlend, augment, fit, train
 from graspd.models.training.systems.registry import (
     SYSTEMS,
     BlendConfig,
@@ -107,20 +105,6 @@ def test_a_member_that_judges_all_grasps_alike_has_no_say() -> None:
     assert fitted.margins(INPUTS) == pytest.approx(0.5 * alone / alone.std(), rel=1e-9)
 
 
-def test_an_augmented_system_sees_four_times_the_grasps() -> None:
-    counts, slipped = separable_counts(64)
-    images = TactileImager(3).build_batch(counts)[0]
-    plain = replace(SYSTEMS["cnn0"], estimator=TINY, recipe=Recipe(epochs=1))
-    augmented = replace(plain, augmentation=Augmentation())
-    given, once = (fit(system, images, slipped, seed=0) for system in (augmented, plain))
-    assert isinstance(given, FittedNetwork)
-    assert isinstance(once, FittedNetwork)
-    norms = [fitted.network.state_dict()["2.num_batches_tracked"] for fitted in (given, once)]
-    assert [int(batches) for batches in norms] == [8, 2]
-    with pytest.raises(ValueError, match="only images"):
-        fit(replace(augmented, input=VectorInput()), INPUTS, SLIPPED, seed=0)
-
-
 def test_a_standardised_system_sees_every_value_by_its_own_mean_and_spread() -> None:
     svm = SYSTEMS_MADE["svm"]
     stretched = 1000.0 + 37.0 * INPUTS.astype(np.float64) * np.arange(1, 79)
@@ -133,11 +117,6 @@ def test_a_standardised_system_sees_every_value_by_its_own_mean_and_spread() -> 
     plain = fit(svm, expected, SLIPPED, seed=0)
     assert fitted.margins(inputs) == pytest.approx(plain.margins(expected), abs=1e-4)
     assert fitted.parameters == plain.parameters + 2 * 78
-
-
-def test_a_network_without_a_recipe_is_refused() -> None:
-    with pytest.raises(ValueError, match="needs a recipe"):
-        fit(replace(MADE, estimator=TINY), INPUTS, SLIPPED, seed=0)
 
 
 @pytest.mark.parametrize("name", sorted(SYSTEMS))

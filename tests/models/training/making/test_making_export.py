@@ -15,7 +15,6 @@ pytest.importorskip("torch", reason="needs the extra `train`")
 
 import onnx
 import onnxruntime as ort
-from numpy.typing import NDArray
 
 from graspd.models.contract import (
     CountsInput,
@@ -38,7 +37,6 @@ from graspd.models.training.estimators.configs import (
     SvmConfig,
 )
 from graspd.models.training.estimators.graphs import Fitted
-from graspd.models.training.fitting.standards import Standards
 from graspd.models.training.fitting.trained import fit
 from graspd.models.training.making.export import ExportError, export
 from graspd.models.training.systems.registry import (
@@ -155,30 +153,6 @@ def test_the_same_training_makes_the_same_bytes_and_tells_nothing_of_the_machine
     for trace in (str(Path(__file__).parents[4]), str(Path.home()), "site-packages", ".py"):
         assert trace not in text
     assert not re.search(r"/(tmp|home|usr|work|root)/", text)
-
-
-def test_a_session_model_is_checked_by_the_statistics_given(tmp_path: Path) -> None:
-    """Every reading by its own: first shifted statistics, then those of the contract."""
-    seen: list[NDArray[np.float32]] = []
-    made = fitted("hard svm")
-    assert isinstance(made, FittedClassical)
-
-    class Watched(FittedClassical):
-        def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
-            seen.append(inputs)
-            return super().margins(inputs)
-
-    mean = np.repeat(RAW.mean(axis=0)[np.newaxis], 4, axis=0)
-    spread = np.repeat(RAW.std(axis=0)[np.newaxis], 4, axis=0)
-    mean[0] += 0.5 * spread[0]
-    standards = Standards(mean, spread)
-    contract = contract_of("hard svm")
-    parity = export(
-        Watched(made.model), 1.0, contract, COUNTS[:4], tmp_path / "made.onnx", standards
-    )
-    assert parity.grasps == 4
-    expected = np.clip((RAW[:4] - mean) / spread, -3.0, 3.0)
-    assert seen[0] == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_file_that_judges_otherwise_is_not_written(tmp_path: Path) -> None:

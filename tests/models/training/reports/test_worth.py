@@ -31,7 +31,6 @@ from graspd.models.training.reports.worth import (
     LEARNING,
     PUBLISHED,
     RISK,
-    draw,
     limits,
     measured,
     risk_figures,
@@ -185,23 +184,6 @@ def test_p_slip_is_honest_on_a_new_day(bts3_dir: Path) -> None:
     assert 0.7 < slope(p_slip, ended) < 1.4
     surely = p_slip < 0.1
     assert ended[surely].mean() == pytest.approx(p_slip[surely].mean(), abs=0.05)
-
-
-@pytest.fixture(scope="module")
-def pictures() -> tuple[str, str]:
-    """Drawn twice, and before a test counts descriptors: matplotlib keeps its fonts open."""
-    curves = curves_of([stream(seed) for seed in range(30)])
-    return draw(curves), draw(curves)
-
-
-def test_the_picture_shows_every_method_and_repeats(
-    pictures: tuple[str, str],
-) -> None:
-    first, second = pictures
-    assert first == second
-    assert first.startswith("<?xml")
-    for name in (PUBLISHED, ALONE, LEARNING, RISK):
-        assert f"<!-- {name} -->" in first
 
 
 @pytest.fixture(scope="module")
