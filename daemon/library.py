@@ -27,7 +27,7 @@ from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.scene import SceneError
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading, RecordingError
-from graspd.drivers.recordings.columns import time_column
+from graspd.drivers.recordings.columns import OBJECT, SLIPPED, time_column
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all, refuse_options
 from graspd.drivers.recordings.layout import BLOCK_ROWS, ReadAs, problem_of_sweeps
 from graspd.models import trial, zoo
@@ -176,10 +176,17 @@ def _grasps(
     if column_names(given):
         rows = counts.reshape(-1, counts.shape[1] * counts.shape[2])
         blocks = np.array_split(rows, range(BLOCK_ROWS, len(rows), BLOCK_ROWS))
-        problem = problem_of_sweeps(blocks, read_as)
+        problem = problem_of_sweeps(blocks, read_as, labelled=_are_labelled(given))
         if problem is not None:
             raise ValueError(f"the table: {_in_arguments(problem)} (graspd.judge judges sweeps)")
     return counts
+
+
+def _are_labelled(table: Any) -> bool:  # noqa: ANN401
+    """Return True for rows with objects and outcomes of both kinds."""
+    if not {OBJECT, SLIPPED} <= set(column_names(table)):
+        return False
+    return len(set(np.asarray(table[SLIPPED]).tolist())) > 1
 
 
 def _time_of(table: Any) -> str | None:  # noqa: ANN401

@@ -17,8 +17,9 @@ from graspd.daemon.publish.companion import Companion
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene.drivers import CanTactile, ReplayTactile, SpiTactile
 from graspd.daemon.scene.scene import Hand
+from graspd.drivers.recordings.columns import MissingFingersError
 from graspd.drivers.recordings.kinds import BAGS, CAN_LOGS, Kind, kind_of, kind_of_all
-from graspd.drivers.recordings.layout import ReadAs, fingers_in_header
+from graspd.drivers.recordings.layout import ReadAs
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 
@@ -101,33 +102,30 @@ class Tables(Source):
         """Make the parts for the model's fingers."""
         hand = Hand(fingers=model.contract.fingers)
         for path in self._paths:
-            self._refuse_other_fingers(path, model)
-        plan = Plan.of(replayed.model_copy(update={"hand": hand}))
+            if kind_of(path) in BAGS:
+                from graspd.drivers.recordings.bag import fingers_of
+
+                _refuse_other_fingers(path, fingers_of(path), model)
+        try:
+            plan = Plan.of(replayed.model_copy(update={"hand": hand}))
+        except MissingFingersError as error:
+            _refuse_other_fingers(error.path, error.there, model)
+            raise
         options = cast(ReplayTactile, replayed.tactile)
         driver = assembly.player(plan, options, speed, strict=self._strict)
         parts = Parts.of(plan, model, driver, lambda: driver.handed_over_ns)
         return replace(parts, boot_id=DRAWS)
 
-    def _refuse_other_fingers(self, path: Path, model: TactileModel) -> None:
-        """Raise `SceneError`, with models that fit, if a file lacks fingers of the model."""
-        judged = model.contract.fingers
-        there = self._fingers(path, judged)
-        if missing := [finger for finger in judged if finger not in there]:
-            fits = zoo.judging([finger for finger in FINGERS if finger in there])
-            advice = f": --model {fits[0]} judges these" if fits else ", and no model judges these"
-            raise SceneError(
-                f"{path}: has {', '.join(there) or 'no finger'}; {model.contract.name} also needs "
-                f"{', '.join(missing)}{advice}"
-            )
 
-    def _fingers(self, path: Path, judged: Sequence[Finger]) -> Sequence[str]:
-        if kind_of(path) in BAGS:
-            from graspd.drivers.recordings.bag import fingers_of
-
-            return fingers_of(path)
-        if len(judged) == 1:  # a file of one finger need not name it
-            return judged
-        return fingers_in_header(path)
+def _refuse_other_fingers(path: Path, there: Sequence[Finger], model: TactileModel) -> None:
+    """Raise `SceneError`, with models that fit, if a file lacks fingers of the model."""
+    if missing := [finger for finger in model.contract.fingers if finger not in there]:
+        fits = zoo.judging([finger for finger in FINGERS if finger in there])
+        advice = f": --model {fits[0]} judges these" if fits else ", and no model judges these"
+        raise SceneError(
+            f"{path}: has {', '.join(there) or 'no finger'}; {model.contract.name} also needs "
+            f"{', '.join(missing)}{advice}"
+        )
 
 
 class LinkLogs(Source):

@@ -18,7 +18,7 @@ from graspd.drivers.recordings.columns import OBJECT, SLIPPED, TIME
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.csv_rows import Row, read_rows
 from graspd.drivers.recordings.kinds import BAGS, TABLES, Kind, files_of, kind_of, refuse_options
-from graspd.drivers.recordings.layout import ReadAs, fingers_in_header, layout_of
+from graspd.drivers.recordings.layout import ReadAs, layout_of
 from graspd.extras import require
 
 if TYPE_CHECKING:
@@ -99,8 +99,10 @@ def _readings(path: Path, read_as: ReadAs | None, rate_hz: float | None) -> pd.D
         fingers = header_of(path).fingers
         driver = McapReplayDriver([path], fingers)
     else:
-        fingers = fingers_in_header(path)
-        driver = ReplayDriver([path], fingers, speed=None, read_as=read_as, rate_hz=rate_hz)
+        layout = layout_of(path, (), read_as, rate_hz)
+        fingers = layout.columns.fingers
+        layouts = {path: layout}
+        driver = ReplayDriver([path], fingers, layouts=layouts, speed=None, rate_hz=rate_hz)
     rows: list[TactileReading] = []
     joints: list[dict[str, float]] = []
     angles: dict[str, float] = {}

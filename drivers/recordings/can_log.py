@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, islice
 from pathlib import Path
 from typing import BinaryIO, Final, Unpack
 
@@ -30,6 +31,8 @@ from graspd.drivers.recordings.kinds import (
 from graspd.drivers.recordings.player import LinkLogDriver
 
 NS_PER_US: Final = 1000
+FIRST_LINES: Final = 20_000
+"""Lines by which the bus is chosen, 5 s of a bus that is full; they are kept meanwhile."""
 IDS_MAX: Final = 4096
 """Most pairs of bus and id that are counted; standard frames of one bus have half as many."""
 SHOWN_MAX: Final = 8
@@ -104,13 +107,12 @@ def _lines(stream: BinaryIO) -> Iterator[str]:
 
 @dataclass(slots=True)
 class Survey:
-    """Buses, ids and strange lines of a log, counted before it is played."""
+    """The begin of a log, by which its bus is chosen; the log is read once."""
 
-    lines: int = 0
-    strange: int = 0
-    """Lines that were not understood."""
-    first: str = ""
-    """The first of them, with its number."""
+    lines: Iterator[Line]
+    """The whole log."""
+    strange: str = ""
+    """The first line that was not understood, with its number."""
     frames: Counter[tuple[str, int | None]] = field(default_factory=Counter)
     """Frames of a bus and arbitration id; None: CAN FD."""
     has_steps: bool = False
@@ -118,19 +120,17 @@ class Survey:
 
     @classmethod
     def of(cls, path: Path) -> Survey:
-        """Read a log once. Raises `RecordingError`."""
-        survey, last_ns, rises, falls = cls(), dict[str, int](), 0, 0
-        for number, text, logged in read_log(path):
-            if logged is not None and logged.bus == NO_BUS:
-                continue
-            survey.lines += 1
+        """Read the begin of a log. Raises `RecordingError`."""
+        log = read_log(path)
+        first = list(islice(log, FIRST_LINES))
+        survey, last_ns, rises, falls = cls(chain(first, log)), dict[str, int](), 0, 0
+        for number, text, logged in first:
             if logged is None:
-                survey.strange += 1
-                survey.first = survey.first or f"line {number}, {text.strip()[:SHOWN_LENGTH_MAX]!r}"
+                survey.strange = survey.strange or _shown(number, text)
                 continue
             key = logged.bus, None if logged.frame is None else logged.frame.arbitration_id
             is_counted = key in survey.frames or len(survey.frames) < IDS_MAX
-            if logged.t_ns is None or not is_counted:
+            if logged.bus == NO_BUS or logged.t_ns is None or not is_counted:
                 continue
             survey.frames[key] += 1
             if logged.may_be_step:
@@ -140,6 +140,10 @@ class Survey:
                 last_ns[logged.bus] = logged.t_ns
         survey.has_steps = bool(last_ns) and falls >= rises * STEPS_SHARE - 1
         return survey
+
+
+def _shown(number: int, text: str) -> str:
+    return f"line {number}, {text.strip()[:SHOWN_LENGTH_MAX]!r}"
 
 
 class CanLog(LinkLogDriver[CanFrame]):
@@ -170,21 +174,14 @@ class CanLog(LinkLogDriver[CanFrame]):
         self.begin()
 
     def open(self) -> None:
-        """Read the logs once, to choose the bus and report what is strange, then start."""
+        """Read the begin of the logs to choose the bus, then start."""
+        self.close()
         self._surveys = {path: Survey.of(path) for path in self.paths}
         frames: Counter[tuple[str, int | None]] = Counter()
         for path, survey in self._surveys.items():
-            if survey.strange == survey.lines:
-                problem = f"no line was understood: {survey.first}; record with `candump -L`"
+            if survey.strange and not survey.frames:
+                problem = f"no line was understood: {survey.strange}; record with `candump -L`"
                 raise RecordingError(path, problem)
-            if survey.strange:
-                _log.warning(
-                    "%s: %d of %d lines were not understood; the first is %s",
-                    path,
-                    survey.strange,
-                    survey.lines,
-                    survey.first,
-                )
             frames += survey.frames
         self._bus = self._choose({bus for bus, _ in frames})
         self._check_ids(frames)
@@ -220,25 +217,36 @@ class CanLog(LinkLogDriver[CanFrame]):
         most = sorted(ids, key=lambda each: -ids[each])[:SHOWN_MAX]
         names = ", ".join("CAN FD" if each is None else f"{each:#x}" for each in most)
         _log.warning(
-            "%s: no frame has tactile.arbitration_id %#x; there are %s",
+            "%s: no frame of the begin has tactile.arbitration_id %#x; there are %s",
             self.paths[0],
             wanted,
             names,
         )
 
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
-        has_steps, since_ns = self._surveys[path].has_steps, 0
-        for _, _, logged in read_log(path):
+        survey = self._surveys[path]
+        buses = {ANY_BUS, NO_BUS, *(bus for bus, _ in survey.frames)}
+        since_ns, lines, strange, first = 0, 0, 0, ""
+        for number, text, logged in survey.lines:
             if logged is None:
+                lines, strange = lines + 1, strange + 1
+                first = first or _shown(number, text)
                 continue
+            lines += logged.bus != NO_BUS
             if logged.t_ns is not None:
-                since_ns = logged.t_ns + (since_ns if has_steps else 0)
+                since_ns = logged.t_ns + (since_ns if survey.has_steps else 0)
+            if logged.bus not in buses and len(buses) < SHOWN_MAX:
+                buses.add(logged.bus)
+                _log.warning("%s: line %d has the channel %s, too", path, number, logged.bus)
             if logged.bus not in (self._bus, ANY_BUS):
                 continue
             if logged.frame is None:
                 self.stream.counters.malformed_frames += 1
                 continue
             yield self._going_on(since_ns), logged.frame
+        if strange:
+            text = "%s: %d of %d lines were not understood; the first is %s"
+            _log.warning(text, path, strange, lines, first)
 
     def _going_on(self, t_ns: int) -> int:
         """Return a time that does not fall where the clock was set back: the link was silent."""

@@ -68,6 +68,17 @@ _UNIT: Final = re.compile(r"\s*[(\[]([^\W\d][^)\]]*|-)[)\]]")
 UNITS: Final = frozenset((*_UNIT_S, "counts", "count", "raw", "adc", "lsb", "bits", "rad", "deg"))
 
 
+class MissingFingersError(RecordingError):
+    """A file lacks fingers that are asked for."""
+
+    def __init__(
+        self, path: Path, problem: str, line: int, column: str, there: Sequence[Finger]
+    ) -> None:
+        """`there`: fingers that the file has."""
+        super().__init__(path, problem, line=line, column=column)
+        self.there = there
+
+
 @dataclass(frozen=True, slots=True)
 class TimeColumn:
     """Column of times, or columns of whole seconds and nanoseconds."""
@@ -205,7 +216,7 @@ def _whole(
         asked = f"{len(fingers)} are" if fingers else "none is"
         problem = f"{example} and so on name no finger, and {asked} asked for: name it, as ff_e1"
         raise RecordingError(path, problem, line=line)
-    there = ", ".join(finger for finger in FINGERS if finger in found)
+    there = tuple(finger for finger in FINGERS if finger in found)
     expected = range(base, base + ELECTRODES)
     for finger in fingers or found:
         numbers = found.get(finger, {})
@@ -214,7 +225,9 @@ def _whole(
             column = re.sub(r"^ff|(?<=tactiles)0", _written(example, finger), example)
             column = re.sub(r"\d+$", str(missing[0]), column)
             others = f", the first of {len(missing)} that are" if len(missing) > 1 else ""
-            problem = f"this column is missing{others}; the file has the fingers {there}"
+            problem = f"this column is missing{others}; the file has the fingers {', '.join(there)}"
+            if finger not in found:
+                raise MissingFingersError(path, problem, line, column, there)
             raise RecordingError(path, problem, line=line, column=column)
         if extra := [number for number in numbers if number not in expected]:
             problem = f"{finger} has electrode {extra[0]}, and they begin at {base}"

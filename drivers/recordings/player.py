@@ -58,7 +58,7 @@ class RecordedDriver(Opened, Generic[Item]):
         return None
 
     def start(self, items: Generator[tuple[int, Item], None, None]) -> None:
-        self.close()
+        """Play `items`, of a driver that is closed."""
         self._began = None
         self.handed_over_ns = self._opened_ns = self._clock()
         self._playing = items

@@ -281,7 +281,7 @@ def test_a_damaged_blf_file_plays_up_to_the_damage(
 
 
 def test_the_channel_of_a_scene_chooses_the_bus(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two boards with one id would give one hand."""
     caplog.set_level(logging.INFO)
@@ -300,6 +300,11 @@ def test_the_channel_of_a_scene_chooses_the_bus(
     readings, _ = played([path], "can0")
     assert len(readings) == 4
     assert "has no channel can0; played is can1" in caplog.text
+    monkeypatch.setattr("graspd.drivers.recordings.can_log.FIRST_LINES", 48)
+    path.write_text("".join([*lines_of(4), *other]))
+    readings, _ = played([path], "can0")
+    assert len(readings) == 4
+    assert f"{path}: line 97 has the channel can1, too" in caplog.text
 
 
 def test_lines_that_are_not_understood_are_counted(
@@ -344,7 +349,7 @@ def test_an_id_that_no_frame_has_is_named(tmp_path: Path, caplog: pytest.LogCapt
     path.write_text("".join(lines_of(2)).replace(" 5A1#", " 0A2#"))
     readings, _ = played([path])
     assert readings == []
-    assert "no frame has tactile.arbitration_id 0x5a1; there are 0xa2" in caplog.text
+    assert "no frame of the begin has tactile.arbitration_id 0x5a1; there are 0xa2" in caplog.text
 
 
 def shown(times_ns: Sequence[int]) -> str:
