@@ -33,8 +33,9 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def to_json(value: object) -> bytes:
-    """Return indented JSON with a newline."""
-    return msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"
+    """Return indented JSON with a newline; `value` may have numbers of numpy."""
+    encoded = msgspec.json.encode(value, enc_hook=lambda number: number.item())
+    return msgspec.json.format(encoded, indent=2) + b"\n"
 
 
 def markdown_table(

@@ -1,21 +1,18 @@
 """How honest `p_slip` is: of the grasps with a probability of 0.1 a tenth should slip.
 
 The learner's scale is fitted on the sessions of some objects and judged on those of the others.
+Rows are those of `streams.live`.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 from scipy import optimize
 
 from graspd.models.training.evaluating.files import markdown_table
-from graspd.models.training.reports.streams import Group, Life
 from graspd.models.trust.learner import SCALE
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
@@ -27,42 +24,14 @@ SPREAD: Final = (0.05, 0.5, 0.95)
 """Quantiles of the sessions' slopes."""
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
-    """Grasps whose `p_slip` is between two edges."""
-
-    low: float
-    high: float
-    grasps: int
-    said: float
-    """Mean `p_slip`."""
-    slipped: float
-    """Fraction."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reliability:
-    """Reliability of `p_slip` after outcomes, with scales fitted without its own objects."""
-
-    parts: list[Part]
-    slope: float
-    """Slope of outcomes on log-odds; 1 is honest."""
-    sessions: tuple[float, ...]
-    """The same of single sessions, at the quantiles `SPREAD`."""
-    scales: list[float]
-    """Scale of each group of objects, fitted on the sessions of the others of its split."""
-    shipped: float
-    """Scale of the learner as it is shipped."""
-
-
-def slope(p_slip: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
-    """Return the factor on the log-odds that makes these probabilities (N,) the likeliest.
+def slope(rows: pd.DataFrame) -> float:
+    """Return the factor on the log-odds that makes these probabilities the likeliest.
 
     1: honest. Above: timid. Below: too sure. At most `SLOPE_MAX`.
     """
-    p = np.clip(p_slip, CONFIDENT, 1.0 - CONFIDENT)
+    p = np.clip(rows["p_slip"].to_numpy(), CONFIDENT, 1.0 - CONFIDENT)
     log_odds = np.log(p / (1.0 - p))
-    for_outcome = np.where(slipped, log_odds, -log_odds)
+    for_outcome = np.where(rows["slipped"], log_odds, -log_odds)
     if not for_outcome.any():
         return 1.0
     best = optimize.minimize_scalar(
@@ -74,59 +43,69 @@ def slope(p_slip: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
     return float(best.x)
 
 
-def fitted_scales(unscaled: Sequence[Life]) -> dict[Group, float]:
-    """Return the scale of each group of objects, fitted on the other groups of its split.
+def fitted_scales(unscaled: pd.DataFrame) -> dict[tuple[int, int], float]:
+    """Return a scale for each split and fold of objects, fitted on the split's other folds.
 
-    `unscaled` are lives with a scale of 1. A group without others has the learner's.
+    `unscaled` are rows of lives with a scale of 1. A fold without others has the learner's.
     """
     scales = {}
-    for group in dict.fromkeys(life.stream.group for life in unscaled):
-        split = [life for life in unscaled if life.stream.group[0] == group[0]]
-        others = [life for life in split if life.stream.group != group]
-        scales[group] = slope(*outcomes_of(others)) if others else SCALE
+    for split, rows in after_outcomes(unscaled).groupby("split"):
+        for fold in rows["fold"].unique():
+            others = rows[rows["fold"] != fold]
+            scales[split, fold] = slope(others) if len(others) else SCALE
     return scales
 
 
-def outcomes_of(lives: Sequence[Life]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return `p_slip` of all judged grasps that rest on an outcome, and whether each slipped."""
-    p_slip = np.concatenate([life.p_slip for life in lives])
-    slipped = np.concatenate([life.stream.slipped for life in lives])
-    refused = np.concatenate([life.stream.refused for life in lives])
-    rows = ~refused & (np.concatenate([life.outcomes for life in lives]) > 0)
-    return p_slip[rows], slipped[rows]
+def after_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the judged grasps whose verdict rests on an outcome."""
+    return rows[~rows["refused"] & (rows["outcomes"] > 0)]
 
 
-def reliability(lives: Sequence[Life], scales: dict[Group, float]) -> Reliability:
-    """Return what `p_slip` of these lives is worth; they were lived with these scales."""
-    p_slip, slipped = outcomes_of(lives)
-    parts = []
-    for low, high in itertools.pairwise(EDGES):
-        inside = (p_slip >= low) & (p_slip < high)
-        if inside.any():
-            said, actual = float(p_slip[inside].mean()), float(slipped[inside].mean())
-            parts.append(Part(low, high, int(inside.sum()), said, actual))
-    spread = tuple(np.quantile([slope(*outcomes_of([life])) for life in lives], SPREAD).tolist())
-    return Reliability(parts, slope(p_slip, slipped), spread, list(scales.values()), SCALE)
+def reliability(learning: pd.DataFrame, scales: dict[tuple[int, int], float]) -> dict[str, Any]:
+    """Return what `p_slip` of these lives is worth; they were lived with these scales.
+
+    `parts`: grasps with a `p_slip` from `low` to `high`, mean of it (`said`) and share that
+    `slipped`. `slope`: of all grasps; `sessions`: of single sessions, at the quantiles `SPREAD`.
+    """
+    rows = after_outcomes(learning)
+    parts = [
+        {
+            "low": edges.left,
+            "high": edges.right,
+            "grasps": len(part),
+            "said": part["p_slip"].to_numpy().mean(),
+            "slipped": part["slipped"].mean(),
+        }
+        for edges, part in rows.groupby(pd.cut(rows["p_slip"], EDGES, right=False), observed=True)
+    ]
+    slopes = [slope(session) for _, session in rows.groupby("session")]
+    return {
+        "parts": parts,
+        "slope": slope(rows),
+        "sessions": np.quantile(slopes, SPREAD).tolist(),
+        "scales": list(scales.values()),
+        "shipped": SCALE,
+    }
 
 
-def reliability_lines(figures: Reliability) -> list[str]:
+def reliability_lines(figures: dict[str, Any]) -> list[str]:
     """Return said and actual share of slips by part of `p_slip`, and the slopes."""
     rows = [
         [
-            f"{part.low:g} to {part.high:g}",
-            str(part.grasps),
-            f"{100 * part.said:.1f}",
-            f"{100 * part.slipped:.1f}",
+            f"{part['low']:g} to {part['high']:g}",
+            str(part["grasps"]),
+            f"{100 * part['said']:.1f}",
+            f"{100 * part['slipped']:.1f}",
         ]
-        for part in figures.parts
+        for part in figures["parts"]
     ]
     lines = list(markdown_table(("`p_slip`", "grasps", "said, %", "slipped, %"), rows))
-    low, middle, high = figures.sessions
+    low, middle, high = figures["sessions"]
+    scales = figures["scales"]
     return [
         *lines,
         "",
-        f"Slope of outcomes on log-odds: {figures.slope:.2f}; of a session {middle:.2f}, from "
+        f"Slope of outcomes on log-odds: {figures['slope']:.2f}; of a session {middle:.2f}, from "
         f"{low:.2f} to {high:.2f} (5 to 95 %). Scale of each group of objects, fitted on the "
-        f"others: {min(figures.scales):.2f} to {max(figures.scales):.2f}; shipped "
-        f"{figures.shipped:g}.",
+        f"others: {min(scales):.2f} to {max(scales):.2f}; shipped {figures['shipped']:g}.",
     ]

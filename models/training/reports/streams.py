@@ -9,12 +9,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
-from graspd.models.training.arrays import Ints
+from graspd.models.training.arrays import Bools, Floats, Floats32, Ints
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
 from graspd.models.training.evaluating.days import Day, by_object
@@ -28,43 +28,20 @@ OWN, PUBLISHED = "small-session", "cnn1"
 """Systems that judge: graspd's default, and the published network on the plain image."""
 DRAWS: Final = 2
 """Streams of each table, fold and order."""
-Order = Literal["random", "by object"]
-ORDERS: Final[tuple[Order, ...]] = ("random", "by object")
-Group = tuple[int, int]
-"""Objects of a stream: seed of the split, and fold. Folds of one split share no object."""
+ORDERS: Final = ("random", "by object")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """The grasps of one table and fold."""
+    """The grasps of one table and of some objects, in the order of one session."""
 
-    group: Group
-    protocol: str
-    table: str
-    order: Order
-    margins: NDArray[np.float64]
-    """Log-odds of slip (N,) of graspd's network."""
-    features: NDArray[np.float32]
-    """Inputs of that network, shape (N, 78)."""
-    refused: NDArray[np.bool_]
-    """Shape (N,): grasps that the daemon does not judge, such as ones that are never seen."""
-    published: NDArray[np.float64]
-    """Log-odds of slip (N,) of the published network, which refuses nothing."""
-    slipped: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Life:
-    """Verdicts on a stream's grasps (N,), each after the outcomes of the grasps before it."""
-
-    stream: Stream
-    p_slip: NDArray[np.float64]
-    """NaN: refused."""
-    stable: NDArray[np.bool_]
-    supervised: NDArray[np.bool_]
-    """Grasps whose lift under supervision was asked for."""
-    outcomes: NDArray[np.int64]
-    """Number of outcomes that each verdict rests on."""
+    rows: pd.DataFrame
+    """A row per grasp: `session`, number of the stream; `split` (seed) and `fold` of the objects,
+    which no other fold of the split has; `day`, `table` and `order`; `grasp`, its place in the
+    session; log-odds of slip of graspd's network (`margin`) and of the `published` one; `refused`,
+    true if the daemon does not judge it, which the published network always does; `slipped`."""
+    features: Floats32
+    """Inputs of graspd's network, shape (N, 78)."""
 
 
 def streams(
@@ -83,10 +60,11 @@ def streams(
     if epochs is not None:
         systems = [with_recipes(system, epochs=epochs) for system in systems]
     names = np.array([file.name for file in grasps.files])[grasps.table_of]
+    sessions = itertools.count()
     for seed, fold in itertools.product(range(seeds), range(folds)):
         fold_of = object_folds(grasps.objects, DAYS_FOLDS, seed)
-        for protocol, training, tables in DAYS:
-            on_day(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {protocol}")
+        for day, training, tables in DAYS:
+            on_day(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {day}")
             others = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
             own, published = (train(system, others, fold_seed(seed, fold)) for system in systems)
             random = np.random.default_rng([seed, fold])
@@ -96,17 +74,25 @@ def streams(
                 if order == "by object":
                     rows = by_object(random, rows, np.array(grasps.objects)[rows])
                 margins, features, refused = judged(own, grasps, rows)
-                theirs = published.margins(grasps.counts[rows], grasps.table_of[rows])
-                slipped = grasps.slipped[rows]
-                yield Stream(
-                    (seed, fold), protocol, table, order,
-                    margins, features, refused, theirs, slipped,
-                )  # fmt: skip
+                frame = pd.DataFrame(
+                    {
+                        "session": next(sessions),
+                        "split": seed,
+                        "fold": fold,
+                        "day": day,
+                        "table": table,
+                        "order": order,
+                        "grasp": np.arange(len(rows)),
+                        "margin": margins,
+                        "refused": refused,
+                        "published": published.margins(grasps.counts[rows], grasps.table_of[rows]),
+                        "slipped": grasps.slipped[rows],
+                    }
+                )
+                yield Stream(frame, features)
 
 
-def judged(
-    trained: Trained, grasps: Grasps, rows: Ints
-) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]:
+def judged(trained: Trained, grasps: Grasps, rows: Ints) -> tuple[Floats, Floats32, Bools]:
     """Judge rows as one session; return margins (N,), inputs (N, features) and what is refused."""
     day = Day(trained)
     margins, refused = np.empty(len(rows)), np.empty(len(rows), np.bool_)
@@ -117,25 +103,29 @@ def judged(
     return margins, inputs, refused
 
 
-def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCALE) -> Life:
+def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCALE) -> pd.DataFrame:
     """Judge, lift and tell one grasp after the other; refused ones are left alone.
 
     Without `every`, only stable and supervised grasps are lifted and their outcomes told. `scale`
     takes the place of the learner's own.
+
+    Returns the stream's rows with the verdict, after the outcomes of the grasps before: `p_slip`,
+    NaN of a refused one; `stable`; `supervised`, true if a lift under supervision was asked for;
+    `outcomes`, the number that it rests on.
     """
     learner, risk = Learner(stream.features.shape[1]), Risk(limits)
-    learner.scale, count = scale, len(stream.slipped)
+    rows, count = stream.rows, len(stream.rows)
+    learner.scale, name = scale, f"{rows['table'].iloc[0]} {rows['order'].iloc[0]}"
     p_slip, stable = np.full(count, np.nan), np.zeros(count, np.bool_)
     supervised, outcomes = np.zeros(count, np.bool_), np.zeros(count, np.int64)
-    for index in np.flatnonzero(~stream.refused).tolist():
-        name = f"{stream.table} {stream.order}", index
-        margin, slipped = float(stream.margins[index]), bool(stream.slipped[index])
-        inputs = stream.features[index]
-        assessed = assess(learner, risk, sigmoid(margin), margin, inputs, name=name)
+    margins, ended = rows["margin"].tolist(), rows["slipped"].tolist()
+    for index in np.flatnonzero(~rows["refused"]).tolist():
+        margin, slipped, inputs = margins[index], ended[index], stream.features[index]
+        assessed = assess(learner, risk, sigmoid(margin), margin, inputs, name=(name, index))
         p_slip[index] = assessed.p_slip
         supervised[index], outcomes[index] = assessed.supervised, assessed.outcomes
         stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5
         if every or stable[index] or assessed.supervised:
             risk.take(stable=bool(stable[index]), slipped=slipped, proves=True)
             learner.learn(np.frombuffer(assessed.features, "<f8"), slipped=slipped)
-    return Life(stream, p_slip, stable, supervised, outcomes)
+    return rows.assign(p_slip=p_slip, stable=stable, supervised=supervised, outcomes=outcomes)

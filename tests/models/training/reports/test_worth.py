@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 pytest.importorskip("torch", reason="needs the extra `train`")
@@ -22,8 +23,7 @@ from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.data.protocols import object_folds
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.reports import streams as module
-from graspd.models.training.reports import worth
-from graspd.models.training.reports.reliability import fitted_scales, outcomes_of, slope
+from graspd.models.training.reports.reliability import after_outcomes, fitted_scales, slope
 from graspd.models.training.reports.streams import Stream, judged, live, streams
 from graspd.models.training.reports.worth import (
     ALLOWED,
@@ -50,46 +50,57 @@ def stream(seed: int = 0) -> Stream:
     slipped = random.random(GRASPS) < 0.5
     features = random.normal(0.0, 1.0, (GRASPS, 6)).astype(np.float32)
     features[:, 0] = np.where(slipped, 1.0, -1.0) * random.uniform(0.5, 2.0, GRASPS)
-    margins = random.normal(0.0, 1.0, GRASPS)
-    refused = np.zeros(GRASPS, np.bool_)
-    published = np.full(GRASPS, -1.0)
-    return Stream(
-        (0, seed), "A", "palm_45", "random", margins, features, refused, published, slipped
-    )
+    rows = {
+        "session": seed,
+        "split": 0,
+        "fold": seed,
+        "day": "A",
+        "table": "palm_45",
+        "order": "random",
+        "grasp": np.arange(GRASPS),
+        "margin": random.normal(0.0, 1.0, GRASPS),
+        "refused": False,
+        "published": -1.0,
+        "slipped": slipped,
+    }
+    return Stream(pd.DataFrame(rows), features)
 
 
-def curves_of(several: Sequence[Stream]) -> worth.Curves:
-    learning = [live(one, RiskLimits(), every=True) for one in several]
-    return measured(learning, [live(one, LIMITS, every=False) for one in several])
+def changed(one: Stream, **columns: object) -> Stream:
+    return replace(one, rows=one.rows.assign(**columns))
+
+
+def lived(several: Sequence[Stream], limits: RiskLimits, *, every: bool) -> pd.DataFrame:
+    return pd.concat([live(one, limits, every=every) for one in several], ignore_index=True)
 
 
 def test_the_figures_are_counted_over_all_streams_by_grasp() -> None:
     several = [stream(seed) for seed in range(30)]
-    curves = curves_of(several)
-    slipped = np.array([one.slipped for one in several])
-    alone = np.array([one.margins < 0.0 for one in several])
+    learning = lived(several, RiskLimits(), every=True)
+    curves = measured(learning, lived(several, LIMITS, every=False))
+    slipped = np.array([one.rows["slipped"] for one in several])
+    alone = np.array([one.rows["margin"] < 0.0 for one in several])
     for index, part in enumerate((slice(0, 10), slice(10, 25), slice(25, 50))):
         own, published = curves[ALONE][index], curves[PUBLISHED][index]
-        assert published.slips_among_stable == pytest.approx(slipped[:, part].mean())
-        assert published.coverage == 1.0
+        assert published["slips_among_stable"] == pytest.approx(slipped[:, part].mean())
+        assert published["coverage"] == 1.0
         said, slips = alone[:, part], slipped[:, part]
-        assert own.slips_among_stable == pytest.approx((said & slips).sum() / said.sum())
-        assert own.coverage == pytest.approx((said & ~slips).sum() / (~slips).sum())
+        assert own["slips_among_stable"] == pytest.approx((said & slips).sum() / said.sum())
+        assert own["coverage"] == pytest.approx((said & ~slips).sum() / (~slips).sum())
     first, last = curves[LEARNING][0], curves[LEARNING][-1]
-    assert last.slips_among_stable < 0.1 < 0.2 < first.slips_among_stable
-    assert curves[RISK][-1].coverage > 0.5 > curves[RISK][0].coverage
-    assert [point.grasps for point in curves[RISK]] == [5, 17, 37, 62, 87, 125, 175, 225, 275]
+    assert last["slips_among_stable"] < 0.1 < 0.2 < first["slips_among_stable"]
+    assert curves[RISK][-1]["coverage"] > 0.5 > curves[RISK][0]["coverage"]
+    assert [point["grasps"] for point in curves[RISK]] == [5, 17, 37, 62, 87, 125, 175, 225, 275]
 
 
 def test_a_verdict_does_not_know_the_outcome_of_its_grasp() -> None:
     whole = stream()
-    turned = whole.slipped.copy()
-    turned[100:] ^= True
+    turned = whole.rows["slipped"] ^ (whole.rows["grasp"] >= 100)
     for every in (True, False):
         as_it_was = live(whole, LIMITS, every=every)
-        otherwise = live(replace(whole, slipped=turned), LIMITS, every=every)
-        np.testing.assert_array_equal(as_it_was.p_slip[:101], otherwise.p_slip[:101])
-        assert not np.array_equal(as_it_was.p_slip, otherwise.p_slip)
+        otherwise = live(changed(whole, slipped=turned), LIMITS, every=every)
+        assert as_it_was["p_slip"][:101].equals(otherwise["p_slip"][:101])
+        assert not as_it_was["p_slip"].equals(otherwise["p_slip"])
 
 
 def test_networks_saw_neither_objects_nor_poses_of_their_streams(
@@ -115,7 +126,8 @@ def test_networks_saw_neither_objects_nor_poses_of_their_streams(
     monkeypatch.setattr(module, "train", watched)
     monkeypatch.setattr(module, "judged", apart)
     found = list(streams(grasps, seeds=1, folds=1, epochs=1))
-    assert {(one.protocol, one.table, one.order) for one in found} == {
+    firsts = [one.rows.iloc[0] for one in found]
+    assert {(row["day"], row["table"], row["order"]) for row in firsts} == {
         (day, table, order)
         for day, table in (
             ("A", "palm_45"),
@@ -128,17 +140,17 @@ def test_networks_saw_neither_objects_nor_poses_of_their_streams(
 def test_a_refused_grasp_counts_as_not_kept() -> None:
     whole = stream()
     refused = np.arange(GRASPS) % 2 == 0
-    life = live(replace(whole, refused=refused), RiskLimits(), every=True)
-    assert np.isnan(life.p_slip[refused]).all()
-    assert not life.stable[refused].any()
-    assert life.outcomes[-1] == GRASPS // 2 - 1
-    figures = risk_figures([life], 0.01, "A")
-    held = ~whole.slipped
-    assert figures.kept == pytest.approx((life.stable & held).sum() / held.sum())
-    assert figures.slips == pytest.approx((life.stable & ~held).sum() / life.stable.sum())
-    assert figures.kept < 0.5
-    assert figures.slips > 0.01
-    assert figures.above == 1.0
+    life = live(changed(whole, refused=refused), RiskLimits(), every=True)
+    assert life["p_slip"][refused].isna().all()
+    assert not life["stable"][refused].any()
+    assert life["outcomes"].iloc[-1] == GRASPS // 2 - 1
+    figures = risk_figures(life, 0.01, "A")
+    held = ~life["slipped"]
+    assert figures["kept"] == pytest.approx((life["stable"] & held).sum() / held.sum())
+    assert figures["slips"] == pytest.approx(life["slipped"][life["stable"]].mean())
+    assert figures["kept"] < 0.5
+    assert figures["slips"] > 0.01
+    assert figures["above"] == 1.0
 
 
 def test_probabilities_that_are_timid_or_too_sure_have_that_slope() -> None:
@@ -147,17 +159,19 @@ def test_probabilities_that_are_timid_or_too_sure_have_that_slope() -> None:
     slipped = random.random(40_000) < 1.0 / (1.0 + np.exp(-log_odds))
     for factor in (0.5, 1.0, 2.0):
         p_slip = 1.0 / (1.0 + np.exp(-log_odds / factor))
-        assert slope(p_slip, slipped) == pytest.approx(factor, abs=0.03 * factor)
+        rows = pd.DataFrame({"p_slip": p_slip, "slipped": slipped})
+        assert slope(rows) == pytest.approx(factor, abs=0.03 * factor)
 
 
 def test_a_scale_is_fitted_on_other_objects_of_its_split() -> None:
     """Outcomes of the judged objects change the others' scales and not their own."""
     several = [stream(seed) for seed in range(3)]
-    other_split = replace(stream(3), group=(1, 0))
-    turned = replace(several[0], slipped=~several[0].slipped)
+    other_split = changed(stream(3), split=1, fold=0)
+    turned = changed(several[0], slipped=~several[0].rows["slipped"])
 
     def scales(streams: Sequence[Stream]) -> dict[tuple[int, int], float]:
-        return fitted_scales([live(one, RiskLimits(), every=True, scale=1.0) for one in streams])
+        lives = [live(one, RiskLimits(), every=True, scale=1.0) for one in streams]
+        return fitted_scales(pd.concat(lives, ignore_index=True))
 
     former, later = scales([*several, other_split]), scales([turned, *several[1:], other_split])
     assert former[0, 0] == later[0, 0]
@@ -178,12 +192,22 @@ def test_p_slip_is_honest_on_a_new_day(bts3_dir: Path) -> None:
     )
     rows = np.random.default_rng(0).permutation(np.flatnonzero(later & (fold_of == 0)))
     margins, features, refused = judged(trained, grasps, rows)
-    slipped = grasps.slipped[rows]
-    one = Stream((0, 0), "A", "palm_45", "random", margins, features, refused, margins, slipped)
-    p_slip, ended = outcomes_of([live(one, RiskLimits(), every=True)])
-    assert 0.7 < slope(p_slip, ended) < 1.4
-    surely = p_slip < 0.1
-    assert ended[surely].mean() == pytest.approx(p_slip[surely].mean(), abs=0.05)
+    frame = stream().rows.iloc[:1].drop(columns=["grasp", "margin", "refused", "slipped"])
+    frame = frame.merge(
+        pd.DataFrame(
+            {
+                "grasp": np.arange(len(rows)),
+                "margin": margins,
+                "refused": refused,
+                "slipped": grasps.slipped[rows],
+            }
+        ),
+        how="cross",
+    )
+    ended = after_outcomes(live(Stream(frame, features), RiskLimits(), every=True))
+    assert 0.7 < slope(ended) < 1.4
+    surely = ended[ended["p_slip"] < 0.1]
+    assert surely["slipped"].mean() == pytest.approx(surely["p_slip"].mean(), abs=0.05)
 
 
 @pytest.fixture(scope="module")
