@@ -53,10 +53,6 @@ def test_what_stable_is_worth_stands_on_the_card() -> None:
     assert rows_of(MEASURED, "warm-up, target 0.05") == [
         [str(one["warm_up"]), *risk_cells(one)] for one in WORTH["warm_up"]
     ]
-    assert rows_of(MEASURED, "day | sessions") == [
-        [one["day"], str(one["sessions"]), *percents(one["alone"], one["learning"])]
-        for one in WORTH["days"]
-    ]
     assert rows_of(MEASURED, "`p_slip` | grasps") == [
         [
             f"{one['low']:g} to {one['high']:g}",
