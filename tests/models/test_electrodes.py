@@ -119,17 +119,6 @@ def test_the_search_takes_out_the_worst_of_those_left_one_by_one(seed: int) -> N
     assert np.flatnonzero(marked).tolist() == np.flatnonzero(out).tolist()
 
 
-def test_what_is_known_to_be_broken_is_not_looked_at() -> None:
-    mean, covariance, seen = correlated()
-    values = np.random.default_rng(6).multivariate_normal(mean, covariance).reshape(SHAPE)
-    broken = NOTHING.copy()
-    broken[1, 7] = True
-    electrodes = Electrodes(seen)
-    for reads in (0.0, 4095.0, 2000.0):
-        values[1, 7] = reads
-        np.testing.assert_array_equal(implausible(electrodes, values, broken, 12), broken)
-
-
 @settings(max_examples=60)
 @given(
     st.integers(0, 2**32 - 1),
@@ -161,21 +150,6 @@ def test_a_stuck_electrode_of_a_real_grasp_is_found_and_hardly_any_sound_one(sid
     values[:, 1, 9] = 0.0
     found = [implausible(electrodes, reading, NOTHING, 13)[1, 9] for reading in values]
     assert np.mean(found) > 0.95
-
-
-def test_a_repaired_electrode_of_a_real_grasp_is_nearer_than_its_mean(side: Grasps) -> None:
-    electrodes = Electrodes(TactileModel(zoo.find("cnn1")).contract.seen)
-    values = side.counts[::8].astype(np.float64)
-    errors, spreads = [], []
-    for place in range(0, 72, 5):
-        out = np.zeros(72, dtype=np.bool_)
-        out[place] = True
-        mask = out.reshape(SHAPE)
-        repaired = np.array([electrodes.repaired(reading, mask)[mask][0] for reading in values])
-        truth = values.reshape(-1, 72)[:, place]
-        errors.append(np.sqrt(np.mean((repaired - truth) ** 2)))
-        spreads.append(truth.std())
-    assert np.median(np.array(errors) / np.array(spreads)) < 0.6
 
 
 def test_a_finger_that_moved_as_a_whole_is_noticed_and_no_electrode_of_it() -> None:

@@ -14,43 +14,13 @@ from graspd.models.contract import (
     Sharpness,
     VectorInput,
 )
-from graspd.models.inputs import SessionBuilder, VectorBuilder, builder, raw_features
+from graspd.models.inputs import builder
 from graspd.models.layout import D1
 from graspd.models.tactile_image import Composition, TactileImager
 
 
 def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
     return np.random.default_rng(seed).integers(5, 3975, (number, 3, 24), dtype=np.uint16)
-
-
-def test_the_vector_is_the_z_score_of_each_finger() -> None:
-    readings = counts(20)
-    vectors, spreads = VectorBuilder(3).build_batch(readings)
-    for reading, vector, spread in zip(readings, vectors, spreads, strict=True):
-        expected = [(finger - np.mean(finger)) / np.std(finger) for finger in reading]
-        np.testing.assert_allclose(vector, np.concatenate(expected), rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(spread, [np.std(finger) for finger in reading])
-
-
-def test_features_are_z_scores_then_means_then_spreads() -> None:
-    reading = counts(1)[0]
-    features = raw_features(reading)
-    assert features.shape == (78,)
-    np.testing.assert_allclose(features[24:48], (reading[1] - reading[1].mean()) / reading[1].std())
-    np.testing.assert_allclose(features[72:75], reading.mean(axis=1))
-    np.testing.assert_allclose(features[75:78], reading.std(axis=1))
-
-
-def test_session_features_are_standardised_and_clipped() -> None:
-    readings = counts(50)
-    raw = raw_features(readings)
-    mean, spread = raw[:30].mean(axis=0), raw[:30].std(axis=0) / 2.0
-    made = SessionBuilder(3, clip=3.0)
-    made.use(mean, spread)
-    features, _ = made.build_batch(readings)
-    expected = np.clip((raw - mean) / spread, -3.0, 3.0)
-    np.testing.assert_allclose(features, expected, rtol=1e-6, atol=1e-6)
-    assert np.abs(features).max() == 3.0
 
 
 def session_input() -> SessionInput:

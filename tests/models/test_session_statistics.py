@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from graspd.models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics, is_odd
+from graspd.models.session_statistics import SessionState, SessionStatistics, is_odd
 
 WIDTH = 5
 
@@ -47,14 +47,6 @@ def test_running_statistics_are_those_of_all_grasps_and_the_prior(
     variance = (((rows - rows.mean(axis=0)) ** 2).sum(axis=0) + prior_grasps * 4.0) / total
     np.testing.assert_allclose(session.mean, mean, rtol=1e-12)
     np.testing.assert_allclose(session.spread, np.sqrt(variance), rtol=1e-12)
-
-
-def test_one_object_handled_for_hours_is_forgotten_within_the_horizon() -> None:
-    session = statistics()
-    observe(session, grasps(20_000, mean=900.0))
-    observe(session, grasps(3 * int(HORIZON_GRASPS), seed=1))
-    # What is left of the old mean after three horizons is exp(-3) = 5 %.
-    np.testing.assert_allclose(session.mean, 500.0, atol=0.06 * 400.0 + 5.0)
 
 
 def test_what_is_not_finite_changes_nothing() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sklearn.metrics import f1_score
@@ -32,39 +32,16 @@ KINDS: dict[str, Breakage] = {
 """Values of a broken electrode, by kind of damage."""
 
 
-@dataclass(frozen=True, slots=True)
-class Broken:
-    """F1, 0..1, with `number` electrodes of each reading broken, at random places."""
-
-    number: int
-    reads: str
-    """Kind of damage, a key of `KINDS`."""
-    unnoticed: float
-    known: float
-    """F1 if all broken electrodes are known and repaired."""
-    found: float
-    """F1 if electrodes are repaired whose values do not fit the others of the reading."""
-    detected: float
-    """Fraction of the broken electrodes that were found by their values."""
-
-
-@dataclass(frozen=True, slots=True)
-class Study:
-    """F1, 0..1, slip positive, with sound and with broken electrodes, on grasps not trained on."""
-
-    grasps: int
-    sound: float
-    false_alarms: float
-    """Fraction of the sound readings in which an electrode was repaired."""
-    sound_repaired: float
-    """F1 of the sound readings after those repairs."""
-    broken: tuple[Broken, ...]
-
-
-def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
+def broken_study(system: System, grasps: Grasps, seed: int) -> dict[str, Any]:
     """Train on folds of the grasps, break electrodes of the held-out grasps, and judge those.
 
     `grasps` have only the system's fingers. Raises `TooFewGraspsError`.
+
+    Returns F1, 0..1, slip positive: `sound` and, after false repairs, `sound_repaired`;
+    `false_alarms`, the fraction of sound readings with such a repair; and of `broken` ones, with
+    `number` electrodes broken at random places in a way of `KINDS` (`reads`): F1 `unnoticed`, with
+    all of them `known` and repaired, with those repaired that were `found` by their values, and
+    the fraction of the electrodes that was `detected` so.
     """
     folds = [
         _Fold(system, grasps, out, fold_seed(seed, fold))
@@ -77,13 +54,13 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
         for fold, found in zip(folds, alarms, strict=True)
     ]
     random = np.random.default_rng(seed)
-    return Study(
-        grasps=sum(len(fold.counts) for fold in folds),
-        sound=float(np.mean(nothing)),
-        false_alarms=float(np.concatenate([found.any(axis=(1, 2)) for found in alarms]).mean()),
-        sound_repaired=float(np.mean(repaired)),
-        broken=tuple(_break(folds, number, reads, random) for reads in KINDS for number in NUMBERS),
-    )
+    return {
+        "grasps": sum(len(fold.counts) for fold in folds),
+        "sound": np.mean(nothing),
+        "false_alarms": np.concatenate([found.any(axis=(1, 2)) for found in alarms]).mean(),
+        "sound_repaired": np.mean(repaired),
+        "broken": [_break(folds, number, reads, random) for reads in KINDS for number in NUMBERS],
+    }
 
 
 def left_out(grasps: Grasps, seed: int) -> list[Bools]:
@@ -131,18 +108,23 @@ class _Fold:
         return np.where(broken, np.clip(repaired, 0.0, COUNT_MAX), counts)
 
 
-def _break(folds: list[_Fold], number: int, reads: str, random: np.random.Generator) -> Broken:
-    unnoticed, known, found, detected = [], [], [], []
+def _break(
+    folds: list[_Fold], number: int, reads: str, random: np.random.Generator
+) -> dict[str, Any]:
+    rows = []
     for fold in folds:
         # The places with the smallest of random numbers, `number` in each reading.
         order = random.random((len(fold.counts), fold.counts[0].size)).argsort(axis=1)
         where: Bools = (order < number).reshape(fold.counts.shape)
         counts = np.where(where, KINDS[reads](fold.counts, random), fold.counts)
         marked = fold.find(counts)
-        unnoticed.append(fold.judge(counts))
-        known.append(fold.judge(fold.repair(counts, where)))
-        found.append(fold.judge(fold.repair(counts, marked)))
-        detected.append((marked & where).sum() / where.sum())
-    return Broken(
-        number, reads, *(float(np.mean(values)) for values in (unnoticed, known, found, detected))
-    )
+        rows.append(
+            {
+                "unnoticed": fold.judge(counts),
+                "known": fold.judge(fold.repair(counts, where)),
+                "found": fold.judge(fold.repair(counts, marked)),
+                "detected": (marked & where).sum() / where.sum(),
+            }
+        )
+    means = {name: np.mean([row[name] for row in rows]) for name in rows[0]}
+    return {"number": number, "reads": reads, **means}

@@ -36,16 +36,6 @@ GROUPS = {
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class AgeFigures:
-    """Figures of grasps by the number before in a session."""
-
-    grasps_before: int
-    """Lowest age of the group, grasps; it ends below that of the next group."""
-    accuracy: float
-    temperature: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Figures:
     """A system in one protocol: its rows, with probabilities, and their figures."""
@@ -156,13 +146,13 @@ def right(rows: pd.DataFrame) -> pd.Series:
     return (rows["margin"] > 0.0) == rows["slipped"]
 
 
-def by_age(rows: pd.DataFrame) -> list[AgeFigures]:
-    """Return the figures of a running variant by the age of its session, the youngest first."""
+def by_age(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
+    """Return the rows of a running variant by the age of its session, the youngest first.
+
+    A key is the lowest age of its rows; they end below the next one of `AGES`.
+    """
     group_of = np.searchsorted(AGES, rows["age"].to_numpy(np.int64), side="right") - 1
-    return [
-        AgeFigures(AGES[group], float(right(part).mean()), temperature(part))
-        for group, part in rows.groupby(group_of)
-    ]
+    return {AGES[group]: part for group, part in rows.groupby(group_of)}
 
 
 def by_day(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:

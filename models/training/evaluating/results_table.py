@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import ABOUT, PROTOCOLS, EvalProtocol
-from graspd.models.training.evaluating.figures import GROUPS, Figures, by_age, by_day
+from graspd.models.training.evaluating.figures import GROUPS, Figures, by_age, by_day, right
 from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.training.evaluating.findings import FINDINGS, HOW_SURE, SEALED
 from graspd.models.training.evaluating.metrics import Spread, paired_difference
@@ -171,7 +171,9 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
         shown.append((f"`{one.system}`", *cells))
     yield _table(("system", *columns), shown)
     young = {
-        one.system: {age.grasps_before: age for age in by_age(one.of_variant(Variant.RUNNING))}
+        one.system: {
+            age: right(part).mean() for age, part in by_age(one.of_variant(Variant.RUNNING)).items()
+        }
         for one in here
         if Variant.RUNNING in one.variants
     }
@@ -181,7 +183,7 @@ def _sessions(by_group: ByGroup) -> Iterator[str]:
         rows = [
             (
                 f"`{name}`",
-                *(_percent(ages[bound].accuracy if bound in ages else None) for bound in bounds),
+                *(_percent(ages.get(bound)) for bound in bounds),
             )
             for name, ages in young.items()
         ]

@@ -46,6 +46,7 @@ from graspd.models.training.fitting.standards import Variant
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.making.export import export
 from graspd.models.training.making.plan import TrainingPlan
+from graspd.models.training.systems.explained import layers, taken
 from graspd.models.training.systems.registry import configuration
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
@@ -97,7 +98,7 @@ def make_model(
     parity = export(trained.fitted, of_margins, contract, trained.grasps.counts, path, standards)
     data, first = path.read_bytes(), found[wanted[0]]
     card = {
-        "what": system.description,
+        "what": f"{layers(system.estimator)} on {taken(system)}.",
         "contract": contract,
         "file": {
             "sha256": hashlib.sha256(data).hexdigest(),
@@ -166,9 +167,9 @@ def _sharpness(measured: list[Figures]) -> tuple[Sharpness, ...]:
     if later is None or Variant.RUNNING not in later.variants:
         return (Sharpness(0.0, 1.0),)
     steps: list[Sharpness] = []
-    for age in reversed(by_age(later.of_variant(Variant.RUNNING))):
+    for age, part in reversed(by_age(later.of_variant(Variant.RUNNING)).items()):
         least = steps[-1].temperature if steps else 1.0
-        steps.append(Sharpness(float(age.grasps_before), max(least, age.temperature / base)))
+        steps.append(Sharpness(float(age), max(least, temperature(part) / base)))
     return tuple(reversed(steps))
 
 

@@ -20,7 +20,6 @@ from scipy import stats
 
 from graspd.biotac import TABLE_FINGERS
 from graspd.models import zoo
-from graspd.models.contract import ModelError
 from graspd.models.layout import D1
 from graspd.models.runtime import TactileModel
 from graspd.models.training.commands.common import say
@@ -69,11 +68,8 @@ def _model(name: str, grasps: Grasps) -> Candidate:
 
 
 def model_step(model: TactileModel, grasps: Grasps) -> Step:
-    """Return what graspd does with a reading. Raises `ModelError` if the grasps lack a finger."""
-    try:
-        counts = grasps.of_fingers(model.contract.fingers).counts
-    except ValueError as error:
-        raise ModelError(f"{model.path}: {error}") from error
+    """Return what graspd does with a reading. Raises `ValueError` if the grasps lack a finger."""
+    counts = grasps.of_fingers(model.contract.fingers).counts
 
     def step(index: int) -> None:
         model.inputs.build(counts[index % len(counts)], model.input)

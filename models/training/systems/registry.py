@@ -89,7 +89,6 @@ class System:
     """One way from counts to a margin, complete except for data and seed."""
 
     name: str
-    description: str
     input: SystemInput
     estimator: Estimator
     recipe: AnyRecipe | None = None
@@ -104,7 +103,7 @@ class System:
 
 
 def digest(system: System) -> str:
-    """Return the SHA-256 of how it is trained, without name, texts, fingers and tables."""
+    """Return the SHA-256 of how it is trained, without name, fingers and tables."""
     parts = configuration(system, "input", "estimator", "recipe", "augmentation", "standardise")
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
@@ -167,7 +166,6 @@ SESSION_RECIPE = SessionRecipe()
 
 def cnn(
     name: str,
-    description: str,
     network: NetworkConfig,
     *published: PaperFigure,
     recipe: Recipe | PublishedRecipe = CNN_RECIPE,
@@ -175,7 +173,7 @@ def cnn(
     takes: ImageInput = IMAGE,
 ) -> System:
     """Return a convolutional network on tactile images, with the paper's figures of it."""
-    return System(name, description, takes, network, recipe, augmentation, published=published)
+    return System(name, takes, network, recipe, augmentation, published=published)
 
 
 _CNN1_FIGURES = (
@@ -185,73 +183,32 @@ _CNN1_FIGURES = (
 _CNN3_FIGURES = PaperFigure("figure 4, CNN3", "cv", (92.2, 2.0))
 
 _PAPER = (
-    cnn(
-        "cnn0",
-        "Conv32 - FC128 on the D1 image, neighbour mean, fingers as channels.",
-        CNN0,
-        PaperFigure("III-B, neighbour mean; III-C, channels", "cv", (92.6, 1.7)),
-    ),
-    cnn(
-        "cnn1",
-        "Conv32 - FC1024, the paper's best network, in 20 epochs of a one-cycle schedule.",
-        CNN1,
-        *_CNN1_FIGURES,
-    ),
-    cnn(
-        "cnn2",
-        "Conv32 - MaxPool2 - FC1024.",
-        CNN2,
-        PaperFigure("figure 4, CNN2", "cv", (92.0, 2.0)),
-    ),
-    cnn(
-        "cnn3",
-        "Conv32 - MaxPool2 - Conv64 (1 x 1, as in the notebooks) - FC1024.",
-        CNN3,
-        _CNN3_FIGURES,
-    ),
-    cnn(
-        "cnn3-3x3",
-        "CNN3 with the second convolution 3 x 3, as in the table of the paper.",
-        replace(CNN3, second=SecondConvolution(kernel=3)),
-        _CNN3_FIGURES,
-    ),
-    cnn(
-        "cnn1-faithful",
-        "CNN1 trained as published: 300 epochs of Adam at a falling rate, L2.",
-        CNN1,
-        *_CNN1_FIGURES,
-        recipe=PublishedRecipe(),
-    ),
+    cnn("cnn0", CNN0, PaperFigure("III-B, neighbour mean; III-C, channels", "cv", (92.6, 1.7))),
+    cnn("cnn1", CNN1, *_CNN1_FIGURES),
+    cnn("cnn2", CNN2, PaperFigure("figure 4, CNN2", "cv", (92.0, 2.0))),
+    cnn("cnn3", CNN3, _CNN3_FIGURES),
+    cnn("cnn3-3x3", replace(CNN3, second=SecondConvolution(kernel=3)), _CNN3_FIGURES),
+    cnn("cnn1-faithful", CNN1, *_CNN1_FIGURES, recipe=PublishedRecipe()),
     cnn(
         "cnn1-augmented",
-        "CNN1 for new objects as published: flips and rotations, dropout, 30 epochs.",
         replace(CNN1, dropout=0.25),
         PaperFigure("III-E, CNN1 augmented", "unknown", (90.1, 0.4)),
         recipe=PublishedRecipe(epochs=30, l2=0.015),
         augmentation=Augmentation(),
     ),
+    cnn("cnn1-dropout", replace(CNN1, dropout=0.25)),
     cnn(
-        "cnn1-dropout",
-        "CNN1 with dropout, to see what regularisation does.",
-        replace(CNN1, dropout=0.25),
-    ),
-    cnn(
-        "cnn1-plain",
-        "CNN1 without batch norm and L2, to see what regularisation does.",
-        replace(CNN1, batch_norm=False),
-        recipe=replace(CNN_RECIPE, weight_decay=0.0),
+        "cnn1-plain", replace(CNN1, batch_norm=False), recipe=replace(CNN_RECIPE, weight_decay=0.0)
     ),
     System(
         "svm",
-        "Support vector machine on the 72 z-scored counts.",
         VECTOR,
         SvmConfig(c=3.0, gamma=0.1),
         published=(PaperFigure("figure 4, SVM", "cv", (88.0, 2.9)),),
     ),
-    System("mlp", "Multi-layer perceptron on the 72 z-scored counts.", VECTOR, MlpConfig((300,))),
+    System("mlp", VECTOR, MlpConfig((300,))),
     System(
         "rf",
-        "Random forest on the 72 z-scored counts.",
         VECTOR,
         ForestConfig(101, None),
         published=(
@@ -265,7 +222,6 @@ _D2_FIGURES = PaperFigure("table III, D2", "cv", (89.7, 1.5), (89.6, 1.7))
 _LAYOUTS = tuple(
     cnn(
         f"cnn0-{layout.name.lower()}-{Fill.LEAST_CONTACT.value}",
-        f"CNN0 on the {layout.name} image, gaps filled with the least contact.",
         CNN0,
         published,
         takes=image(layout.name, Fill.LEAST_CONTACT),
@@ -285,7 +241,6 @@ _LAYOUTS = tuple(
 _COMPOSITIONS = tuple(
     cnn(
         f"cnn0-{composition.value}",
-        f"CNN0 on one image with the fingers {where}.",
         CNN0,
         PaperFigure(f"III-C, {composition.value}", "cv", f1),
         takes=image(composition=composition),
@@ -298,32 +253,16 @@ _COMPOSITIONS = tuple(
 """CNN0 on the images of the paper's section III-C, beside `cnn0` itself."""
 
 _ELECTRODES = (
-    System(
-        "svm-electrodes",
-        "Support vector machine on counts, each electrode standardised by the training.",
-        COUNTS,
-        SHARP_SVM,
-        standardise=True,
-    ),
+    System("svm-electrodes", COUNTS, SHARP_SVM, standardise=True),
     System(
         "blend-electrodes",
-        "Mean of a support vector machine and two CNN0 on counts, each electrode standardised by "
-        "the training.",
         COUNTS,
         BlendConfig((Member(SHARP_SVM), Member(CNN0, CNN_RECIPE, copies=2))),
         standardise=True,
     ),
-    System(
-        "cnn0-electrodes",
-        "CNN0 on the image of counts, each electrode standardised by the training.",
-        COUNTS,
-        CNN0,
-        CNN_RECIPE,
-        standardise=True,
-    ),
+    System("cnn0-electrodes", COUNTS, CNN0, CNN_RECIPE, standardise=True),
     System(
         "small-electrodes",
-        "Conv16 - FC64 on the image of counts, each electrode standardised by the training.",
         COUNTS,
         NetworkConfig(filters=16, hidden=64),
         CNN_RECIPE,
@@ -332,28 +271,15 @@ _ELECTRODES = (
 )
 
 _SESSION = (
-    System(
-        "svm-session",
-        "Support vector machine on session-calibrated features.",
-        SESSION,
-        SvmConfig(c=3.0, gamma=0.003),
-    ),
+    System("svm-session", SESSION, SvmConfig(c=3.0, gamma=0.003)),
     System(
         "hgb-session",
-        "Gradient boosting on session-calibrated features.",
         SESSION,
         BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3),
     ),
-    System(
-        "cnn1-session",
-        "CNN1 on session-calibrated features.",
-        SESSION,
-        replace(CNN1, dropout=0.3),
-        SESSION_RECIPE,
-    ),
+    System("cnn1-session", SESSION, replace(CNN1, dropout=0.3), SESSION_RECIPE),
     System(
         "small-session",
-        "Conv16 - FC64 on session-calibrated features: under 100,000 parameters.",
         SESSION,
         NetworkConfig(filters=16, hidden=64, dropout=0.3),
         SESSION_RECIPE,
@@ -363,12 +289,7 @@ _SESSION = (
 
 _HAND: tuple[Finger, ...] = TABLE_FINGERS
 _FEWER_FINGERS = tuple(
-    replace(
-        _SESSION[-1],
-        name=f"small-session-{'-'.join(fingers)}",
-        description=f"Conv16 - FC64 on session-calibrated features of {' and '.join(fingers)}.",
-        fingers=fingers,
-    )
+    replace(_SESSION[-1], name=f"small-session-{'-'.join(fingers)}", fingers=fingers)
     for fingers in (*combinations(_HAND, 1), *combinations(_HAND, 2))
 )
 """The default system for hands with fewer sensors: fewer channels, no padding."""

@@ -306,24 +306,13 @@ def test_a_number_out_of_range_is_exit_code_2(option: str, value: str) -> None:
     assert f"argument {option}: '{value}' is not a whole number from" in last
 
 
-@pytest.mark.parametrize(
-    ("error", "code", "says"),
-    [
-        (KeyboardInterrupt(), 130, "interrupted; the same command goes on from here"),
-        (ExportError("the exported file differs"), 1, "the exported file differs"),
-    ],
-)
-def test_a_training_that_does_not_end_says_why(
-    error: BaseException,
-    code: int,
-    says: str,
-    data: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_file_that_judges_otherwise_is_exit_code_1(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(*_: object) -> None:
-        raise error
+        raise ExportError("the exported file differs")
 
     monkeypatch.setattr(make_model, "make_model", failing)
     done = train("--data", data, "--out", tmp_path / "out")
-    assert (done.returncode, done.stderr.splitlines()[-1]) == (code, f"graspd train: {says}")
+    assert done.returncode == 1
+    assert done.stderr.endswith("graspd train: the exported file differs\n")

@@ -189,11 +189,6 @@ def shifted(features: torch.Tensor, *shift: float) -> torch.Tensor:
     return on_another_day(features, DayShift(*shift))
 
 
-def test_another_day_without_a_shift_is_the_same_day() -> None:
-    features = torch.randn(5, 78)
-    assert torch.equal(shifted(features, 0.0, 0.0, 0.0), features)
-
-
 def test_each_feature_of_each_grasp_has_a_gain_of_its_own() -> None:
     exponents = shifted(torch.ones(4000, 52), 0.3, 0.0, 0.0).log()
     assert exponents.std(dim=0).numpy() == pytest.approx(0.3, abs=0.02)

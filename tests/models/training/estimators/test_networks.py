@@ -10,7 +10,7 @@ pytest.importorskip("torch", reason="needs the extra `train`")
 import torch
 from torch import nn
 
-from graspd.models.layout import D1
+import graspd
 from graspd.models.training.estimators.configs import (
     CNN0,
     CNN1,
@@ -130,23 +130,14 @@ def test_a_deep_network_has_its_layers_in_the_papers_order() -> None:
 
 
 def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
-    """The image is filled here by loops: twice the mean of the known neighbours."""
-    features = np.random.default_rng(5).normal(size=(3, 78)).astype(np.float32)
+    features = np.random.default_rng(5).integers(1, 4096, (3, 78)).astype(np.float32)
     network = _unsettled(NetworkConfig(filters=4, hidden=8), FEATURES)
     beside = network[0]
     assert isinstance(beside, Beside)
     front = beside.look[0](torch.from_numpy(features[:, :72])).numpy()
     assert front.shape == (3, 3, 12, 11)
-    for finger in range(3):
-        image = np.full((12, 11), np.nan)
-        image[list(D1.rows), list(D1.columns)] = features[1, 24 * finger : 24 * finger + 24]
-        for _ in range(2):
-            known = image.copy()
-            for row, column in np.argwhere(np.isnan(known)):
-                window = known[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-                if not np.isnan(window).all():
-                    image[row, column] = np.nanmean(window)
-        assert front[1, finger] == pytest.approx(image, abs=1e-5)
+    filled = graspd.tactile_images(features[:, :72].reshape(3, 3, 24))
+    assert front == pytest.approx(filled.transpose(0, 3, 1, 2), rel=1e-6)
     laid = beside(torch.from_numpy(features)).detach().numpy()
     assert laid.shape == (3, 4 * 90 + 6)
     assert np.array_equal(laid[:, -6:], features[:, 72:])

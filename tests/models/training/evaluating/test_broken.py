@@ -14,10 +14,10 @@ from tests.models.training.samples import sessions
 @pytest.mark.parametrize("name", ["svm", "svm-session"])
 def test_dead_electrodes_cost_less_once_they_are_repaired(name: str) -> None:
     study = broken_study(SYSTEMS[name], sessions(150), seed=1)
-    assert len(study.broken) == len(KINDS) * len(NUMBERS)
-    assert study.grasps == 135
+    assert len(study["broken"]) == len(KINDS) * len(NUMBERS)
+    assert study["grasps"] == 135
     # A tenth of the labels is wrong, so 90 % is the best that anybody could reach.
-    assert study.sound > 0.8
-    dead = next(b for b in study.broken if b.reads == "at 0" and b.number == 12)
-    assert dead.unnoticed < dead.known
-    assert dead.known > study.sound - 0.05
+    assert study["sound"] > 0.8
+    dead = next(b for b in study["broken"] if b["reads"] == "at 0" and b["number"] == 12)
+    assert dead["unnoticed"] < dead["known"]
+    assert dead["known"] > study["sound"] - 0.05

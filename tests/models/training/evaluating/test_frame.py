@@ -33,10 +33,10 @@ from graspd.models.training.systems.registry import SYSTEMS, SessionFeatures, Sy
 from tests.models.training.samples import sessions
 
 GRASPS = sessions(200)
-SVM = System("svm", "A machine.", VectorInput(), SvmConfig(3.0, 0.01))
-SESSION_SVM = System("svm-s", "A machine, calibrated.", SessionFeatures(), SvmConfig(3.0, 0.003))
+SVM = System("svm", VectorInput(), SvmConfig(3.0, 0.01))
+SESSION_SVM = System("svm-s", SessionFeatures(), SvmConfig(3.0, 0.003))
 SESSION_JOB = Job(SESSION_SVM, "session", 0, 1, 4)
-FOREST = System("forest", "A random forest.", VectorInput(), ForestConfig(5, None))
+FOREST = System("forest", VectorInput(), ForestConfig(5, None))
 JOBS = [Job(FOREST, "cv", 0, fold, 4) for fold in range(4)]
 CLUSTER = """
 import graspd.models.training.evaluating.frame  # not while the scheduler has to answer
@@ -87,7 +87,7 @@ def test_everything_that_changes_the_verdicts_is_a_cause() -> None:
     ]
     causes = {job.causes("data"), job.causes("other"), *(one.causes("data") for one in others)}
     assert len(causes) == len(others) + 2
-    renamed = dataclasses.replace(job, system=dataclasses.replace(SVM, description="Another."))
+    renamed = dataclasses.replace(job, system=dataclasses.replace(SVM, name="other"))
     assert renamed.causes("data") == job.causes("data")
 
 
@@ -171,6 +171,6 @@ def test_an_interrupted_training_is_no_result(monkeypatch: pytest.MonkeyPatch) -
 
     # What Ctrl-C meets in the middle of a fit; scikit-learn itself would return what it has so far.
     monkeypatch.setattr(MLPClassifier, "_update_no_improvement_count", interrupted)
-    system = System("mlp", "A perceptron.", VectorInput(), MlpConfig((4,)))
+    system = System("mlp", VectorInput(), MlpConfig((4,)))
     with pytest.raises(KeyboardInterrupt):
         judged(Job(system, "cv", 0, 0, 4), GRASPS)

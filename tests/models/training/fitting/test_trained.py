@@ -42,7 +42,7 @@ BLEND = BlendConfig(
         Member(TINY, QUICK, copies=2),
     )
 )
-MADE = System("made", "Made up.", SessionFeatures(), BLEND)
+MADE = System("made", SessionFeatures(), BLEND)
 SYSTEMS_MADE = {
     "svm": replace(MADE, estimator=SvmConfig(3.0, 0.003)),
     "boosting": replace(MADE, estimator=BoostingConfig(iterations=10, leaves=4)),

@@ -80,7 +80,7 @@ BLEND = BlendConfig(
 
 
 def system(kind: SystemInput, estimator: Estimator, recipe: Recipe | None = None) -> System:
-    return System("made", "Made up.", kind, estimator, recipe, standardise=kind == COUNTS_INPUT)
+    return System("made", kind, estimator, recipe, standardise=kind == COUNTS_INPUT)
 
 
 CASES = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +15,10 @@ pytest.importorskip("matplotlib", reason="needs the extra `report`")
 from matplotlib.figure import Figure
 
 from graspd.models import zoo
-from graspd.models.contract import ModelError
-from graspd.models.runtime import TactileModel
 from graspd.models.tactile_image import TactileImager
 from graspd.models.training.reports import error_vs_time
-from graspd.models.training.reports.candidates import errors, loop_image, measure, model_step
-from tests.daemon.fakes import FakeModel, contract
+from graspd.models.training.reports.candidates import errors, loop_image, measure
 from tests.kit.inside import graspd
-from tests.models.training.samples import sessions
 
 WHOLE_S = 300.0
 """A quick report takes a quarter of a minute, and many on a busy machine."""
@@ -136,13 +132,6 @@ def test_candidates_take_turns_and_each_reading_is_timed() -> None:
     assert times["b"]["paced_p50_us"] > 0.0
     assert order[-6:] == ["a", "b"] * 3
     assert order[40:44] == ["a", "a", "b", "b"], "after the warm-up: two of each per round"
-
-
-def test_a_model_of_fingers_that_were_never_recorded_is_refused() -> None:
-    model = FakeModel()
-    model.contract = contract(("ff", "lf"))
-    with pytest.raises(ModelError, match="have not the fingers ff, lf"):
-        model_step(cast(TactileModel, model), sessions(20))
 
 
 def test_a_folder_without_tables_is_one_line(tmp_path: Path) -> None:

@@ -12,16 +12,13 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `train`")
 
 from graspd.models import zoo
-from graspd.models.contract import VectorInput
 from graspd.models.runtime import TactileModel
-from graspd.models.training.estimators.configs import CNN1, PublishedRecipe, Recipe, SvmConfig
+from graspd.models.training.estimators.configs import CNN1, PublishedRecipe
 from graspd.models.training.evaluating.frame import Job, judged
 from graspd.models.training.making.make_model import make_model
 from graspd.models.training.making.plan import TrainingPlan
 from graspd.models.training.systems.registry import (
     SYSTEMS,
-    BlendConfig,
-    Member,
     configuration,
     digest,
     with_recipes,
@@ -54,23 +51,6 @@ def test_the_faithful_recipe_and_the_augmented_one_are_the_published_ones() -> N
     assert augmented.estimator == replace(CNN1, dropout=0.25)
     assert augmented.augmentation is not None
     assert augmented.augmentation.rotation_deg == 10.0
-
-
-def test_a_digest_tells_apart_what_gives_other_results_and_nothing_else() -> None:
-    cnn1 = SYSTEMS["cnn1"]
-    assert digest(cnn1) == digest(replace(cnn1, name="other", description="Another.", published=()))
-    others = [
-        replace(cnn1, recipe=Recipe(epochs=21)),
-        replace(cnn1, recipe=Recipe(input_noise=0.1)),
-        replace(cnn1, estimator=replace(CNN1, dropout=0.1)),
-        replace(cnn1, input=VectorInput()),
-        replace(cnn1, standardise=True),
-        replace(cnn1, estimator=SvmConfig(1.0, 0.1)),
-        replace(cnn1, estimator=BlendConfig((Member(CNN1, Recipe()),))),
-        replace(cnn1, estimator=BlendConfig((Member(CNN1, Recipe(), weight=2.0),))),
-    ]
-    assert len({digest(system) for system in (cnn1, *others)}) == len(others) + 1
-    assert len(digest(cnn1)) == 64
 
 
 def test_there_is_a_form_of_the_default_system_for_every_smaller_hand() -> None:
