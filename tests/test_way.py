@@ -92,6 +92,7 @@ def rounds_of(file: Path) -> list[list[Call]]:
     return rounds
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("comes_first")
 def test_the_page_names_each_file_that_a_judged_reading_enters_once_and_in_order(
     tmp_path: Path,

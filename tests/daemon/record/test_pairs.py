@@ -100,7 +100,7 @@ def sweeps(name: str | None, keep: slice, seed: int | None, scale: float) -> byt
         (slice(40, 340), 4), (slice(0, 1200, 7), 5), (slice(0, 1200, 20), 6), (slice(5, 8), 7),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("scale", [1.0, 1e3, 1e9])
+@pytest.mark.parametrize("scale", [1.0, 1e9])
 def test_a_sweep_of_an_open_hand_is_never_stable(
     tmp_path: Path, name: str | None, keep: slice, seed: int | None, scale: float
 ) -> None:
