@@ -78,6 +78,8 @@ def test_no_command_ends_in_a_traceback(tmp_path: Path, place: str) -> None:
     assert walked.returncode == 0, walked.stdout[-500:] + walked.stderr
     assert walked.stdout.count("\n") > len(COMMANDS)
     assert "Traceback" not in walked.stdout + walked.stderr, walked.stdout + walked.stderr
+    is_denied = place == "shut/below" and (before or os.geteuid() != 0)
+    assert ("you may not reach the port" in walked.stdout) == bool(is_denied)
 
 
 def furnish(folder: Path) -> None:
