@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 TOPIC = b"verdict.right"
 MS = 1_000_000
+MAX_AGE_NS = 100 * MS
 """In ns."""
 NEEDED = (
     "v", "boot_id", "seq", "t_mono_ns", "grasp", "verdict", "verdict_code", "p_slip", "valid",

@@ -253,7 +253,7 @@ def test_a_missing_answer_is_told_beside_motion(
     lift_gate: Path, tmp_path: Path, reasons: list[str], answers: bool
 ) -> None:
     out, ask = f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/{'ask' if answers else 'nobody'}"
-    deadline_s = 3.0 if answers else DEADLINE_S
+    deadline_s = 1.0 if answers else DEADLINE_S
     expected = [*reasons, *([] if answers else ["no-answer"])]
     with (
         false_daemon(tmp_path, told(), "unknown", reasons=reasons),

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from deploy.clients.python.graspd_client import Newest
 from tests.clients.building import Probe
-from tests.clients.messages import MS, TOPIC, Event, events, frames, verdict
-from tests.clients.oracle import MAX_AGE_NS
+from tests.clients.messages import MAX_AGE_NS, MS, TOPIC, Event, events, frames, verdict
 
 START_NS = 1000 * MS
 

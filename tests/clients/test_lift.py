@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
-from tests.clients.messages import ADDED, MS, TEACHES, Event, events, frames, supervised, verdict
-from tests.clients.oracle import has_been_still, is_stable, is_to_be_watched, newest, told
+from tests.clients.messages import ADDED, MS, TEACHES, frames, supervised, verdict
 
 START_NS = 1000 * MS
 ASK = "ipc:///nowhere.ask"
@@ -342,51 +339,3 @@ def test_a_flood_does_not_hold_it_up() -> None:
     with client(world) as graspd:
         assert graspd.verdict().reasons == ("behind",)
         assert graspd.verdict().reasons == ("malformed",)
-
-
-@settings(max_examples=100)
-@given(
-    events(),
-    st.lists(st.tuples(st.integers(0, 60), events()), max_size=4),
-    st.booleans(),
-    st.sampled_from([0, 10, 150]),
-    st.booleans(),
-    st.sampled_from([None, None, 0.0, 100.0, 240.0]),
-)
-def test_a_lift_needs_something_fresh_and_stable(
-    sequence: Sequence[Event],
-    answers: Sequence[tuple[int, Sequence[Event]]],
-    ask: bool,
-    deadline_ms: int,
-    watch: bool,
-    still_ms: float | None,
-) -> None:
-    coming, at_ns = [], START_NS
-    for event in sequence:
-        coming.append((at_ns, event.frames))
-        at_ns += event.wait_ns
-    said = [(delay * MS, sent[-1].frames[-1:]) for delay, sent in answers]
-    world = World(coming, [(delay, found[0] if found else b"") for delay, found in said])
-    with client(world, ask) as graspd:
-        answer = graspd.may_i_lift(deadline_ms / 1e3, supervised=watch, still_ms=still_ms)
-    assert answer.waited_s <= deadline_ms / 1e3 + 1e-3
-    assert not answer.supervised or watch
-    if not answer:
-        return
-    holds = is_to_be_watched if answer.supervised else is_stable
-    # It looked at the clock a moment before it answered.
-    assert any(holds(world.came, world.now_ns - looks * LOOK_NS) for looks in range(21))
-    last = newest(world.came)
-    assert last is not None
-    assert has_been_still(last, still_ms)
-    assert not (answer.supervised and last.early)
-    if ask:
-        told_so = told(world.asking.answered[-1])
-        assert told_so is not None
-        assert told_so.teaches == answer.supervised
-        assert has_been_still(told_so, still_ms)
-        assert not (answer.supervised and told_so.early)
-        assert told_so.verdict == "stable" or answer.supervised
-        assert told_so.boot_id == last.boot_id
-        assert told_so.grasp == last.grasp
-        assert told_so.seq <= last.seq

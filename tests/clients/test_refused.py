@@ -17,8 +17,7 @@ import pytest
 
 from deploy.clients.python.graspd_client import Client, Newest
 from tests.clients.building import Probe
-from tests.clients.messages import ADDED, MS, TOPIC, verdict
-from tests.clients.oracle import MAX_AGE_NS
+from tests.clients.messages import ADDED, MAX_AGE_NS, MS, TOPIC, verdict
 from tests.clients.test_cpp_rules import START_NS, as_hex, said
 
 CASES: list[dict[str, Any]] = json.loads(
