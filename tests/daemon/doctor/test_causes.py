@@ -248,31 +248,6 @@ def test_a_port_to_publish_on_that_cannot_be_had_is_told(
     assert (f"PID {pid}, " in mine[0]["what"]) == (cause == "socket-held")
 
 
-def test_what_the_kernel_says_of_controllers_is_read(tmp_path: Path) -> None:
-    for name, state in (("can0", "up"), ("vcan0", "unknown"), ("can1", "down")):
-        (tmp_path / "net" / name).mkdir(parents=True)
-        (tmp_path / "net" / name / "type").write_text("280\n")
-        (tmp_path / "net" / name / "operstate").write_text(f"{state}\n")
-    info = {"state": "ERROR-PASSIVE", "bittiming": {"bitrate": 250_000}}
-    said = [
-        {"ifname": "lo"},
-        {"ifname": "can0", "linkinfo": {"info_kind": "can", "info_data": info}},
-        {"ifname": "can1", "linkinfo": {"info_kind": "can", "info_data": {"state": "STOPPED"}}},
-        {"ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}},
-    ]
-    answer = tmp_path / "answer.json"
-    answer.write_text(json.dumps(said))
-    found = computer.can_interfaces(tmp_path / "net", ("cat", str(answer)))
-    assert [str(interface) for interface in found] == [
-        "CAN interface can0 is error-passive, 250000 bit/s",
-        "CAN interface can1 is stopped",
-        "CAN interface vcan0 is up",
-    ]
-    assert [interface.is_down for interface in found] == [False, True, False]
-    without = computer.can_interfaces(tmp_path / "net", ("no-such-command",))
-    assert [interface.state for interface in without] == ["up", "down", "up"]
-
-
 SURROUNDINGS: dict[str, tuple[str, str, str]] = {
     "model missing": ('[model]\npath = "absent.onnx"\n', "model-missing", "graspd models"),
     "model of no zoo": ('[model]\nname = "nonesuch"\n', "model-missing", "graspd models"),

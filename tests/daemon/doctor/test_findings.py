@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Level
 from graspd.daemon.doctor.link import (
@@ -278,3 +280,28 @@ def test_a_link_that_comes_and_goes_is_one_cause(now: LinkCause) -> None:
     denied = Fact("waiting", LinkCause.DENIED)
     (finding,) = device_findings("spi", {"link": denied}, {"link_losses": 4})
     assert finding.cause is Cause.PORT_DENIED
+
+
+def test_what_the_kernel_says_of_controllers_is_read(tmp_path: Path) -> None:
+    for name, state in (("can0", "up"), ("vcan0", "unknown"), ("can1", "down")):
+        (tmp_path / "net" / name).mkdir(parents=True)
+        (tmp_path / "net" / name / "type").write_text("280\n")
+        (tmp_path / "net" / name / "operstate").write_text(f"{state}\n")
+    info = {"state": "ERROR-PASSIVE", "bittiming": {"bitrate": 250_000}}
+    said = [
+        {"ifname": "lo"},
+        {"ifname": "can0", "linkinfo": {"info_kind": "can", "info_data": info}},
+        {"ifname": "can1", "linkinfo": {"info_kind": "can", "info_data": {"state": "STOPPED"}}},
+        {"ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}},
+    ]
+    answer = tmp_path / "answer.json"
+    answer.write_text(json.dumps(said))
+    found = computer.can_interfaces(tmp_path / "net", ("cat", str(answer)))
+    assert [str(interface) for interface in found] == [
+        "CAN interface can0 is error-passive, 250000 bit/s",
+        "CAN interface can1 is stopped",
+        "CAN interface vcan0 is up",
+    ]
+    assert [interface.is_down for interface in found] == [False, True, False]
+    without = computer.can_interfaces(tmp_path / "net", ("no-such-command",))
+    assert [interface.state for interface in without] == ["up", "down", "up"]

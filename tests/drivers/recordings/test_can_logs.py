@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -10,15 +9,11 @@ from pathlib import Path
 
 import can
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from graspd.drivers.base import RecordingError, TactileReading
 from graspd.drivers.biotac import sample_command
-from graspd.drivers.can.frames import ERROR, EXTENDED, LOST, REMOTE, CanFrame
-from graspd.drivers.recordings.can_files import read_asc, read_trc
+from graspd.drivers.can.frames import CanFrame
 from graspd.drivers.recordings.can_log import CanLog, line_of, read_log
-from graspd.drivers.recordings.candump import Logged, parse
 from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
@@ -28,171 +23,6 @@ MF_FF_TH = [[2602], [2713], [2391]]
 SAMPLES = [bytes([sample_command(at)]) + bytes.fromhex("A251 A8C8 94B9") for at in range(17, 41)]
 """Data of the frames of one sweep of the electrodes."""
 STEP_NS = 400_000
-
-
-@st.composite
-def frames(draw: st.DrawFn) -> CanFrame:
-    """A frame as it can come from a bus."""
-    kind = draw(st.sampled_from([0, EXTENDED, REMOTE, REMOTE | EXTENDED, ERROR]))
-    highest = 0x1FFFFFFF if kind & (EXTENDED | ERROR) else 0x7FF
-    data = b"" if kind & REMOTE else draw(st.binary(max_size=8))
-    return CanFrame(draw(st.integers(0, highest)), data, kind)
-
-
-@given(frames(), st.integers(0, 4 * 10**18))
-def test_a_frame_comes_back_from_its_line_to_the_microsecond(frame: CanFrame, wall_ns: int) -> None:
-    line = line_of(frame, wall_ns, "can0")
-    assert parse(line) == Logged(wall_ns // 1000 * 1000, "can0", frame)
-
-
-@given(frames())
-def test_python_can_reads_our_lines(frame: CanFrame) -> None:
-    if frame.flags & ERROR:
-        return  # python-can keeps no class of an error
-    (message,) = can.CanutilsLogReader(io.StringIO(line_of(frame, 10**18, "can0")))
-    assert message.arbitration_id == frame.arbitration_id
-    assert bytes(message.data or b"") == frame.data
-    assert message.is_extended_id == bool(frame.flags & EXTENDED)
-    assert message.is_remote_frame == bool(frame.flags & REMOTE)
-    assert message.timestamp == pytest.approx(1e9)
-
-
-BUS_WARNING = CanFrame(4, b"\0\1" + 6 * b"\0", ERROR)
-WARNING_DATA = "00 01 00 00 00 00 00 00"
-EIGHT = CanFrame(0x123, bytes.fromhex("1122334455667788"))
-ASKED = CanFrame(0x123, b"", EXTENDED | REMOTE)
-THREE = CanFrame(0x123, b"\x0d\x3a\x1f")
-AT_NS = 1_436_509_052_249_713_000
-
-
-@pytest.mark.parametrize(
-    ("line", "t_ns", "frame"),
-    [  # candump of can-utils: -L and -l
-        ("(1436509052.249713) can0 123#0D3A1F\n", AT_NS, THREE),
-        ("(1436509052.249713) can0 123#0d3a1f R\r\n", AT_NS, THREE),
-        ("(1436509052.249713) can0 123#0D3A1F T", AT_NS, THREE),
-        ("(1436509052.249713250)   can0 123#0D3A1F", AT_NS + 250, THREE),
-        ("(1436509052.2497) can0 123#0D3A1F", AT_NS - 13_000, THREE),
-        ("(1436509052) can0 123#0D3A1F", 1_436_509_052 * 10**9, THREE),
-        ("(0000000052.249713) can0 123#", 52_249_713_000, CanFrame(0x123, b"")),
-        ("(1436509052.249713) can0 00000123#R", AT_NS, ASKED),
-        ("(1436509052.249713) can0 213#R8", AT_NS, CanFrame(0x213, b"", REMOTE)),
-        ("(1436509052.249713) can0 20000004#0001000000000000", AT_NS, BUS_WARNING),
-        ("(1436509052.249713) can0 123#1122334455667788_B", AT_NS, EIGHT),
-        ("(1436509052.249713) can0 123##10D3A1F", AT_NS, None),
-        # -ta, -tA, with -x, -a, -c, -e, and as older versions align ids
-        (" (1436509052.249713)  can0  123   [3]  0D 3A 1F", AT_NS, THREE),
-        (" (2015-07-10 06:17:32.249713)  can0  123   [3]  0D 3A 1F", AT_NS, THREE),
-        (" (1436509052.249713)  can0  RX - -  123   [3]  0D 3A 1F", AT_NS, THREE),
-        (" (1436509052.249713)  can0  TX B E       123   [3]  0D 3A 1F   '.:.'", AT_NS, THREE),
-        ("\x1b[34m (1436509052.249713)  \x1b[32mcan0\x1b[0m  123   [3]  0D 3A 1F", AT_NS, THREE),
-        (" (1436509052.249713)  can0   52  [2] 0D 3A", AT_NS, CanFrame(0x52, b"\x0d\x3a")),
-        (" (1436509052.249713)  can0  00000123   [0] ", AT_NS, CanFrame(0x123, b"", EXTENDED)),
-        (" (1436509052.249713)  can0  00000123   [8]  remote request", AT_NS, ASKED),
-        (f" (1436509052.249713) can0 20000004 [8] {WARNING_DATA}  ERRORFRAME", AT_NS, BUS_WARNING),
-        (f" (1436509052.249713)  can0  123  [12]  {WARNING_DATA} 08 09 0A 0B", AT_NS, None),
-    ],
-)  # fmt: skip
-def test_lines_of_candump_are_read(line: str, t_ns: int, frame: CanFrame | None) -> None:
-    found = parse(line)
-    assert found is not None
-    assert found[:3] == (t_ns, "can0", frame)
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "\n",
-        "(1436509052.249713) vcan0 044#2A366",
-        "(1436509052.249713) vcan0 844#2A",
-        "(1436509052,249713) vcan0 044#2A",
-        "(1436509052.249713) vcan0 044#" + "00" * 9,
-        "(1436509052.249713) vcan0 44#00",
-        "(1436509052.249713) vcan0 0x4#00",
-        "can0  100   [3]  0D 3A 1F",
-        " (000.000123)  can0  100   [3]  0D 3A",
-        " (000.000123)  can0  100   [3]  0D 3A 1",
-        " (000.000123)  can0  100   [3]  1F`3A`0D",
-        " (000.000123)  can0  100   [2]  00001101 00111010",
-        " (2015-13-10 06:17:32.249713)  can0  123   [3]  0D 3A 1F",
-    ],
-)
-def test_a_line_that_is_no_frame_is_none(line: str) -> None:
-    assert parse(line) is None
-
-
-def test_where_candump_lost_frames_is_a_loss() -> None:
-    line = "DROPCOUNT: dropped 3 CAN frames on 'can0,5A1:7FF' socket (total drops 3)\n"
-    assert parse(line) == Logged(None, "can0", CanFrame(0, b"", LOST))
-
-
-@given(st.text(max_size=60))
-def test_no_text_makes_a_line_parser_raise(text: str) -> None:
-    parse(text)
-    list(read_asc([text]))
-    list(read_trc([text]))
-
-
-HALF_NS = 500_000_000
-ASC_HEAD = ["date Thu Nov 26 12:31:53.458 2026", "base hex  timestamps absolute", "// a comment"]
-ERROR_FRAME = CanFrame(0x80, b"", ERROR)
-
-
-@pytest.mark.parametrize(
-    ("line", "logged"),
-    [
-        ("0.5 1  123             Rx   d 3 0D 3A 1F", Logged(HALF_NS, "can0", THREE)),
-        ("0.5 2  123x  Rx   r 3", Logged(HALF_NS, "can1", ASKED)),
-        ("0.5 1  ErrorFrame", Logged(HALF_NS, "can0", ERROR_FRAME)),
-        ("0.5 1  123  Rx   d 3 0D 3A 1F  Length = 0 BitCount = 64", Logged(HALF_NS, "can0", THREE)),
-        ("0.5 CANFD  1 Rx  123  1 0 3  3 0D 3A 1F   0 0 3000 0 0 0", Logged(HALF_NS, "can0", None)),
-        ("0.5 CANFD 1 Rx 123  Name  0 0 3  3 0D 3A 1F  9 8 200000", Logged(HALF_NS, "can0", THREE)),
-        ("0.5 1  123             Rx   d 3 0D 3A", None),
-        ("0.5 1  123             Rx   d 3 0D A 1F", None),
-        ("0.5 1  123             Rx   d 3 0D XX 1F", None),
-        ("0.5 1  FFFFFFFFx       Rx   d 1 00", None),
-        ("0.5 1  923             Rx   d 1 00", None),
-        ("nonsense", None),
-    ],
-)  # fmt: skip
-def test_lines_of_an_asc_file_are_read(line: str, logged: Logged | None) -> None:
-    others = ["0.4 1  Statistic: D 1 R 0", "0.4 CAN 1 Status:chip status error active", ""]
-    ((number, _, found),) = read_asc([*ASC_HEAD, *others, line])
-    assert (number, found) == (len(ASC_HEAD) + 4, logged)
-
-
-def test_decimal_data_of_an_asc_file_is_read() -> None:
-    ((_, _, found),) = read_asc(["base dec  timestamps absolute", "0.5 1 291 Rx d 3 13 58 31"])
-    assert found == Logged(HALF_NS, "can0", THREE)
-
-
-TRC_2_1 = [";$FILEVERSION=2.1", ";$STARTTIME=0", ";$COLUMNS=N,O,T,B,I,d,R,L,D"]
-DAYS_S = 25569 * 86400
-"""From the zero of TRC files, 30 December 1899, to that of Unix."""
-
-
-@pytest.mark.parametrize(
-    ("head", "line", "frame"),
-    [  # lines as in PEAK's description of the formats
-        ([], "     1)      500  0123  3  0D 3A 1F", THREE),
-        ([";$FILEVERSION=1.1"], "     1)      500.0  Rx     0123  3  0D 3A 1F", THREE),
-        ([";$FILEVERSION=1.3"], "     1)      500.0 1  Rx     0123  -  3    0D 3A 1F", THREE),
-        (TRC_2_1, "      1     500.000 DT  1     0123 Rx -  3    0D 3A 1F", THREE),
-        (TRC_2_1, "      1     500.000 RR  1 00000123 Rx -  3", ASKED),
-        (TRC_2_1, "      1     500.000 FD  1     0123 Rx -  3    0D 3A 1F", "CAN FD"),
-        (TRC_2_1, "      1     500.000 DT  1     0123 Rx -  3    0D 3A", None),
-        (TRC_2_1, "      1     500.000 DT  1     0123 Rx -  3    0D 3A 1", None),
-        ([";$FILEVERSION=1.1"], "     1)      500.0  Rx     0123  3  0D A 1F", None),
-        ([";$FILEVERSION=1.2"], "     1)      500.0 1  Rx     0123  3    0D 3A 1F", None),
-    ],
-)  # fmt: skip
-def test_lines_of_a_trc_file_are_read(
-    head: list[str], line: str, frame: CanFrame | str | None
-) -> None:
-    ((_, _, found),) = read_trc([*head, ";  Message Number", line])
-    at_ns = HALF_NS - (DAYS_S * 10**9 if head == TRC_2_1 else 0)
-    logged = Logged(at_ns, "can0", frame if isinstance(frame, CanFrame) else None)
-    assert found == (None if frame is None else logged)
 
 
 def messages(sweeps: int, channel: int = 0) -> Iterator[can.Message]:

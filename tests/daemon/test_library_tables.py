@@ -1,0 +1,144 @@
+"""Tables of any kind are judged by the library as their files are, or are refused."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import graspd
+from graspd.daemon.session.file import SessionFileError
+from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING
+from graspd.models.contract import ModelError
+from tests.daemon.test_library import GIVEN, columns, messages
+
+
+def test_a_stream_is_judged_as_replay_judges_it() -> None:
+    names = "grasp", "judged", "gate", "verdict", "p_slip", "reasons", "motion"
+    expected = [{name: each[name] for name in names} for each in messages(DEMO_RECORDING)]
+    judged = map(msgspec.to_builtins, graspd.judge(DEMO_RECORDING))
+    got = [{name: each[name] for name in names} for each in judged]
+    assert {each["verdict"] for each in got} >= {"stable", "unknown"}
+    assert got == expected
+
+
+@pytest.mark.parametrize(
+    "given", ["columns by name", "Arrow", "polars", "pandas of its own integers"]
+)
+def test_a_table_is_judged_as_its_file(
+    counts: NDArray[np.float64], tmp_path: Path, given: str
+) -> None:
+    values = counts[:12].copy()
+    values[3, 1, 7] = np.nan
+    held = columns(values)
+    rows = [
+        ["" if each is None else each for each in row] for row in zip(*held.values(), strict=True)
+    ]
+    with (path := tmp_path / "grasps.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([list(held), *rows])
+    told = [
+        [(each.verdict, each.p_slip, each.reasons) for each in graspd.judge(recording, model="mlp")]
+        for recording in (path, GIVEN[given](values))
+    ]
+    assert {each[0] for each in told[0]} >= {"stable", "slip"}
+    assert told[0] == told[1]
+
+
+@pytest.mark.filterwarnings("ignore:of 300 grasps 177 were not judged")
+def test_what_the_readers_return_is_judged_as_its_file() -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    frame = graspd.read_grasps(DEMO_DAY)
+    numbered = frame.assign(object="#1")  # begins no comment
+    told = [
+        [(each.verdict, each.p_slip) for each in graspd.judge(given, model="mlp")]
+        for given in (DEMO_DAY, frame, numbered)
+    ]
+    assert len(told[0]) == 300
+    assert told[0] == told[1] == told[2]
+
+
+TIMES: dict[str, Callable[[NDArray[np.float64]], Any]] = {
+    "float32": lambda t_s: t_s.astype(np.float32),
+    "seconds since 1970": lambda t_s: t_s + 1.7e9,
+    "whole milliseconds": lambda t_s: (1e3 * t_s).round().astype(int),
+    "dates": lambda t_s: (1e9 * t_s).round().astype("datetime64[ns]"),
+    "spans": lambda t_s: (1e3 * t_s).round().astype("timedelta64[ms]"),
+}
+
+
+@pytest.mark.parametrize("times", TIMES.values(), ids=TIMES)
+def test_times_of_any_kind_give_the_same_verdicts(
+    times: Callable[[NDArray[np.float64]], Any],
+) -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    stream = graspd.read_recording(DEMO_RECORDING)[:400]
+    name = "time_us" if times(np.zeros(1)).dtype.kind in "mM" else "t"  # their own unit counts
+    other = stream.drop(columns="t").assign(**{name: times(stream.t.to_numpy())})
+    told = [
+        [(each.verdict, each.p_slip, each.motion) for each in graspd.judge(given)]
+        for given in (stream, other)
+    ]
+    assert {each[0] for each in told[0]} >= {"slip", "unknown"}
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (
+            lambda t_s: np.where(t_s == 0.5, np.nan, t_s),
+            r"^the table, row 50 \(from 0\), column t:",
+        ),
+        (lambda t_s: (t_s + 1e5).astype(np.float32), r"float32 rounds these times to 0\.0078"),
+        (lambda t_s: t_s.astype(int), "^the table, column t: .*read_as=table.*rate_hz="),
+    ],
+)
+def test_times_that_mean_little_are_refused(
+    times: Callable[[NDArray[np.float64]], Any], words: str
+) -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    stream = graspd.read_recording(DEMO_RECORDING)[:100]
+    with pytest.raises(ValueError, match=words):
+        list(graspd.judge(stream.assign(t=times(stream.t.to_numpy()))))
+
+
+def test_sweeps_without_times_are_never_grasps() -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    sweeps = graspd.read_recording(DEMO_RECORDING)[:260].drop(columns="t")
+    model = graspd.load("mlp")
+    for judge in (graspd.judge, model.predict, model.predict_proba):
+        with pytest.raises(ValueError, match=r"nearly repeat another: sweeps .*read_as=stream"):
+            list(judge(sweeps))
+        with pytest.raises(ValueError, match="they change as sweeps of a stream do"):
+            list(judge(sweeps, read_as="table"))
+    again = sweeps[:1].loc[[0, 0]]
+    assert len(model.predict(again, read_as="table")) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (np.zeros((1, 3, 24)), "files and tables, not ndarray: GraspModel.predict takes counts"),
+        ([[2000]], "files and tables, not list"),
+        (memoryview(bytes(6)).cast("B", (2, 3)), "files and tables, not memoryview"),
+        ([], "no recording was given"),
+    ],
+)
+def test_what_is_no_recording_is_refused(given: Any, words: str) -> None:  # noqa: ANN401
+    with pytest.raises(ValueError, match=words):
+        list(graspd.judge(given))
+
+
+def test_a_session_that_does_not_fit_is_refused(
+    counts: NDArray[np.float64], tmp_path: Path
+) -> None:
+    with pytest.raises(ModelError, match="mlp keeps no session"):
+        graspd.load("mlp").predict_proba(counts[:1], session=counts)
+    with pytest.raises(SessionFileError, match="No such file"):
+        graspd.load("small-session").predict_proba(counts[:1], session=tmp_path / "none")
