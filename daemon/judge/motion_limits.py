@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import le
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -59,7 +60,7 @@ class MotionLimits:
 
     def __init__(self, fingers: int, tails: Tails) -> None:
         self._alone, self._beside = _usual(tails.alone), _usual(tails.fast)
-        self._tail, self._creep = tails.slow, creep(tails.slow) ** 2
+        self._tail, self._creep = tails.slow, creep(tails.slow) ** 2 - CREEP_COUNTS_PER_S**2
         self._ones = [1.0] * fingers
         self.forget()
 
@@ -82,33 +83,26 @@ class MotionLimits:
         `fast`, `slow`: motion in units of noise. `fast_noise`: mean absolute slopes that noise
         makes, counts/s.
         """
-        self.fast, self.early = self._keeps_to(self._alone, fast, fast_noise)
+        self.fast = _fast_limits(self._alone, fast_noise)
+        self.early = all(map(le, fast, self.fast))
         if slow_noise is None:
             self.slow, self.sure = self._ones, False
             return
-        self.sure = self.early
-        if self._beside != self._alone:
-            _, self.sure = self._keeps_to(self._beside, fast, fast_noise)
-        extent, squares, spreads = slow_noise
-        self.slow = []
-        for move, noise, spread in zip(slow, squares, spreads, strict=True):
-            usual, most = CREEP_COUNTS_PER_S**2 * (extent / noise), self._creep * (extent / noise)
-            # Noise and creep know nothing of each other: their deviations add up as squares do.
-            above = math.hypot(self._tail * spread * (1.0 + usual), most - usual)
-            limit = math.sqrt(1.0 + usual + above)
-            self.slow.append(limit)
-            self.sure = self.sure and move <= limit
+        self.slow = self._slow_limits(slow_noise)
+        self.sure = self.early and all(map(le, slow, self.slow))
+        if self.sure and self._beside != self._alone:
+            self.sure = all(map(le, fast, _fast_limits(self._beside, fast_noise)))
 
-    def _keeps_to(
-        self, tail: tuple[float, float], fast: Sequence[float], fast_noise: Sequence[float]
-    ) -> tuple[list[float], bool]:
-        """Return the limits of mean absolute slopes, and whether all fingers are within."""
-        (usual, creeps), limits, within = tail, list[float](), True
-        for move, noise in zip(fast, fast_noise, strict=True):
-            limit = math.hypot(usual, creeps / noise)
-            limits.append(limit)
-            within = within and move <= limit
-        return limits, within
+    def _slow_limits(self, slow_noise: SlowNoise) -> list[float]:
+        extent, squares, spreads = slow_noise
+        limits = []
+        for noise, spread in zip(squares, spreads, strict=True):
+            stretch = extent / noise
+            usual = 1.0 + CREEP_COUNTS_PER_S**2 * stretch
+            # Noise and creep know nothing of each other: their deviations add up as squares do.
+            above = math.hypot(self._tail * spread * usual, self._creep * stretch)
+            limits.append(math.sqrt(usual + above))
+        return limits
 
 
 def creep(tail: float) -> float:
@@ -120,3 +114,8 @@ def _usual(tail: float) -> tuple[float, float]:
     """Return a finger's mean absolute slope at a tail: by its noise, in units of it, and by creep,
     counts/s."""
     return math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)
+
+
+def _fast_limits(tail: tuple[float, float], fast_noise: Sequence[float]) -> list[float]:
+    usual, creeps = tail
+    return [math.hypot(usual, creeps / noise) for noise in fast_noise]

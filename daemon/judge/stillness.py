@@ -6,6 +6,8 @@ A sweep goes through `SpikeFilter`, `StepRing` and `NoiseBlocks`; `MotionLimits`
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from operator import truediv
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +45,11 @@ SIGMA_COUNTS = (0.5, 10.0)
 SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
+EACH_STEP = np.ones(STEPS, dtype=np.float32)
 Sweep = NDArray[np.float32]
 """Counts, shape (fingers, 24)."""
 Usable = NDArray[np.bool_]
 """Which electrodes can be used, shape (fingers, 24)."""
-Times = NDArray[np.float64]
 
 
 class SpikeFilter:
@@ -96,12 +98,14 @@ class StepRing:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
-        self.times_ns = np.zeros(2 * STEPS, dtype=np.int64)
-        """Oldest first; as with `steps`, what is remembered is a slice."""
+        self.times_ns: list[int] = []
+        """Times of the steps that are remembered, oldest first."""
+        self.times_s = np.zeros(2 * STEPS)
+        """Times of `steps` since the first sweep, s."""
         self.steps = np.zeros((2 * STEPS, *shape), dtype=np.float32)
-        """It moves to the right, and then goes back to the left."""
-        self.first = self.number = 0
-        """Index of the oldest entry in `steps`, and number of steps that are remembered."""
+        """What is remembered is a slice: it moves to the right, and then goes back to the left."""
+        self.first = 0
+        """Index of the oldest entry in `steps`."""
         self.usable_since_ns = np.zeros(shape, dtype=np.int64)
         """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
         self.sweeps = 0
@@ -117,15 +121,18 @@ class StepRing:
         """Sum of the sweeps of the step at hand."""
         self._total_ns = 0
         """Sum of their times since the step before."""
+        self._begun_ns = 0
+        """Time of the first sweep."""
 
     def reset(self) -> None:
         """Forget the steps."""
-        self.first = self.number = self.sweeps = self._total_ns = 0
+        self.first = self.sweeps = self._total_ns = 0
+        self.times_ns.clear()
         self.last_ns = None
 
     def begin(self, t_ns: int) -> None:
         """Take the first sweep, of `t_ns`, for the end of a step."""
-        self.last_ns = self._all_usable_since_ns = t_ns
+        self.last_ns = self._all_usable_since_ns = self._begun_ns = t_ns
         self._lost.fill(LOST_MAX)
         self.usable_since_ns.fill(t_ns)
 
@@ -151,35 +158,49 @@ class StepRing:
         self._total_ns += t_ns - since_ns
         self.sweeps += 1
         self.crowded = self.sweeps > STEP_SWEEPS_MAX
-        if self.number and t_ns - since_ns < STEP_NS:
+        if self.times_ns and t_ns - since_ns < STEP_NS:
             return False
-        if self.number == STEPS:
+        if len(self.times_ns) == STEPS:
             self.first += 1
-            self.number -= 1
-        place = self.first + self.number
-        if place == len(self.steps):
-            self.steps[: self.number] = self.steps[self.first :]
-            self.times_ns[: self.number] = self.times_ns[self.first :]
-            self.first, place = 0, self.number
-        np.divide(self._total, self.sweeps, out=self.steps[place])
-        self.times_ns[place] = since_ns + self._total_ns // self.sweeps
-        self.number += 1
+            del self.times_ns[0]
+        number = len(self.times_ns)
+        if self.first + number == len(self.steps):
+            self.steps[:number] = self.steps[self.first :]
+            self.times_s[:number] = self.times_s[self.first :]
+            self.first = 0
+        step_ns = since_ns + self._total_ns // self.sweeps
+        np.divide(self._total, self.sweeps, out=self.steps[self.first + number])
+        self.times_s[self.first + number] = (step_ns - self._begun_ns) / 1e9
+        self.times_ns.append(step_ns)
         self.sweeps = self._total_ns = 0
         self.last_ns = t_ns
         return True
 
-    def mean(self, values: Sweep, begin: int) -> NDArray[np.float64]:
+    def since(self, begin: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Return the steps from number `begin` on, shape (steps, fingers * 24), and their times.
+
+        Times are counted from their mean, s.
+        """
+        times_ns, first = self.times_ns[begin:], self.first + begin
+        number = len(times_ns)
+        mean_ns = (sum(times_ns) - number * self._begun_ns) / number
+        steps = self.steps[first : first + number].reshape(number, -1)
+        return steps, self.times_s[first : first + number] - mean_ns / 1e9
+
+    def mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
         """Return each finger's mean over electrodes usable since step `begin`; infinite: too few.
 
-        `values`: shape (fingers, 24); the result has shape (fingers,).
+        `values`: shape (fingers * 24,).
         """
-        since_ns = self.times_ns.item(begin)
+        values, since_ns = values.reshape(self._total.shape), self.times_ns[begin]
         if self._all_usable_since_ns <= since_ns:
-            return np.asarray(values.dot(ONES) / np.float64(ELECTRODES))
+            return [total / ELECTRODES for total in values.dot(ONES).tolist()]
         usable = self.usable_since_ns <= since_ns
         numbers = np.count_nonzero(usable, axis=1)
         means = (values * usable) @ ONES / np.maximum(numbers, 1)
-        return np.where(numbers >= SOUND_MIN, means, math.inf)
+        means[numbers < SOUND_MIN] = math.inf
+        known: list[float] = means.tolist()
+        return known
 
 
 class NoiseBlocks:
@@ -211,7 +232,7 @@ class NoiseBlocks:
 
     def learn(self, ring: StepRing) -> None:
         """Take in the step that has just ended."""
-        if ring.number <= APART:
+        if len(ring.times_ns) <= APART:
             return
         self._pending += 1
         self._steps += 1
@@ -224,22 +245,19 @@ class NoiseBlocks:
 
     def lose(self, gone: Usable, ring: StepRing) -> None:
         """Take in the pending steps before these electrodes are lost."""
-        end = ring.first + ring.number
-        was_usable = ring.usable_since_ns[gone] <= ring.times_ns[end - 1 - APART]
-        if self._pending and was_usable.any():
+        if self._pending and (ring.usable_since_ns[gone] <= ring.times_ns[-1 - APART]).any():
             self._fill(ring)
 
     def _fill(self, ring: StepRing) -> None:
         """Take the pending steps into the block, by the electrodes that are usable until now."""
-        end = ring.first + ring.number
+        end = ring.first + len(ring.times_ns)
+        since_ns = np.array(ring.times_ns[-self._pending - APART : -APART])
         begin, self._pending = end - self._pending, 0
-        since_ns = ring.times_ns[begin - APART : end - APART, np.newaxis, np.newaxis]
-        usable = ring.usable_since_ns <= since_ns
+        usable = ring.usable_since_ns <= since_ns[:, np.newaxis, np.newaxis]
         numbers = np.maximum(np.count_nonzero(usable, axis=2), 1)
         for apart, sums in enumerate(self.sums, start=1):
             differences = ring.steps[begin:end] - ring.steps[begin - apart : end - apart]
-            means = (np.square(differences) * usable) @ ONES / numbers
-            np.add.reduce((sums, *means), axis=0, out=sums)
+            sums += ((np.square(differences) * usable) @ ONES / numbers).sum(axis=0)
 
     def noise(self) -> Noise:
         """Return the motion that noise seems to be. Call it with `BLOCKS_MIN` blocks."""
@@ -252,11 +270,6 @@ class NoiseBlocks:
             variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
             self._noise = Noise.of(variance, correlations)
         return self._noise
-
-
-def centred(times_s: Times) -> Times:
-    """Return times with a mean of 0."""
-    return np.asarray(times_s - np.add.reduce(times_s) / len(times_s))
 
 
 class Motion:
@@ -342,47 +355,42 @@ class Motion:
 
     def _look(self) -> None:
         """Work out how the fingers move within the steps."""
-        ring, first, number = self.ring, self.ring.first, self.ring.number
-        end = first + number
-        times_ns = ring.times_ns[first:end]
-        now_ns = times_ns.item(-1)
-        age_ns = now_ns - times_ns.item(0)
-        if self.blocks.number < BLOCKS_MIN or number <= STEPS_MIN or age_ns < SHORT_NS:
+        times_ns = self.ring.times_ns
+        now_ns, last = times_ns[-1], len(times_ns) - STEPS_MIN
+        age_ns = now_ns - times_ns[0]
+        if self.blocks.number < BLOCKS_MIN or last <= 0 or age_ns < SHORT_NS:
             self._say_unknown()
             self.looked = True
             return
         self.looked = True
-        windows = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
-        short, long = np.minimum(windows, number - STEPS_MIN).tolist()
-        times_s, noise = (times_ns[long:] - now_ns) / 1e9, self.blocks.noise()
-        fast_noise = self._follow_fast(first + short, end, times_s[short - long :], noise)
+        noise = self.blocks.noise()
+        fast_noise = self._follow_fast(min(bisect_right(times_ns, now_ns - SHORT_NS), last), noise)
         self.known = max(self.fast) < math.inf
         slow_noise, self.slow = None, self._unknown
         if age_ns >= LONG_NS:
-            slow_noise = self._follow_slow(first + long, end, times_s, noise)
+            begin = min(bisect_right(times_ns, now_ns - LONG_NS), last)
+            slow_noise = self._follow_slow(begin, noise)
         self.strict.lay(self.fast, fast_noise, self.slow, slow_noise)
         self.loose.lay(self.fast, fast_noise, self.slow, slow_noise)
 
-    def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
+    def _follow_fast(self, begin: int, noise: Noise) -> list[float]:
         """Find how steps moved; return the mean absolute slopes that noise makes, counts/s."""
-        ring, line = self.ring, centred(times_s)
-        extent = float(line.dot(line))
-        by_noise: Times = noise.slope[len(line)] / math.sqrt(extent)
-        weights = (line / extent).astype(np.float32)
-        slopes = np.abs(weights.dot(ring.steps[begin:end].reshape(len(line), -1)))
-        self.fast = (ring.mean(slopes.reshape(-1, ELECTRODES), begin) / by_noise).tolist()
-        usual: list[float] = by_noise.tolist()
-        return usual
+        steps, line = self.ring.since(begin)
+        extent = line.dot(line).item()
+        slopes = np.abs((line / extent).astype(np.float32).dot(steps))
+        by_noise = [each / math.sqrt(extent) for each in noise.slope[len(line)]]
+        self.fast = list(map(truediv, self.ring.mean(slopes, begin), by_noise))
+        return by_noise
 
-    def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> SlowNoise:
+    def _follow_slow(self, begin: int, noise: Noise) -> SlowNoise:
         """Find how far steps have spread; return what noise makes of that."""
-        steps, number, line = self.ring.steps[begin:end], end - begin, centred(times_s)
-        middle = np.add.reduce(steps, axis=0)
-        middle /= number
-        squares = np.add.reduce(np.square(steps - middle), axis=0)
-        by_noise = noise.variance[number] * (number - 1)
-        self.slow = np.sqrt(self.ring.mean(squares, begin) / by_noise).tolist()
-        return SlowNoise(float(line.dot(line)), by_noise.tolist(), noise.spread[number].tolist())
+        steps, line = self.ring.since(begin)
+        number, each_step = len(line), EACH_STEP[: len(line)]
+        squares = each_step.dot(np.square(steps - each_step.dot(steps) / number))
+        by_noise = [each * (number - 1) for each in noise.variance[number]]
+        ratios = map(truediv, self.ring.mean(squares, begin), by_noise)
+        self.slow = list(map(math.sqrt, ratios))
+        return SlowNoise(line.dot(line).item(), by_noise, noise.spread[number])
 
     def _say_unknown(self) -> None:
         self.fast = self.slow = self._unknown

@@ -52,19 +52,16 @@ for _number in range(STEPS_MIN, STEPS + 1):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Motion that noise alone seems to show; row n is that of a window of n steps.
+    """Motion of each finger that noise alone seems to show, by the number of a window's steps."""
 
-    Shape of each array: (`STEPS` + 1, fingers).
-    """
-
-    slope: NDArray[np.float64]
+    slope: list[list[float]]
     """Mean absolute slope times the square root of the sum of squared times, counts.
 
     The times are counted from their mean, s. Divide by that root to get the slope, counts/s.
     """
-    variance: NDArray[np.float64]
+    variance: list[list[float]]
     """Mean square deviation from the mean, counts**2."""
-    spread: NDArray[np.float64]
+    spread: list[list[float]]
     """Standard deviation of a finger's `variance`, as a share of it."""
 
     @classmethod
@@ -78,8 +75,9 @@ class Noise:
         slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
         spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
         free = ELECTRODES * np.maximum(np.arange(STEPS + 1) - 1.0, 1.0)[:, np.newaxis]
+        echoes = 2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0))
         return cls(
-            slope=MEAN_ABS * np.sqrt(variance * slopes),
-            variance=variance * spreads,
-            spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
+            slope=(MEAN_ABS * np.sqrt(variance * slopes)).tolist(),
+            variance=(variance * spreads).tolist(),
+            spread=np.sqrt(echoes / free).tolist(),
         )

@@ -207,8 +207,8 @@ def test_memory_is_bounded_however_fast_readings_come() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(0.5, 20_000.0, 3.5, 14)
     fed(motion, counts, 20_000.0)
     ring = motion.ring
-    assert ring.number <= STEPS
-    assert ring.first + ring.number <= len(ring.steps)
+    assert len(ring.times_ns) <= STEPS
+    assert ring.first + len(ring.times_ns) <= len(ring.steps)
 
 
 def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
