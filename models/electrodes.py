@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import ELECTRODES
 from graspd.models.contract import SeenCounts
 
 IMPLAUSIBLE = 8.0
@@ -53,6 +54,7 @@ CONTRADICTED_DISTANCES = 0.75
 A tenth of the readings whose electrodes come from different grasps have at most two contradicting
 electrodes. This limit refuses 19 of 20 of these, and a tenth of the real readings.
 """
+ONES = np.ones(ELECTRODES)
 
 
 class Deviations(NamedTuple):
@@ -177,7 +179,7 @@ class Electrodes:
         The offset is estimated from all electrodes, and must be over `IMPLAUSIBLE` standard
         deviations. No single electrode need contradict the others.
         """
-        of_fingers = np.add.reduce(deviations.residuals.reshape(self._shape), axis=1)
+        of_fingers = deviations.residuals.reshape(self._shape).dot(ONES)
         return 0 in (np.abs(of_fingers) <= self._finger_limits).tobytes()
 
     def repaired(

@@ -124,7 +124,7 @@ class SessionBuilder(InputBuilder):
         features, spread = _features(counts)
         standard: Floats = features - self._mean
         standard *= self._scale
-        return np.clip(standard, self._low, self._high), spread
+        return np.minimum(np.maximum(standard, self._low), self._high), spread
 
 
 def raw_features(counts: NDArray[np.generic]) -> Floats:

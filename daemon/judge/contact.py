@@ -191,12 +191,14 @@ class Window:
     def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
         """Yield the tare of each of these fingers; None: it moved. Call it with a full window."""
         oldest = self.number % WINDOW
-        window = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
+        sweeps = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
+        # Electrode by electrode, as 32-bit numbers, they are sorted in a quarter of the time.
+        window = np.ascontiguousarray(sweeps.transpose(1, 2, 0), dtype=np.int32)
+        halves = _median(window[..., WINDOW // 2 :]) - _median(window[..., : WINDOW // 2])
         baseline = _median(window)
-        # Twice as large they are whole numbers, which are sorted in a fifth of the time.
-        twice = np.abs(2 * window.astype(np.int32) - (2.0 * baseline).astype(np.int32))
+        # Twice as large they are whole numbers.
+        twice = np.abs(2 * window - (2.0 * baseline).astype(np.int32)[..., np.newaxis])
         sigmas = MAD_TO_SIGMA * (_median(twice) / 2.0)
-        halves = _median(window[WINDOW // 2 :]) - _median(window[: WINDOW // 2])
         usable = np.logical_and.reduce(self.usable, axis=0)
         sound = (baseline > 0) & (baseline < COUNT_MAX) & (sigmas <= 3.0 * SIGMA_MAX_COUNTS)
         sound &= usable
@@ -218,9 +220,9 @@ class Contact:
         """`fingers`: their number. None has a baseline yet."""
         shape = (fingers, ELECTRODES)
         self.touches = [Touch() for _ in range(fingers)]
-        self.touching = np.zeros(fingers, dtype=np.bool_)
-        """True for fingers that touch, shape (fingers,)."""
-        self.tared = np.zeros(fingers, dtype=np.bool_)
+        self.touching = [False] * fingers
+        """True for fingers that touch."""
+        self.tared = [False] * fingers
         """True for fingers that have a baseline; contact of the others is not known."""
         self.baseline = np.full(shape, np.inf)
         """Resting count of each electrode, shape (fingers, 24); infinite: not known yet."""
@@ -316,7 +318,8 @@ class Contact:
 
 
 def _median(values: NDArray[np.number]) -> Floats:
-    """Return it along the first axis. Sorting takes a fifth of the time of `np.median` here."""
-    ordered = np.sort(values, axis=0)
-    low, high = ordered[(len(values) - 1) // 2], ordered[len(values) // 2]
+    """Sort along the last axis and return the median: a fifth of the time of `np.median` here."""
+    values.sort()
+    number = values.shape[-1]
+    low, high = values[..., (number - 1) // 2], values[..., number // 2]
     return np.asarray(low / 2.0 + high / 2.0)

@@ -304,11 +304,9 @@ class Gate:
             return ()
         # Whole numbers below 2**16: float32 adds 24 of them exactly.
         distance = np.abs(median.astype(np.float32) - self._reference)
-        if usable is None:
-            means = (distance @ ONES) / np.float64(ELECTRODES)
-        else:
-            means = (distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1)
-        if max(means.tolist()) > CHANGE_COUNTS:
+        if usable is not None:
+            distance *= usable * (ELECTRODES / np.maximum(usable.sum(axis=1, keepdims=True), 1))
+        if max(distance.dot(ONES).tolist()) > CHANGE_COUNTS * ELECTRODES:
             self._go(ways.CHANGED, t_ns)
             return ()
         if limits.early if still.early else limits.sure:
@@ -349,6 +347,7 @@ class Gate:
         for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * slide_limit:
                 moves, limit = slides, slide_limit
-            motion[finger] = round(moves, 2) if moves < math.inf else None
-            limits[finger] = round(limit, 2)
+            # In a third of the time of `round` to two digits.
+            motion[finger] = round(100.0 * moves) / 100.0 if moves < math.inf else None
+            limits[finger] = round(100.0 * limit) / 100.0
         return motion, limits

@@ -77,8 +77,8 @@ class FreshMedian:
         71.43 Hz never repeats twice.
         """
         oldest, middle, newest = self._fresh
-        self._held = (counts == self._last) & ~self._held
-        fresh = ~self._held
+        fresh = (counts != self._last) | self._held
+        self._held = ~fresh
         if usable is not None:
             fresh &= usable
         np.putmask(oldest, fresh, middle)
@@ -181,7 +181,7 @@ class HandTracker:
     def read_rest(self) -> NDArray[np.float64]:
         """Return the resting counts, shape (fingers, 24); 0: not known."""
         contact = self._contact
-        known = np.isfinite(contact.baseline) & contact.tared[:, np.newaxis]
+        known = np.isfinite(contact.baseline) & np.array(contact.tared)[:, np.newaxis]
         return np.where(known, contact.baseline, 0.0)
 
     def health(self) -> dict[str, Reason]:
@@ -247,10 +247,8 @@ class HandTracker:
         self._fresh.push(counts, usable)
         median, fresh = self._fresh.counts, self._fresh.is_full(usable)
         self._contact.observe(t_ns, counts, median, usable)
-        contact = self._contact
-        touching, tared = contact.touching.tolist(), contact.tared.tolist()
-        named_tared = compress(self._fingers, tared)
-        objections = () if self.gate.required.issubset(named_tared) else (Reason.NOT_TARED,)
+        touching = self._contact.touching
+        objections = () if self.gate.required.issubset(self.tared) else (Reason.NOT_TARED,)
         joints = None if self._joints is None else self._joints.objection(t_ns)
         if joints is not None:
             objections = (*objections, joints)
@@ -260,9 +258,9 @@ class HandTracker:
             t_ns,
             median,
             usable,
-            tuple(compress(self._fingers, touching)),
+            self._named(touching),
             objections,
-            fingers=self._feel(t_ns, touching, tared),
+            fingers=self._feel(t_ns),
             in_time=in_time,
             fresh=fresh,
         )
@@ -276,17 +274,15 @@ class HandTracker:
         touching = self._named(self._contact.touching)
         return self.gate.moment(touching, dict.fromkeys(self._fingers))
 
-    def _feel(
-        self, t_ns: int, touching: list[bool], tared: list[bool]
-    ) -> dict[Finger, FingerState | None]:
+    def _feel(self, t_ns: int) -> dict[Finger, FingerState | None]:
         """Return what each finger feels by the reading just observed."""
-        motion, loose = self.motion, self.motion.loose
+        motion, loose, contact = self.motion, self.motion.loose, self._contact
         feelings: dict[Finger, FingerState | None] = {}
         for place, finger in enumerate(self._fingers):
             word = self._words[place]
-            if not touching[place]:
+            if not contact.touching[place]:
                 word.let_go()
-                feelings[finger] = FingerState.FREE if tared[place] else None
+                feelings[finger] = FingerState.FREE if contact.tared[place] else None
                 continue
             fast, slow = motion.fast[place], motion.slow[place]
             is_known = fast < math.inf and slow < math.inf
@@ -312,5 +308,5 @@ class HandTracker:
         """Return True if a reading of `t_ns` does not continue the last usable one."""
         return self._last_ns is not None and not 0 <= t_ns - self._last_ns <= GAP_NS
 
-    def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
-        return tuple(compress(self._fingers, which.tolist()))
+    def _named(self, which: list[bool]) -> tuple[Finger, ...]:
+        return tuple(compress(self._fingers, which))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graspd.biotac import COUNT_MAX, ELECTRODES, Finger, electrode_name
 from graspd.models.contract import Input, ModelError, SeenCounts, SessionInput
-from graspd.models.electrodes import Electrodes, any_of, too_many
+from graspd.models.electrodes import ONES, Electrodes, any_of, too_many
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS, InputBuilder, SessionBuilder
 from graspd.models.runtime import TactileModel
 
@@ -28,7 +28,6 @@ FLAT_SPREAD_COUNTS = 70.0
 
 It is half of 148, the smallest of 4682 real grasps.
 """
-ONES = np.ones(ELECTRODES)
 TINY = 1e-12  # for a probability of zero, which has no logarithm
 
 
@@ -170,7 +169,7 @@ class GraspJudge:
         if examined.refusal is not None:
             return Opinion(None, examined.refusal, repaired)
         spread = self.prepare(examined.counts)
-        if not (spread >= SPREAD_FLOOR_COUNTS).all():  # also for NaN
+        if not all(each >= SPREAD_FLOOR_COUNTS for each in spread.tolist()):  # also for NaN
             return Opinion(None, Refusal.FLAT, repaired)
         try:
             p_stable, p_slip = network.run()

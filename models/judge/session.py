@@ -57,10 +57,9 @@ class SessionCalibration:
         """Grasps of this session that were taken in."""
         return self._statistics.grasps
 
-    def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
+    def to_training(self, counts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return counts (fingers, 24) as the training's sensors would read them."""
-        deviation = counts.astype(np.float64) - self.counts_mean
-        values: NDArray[np.float64] = self._training[0] + deviation * self.scale
+        values: NDArray[np.float64] = self._training[0] + (counts - self.counts_mean) * self.scale
         return values
 
     def from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:

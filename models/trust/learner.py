@@ -103,17 +103,19 @@ class Learner:
         """
         if inputs.shape != (self.inputs,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self.inputs},)")
-        is_within = (np.abs(inputs) <= INPUT_MAX).all()  # false for NaN
+        is_within = 0 not in (np.abs(inputs) <= INPUT_MAX).tobytes()  # false for NaN
         if not (is_within and math.isfinite(margin)):
             raise ValueError("margin or inputs are not finite, or too large")
         limited = min(max(margin, -MARGIN_MAX), MARGIN_MAX)
         features = np.concatenate(([limited / TEMPERATURE, 1.0], inputs))
         known = self._known(features)
-        variance = float(known @ (self._spread @ known)) + self._residual.variance
+        variance = known.dot(self._spread.dot(known)).item() + self._residual.variance
         moderation = math.sqrt(1.0 + math.pi / 8.0 * variance)  # MacKay's moderated output
-        return self.scale * float(known @ self._mean) / moderation, features
+        return self.scale * known.dot(self._mean).item() / moderation, features
 
     def _known(self, features: Vector) -> Vector:
+        if not len(self._residual.grasps):
+            return features
         return np.concatenate((features, self._residual.shared(features[2:])))
 
     def learn(self, features: Vector, *, slipped: bool) -> None:

@@ -191,9 +191,9 @@ def test_a_finger_that_touches_with_others_is_not_alone() -> None:
     both[:, :6] -= np.uint16(200)
     for at_s, counts in ((1, one), (20, both), (21, one), (50, one)):
         contact.observe(at_s * S, counts, counts, None)
-        assert contact.tared.tolist() == [True, True]
+        assert contact.tared == [True, True]
     contact.observe(51 * S + 1, one, one, None)
-    assert contact.tared.tolist() == [False, True], "half a minute since it was left alone"
+    assert contact.tared == [False, True], "half a minute since it was left alone"
 
 
 def test_the_baseline_is_the_median_of_100_sweeps() -> None:
@@ -261,9 +261,9 @@ def test_an_electrode_far_noisier_than_its_finger_has_no_rest(step: int, known: 
 def test_a_touch_takes_five_sigmas_or_twenty_counts(step: int, threshold: float) -> None:
     contact = Contact(1)
     for place, counts in enumerate(wavering(step)):
-        assert not contact.tared.any()
+        assert not any(contact.tared)
         contact.observe(place * 10 * MS, counts[None], counts[None], ALL)
-    assert contact.tared.all()
+    assert all(contact.tared)
     assert contact.touches[0].threshold == pytest.approx(threshold)
 
 
@@ -293,5 +293,5 @@ def test_the_third_deepest_electrode_makes_the_touch() -> None:
         pressed = rest.copy()
         pressed[0, :fallen] -= np.arange(50, 50 + fallen, dtype=np.uint16)
         contact.observe(S, pressed, pressed, ALL)
-        assert contact.touching.tolist() == [touches]
+        assert contact.touching == [touches]
     assert contact.touches[0].fall == 50.0

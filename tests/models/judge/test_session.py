@@ -66,7 +66,7 @@ def test_a_count_is_mapped_by_its_distance_in_spreads() -> None:
     session = new_session()
     session.counts_mean = np.full(SHAPE, 1500.0)
     session.scale = np.full(SHAPE, SPREAD / 50.0)
-    counts = np.full(SHAPE, 1600, dtype=np.uint16)  # two spreads of 50 above 1500
+    counts = np.full(SHAPE, 1600.0)  # two spreads of 50 above 1500
     assert (session.to_training(counts) == MEAN + 2 * SPREAD).all()
     assert (session.from_training(session.to_training(counts)) == counts).all()
 
