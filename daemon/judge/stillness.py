@@ -103,7 +103,7 @@ class StepRing:
         self.times_s = np.zeros(2 * STEPS)
         """Times of `steps` since the first sweep, s."""
         self.steps = np.zeros((2 * STEPS, *shape), dtype=np.float32)
-        """What is remembered is a slice: it moves to the right, and then goes back to the left."""
+        """The steps that are remembered are a slice, which moves right, then back to the left."""
         self.first = 0
         """Index of the oldest entry in `steps`."""
         self.usable_since_ns = np.zeros(shape, dtype=np.int64)
