@@ -77,9 +77,8 @@ class JointStream:
 
     def parse(self, data: bytes) -> JointMessage | None:
         """Return the message of a datagram; None, and count it, if it is not valid."""
-        message = read_message(data, "joints")
+        message = read_message(data, "joints", self.counters)
         if message is None:
-            self.counters.bad_messages += 1
             return None
         angles: dict[str, float] = {}
         for name, value in message.values.items():

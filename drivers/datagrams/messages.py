@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ from graspd.drivers.udp import DatagramCounters
 
 DATAGRAM_BYTES_MAX = 4096
 """Longest message, bytes; 28 joints in full precision or five fingers take about 900."""
+SHOWN_BYTES_MAX: Final = 80
+"""Most bytes of a message in the log."""
 SILENCE_NS: Final = 500_000_000
 """Timeout of a link, ns: 50 messages at 100 Hz. A sender of 10 Hz passes."""
 NUMBER_MAX: Final = (1 << 63) - 1
@@ -21,6 +24,8 @@ SEQ_JUMP_MAX: Final = 1000
 OLD_MESSAGES_MAX: Final = 10
 """Old messages in a row, each after the one before, that may have been delayed; one more: a
 restart."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -69,24 +74,37 @@ def write_message(stamp: Stamp, **fields: object) -> bytes:
     return json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
 
 
-def read_message(data: bytes, key: str) -> Message | None:
-    """Return the message of a datagram, with the values of `key`; None if it is not valid."""
-    if len(data) > DATAGRAM_BYTES_MAX:
-        return None
+def read_message(data: bytes, key: str, counters: MessageCounters) -> Message | None:
+    """Return the message of a datagram, with the values of `key`; None if it is not valid.
+
+    Invalid messages are counted, and the log says what is wrong with the first.
+    """
     try:
-        # JSON has no NaN; as text it costs only the value that has it.
-        fields = json.loads(data.decode(), object_pairs_hook=_without_doubles, parse_constant=str)
-    except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
+        return _message(data, key)
+    except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, or nested without end
+        if not counters.bad_messages:
+            shown = data[:SHOWN_BYTES_MAX].decode(errors="replace")
+            _log.warning("datagrams: a message is dropped: %s: %r", error, shown)
+        counters.bad_messages += 1
         return None
+
+
+def _message(data: bytes, key: str) -> Message:
+    if len(data) > DATAGRAM_BYTES_MAX:
+        raise ValueError(f"it is longer than {DATAGRAM_BYTES_MAX} bytes")
+    # JSON has no NaN; as text it costs only the value that has it.
+    fields = json.loads(data.decode(), object_pairs_hook=_without_doubles, parse_constant=str)
     if not isinstance(fields, dict) or not isinstance(fields.get(key), dict):
-        return None
+        raise ValueError(f"it is not an object with an object `{key}`")
     seq, t_s = fields.get("seq"), fields.get("t")
     if seq is not None and (type(seq) is not int or not 0 <= seq <= NUMBER_MAX):
-        return None
+        raise ValueError(f"`seq` is {seq!r}, and not an integer from 0 on")
     if t_s is not None:
         t_s = number(t_s)
         if math.isnan(t_s):
-            return None
+            raise ValueError(f"`t` is {fields['t']!r}, and not a number of seconds")
+    if key == "counts" and seq is None and t_s is None:
+        raise ValueError("it has neither `seq` nor `t`")
     return Message(Stamp(seq, t_s), fields.get("hand"), fields[key])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.datagrams.messages import (
     DATAGRAM_BYTES_MAX,
+    SHOWN_BYTES_MAX,
     SILENCE_NS,
-    UNSTAMPED,
     Message,
     MessageCounters,
     Order,
@@ -22,6 +23,8 @@ from graspd.drivers.datagrams.messages import (
 )
 from graspd.drivers.link import SenderClock
 from graspd.drivers.udp import DatagramDriver
+
+_log = logging.getLogger(__name__)
 
 LATE_NS: Final = 100_000_000
 """Delay of a message, ns, from which it is counted as late: the usual age limit."""
@@ -64,11 +67,13 @@ class TactileStream:
 
     def receive(self, data: bytes, t_ns: int) -> list[TactileReading] | None:
         """Return the reading of a message; None if the message is dropped."""
-        message, counters = read_message(data, "counts"), self.counters
-        if message is None or message.stamp == UNSTAMPED:
-            counters.bad_messages += 1
+        counters = self.counters
+        message = read_message(data, "counts", counters)
+        if message is None:
             return None
         if message.hand not in (None, self._hand):
+            if not counters.other_hands:
+                _log.warning("datagrams: a message names the hand %r: dropped", message.hand)
             counters.other_hands += 1
             return None
         restarts = counters.restarts
@@ -95,7 +100,11 @@ class TactileStream:
             counts[row] = [value or 0 for value in values]
         seq = counters.readings + counters.missed_readings
         counters.readings += 1
-        counters.faulty_readings += bool(faults.any())
+        if faults.any():
+            if not counters.faulty_readings:
+                shown = str(dict(message.values))[:SHOWN_BYTES_MAX]
+                _log.warning("datagrams: not 24 counts in 0..4095 of each finger: %s", shown)
+            counters.faulty_readings += 1
         interrupted, self._interrupted = self._interrupted, False
         return TactileReading(t_ns, seq, counts, faults, interrupted=interrupted)
 

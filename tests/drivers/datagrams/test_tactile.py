@@ -49,25 +49,29 @@ def test_a_message_is_a_reading(fields: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "counter"),
+    ("data", "counter", "said"),
     [
-        (b"", "bad_messages"),
-        (b'{"seq": 1}', "bad_messages"),
-        (message(counts=[COUNTS] * 3), "bad_messages"),
-        (message(seq=None), "bad_messages"),
-        (message(seq=-1), "bad_messages"),
-        (message(seq=1.0), "bad_messages"),
-        (message(t="now"), "bad_messages"),
-        (message(t=1e300), "bad_messages"),
-        (message(t=float("nan")), "bad_messages"),
-        (message(pad=" " * 4096), "bad_messages"),
-        (b'{"seq": 1, "counts": {"ff": [], "ff": []}}', "bad_messages"),
-        (message(hand="left"), "other_hands"),
-        (message(hand=["right"]), "other_hands"),
+        (b"", "bad_messages", "Expecting value"),
+        (b'{"seq": 1}', "bad_messages", "not an object with an object `counts`"),
+        (message(counts=[COUNTS] * 3), "bad_messages", "not an object with an object `counts`"),
+        (message(seq=None), "bad_messages", "it has neither `seq` nor `t`"),
+        (message(seq=-1), "bad_messages", "`seq` is -1, and not an integer"),
+        (message(seq=1.0), "bad_messages", "`seq` is 1.0"),
+        (message(t="now"), "bad_messages", "`t` is 'now', and not a number of seconds"),
+        (message(t=1e300), "bad_messages", "`t` is 1e+300"),
+        (message(t=float("nan")), "bad_messages", "`t` is 'NaN'"),
+        (message(pad=" " * 4096), "bad_messages", "it is longer than 4096 bytes"),
+        (b'{"seq": 1, "counts": {"ff": [], "ff": []}}', "bad_messages", "a key stands twice"),
+        (message(hand="left"), "other_hands", "names the hand 'left'"),
+        (message(hand=["right"]), "other_hands", "names the hand ['right']"),
     ],
 )
-def test_another_message_is_counted_and_dropped(data: bytes, counter: str) -> None:
-    assert received(data) == ([], {counter: 1})
+def test_another_message_is_counted_named_and_dropped(
+    data: bytes, counter: str, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert received(data, data) == ([], {counter: 2})
+    assert len(caplog.messages) == 1
+    assert said in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -86,9 +90,14 @@ def test_another_message_is_counted_and_dropped(data: bytes, counter: str) -> No
     ],
 )  # fmt: skip
 def test_what_is_no_count_costs_no_other(
-    finger: object, faults: dict[ElectrodeFault, int], counter: str | None, number: int
+    finger: object,
+    faults: dict[ElectrodeFault, int],
+    counter: str | None,
+    number: int,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     (reading,), counters = received(message({"ff": COUNTS, "mf": finger, "th": COUNTS}))
+    assert ("not 24 counts in 0..4095 of each finger" in caplog.text) == bool(counter)
     assert reading.counts[[0, 2]].tolist() == [COUNTS] * 2
     for fault in ElectrodeFault:
         assert len(flags(reading, fault)) == faults.get(fault, 0)
