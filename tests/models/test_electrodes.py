@@ -71,7 +71,7 @@ def test_a_broken_electrode_is_repaired_by_its_conditional_mean(number: int) -> 
     np.testing.assert_allclose(repaired[out], expected, rtol=1e-6)
 
 
-def test_mean_and_spread_of_the_training_are_those_of_the_contract() -> None:
+def test_mean_and_spread_are_those_of_the_contract() -> None:
     mean, covariance, seen = correlated()
     electrodes = Electrodes(seen)
     np.testing.assert_allclose(electrodes.centre.ravel(), mean)
@@ -94,7 +94,7 @@ def test_an_electrode_is_implausible_from_eight_conditional_deviations_on(
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_search_takes_out_the_worst_of_those_left_one_by_one(seed: int) -> None:
+def test_the_search_takes_out_the_worst_first(seed: int) -> None:
     mean, covariance, seen = correlated(seed)
     random = np.random.default_rng(seed)
     values = random.multivariate_normal(mean, covariance)
@@ -142,7 +142,7 @@ def side(bts3_dir: Path) -> Grasps:
     return read_table(bts3_dir / "palm_side.csv")
 
 
-def test_a_stuck_electrode_of_a_real_grasp_is_found_and_hardly_any_sound_one(side: Grasps) -> None:
+def test_stuck_electrodes_of_real_grasps_are_found(side: Grasps) -> None:
     electrodes = Electrodes(TactileModel(zoo.find("cnn1")).contract.seen)
     values = side.counts[::4].astype(np.float64)
     alarms = [implausible(electrodes, reading, NOTHING, 13).any() for reading in values]
@@ -152,7 +152,7 @@ def test_a_stuck_electrode_of_a_real_grasp_is_found_and_hardly_any_sound_one(sid
     assert np.mean(found) > 0.95
 
 
-def test_a_finger_that_moved_as_a_whole_is_noticed_and_no_electrode_of_it() -> None:
+def test_a_finger_that_moved_as_a_whole_is_noticed() -> None:
     mean, covariance, seen = correlated()
     random = np.random.default_rng(8)
     electrodes = Electrodes(seen)

@@ -93,7 +93,7 @@ def test_a_contract_that_contradicts_itself_is_refused(
     [(1.0, True, True, True), (1.9, True, False, True), (2.6, False, False, True),
      (5.1, False, False, False)],
 )  # fmt: skip
-def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
+def test_a_session_learns_twice_as_far_as_it_judges(
     distance: float, near: bool, near_though_contradicted: bool, learned: bool
 ) -> None:
     check = Electrodes(seen(spread=1 / 100))
@@ -104,7 +104,7 @@ def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
     assert check.is_learned(deviations.mean_square()) is learned
 
 
-def test_a_reading_that_is_not_finite_is_neither_near_nor_learned() -> None:
+def test_a_reading_that_is_not_finite_teaches_nothing() -> None:
     check, values = Electrodes(seen(spread=1 / 100)), np.full((3, 24), 2000.0)
     values[0, 0] = np.nan
     square = check.compare(values).mean_square()

@@ -80,7 +80,7 @@ def test_a_model_that_contradicts_its_contract_is_refused(
         TactileModel(tmp_path / "model.onnx")
 
 
-def test_a_model_of_another_input_or_without_a_contract_is_refused(tmp_path: Path) -> None:
+def test_another_input_or_no_contract_is_refused(tmp_path: Path) -> None:
     onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
     model, path = onnx.load(CNN1), tmp_path / "model.onnx"
     renamed = onnx.compose.add_prefix(model, "another_")

@@ -105,7 +105,7 @@ def test_no_sequence_of_grasps_takes_the_spread_away(rows: list[list[float]]) ->
     assert (session.spread >= 2.0 * np.sqrt(1.0 / (len(rows) + 1)) - 1e-9).all()
 
 
-def test_the_same_grasp_again_and_again_counts_once_however_little_the_session_varies() -> None:
+def test_the_same_grasp_again_and_again_counts_once() -> None:
     session = SessionStatistics(np.full(WIDTH, 500.0), np.full(WIDTH, 30.0))
     random = np.random.default_rng(2)
     again = [session.observe(520.0 + random.normal(0.0, 1.0, WIDTH)) for _ in range(50)]

@@ -149,7 +149,7 @@ def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
         trial.load(path)
 
 
-def test_what_is_not_the_model_alone_is_refused_without_being_loaded(
+def test_weights_in_another_file_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="needs the extra `train`")

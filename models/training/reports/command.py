@@ -48,7 +48,6 @@ def _error_vs_time(parser: argparse.ArgumentParser) -> None:
         help="also put the table into this page, and the picture beside it (deploy/MEASURED.md)",
     )
     parser.add_argument("--quick", action="store_true", help="few readings: does it run?")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
 
 
 def _stability(parser: argparse.ArgumentParser) -> None:

@@ -89,17 +89,17 @@ def run(args: argparse.Namespace) -> int:
     say("report", "measuring, one candidate after the other: some minutes")
     measured = report(grasps, quick=args.quick)
     args.out.mkdir(parents=True, exist_ok=True)
-    lines, figures = table(measured), json.dumps(measured)
+    lines = table(measured)
     text = "\n".join(lines)
     base = args.out / "error-vs-time"
-    base.with_suffix(".json").write_text(figures + "\n")
+    base.with_suffix(".json").write_text(json.dumps(measured) + "\n")
     base.with_suffix(".md").write_text(text + "\n")
     base.with_suffix(".svg").write_text(draw(measured, lines))
     if page is not None:
         put = "\n".join(page_table(measured)) + "\n"
         args.page.write_text(PAGE_TABLE.sub(lambda _: put, page))
         (args.page.parent / "error-vs-time.svg").write_text(draw(measured, lines))
-    sys.stdout.write(f"{figures if args.json else text}\n")
+    sys.stdout.write(f"{text}\n")
     return 0
 
 

@@ -22,9 +22,8 @@ from graspd.models.contract import (
 )
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS
 from graspd.models.judge.grasp_judge import TINY
-from graspd.models.layout import LAYOUTS, Layout
+from graspd.models.layout import D1
 from graspd.models.session_statistics import SessionState
-from graspd.models.tactile_image import Composition, Fill, Normalisation
 
 if TYPE_CHECKING:
     import onnx
@@ -99,8 +98,8 @@ def exact_input(
     """
     values = counts.astype(np.longdouble)
     match contract.input:
-        case ImageInput() as image:
-            return _image(values, image)
+        case ImageInput():
+            return _image(values)
         case CountsInput():
             return values.reshape(len(values), -1), _z_scores(values)[2]
         case SessionInput() as session:
@@ -177,36 +176,26 @@ def _features(
     return clipped, spread
 
 
-def _image(values: Exact, wanted: ImageInput) -> tuple[Exact, Exact]:
-    filled = _filled(values, LAYOUTS[wanted.layout], Fill(wanted.fill))
-    height, width = filled.shape[2:]
+def _image(values: Exact) -> tuple[Exact, Exact]:
+    """Return images (N, height, width, fingers) of counts, as the zoo's `cnn1` has them.
+
+    Each finger on D1 is standardised over its filled image.
+    """
+    filled = _filled(values)
     pixels = filled.reshape(*filled.shape[:2], -1)
-    if Normalisation(wanted.normalisation) is Normalisation.FILLED_IMAGE:
-        mean, spread = _moments(pixels)
-    else:
-        mean, spread = _moments(values)
+    mean, spread = _moments(pixels)
     planes = _divided(pixels - mean[..., np.newaxis], spread)
-    images = planes.reshape(*planes.shape[:2], height, width)
-    match Composition(wanted.composition):
-        case Composition.CHANNELS:
-            return images.transpose(0, 2, 3, 1), spread
-        case Composition.HORIZONTAL:
-            return np.concatenate(list(images.swapaxes(0, 1)), axis=2)[..., np.newaxis], spread
-        case Composition.VERTICAL:
-            return np.concatenate(list(images.swapaxes(0, 1)), axis=1)[..., np.newaxis], spread
+    return planes.reshape(filled.shape).transpose(0, 2, 3, 1), spread
 
 
-def _filled(values: Exact, layout: Layout, fill: Fill) -> Exact:
+def _filled(values: Exact) -> Exact:
     """Images (N, fingers, height, width) of counts (N, fingers, 24), paper section II-A."""
-    height, width = layout.shape
+    height, width = D1.shape
     images = np.zeros((*values.shape[:2], height, width), dtype=np.longdouble)
     known = np.zeros((height, width), dtype=np.bool_)
-    for electrode, (row, column) in enumerate(zip(layout.rows, layout.columns, strict=True)):
+    for electrode, (row, column) in enumerate(zip(D1.rows, D1.columns, strict=True)):
         images[..., row, column] = values[..., electrode]
         known[row, column] = True
-    if fill is Fill.LEAST_CONTACT:
-        images[..., ~known] = values.max(axis=-1)[..., np.newaxis]
-        return images
     while not known.all():
         before, was_known = images.copy(), known.copy()
         for row, column in np.argwhere(~was_known).tolist():

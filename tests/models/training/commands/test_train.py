@@ -58,9 +58,7 @@ def data(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_session_model_comes_with_all_that_the_daemon_and_its_user_need(
-    data: Path, tmp_path: Path
-) -> None:
+def test_a_session_model_comes_with_its_card(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / SYSTEM
     done = train("--data", data, "--out", out, "--folds", "2", "--seed", "3")
     assert done.returncode == 0
@@ -108,9 +106,7 @@ def test_a_model_of_the_later_session_needs_its_table(data: Path, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
-    data: Path, tmp_path: Path
-) -> None:
+def test_an_own_table_is_used_beside_the_published(data: Path, tmp_path: Path) -> None:
     write(tmp_path / "lab 1.csv", table("lab 1", 60, 3))
     options = "--data", data, "--own", tmp_path / "lab 1.csv", "--folds", "2"
     done = train(*options, "--out", tmp_path / "out", system="svm")
@@ -142,7 +138,7 @@ def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
     assert "lab 1.csv is not" not in done.stderr
 
 
-def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
+def test_the_smallest_own_table_makes_a_model(
     tmp_path: Path,
 ) -> None:
     write(tmp_path / "lab.csv", smallest())
@@ -190,7 +186,7 @@ def test_a_session_model_needs_several_objects_of_each_session(data: Path, tmp_p
     assert "put the tables of a session together" in last
 
 
-def test_a_fold_that_leaves_one_kind_of_grasps_to_train_on_is_exit_code_2(tmp_path: Path) -> None:
+def test_a_fold_with_one_kind_of_grasps_is_refused(tmp_path: Path) -> None:
     made = smallest()
     objects = tuple("ball" if slip else "box" for slip in made.slipped)
     write(tmp_path / "lab.csv", dataclasses.replace(made, objects=objects))
@@ -207,7 +203,7 @@ def warnings(done: CompletedProcess[str]) -> list[str]:
     return [line.removeprefix(start) for line in lines if line.startswith(start)]
 
 
-def test_what_a_model_will_not_be_able_to_do_is_said_before_it_is_trained(
+def test_limits_of_a_model_are_named_before_it_is_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
@@ -258,7 +254,7 @@ def test_as_many_folds_are_taken_as_grasps_are_enough_for(
     assert f"--folds {folds}" in card["command"]
 
 
-def test_a_model_is_named_and_its_end_says_how_a_scene_gets_it(tmp_path: Path) -> None:
+def test_a_named_model_says_how_a_scene_gets_it(tmp_path: Path) -> None:
     write(tmp_path / "lab.csv", smallest())
     out = tmp_path / "out"
     options = "--own", tmp_path / "lab.csv", "--out", out, "--folds", "2", "--only", "cv"
@@ -292,7 +288,7 @@ def test_without_any_data_there_is_nothing_to_train_on() -> None:
     assert last_error(train()) == "graspd train: needs --data DIR, --own FILE, or both"
 
 
-def test_an_output_folder_that_is_a_file_is_exit_code_2(data: Path) -> None:
+def test_an_output_folder_that_is_a_file_is_refused(data: Path) -> None:
     out = data / "palm_45.csv"
     assert last_error(train("--data", data, "--out", out)) == f"graspd train: {out}: File exists"
 

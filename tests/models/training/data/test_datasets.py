@@ -66,7 +66,7 @@ def test_counts_stand_by_finger_and_electrode(bts3_dir: Path) -> None:
             assert grasps.slipped[index] == (row["slipped"] == "1")
 
 
-def test_a_folder_is_palm_down_then_palm_side_then_palm_45(bts3_dir: Path) -> None:
+def test_tables_of_a_folder_have_their_order(bts3_dir: Path) -> None:
     grasps = read_all(bts3_dir)
     whole = grasps.rows(grasps.rows_of(("palm_down", "palm_side")))
     assert (len(grasps), len(whole), int(whole.slipped.sum())) == (4682, 2549, 1279)
@@ -134,7 +134,7 @@ def test_some_rows_keep_counts_labels_objects_and_tables_together(made_up: Path)
     assert whole.rows(np.arange(12)).digest() == whole.digest()
 
 
-def test_the_digest_of_grasps_is_of_counts_labels_objects_and_tables(made_up: Path) -> None:
+def test_the_digest_changes_with_each_part_of_grasps(made_up: Path) -> None:
     down, side = (read_table(made_up / f"{name}.csv") for name in ("palm_down", "palm_side"))
     digests = {
         concatenate([down, side]).digest(),

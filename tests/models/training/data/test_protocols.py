@@ -46,7 +46,7 @@ def real(bts3_dir: Path) -> Grasps:
 
 
 @pytest.mark.parametrize("protocol", JUDGED)
-def test_every_grasp_of_a_protocol_is_judged_once_by_who_never_saw_it(
+def test_every_grasp_of_a_protocol_is_judged_once_unseen(
     real: Grasps, protocol: EvalProtocol
 ) -> None:
     made = splits(protocol, real, seed=3)
@@ -83,7 +83,7 @@ def test_no_object_is_on_both_sides(real: Grasps, protocol: EvalProtocol) -> Non
         assert not judged & {real.objects[row] for row in split.train}
 
 
-def test_a_session_is_judged_by_other_days_and_calibrated_by_other_objects(real: Grasps) -> None:
+def test_a_session_is_judged_by_other_days_and_objects(real: Grasps) -> None:
     for split in splits("session", real, seed=0):
         assert set(real.table_of[split.train].tolist()) == {0, 1}
         assert set(real.table_of[split.test].tolist()) == {2}

@@ -10,8 +10,6 @@ pytest.importorskip("torch", reason="needs the extra `train`")
 from graspd.models.inputs import VectorBuilder
 from graspd.models.training.estimators.classical import fit_classical
 from graspd.models.training.estimators.configs import (
-    BoostingConfig,
-    ClassicalConfig,
     ForestConfig,
     MlpConfig,
     SvmConfig,
@@ -20,24 +18,6 @@ from tests.models.training.samples import separable_counts
 
 COUNTS, SLIPPED = separable_counts(120)
 VECTORS = VectorBuilder(3).build_batch(COUNTS)[0]
-KINDS: list[ClassicalConfig] = [
-    SvmConfig(3.0, 0.01),
-    ForestConfig(11, None),
-    ForestConfig(11, 2),
-    MlpConfig((8,), epochs=40),
-    BoostingConfig(iterations=20, leaves=4),
-]
-
-
-@pytest.mark.parametrize("config", KINDS)
-def test_a_positive_margin_says_slip(config: ClassicalConfig) -> None:
-    counts, slipped = separable_counts(60, seed=9)
-    vectors = VectorBuilder(3).build_batch(counts)[0]
-    fitted = fit_classical(config, VECTORS, SLIPPED, seed=0)
-    margins = fitted.margins(vectors)
-    assert margins.dtype == np.float64
-    assert ((margins > 0.0) == slipped).all()
-    assert fitted.margins(vectors[:0]).shape == (0,)
 
 
 def test_an_svm_decides_by_the_radial_kernel() -> None:

@@ -62,7 +62,7 @@ def test_a_tiny_training_learns_what_can_be_separated(trained: nn.Sequential) ->
     assert ((logits(trained, unseen).argmax(axis=1) == 1) == labels).all()
 
 
-def test_the_same_seed_gives_the_same_weights_and_another_gives_others(
+def test_the_seed_alone_decides_the_weights(
     trained: nn.Sequential,
 ) -> None:
     torch.manual_seed(99)  # the state around a training does not matter
@@ -160,7 +160,7 @@ def test_an_epoch_sees_each_grasp_at_most_once(
     assert len(rows) == sum(map(len, batches)) == seen
 
 
-def test_days_are_drawn_from_the_seed_and_change_what_is_learned(
+def test_drawn_days_change_what_is_learned(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(networks, "build", lambda *_: plain_network(26))
@@ -189,13 +189,13 @@ def shifted(features: torch.Tensor, *shift: float) -> torch.Tensor:
     return on_another_day(features, DayShift(*shift))
 
 
-def test_each_feature_of_each_grasp_has_a_gain_of_its_own() -> None:
+def test_each_feature_of_a_grasp_has_its_own_gain() -> None:
     exponents = shifted(torch.ones(4000, 52), 0.3, 0.0, 0.0).log()
     assert exponents.std(dim=0).numpy() == pytest.approx(0.3, abs=0.02)
     assert torch.corrcoef(exponents.T).fill_diagonal_(0.0).abs().max() < 0.1
 
 
-def test_a_finger_gain_is_one_for_its_24_electrodes_and_none_for_mean_and_spread() -> None:
+def test_a_finger_gain_is_of_its_24_electrodes_alone() -> None:
     features = shifted(torch.ones(4000, 52), 0.0, 0.3, 0.0)
     ff, th, rest = features[:, :24], features[:, 24:48], features[:, 48:]
     assert torch.equal(ff, ff[:, :1].expand(-1, 24))

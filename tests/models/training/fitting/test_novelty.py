@@ -36,7 +36,7 @@ def test_seen_counts_are_range_mean_and_inverse_covariance() -> None:
     np.testing.assert_allclose(lower @ lower.T @ covariance, np.eye(72), atol=1e-5)
 
 
-def test_a_held_out_fold_is_not_judged_by_its_own_range() -> None:
+def test_a_held_out_fold_does_not_widen_its_range() -> None:
     counts = random_counts(100)
     counts[:2, 0, 0] = 3500
     group_of = np.arange(100) // 50

@@ -105,7 +105,7 @@ def test_a_member_that_judges_all_grasps_alike_has_no_say() -> None:
     assert fitted.margins(INPUTS) == pytest.approx(0.5 * alone / alone.std(), rel=1e-9)
 
 
-def test_a_standardised_system_sees_every_value_by_its_own_mean_and_spread() -> None:
+def test_a_standardised_system_sees_standardised_values() -> None:
     svm = SYSTEMS_MADE["svm"]
     stretched = 1000.0 + 37.0 * INPUTS.astype(np.float64) * np.arange(1, 79)
     stretched[:, 5] = 2000.0  # an electrode that never changes
@@ -166,7 +166,7 @@ def test_rotations_go_ten_degrees_to_either_side() -> None:
     assert 4 <= sum(turned) <= 16
 
 
-def test_a_session_model_sees_drifted_tables_as_if_of_the_same_sensors() -> None:
+def test_a_session_model_maps_drifted_tables_to_one_another() -> None:
     grasps = sessions(200)
     trained = train(SYSTEMS["svm-session"], grasps, 0)
     mapped = trained.mapped(grasps.counts, grasps.table_of)

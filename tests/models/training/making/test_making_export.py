@@ -117,9 +117,7 @@ fitted = functools.cache(trained)
 
 
 @pytest.mark.parametrize("name", sorted(CASES))
-def test_the_file_judges_as_the_trainer_on_grasps_that_it_never_saw(
-    name: str, tmp_path: Path
-) -> None:
+def test_the_file_judges_unseen_grasps_as_the_trainer(name: str, tmp_path: Path) -> None:
     contract = contract_of(name)
     path = tmp_path / "made.onnx"
     counts = np.concatenate((COUNTS, OTHER_COUNTS))
@@ -140,9 +138,7 @@ def test_the_file_judges_as_the_trainer_on_grasps_that_it_never_saw(
 
 
 @pytest.mark.parametrize("name", ["session network", "svm", "mlp", "forest", "boosting"])
-def test_the_same_training_makes_the_same_bytes_and_tells_nothing_of_the_machine(
-    name: str, tmp_path: Path
-) -> None:
+def test_the_same_training_makes_the_same_bytes_anywhere(name: str, tmp_path: Path) -> None:
     contract = contract_of(name)
     files = [tmp_path / "once.onnx", tmp_path / "again.onnx"]
     for path, made in zip(files, (fitted(name), trained(name)), strict=True):

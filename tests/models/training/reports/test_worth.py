@@ -18,7 +18,7 @@ pytest.importorskip("torch", reason="needs the extra `train`")
 pytest.importorskip("matplotlib", reason="needs the extra `report`")
 
 from graspd.models import zoo
-from graspd.models.training.arrays import Ints
+from graspd.models.training.arrays import Bools, Floats, Floats32, Ints
 from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.data.protocols import object_folds
 from graspd.models.training.fitting.trained import Trained, train
@@ -50,16 +50,22 @@ def stream(seed: int = 0) -> Stream:
     slipped = random.random(GRASPS) < 0.5
     features = random.normal(0.0, 1.0, (GRASPS, 6)).astype(np.float32)
     features[:, 0] = np.where(slipped, 1.0, -1.0) * random.uniform(0.5, 2.0, GRASPS)
+    return stream_of(random.normal(0.0, 1.0, GRASPS), features, slipped, seed)
+
+
+def stream_of(
+    margins: Floats, features: Floats32, slipped: Bools, fold: int, refused: object = False
+) -> Stream:
     rows = {
-        "session": seed,
+        "session": fold,
         "split": 0,
-        "fold": seed,
+        "fold": fold,
         "day": "A",
         "table": "palm_45",
         "order": "random",
-        "grasp": np.arange(GRASPS),
-        "margin": random.normal(0.0, 1.0, GRASPS),
-        "refused": False,
+        "grasp": np.arange(len(slipped)),
+        "margin": margins,
+        "refused": refused,
         "published": -1.0,
         "slipped": slipped,
     }
@@ -192,19 +198,8 @@ def test_p_slip_is_honest_on_a_new_day(bts3_dir: Path) -> None:
     )
     rows = np.random.default_rng(0).permutation(np.flatnonzero(later & (fold_of == 0)))
     margins, features, refused = judged(trained, grasps, rows)
-    frame = stream().rows.iloc[:1].drop(columns=["grasp", "margin", "refused", "slipped"])
-    frame = frame.merge(
-        pd.DataFrame(
-            {
-                "grasp": np.arange(len(rows)),
-                "margin": margins,
-                "refused": refused,
-                "slipped": grasps.slipped[rows],
-            }
-        ),
-        how="cross",
-    )
-    ended = after_outcomes(live(Stream(frame, features), RiskLimits(), every=True))
+    one = stream_of(margins, features, grasps.slipped[rows], 0, refused)
+    ended = after_outcomes(live(one, RiskLimits(), every=True))
     assert 0.7 < slope(ended) < 1.4
     surely = ended[ended["p_slip"] < 0.1]
     assert surely["slipped"].mean() == pytest.approx(surely["p_slip"].mean(), abs=0.05)

@@ -37,12 +37,12 @@ def test_stored_results_of_every_system_stay_valid() -> None:
 
 
 @pytest.mark.parametrize("name", zoo.names())
-def test_a_model_of_the_zoo_was_made_of_the_system_of_its_name(name: str) -> None:
+def test_a_zoo_model_was_made_of_its_system(name: str) -> None:
     fields = ("input", "estimator", "recipe", "augmentation", "tables")
     assert zoo.card(name)["system"] == configuration(SYSTEMS[name], *fields)
 
 
-def test_the_faithful_recipe_and_the_augmented_one_are_the_published_ones() -> None:
+def test_published_recipes_are_those_of_the_paper() -> None:
     assert SYSTEMS["cnn1-faithful"].recipe == PublishedRecipe(
         epochs=300, batch=32, learning_rate=1e-4, decay=0.005, l2=0.01
     )
@@ -53,7 +53,7 @@ def test_the_faithful_recipe_and_the_augmented_one_are_the_published_ones() -> N
     assert augmented.augmentation.rotation_deg == 10.0
 
 
-def test_there_is_a_form_of_the_default_system_for_every_smaller_hand() -> None:
+def test_every_smaller_hand_has_a_default_system() -> None:
     whole = SYSTEMS["small-session"]
     for name, fingers in HANDS.items():
         system = SYSTEMS[name]
