@@ -33,7 +33,8 @@ HANG_UPS = (
     (AS_DEALER, b"READY", (b"\0\5clock") * 40 + PING * 20),
 )
 """What a peer says, what it waits for, and what it says before it hangs up."""
-HANG_UPS_AT_ONCE = 50
+HANG_UPS_AT_ONCE, WITH_KEYS = 50, 20
+"""Peers of each kind, without keys and with keys."""
 MADE_MIN = 0.8
 """Smallest share of the verdicts at rest that must be made. A start of a process costs some ms."""
 FILLING = 300
@@ -109,7 +110,7 @@ def _hang_up_with_keys(endpoint: str, kind: int, folder: Path) -> int:
     """Do the same as peers that may connect, subscribers or askers; libzmq sends heartbeats."""
     own, server = load_pair(folder / "clients" / "friend.key_secret"), folder / "daemon.key_secret"
     with zmq.Context() as context:
-        for _ in range(HANG_UPS_AT_ONCE):
+        for _ in range(WITH_KEYS):
             with context.socket(kind) as peer:
                 peer.linger = 0
                 peer.heartbeat_ivl = 1
@@ -124,4 +125,4 @@ def _hang_up_with_keys(endpoint: str, kind: int, folder: Path) -> int:
                     for _ in range(FILLING):
                         peer.send(b"clock")
                 peer.poll(1000)
-    return HANG_UPS_AT_ONCE
+    return WITH_KEYS
