@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from graspd.models.inputs import builder
@@ -18,20 +18,30 @@ from graspd.models.training.systems.registry import SessionFeatures
 from graspd.models.trust.learner import sigmoid
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verdicts:
-    """Verdicts of one variant on grasps, shape (N,) each."""
+def verdicts(
+    variant: Variant,
+    rows: Ints,
+    margins: Floats,
+    refused: Bools | None = None,
+    ages: Ints | None = None,
+) -> pd.DataFrame:
+    """Return the verdicts of a variant on these rows of grasps, as `frame.judged` has them.
 
-    variant: Variant
-    margins: Floats
-    """Uncalibrated log-odds of slip."""
-    refused: Bools | None = None
-    """Grasps that the daemon would call `unknown`; None: not known."""
-    ages: Ints | None = None
-    """Grasps that the running session had before each one; None: there is no such session."""
+    `refused` None: not known; `ages` None: there is no running session.
+    """
+    unknown = [None] * len(rows)
+    return pd.DataFrame(
+        {
+            "variant": str(variant),
+            "grasp": rows,
+            "margin": margins,
+            "refused": pd.array(unknown if refused is None else refused, dtype="boolean"),
+            "age": pd.array(unknown if ages is None else ages, dtype="Int64"),
+        }
+    )
 
 
-def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iterator[Verdicts]:
+def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iterator[pd.DataFrame]:
     """Judge the rows `test` of grasps with a trained system; each table is a new session.
 
     A session system judges each table in random order, and again object by object. Refused grasps
@@ -43,7 +53,7 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iter
         found = [day.judge_of.examine(reading) for reading in counts]
         inputs, _ = day.network.inputs.build_batch(np.stack([each.counts for each in found]))
         refused = np.array([each.refusal is not None for each in found])
-        yield Verdicts(Variant.NONE, trained.fitted.margins(inputs), refused)
+        yield verdicts(Variant.NONE, test, trained.fitted.margins(inputs), refused)
         return
     random = np.random.default_rng(seed)
     for variant in (Variant.RUNNING, Variant.RUNNING_SORTED):
@@ -57,7 +67,7 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iter
             day = days[table_of[place]]
             ages[place] = day.grasps
             margins[place], refused[place] = day.judge(counts[place])
-        yield Verdicts(variant, margins, refused, ages)
+        yield verdicts(variant, test, margins, refused, ages)
 
 
 def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]) -> Ints:

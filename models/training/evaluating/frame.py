@@ -21,10 +21,9 @@ from joblib.externals.loky import get_reusable_executor
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from graspd.models.inputs import raw_features
-from graspd.models.training.arrays import Bools, Ints
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.data.protocols import FOLDS, EvalProtocol, Split, fold_seed, splits
-from graspd.models.training.evaluating.days import Verdicts, judged_days
+from graspd.models.training.evaluating.days import judged_days, verdicts
 from graspd.models.training.fitting.standards import Variant, later_session
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SessionFeatures, System, digest
@@ -93,19 +92,7 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
             else _judged_at_once(trained, grasps, split, seed)
         )
         seconds = time.perf_counter() - started_s
-    rows = [
-        pd.DataFrame(
-            {
-                "variant": str(one.variant),
-                "grasp": split.test,
-                "margin": one.margins,
-                "refused": pd.array(_or_unknown(one.refused, split), dtype="boolean"),
-                "age": pd.array(_or_unknown(one.ages, split), dtype="Int64"),
-            }
-        )
-        for one in several
-    ]
-    return pd.concat(rows, ignore_index=True).assign(
+    return pd.concat(several, ignore_index=True).assign(
         fold_name=split.name,
         train_grasps=len(split.train),
         parameters=trained.fitted.parameters,
@@ -115,22 +102,19 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
 
 def _judged_at_once(
     trained: Trained, grasps: Grasps, split: Split, seed: int
-) -> Iterator[Verdicts]:
+) -> Iterator[pd.DataFrame]:
     """Judge the test grasps of a split; only those of a later session in several variants."""
     test, kind, standards = split.test, trained.system.input, trained.standards
     if split.calibration is None or standards is None or not isinstance(kind, SessionFeatures):
         variant = Variant.NONE if standards is None else Variant.TRAINING
-        yield Verdicts(variant, trained.margins(grasps.counts[test], grasps.table_of[test]))
+        margins = trained.margins(grasps.counts[test], grasps.table_of[test])
+        yield verdicts(variant, test, margins)
         return
     features = raw_features(grasps.counts)
     by_variant, ages = later_session(features, test, split.calibration, standards, seed)
     for variant, by in by_variant.items():
         margins = trained.fitted.margins(by.apply(features[test], kind.clip))
-        yield Verdicts(variant, margins, ages=ages.get(variant))
-
-
-def _or_unknown(values: Bools | Ints | None, split: Split) -> Bools | Ints | list[None]:
-    return [None] * len(split.test) if values is None else values
+        yield verdicts(variant, test, margins, ages=ages.get(variant))
 
 
 def evaluated(
