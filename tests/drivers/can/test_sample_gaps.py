@@ -36,8 +36,8 @@ def assert_of_one_sweep(reading: TactileReading) -> int:
 
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("where", [0.0, 0.04, 0.13, 0.5, 0.75, 0.97])
-@pytest.mark.parametrize("lost", [24, 28, 48, 54, 56, 72, 108, 144, 162, 168, 324])
+@pytest.mark.parametrize("where", [0.0, 0.13, 0.5, 0.97])
+@pytest.mark.parametrize("lost", [24, 28, 54, 56, 72, 144, 162, 324])
 def test_samples_lost_by_whole_sweeps_are_counted_one_by_one(
     sequence: str, where: float, lost: int
 ) -> None:
