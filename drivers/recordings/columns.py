@@ -123,17 +123,15 @@ class Columns:
                 _refuse_twice(path, names, line, joints.get(joint), place)
                 joints[joint] = place
         time = time_column(names)
-        single = {}
-        for wanted in (OBJECT, SLIPPED, *(() if time is None else (time.name,))):
-            is_label = wanted in (OBJECT, SLIPPED)  # of any letters, as electrodes are
-            cased = [name.lower() for name in names] if is_label else names
-            places = [place for place, name in enumerate(cased) if name == wanted]
-            single[wanted] = places[0] if places else None
-            for place in places[1:]:
-                _refuse_twice(path, names, line, places[0], place)
-        known = {*joints.values(), *(() if time is None else time.places)}
+        single: dict[str, int] = {}
+        for place, name in enumerate(names):
+            is_time = time is not None and name == time.name
+            if is_time or name.lower() in (OBJECT, SLIPPED):  # of any letters, as electrodes are
+                key = name if is_time else name.lower()
+                _refuse_twice(path, names, line, single.get(key), place)
+                single[key] = place
+        known = {*joints.values(), *single.values(), *(() if time is None else time.places)}
         known |= {place for electrodes in found.values() for place in electrodes.values()}
-        known |= {place for place in single.values() if place is not None}
         every = tuple(finger for finger in FINGERS if finger in found)
         return cls(
             electrodes=tuple(
@@ -141,8 +139,8 @@ class Columns:
             ),
             joints=joints,
             time=time,
-            object=single[OBJECT],
-            slipped=single[SLIPPED],
+            object=single.get(OBJECT),
+            slipped=single.get(SLIPPED),
             ignored=tuple(name for place, name in enumerate(names) if place not in known),
             fingers=every,
         )
@@ -246,17 +244,14 @@ def _nearest(names: Sequence[str]) -> str:
     """Return the name that is most like one of a scheme, and the names that were looked for."""
     from difflib import SequenceMatcher  # only where it is needed
 
-    looked = ", ".join(SCHEMES)
     likeness = [
-        (SequenceMatcher(None, name.lower(), example).ratio(), name, example)
+        (SequenceMatcher(None, name.lower(), example).ratio(), example, name)
         for name in names[:200]
         for example in SCHEMES
         if re.search(r"\d", name)
     ]
-    if not likeness:
-        return f": looked for {looked}"
-    _, name, example = max(likeness)
-    return f": looked for {looked}; {name[:60]!r} is nearest to {example}"
+    nearest = [f"{name[:60]!r} is nearest to {example}" for _, example, name in sorted(likeness)]
+    return "; ".join([f": looked for {', '.join(SCHEMES)}", *nearest[-1:]])
 
 
 def time_column(names: Sequence[str]) -> TimeColumn | None:
