@@ -101,7 +101,7 @@ class DayTable(Companion):
         stable, slips = tally.stable
         worth = tally.worth() or {}
         share, kept = worth.get("slips_among_stable"), worth.get("coverage")
-        slipped = f"{slips:6}" + (f"{100 * share:3.0f} %" if share is not None else f"{'-':>5}")
+        slipped = f"{slips:5}" + (f"{100 * share:4.0f} %" if share is not None else f"{'-':>6}")
         if share is not None and allowed is not None:
             slipped = coloured(slipped, Colour.RED if share > allowed else Colour.GREEN)
         good = f"{100 * kept:.0f} %" if kept is not None else "-"
