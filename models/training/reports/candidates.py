@@ -45,9 +45,14 @@ Candidate = tuple[Row, Step]
 
 
 def candidates(grasps: Grasps) -> list[Candidate]:
-    """Return the models of the zoo, and the published code if Keras is installed.
-    Raises `ModelError`."""
-    models = [_model(name, grasps) for name in zoo.names()]
+    """Return the models of the zoo for the grasps' fingers, and the published code if Keras is
+    installed. Raises `ModelError`."""
+    zoo_models = (TactileModel(zoo.find(name)) for name in zoo.names())
+    models = [
+        _model(model, grasps)
+        for model in zoo_models
+        if set(model.contract.fingers) <= set(grasps.fingers)
+    ]
     if find_spec("keras") is None:
         say("report", "keras is not installed: the published code is left out (extra: report)")
         return models
@@ -60,22 +65,17 @@ def candidates(grasps: Grasps) -> list[Candidate]:
     return [*models, (published, _published(grasps.counts))]
 
 
-def _model(name: str, grasps: Grasps) -> Candidate:
-    model, protocols = TactileModel(zoo.find(name)), zoo.card(name)["protocols"]
+def _model(model: TactileModel, grasps: Grasps) -> Candidate:
+    name, fingers = model.contract.name, model.contract.fingers
+    protocols = zoo.card(name)["protocols"]
     error = {protocol: errors(figures) for protocol, figures in protocols.items()}
-    row = {"name": name, "kind": "model", "fingers": model.contract.fingers, "error": error}
-    return row, model_step(model, grasps)
-
-
-def model_step(model: TactileModel, grasps: Grasps) -> Step:
-    """Return what graspd does with a reading. Raises `ValueError` if the grasps lack a finger."""
-    counts = grasps.of_fingers(model.contract.fingers).counts
+    counts = grasps.of_fingers(fingers).counts
 
     def step(index: int) -> None:
         model.inputs.build(counts[index % len(counts)], model.input)
         model.run()
 
-    return step
+    return {"name": name, "kind": "model", "fingers": fingers, "error": error}, step
 
 
 def errors(figures: dict[str, Any]) -> dict[str, float]:
