@@ -252,8 +252,7 @@ class HandTracker:
         joints = None if self._joints is None else self._joints.objection(t_ns)
         if joints is not None:
             objections = (*objections, joints)
-        touches = any(touching)
-        self.motion.add(t_ns, counts, usable, wanted=touches or not self.gate.required)
+        self.motion.add(t_ns, counts, usable, wanted=any(touching) or not self.gate.required)
         moment = self.gate.step(
             t_ns,
             median,

@@ -199,8 +199,7 @@ class StepRing:
         numbers = np.count_nonzero(usable, axis=1)
         means = (values * usable) @ ONES / np.maximum(numbers, 1)
         means[numbers < SOUND_MIN] = math.inf
-        known: list[float] = means.tolist()
-        return known
+        return [float(each) for each in means]
 
 
 class NoiseBlocks:
@@ -355,18 +354,16 @@ class Motion:
 
     def _look(self) -> None:
         """Work out how the fingers move within the steps."""
-        times_ns = self.ring.times_ns
+        self._say_unknown()
+        times_ns, self.looked = self.ring.times_ns, True
         now_ns, last = times_ns[-1], len(times_ns) - STEPS_MIN
         age_ns = now_ns - times_ns[0]
         if self.blocks.number < BLOCKS_MIN or last <= 0 or age_ns < SHORT_NS:
-            self._say_unknown()
-            self.looked = True
             return
-        self.looked = True
         noise = self.blocks.noise()
         fast_noise = self._follow_fast(min(bisect_right(times_ns, now_ns - SHORT_NS), last), noise)
         self.known = max(self.fast) < math.inf
-        slow_noise, self.slow = None, self._unknown
+        slow_noise = None
         if age_ns >= LONG_NS:
             begin = min(bisect_right(times_ns, now_ns - LONG_NS), last)
             slow_noise = self._follow_slow(begin, noise)

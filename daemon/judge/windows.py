@@ -75,9 +75,8 @@ class Noise:
         slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
         spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
         free = ELECTRODES * np.maximum(np.arange(STEPS + 1) - 1.0, 1.0)[:, np.newaxis]
-        echoes = 2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0))
         return cls(
             slope=(MEAN_ABS * np.sqrt(variance * slopes)).tolist(),
             variance=(variance * spreads).tolist(),
-            spread=np.sqrt(echoes / free).tolist(),
+            spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free).tolist(),
         )
