@@ -40,6 +40,7 @@ def whole(low: int, high: int) -> Callable[[str], int]:
 
 def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of both commands."""
+    parser.add_argument("--quiet", action="store_true", help="show no progress bar")
     parser.add_argument(
         "--data",
         type=Path,
@@ -163,7 +164,9 @@ def say(command: str, text: str) -> None:
 
 
 @contextmanager
-def progress_bar(first: str, total: int) -> Iterator[Callable[[str], None]]:
+def progress_bar(
+    first: str, total: int, *, hidden: bool = False
+) -> Iterator[Callable[[str], None]]:
     """Show on stderr, if it is a terminal, how many of `total` trainings are done.
 
     Yields a function to call after each training, with the bar's next text.
@@ -173,8 +176,7 @@ def progress_bar(first: str, total: int) -> Iterator[Callable[[str], None]]:
 
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(
-        *columns, console=console, disable=not console.is_terminal, transient=True
-    ) as bar:
+    hidden = hidden or not console.is_terminal
+    with Progress(*columns, console=console, disable=hidden, transient=True) as bar:
         task = bar.add_task(first, total=total)
         yield lambda name: bar.update(task, advance=1, description=name)

@@ -166,7 +166,7 @@ def _evaluated(
     wanted = [job for group in groups.values() for job in group]
     found: dict[Job, pd.DataFrame] = {}
     made: dict[tuple[str, str], Figures] = {}
-    with progress_bar("starting", len(wanted)) as on_job:
+    with progress_bar("starting", len(wanted), hidden=args.quiet) as on_job:
         for job, rows in evaluated(wanted, grasps, args.out / "jobs"):
             found[job] = rows
             on_job(f"{job.system.name} {job.protocol}")

@@ -105,7 +105,7 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
         # Now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
         total = len(plan.jobs(grasps)) + EXTRA_TRAININGS
-        with progress_bar(args.model, total) as on_job:
+        with progress_bar(args.model, total, hidden=args.quiet) as on_job:
             contract = make_model(plan, grasps, out, lambda: on_job(args.model))
     except TooFewGraspsError as error:
         raise WrongInputError(f"{error} (see --folds and --only)") from error
