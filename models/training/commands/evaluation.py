@@ -53,7 +53,7 @@ from graspd.models.training.systems.registry import (
 
 SEEDS = 3
 """Split seeds of an evaluation unless `--seeds` says otherwise."""
-QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 400, 2, 1
+QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 200, 2, 1
 """Grasps, folds and epochs of `--quick`: enough to see that all runs; figures mean nothing."""
 
 
