@@ -27,6 +27,8 @@ WARNINGS_MAX = 8
 
 CLOCK_STEP_NS: Final = 1_000_000_000
 """Delay of the first message after a fall of its time, ns, from which that has another zero."""
+LEAP: Final = 10
+LEAP_NS: Final = 200_000_000
 DRIFT: Final = 1000
 """Clocks of two computers differ by less than one part in this; NTP slews by half of it."""
 READABLE: Final = 1
@@ -151,6 +153,16 @@ class SenderClock:
         self._offset_ns: int | None = None
         """Smallest difference of reception and sender's time, ns; it grows with the drift."""
         self._sent_ns = self._received_ns = 0
+
+    def leaps(self, t_s: float | None, received_ns: int) -> bool:
+        """Return True if the sender's time passed ten times as fast as here since the last message.
+
+        It is not in seconds, or was set: a delay would not be seen. Leaps of 200 ms pass.
+        """
+        if t_s is None or self._offset_ns is None:
+            return False
+        passed_ns = received_ns - self._received_ns
+        return round(t_s * 1e9) - self._sent_ns > LEAP * passed_ns + LEAP_NS
 
     def made_ns(self, t_s: float | None, received_ns: int) -> int:
         """Return when a message was made at the latest, monotonic ns.

@@ -80,7 +80,14 @@ class TactileStream:
         if not self._order.admits(message.stamp):
             return None
         self._interrupted |= counters.restarts > restarts
+        leaps = self._clock.leaps(message.stamp.t_s, t_ns)
         made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
+        if leaps:
+            if not counters.bad_messages:
+                _log.warning("datagrams: `t` leaps: is it in seconds? A message is dropped")
+            counters.bad_messages += 1
+            self._interrupted = counters.readings > 0
+            return None
         counters.late_messages += t_ns - made_ns > LATE_NS
         return [self._reading(message, made_ns)]
 

@@ -140,7 +140,7 @@ def test_a_finger_without_a_name_is_left_out_and_counted() -> None:
     ("stamps", "taken"),
     [
         ([{"seq": n} for n in (5, 5, 4, 6)], [0, 3]),
-        ([{"seq": None, "t": n} for n in (5, 5, 4, 6)], [0, 3]),
+        ([{"seq": None, "t": n / 100} for n in (5, 5, 4, 6)], [0, 3]),
         ([{"seq": n, "t": 1} for n in range(20)], [0]),
         ([{"seq": 1, "t": n} for n in range(20)], [0]),
         ([{"seq": 5}, {"seq": None, "t": 9}, {"seq": 5}, {"seq": None, "t": 9}], [0, 1]),
@@ -195,6 +195,22 @@ def test_messages_that_waited_stay_old_after_many_losses() -> None:
     # Clocks may drift by 0.1 % of 20 s.
     assert ages_ms == pytest.approx([0, 7980, 7980], abs=1)
     assert (stream.counters.restarts, stream.counters.late_messages) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("times", "readings"),
+    [
+        ([10.0, 20.0, 30.0, 40.0], 1),  # milliseconds
+        ([1e7, 2e7, 3e7, 4e7], 1),  # nanoseconds
+        ([0.01, 0.02, 3600.03, 3600.04], 3),  # a clock that was set
+        ([0.01, 0.25, 0.26, 0.27], 4),  # a message that waited, and losses behind it
+    ],
+)
+def test_sender_time_that_leaps_is_dropped(times: list[float], readings: int) -> None:
+    stream = TactileStream(FINGERS, "right")
+    for number, t_s in enumerate(times):
+        stream.receive(message(seq=number, t=t_s), 10 * number * MS)
+    assert (stream.counters.readings, stream.counters.bad_messages) == (readings, 4 - readings)
 
 
 @pytest.fixture
