@@ -6,6 +6,8 @@ import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import pytest
+
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_rows import Recording, Row
 from graspd.drivers.recordings.layout import survey
@@ -85,3 +87,11 @@ def rows_or_message(content: bytes) -> list[Row] | str:
         return rows_of(content)
     except RecordingError as error:
         return str(error)
+
+
+def refusal(content: bytes, fingers: Sequence[str] = FINGERS) -> str:
+    """Why a recording is refused, in one line."""
+    with pytest.raises(RecordingError) as caught:
+        rows_of(content, fingers)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
