@@ -69,6 +69,7 @@ COMMANDS = (
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("place", PLACES)
 def test_no_command_ends_in_a_traceback(tmp_path: Path, place: str) -> None:
     can_lose = os.geteuid() == 0 and shutil.which(WITHOUT_RIGHTS[0])
