@@ -2,7 +2,7 @@
 
 `python -m tests.bench.wire` prints it for several hands at 100 Hz, each with its own twin, on an
 idle computer and beside a busy process for each core. Daemons and echoes take turns. An echo reads
-the same line and publishes its bytes as they come. It takes half an hour, `--quick` one
+the same line and publishes its bytes as they come. It takes twelve minutes, `--quick` one
 minute, and needs the extra `train`.
 """
 
@@ -44,7 +44,7 @@ Way = Literal["echo", "daemon"]
 WAYS: tuple[Way, ...] = ("echo", "daemon")
 HANDS, QUICK_HANDS = (1, 2, 4, 8), (2,)
 ROUNDS, QUICK_ROUNDS = 3, 1
-SECONDS, QUICK_SECONDS = 20.0, 3.0
+SECONDS, QUICK_SECONDS = 10.0, 3.0
 """Time that is measured in each turn, s."""
 WARM_UP = 50
 """Messages of each hand before that."""
