@@ -29,7 +29,8 @@ from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading, RecordingError
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED, time_column
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all, refuse_options
-from graspd.drivers.recordings.layout import BLOCK_ROWS, ReadAs, problem_of_sweeps
+from graspd.drivers.recordings.layout import BLOCK_ROWS, ReadAs, are_labelled, problem_of_sweeps
+from graspd.drivers.recordings.values import BLANK
 from graspd.models import trial, zoo
 from graspd.models.contract import CLASSES, ModelError, SessionInput
 from graspd.models.counts import check_fingers, column_names, counts_of, write_csv
@@ -183,10 +184,12 @@ def _grasps(
 
 
 def _are_labelled(table: Any) -> bool:  # noqa: ANN401
-    """Return True for rows with objects and outcomes of both kinds."""
+    """Return True for rows that each have an object and an outcome, of both kinds."""
     if not {OBJECT, SLIPPED} <= set(column_names(table)):
         return False
-    return len(set(np.asarray(table[SLIPPED]).tolist())) > 1
+    labels = (np.asarray(table[name], dtype=object).tolist() for name in (OBJECT, SLIPPED))
+    texts = [["" if str(each).lower() in BLANK else str(each) for each in one] for one in labels]
+    return are_labelled(zip(*texts, strict=True))
 
 
 def _time_of(table: Any) -> str | None:  # noqa: ANN401

@@ -192,8 +192,7 @@ class _Rows:
         name, slipped = self.columns.object, self.columns.slipped
         if name is None or slipped is None:
             return False
-        every = all(row[name].strip() and is_outcome(row[slipped]) for row in self.first)
-        return every and len({row[slipped] for row in self.first}) > 1
+        return are_labelled((row[name], row[slipped]) for row in self.first)
 
     def times(self, column: TimeColumn) -> list[float]:
         """Return the times of the first rows in the unit of the column."""
@@ -278,6 +277,16 @@ def _timed(rows: _Rows, column: TimeColumn, read_as: ReadAs | None) -> Layout:
         )
         raise RecordingError(rows.path, problem, column=column.name)
     return layout
+
+
+def are_labelled(cells: Iterable[tuple[str, str]]) -> bool:
+    """Return True for rows that each have an object and an outcome, of both kinds."""
+    outcomes = set[str]()
+    for name, outcome in cells:
+        if not name.strip() or not is_outcome(outcome):
+            return False
+        outcomes.add(outcome)
+    return len(outcomes) > 1
 
 
 def problem_of_sweeps(

@@ -108,6 +108,16 @@ def test_times_that_mean_little_are_refused(
         list(graspd.judge(stream.assign(t=times(stream.t.to_numpy()))))
 
 
+def test_blank_labels_make_no_grasps_of_few_slow_sweeps() -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    every = graspd.read_recording(DEMO_RECORDING)[1250:1550:25].drop(columns="t")
+    blank = every.assign(object=np.nan, slipped=np.nan)
+    model = graspd.load("mlp")
+    for sweeps in (every, blank, blank.assign(slipped=[None, 1.0] * 6)):
+        with pytest.raises(ValueError, match="most of 12 rows are much like another"):
+            model.predict(sweeps)
+
+
 def test_sweeps_without_times_are_never_grasps() -> None:
     pytest.importorskip("pandas", reason="needs the extra `pandas`")
     sweeps = graspd.read_recording(DEMO_RECORDING)[:260].drop(columns="t")
