@@ -28,7 +28,9 @@ WARNINGS_MAX = 8
 CLOCK_STEP_NS: Final = 1_000_000_000
 """Delay of the first message after a fall of its time, ns, from which that has another zero."""
 LEAP: Final = 10
+"""Times as fast as here from which a sender's time is not in seconds, or was set."""
 LEAP_NS: Final = 200_000_000
+"""Rise, ns, beyond that: a message that waited, and losses behind it, rise as far at once."""
 DRIFT: Final = 1000
 """Clocks of two computers differ by less than one part in this; NTP slews by half of it."""
 READABLE: Final = 1

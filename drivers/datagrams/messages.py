@@ -82,11 +82,16 @@ def read_message(data: bytes, key: str, counters: MessageCounters) -> Message | 
     try:
         return _message(data, key)
     except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, or nested without end
-        if not counters.bad_messages:
-            shown = data[:SHOWN_BYTES_MAX].decode(errors="replace")
-            _log.warning("datagrams: a message is dropped: %s: %r", error, shown)
-        counters.bad_messages += 1
+        drop(data, error, counters)
         return None
+
+
+def drop(data: bytes, why: object, counters: MessageCounters) -> None:
+    """Count a message that is not valid; the log says why of the first."""
+    if not counters.bad_messages:
+        shown = data[:SHOWN_BYTES_MAX].decode(errors="replace")
+        _log.warning("datagrams: a message is dropped: %s: %r", why, shown)
+    counters.bad_messages += 1
 
 
 def _message(data: bytes, key: str) -> Message:

@@ -19,6 +19,7 @@ from graspd.drivers.datagrams.messages import (
     Message,
     MessageCounters,
     Order,
+    drop,
     read_message,
 )
 from graspd.drivers.link import SenderClock
@@ -83,9 +84,7 @@ class TactileStream:
         leaps = self._clock.leaps(message.stamp.t_s, t_ns)
         made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
         if leaps:
-            if not counters.bad_messages:
-                _log.warning("datagrams: `t` leaps: is it in seconds? A message is dropped")
-            counters.bad_messages += 1
+            drop(data, "`t` leaps: is it in seconds?", counters)
             self._interrupted = counters.readings > 0
             return None
         counters.late_messages += t_ns - made_ns > LATE_NS
