@@ -18,7 +18,7 @@ from graspd.daemon.session.folder import SessionFolder, look
 from graspd.daemon.session.keeper import SessionKeeper
 from graspd.daemon.session.sensors import SensorWatch
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
-from graspd.daemon.trust.trust import Trust
+from graspd.daemon.trust.trust import Trust, TrustState
 from graspd.drivers.base import Driver
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.models.contract import SessionInput, Sharpness
@@ -149,3 +149,19 @@ def sensor_watch(
     read_rest: Callable[[], NDArray[np.float64]] | None = None,
 ) -> SensorWatch:
     return SensorWatch(cast(Pipeline, FakeJudge(None, None, read_rest, hear)), tactile)
+
+
+def kept_trust(folder: SessionFolder) -> TrustState | None:
+    kept = last_kept(folder.path)
+    return None if kept is None or kept.trust is None else kept.trust
+
+
+def taught(folder: SessionFolder) -> tuple[SessionCalibration, Trust, SessionKeeper]:
+    """A session of 30 grasps, and what the outcomes of 20 have taught."""
+    session, part = calibration(), trust()
+    keeper = session_keeper(session, sensors(), folder, part=part)
+    observe(session, 30)
+    for grasp in range(20):
+        judge(part, grasp)
+        tell(part, grasp)
+    return session, part, keeper

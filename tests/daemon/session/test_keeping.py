@@ -27,7 +27,6 @@ from graspd.daemon.session.keeper import (
 )
 from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.trust import Trust, TrustState
-from graspd.models.judge.session import SessionCalibration
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
@@ -36,11 +35,13 @@ from tests.daemon.session.learning import (
     calibration,
     judge,
     kept_in,
+    kept_trust,
     last_kept,
     observe,
     read_once,
     sensors,
     session_keeper,
+    taught,
     tell,
     trust,
 )
@@ -97,25 +98,9 @@ def go_round(keeper: SessionKeeper) -> None:
         keeper.before_wait(NOBODY)
 
 
-def kept_trust(folder: SessionFolder) -> TrustState | None:
-    kept = last_kept(folder.path)
-    return None if kept is None or kept.trust is None else kept.trust
-
-
 def outcomes(folder: SessionFolder) -> int:
     kept = kept_trust(folder)
     return 0 if kept is None else kept.learner.outcomes
-
-
-def taught(folder: SessionFolder) -> tuple[SessionCalibration, Trust, SessionKeeper]:
-    """A session of 30 grasps, and what the outcomes of 20 have taught."""
-    session, part = calibration(), trust()
-    keeper = session_keeper(session, sensors(), folder, part=part)
-    observe(session, 30)
-    for grasp in range(20):
-        judge(part, grasp)
-        tell(part, grasp)
-    return session, part, keeper
 
 
 def test_an_outcome_is_answered_once_it_is_on_disk(

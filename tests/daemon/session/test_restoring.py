@@ -12,14 +12,15 @@ from tests.daemon.session.learning import (
     calibration,
     judge,
     kept_in,
+    kept_trust,
     observe,
     read_once,
     sensors,
     session_keeper,
+    taught,
     tell,
     trust,
 )
-from tests.daemon.session.test_keeping import kept_trust, taught
 
 
 def test_session_and_what_was_learned_are_restored_together(folder: SessionFolder) -> None:
