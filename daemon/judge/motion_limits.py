@@ -89,9 +89,10 @@ class MotionLimits:
             self.slow, self.sure = self._ones, False
             return
         self.slow = self._slow_limits(slow_noise)
-        self.sure = self.early and all(map(le, slow, self.slow))
-        if self.sure and self._beside != self._alone:
-            self.sure = all(map(le, fast, _fast_limits(self._beside, fast_noise)))
+        is_within = self.early
+        if self._beside != self._alone:  # where the long window decides, the short one is looser
+            is_within = all(map(le, fast, _fast_limits(self._beside, fast_noise)))
+        self.sure = is_within and all(map(le, slow, self.slow))
 
     def _slow_limits(self, slow_noise: SlowNoise) -> list[float]:
         extent, squares, spreads = slow_noise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.motion_limits import MotionLimits, Tails, creep
+from graspd.daemon.judge.motion_limits import MotionLimits, SlowNoise, Tails, creep
 from graspd.daemon.judge.stillness import Motion
 from graspd.daemon.judge.windows import STEPS, Noise
 from tests.drivers.twins.slides import STANDSTILL_S, held
@@ -295,3 +295,13 @@ def test_a_held_touch_creeps_as_measured() -> None:
     # which noise makes 12.6, and root mean squares are 1.25 times mean absolute values.
     assert creep(0.0) == pytest.approx(1.25 * np.sqrt(14.0**2 - 12.6**2), rel=0.05)
     assert creep(1.645) == pytest.approx(1.25 * np.sqrt(25.0**2 - 12.6**2), rel=0.2)
+
+
+def test_where_the_long_window_decides_the_short_one_is_looser() -> None:
+    # Of one finger's tails at 1 %: 2.326 for the short window alone, 3.090 beside the long one.
+    limits = MotionLimits(1, Tails.of(1, 0.01, early=True))
+    still = SlowNoise(1.0, [1.0], [0.1])
+    limits.lay([0.0], [1.0], [0.0], still)
+    above = limits.fast[0] * 1.01
+    limits.lay([above], [1.0], [0.0], still)
+    assert (limits.early, limits.sure) == (False, True)
