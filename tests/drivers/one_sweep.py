@@ -1,6 +1,6 @@
-"""Sweeps whose counts are their number, and what happens to them between a board and a driver.
+"""Sweeps whose counts give their number, and what happens to them between a board and a driver.
 
-A reading that mixes two sweeps holds two numbers, whatever the driver thinks of it.
+A reading that mixes two sweeps, or moves a count to another electrode, shows two numbers.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from hypothesis import strategies as st
@@ -17,30 +18,25 @@ from graspd.biotac import ELECTRODES
 from graspd.drivers.base import Reading, TactileReading
 
 FIRST, NUMBERS = 50, 4000
-"""The count of sweep 0, and how many sweeps there are before a count comes again."""
-SWEEPS_PER_BOOT = 700
-"""Numbers apart are the sweeps of two starts of a board."""
+"""The lowest count, and how many sweeps there are before a count comes again."""
+FINGERS: Final = 3
+_PLACES = 53 * np.random.default_rng(1).permutation(FINGERS * ELECTRODES)
+"""Each electrode's own part of its count."""
 
 
-def number_of(sweep: int, boot: int = 0) -> int:
-    """The count that all electrodes have in a sweep, by its place since a start of the board."""
-    return FIRST + (sweep + SWEEPS_PER_BOOT * boot) % NUMBERS
+def counts_of(number: int) -> NDArray[np.uint16]:
+    """Counts of a sweep, shape (3, 24): no two electrodes agree."""
+    return (FIRST + (number + _PLACES) % NUMBERS).astype(np.uint16).reshape(FINGERS, ELECTRODES)
 
 
-def counts_of(number: int, fingers: int = 3) -> NDArray[np.uint16]:
-    """Counts of a sweep, shape (fingers, 24)."""
-    return np.full((fingers, ELECTRODES), number, dtype=np.uint16)
-
-
-def expect_one_sweep(readings: Iterable[Reading]) -> int:
-    """Fail if a reading holds counts of two sweeps without a flag; how many hold any."""
-    sound = 0
-    for reading in readings:
-        assert isinstance(reading, TactileReading)
-        numbers = set(reading.counts[reading.faults == 0].tolist())
-        assert len(numbers) <= 1, f"mixes the sweeps {sorted(numbers)}"
-        sound += bool(numbers)
-    return sound
+def number_in(reading: TactileReading) -> int | None:
+    """The number of a reading's sweep; None if all is flagged. Fails if there are two numbers."""
+    sound = reading.faults == 0
+    assert not reading.counts[~sound].any(), "a flagged electrode has a count"
+    places = _PLACES.reshape(sound.shape)[sound]
+    numbers = {int(number) for number in (reading.counts[sound] - FIRST - places) % NUMBERS}
+    assert len(numbers) <= 1, f"mixes the sweeps {sorted(numbers)}"
+    return numbers.pop() if numbers else None
 
 
 def tactile(readings: Iterable[Reading]) -> list[TactileReading]:
@@ -89,6 +85,19 @@ def plans(sweep: int, steady_sweeps: int = 1) -> st.SearchStrategy[list[Step]]:
         torn,
         st.lists(any_step, min_size=5, max_size=50),
     )
+
+
+def losses(sweep: int) -> st.SearchStrategy[list[Step]]:
+    """Plans that lose and copy units only, of a board whose pace is known."""
+    some = st.integers(1, 2 * sweep)
+    whole = st.integers(1, 6).map(lambda sweeps: sweep * sweeps)
+    step = st.one_of(
+        st.builds(Step, st.just("send"), st.one_of(some, whole)),
+        st.builds(Step, st.just("lose"), st.one_of(some, whole)),
+        st.just(Step("again", 1)),
+    )
+    steady = Step("send", 8 * sweep)
+    return st.lists(step, min_size=1, max_size=20).map(lambda steps: [steady, *steps, steady])
 
 
 @dataclass(frozen=True)

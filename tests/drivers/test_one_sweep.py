@@ -1,4 +1,4 @@
-"""No reading of any driver mixes two sweeps, whatever is lost, doubled, late, or begins anew.
+"""Each link's assembler: no reading mixes sweeps, none is newer than it says, no loss is hidden.
 
 What boards must number and how long links may hold frames back, so that this holds, say
 `deploy/bridge/PROTOCOL.md`, `deploy/can/PROTOCOL.md` and, of palms, `deploy/CONNECT.md`.
@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from graspd.drivers.base import Reading
-from graspd.drivers.biotac import SEQUENCES
+from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
+from graspd.drivers.biotac import E1, SEQUENCES
 from graspd.drivers.can.frames import CanFrame, encode_sample
 from graspd.drivers.can.stream import CanStream
 from graspd.drivers.datagrams.joints import JointMessage, JointStream
@@ -31,14 +31,17 @@ from graspd.drivers.spi.conversation import LineEvent
 from graspd.drivers.spi.messages import FrameParser, Ping, Sweep, encode
 from graspd.drivers.twins.datagrams import PalmTwin
 from tests.drivers.can.can_words import SLOT_NS, word
+from tests.drivers.one_sweep import FINGERS as WIDTH
 from tests.drivers.one_sweep import (
+    NUMBERS,
     Step,
     Unit,
     arrivals,
     counts_of,
-    expect_one_sweep,
-    number_of,
+    losses,
+    number_in,
     plans,
+    tactile,
 )
 from tests.drivers.spi.bridge_bench import T0, greeted, hello
 
@@ -50,48 +53,59 @@ SILENT_NS = 110 * MS
 WORDS = [word(count) for count in range(4096)]
 ROUND = 14
 PACKETS = [
-    packet.to_bytes()
-    for packet in PalmTwin(counts_of(number_of(at)) for at in range(600)).packets()
+    packet.to_bytes() for packet in PalmTwin(counts_of(number) for number in range(600)).packets()
 ]
-"""More rounds than the longest plan has, and some for other starts."""
+"""More rounds than the longest plan has."""
+SEQ_FIRST = (1 << 32) - 9
+"""Number of a bridge's first sweep, soon before it wraps."""
+SWEEPS_PER_BOOT = 700
+"""Numbers apart are the sweeps of two starts of a board."""
+
+Feed = Callable[[Unit, int, int], Sequence[Reading]]
+"""A driver that takes a unit, of a sweep of this number, at this time in ns."""
 
 
-def sample(unit: Unit, channels: Sequence[int]) -> CanFrame:
+def words_of(number: int) -> NDArray[np.uint16]:
+    """Words of a sweep, shape (24, 3)."""
+    words = [[int.from_bytes(WORDS[count]) for count in row] for row in counts_of(number).T]
+    return np.array(words, dtype=np.uint16)
+
+
+def sample(number: int, slot: int, channels: Sequence[int]) -> CanFrame:
     """One channel of three sensors, in the order of a sequence."""
-    sweep, slot = divmod(unit.index, len(channels))
-    words = WORDS[number_of(sweep, unit.boot)] * 3
-    return CanFrame(BASE_ID, encode_sample(channels[slot], words))
+    channel = channels[slot % len(channels)]
+    words = WORDS[2050] * WIDTH
+    if channel >= E1:
+        words = b"".join(WORDS[count] for count in counts_of(number)[:, channel - E1])
+    return CanFrame(BASE_ID, encode_sample(channel, words))
 
 
-Feed = Callable[[Unit], Sequence[Reading]]
-
-
-def palm(first: int) -> Feed:
-    """A relay that was started again goes on in any round."""
+def palm() -> Feed:
     stream = PalmStream(FINGERS)
 
-    def feed(unit: Unit) -> Sequence[Reading]:
-        at = first + unit.index + 37 * unit.boot
-        return stream.receive(PACKETS[at % len(PACKETS)], unit.at * MS) or ()
+    def feed(unit: Unit, _number: int, t_ns: int) -> Sequence[Reading]:
+        data = PACKETS[unit.index + PALM_SHIFT * unit.boot]
+        return stream.receive(data, t_ns) or ()
 
     return feed
 
 
-def samples(sequence: str) -> Callable[[int], Feed]:
-    def begin(_first: int) -> Feed:
+def samples(sequence: str) -> Callable[[], Feed]:
+    def begin() -> Feed:
         stream = CanStream("bus", FINGERS, arbitration_id=BASE_ID, sequence=sequence)
-        return lambda unit: stream.push(sample(unit, SEQUENCES[sequence]), unit.at * SLOT_NS)
+        channels = SEQUENCES[sequence]
+        return lambda unit, number, t_ns: stream.push(sample(number, unit.index, channels), t_ns)
 
     return begin
 
 
-def bus_log(_first: int) -> Feed:
-    """Through the lines of a log, which must tell no other story than the bus."""
+def bus_log() -> Feed:
+    """Through the lines of a log, which must give the readings of the bus."""
     log = CanLog([Path("bus.log")], FINGERS, arbitration_id=BASE_ID, sequence="electrodes")
 
-    def feed(unit: Unit) -> Sequence[Reading]:
-        frame = sample(unit, SEQUENCES["electrodes"])
-        logged = parse(line_of(frame, unit.at * SLOT_NS, "can0"))
+    def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
+        frame = sample(number, unit.index, SEQUENCES["electrodes"])
+        logged = parse(line_of(frame, t_ns, "can0"))
         assert logged is not None
         assert logged.t_ns is not None
         assert logged.frame is not None
@@ -100,27 +114,28 @@ def bus_log(_first: int) -> Feed:
     return feed
 
 
-def spi_sweep(unit: Unit) -> bytes:
-    words = np.full((24, 3), int.from_bytes(WORDS[number_of(unit.index, unit.boot)]), np.uint16)
+def spi_sweep(unit: Unit, number: int) -> bytes:
     tick = 2000 + unit.index * 1000
-    return encode(Sweep(unit.index, tick, tick + 1900, 7, words))
+    return encode(
+        Sweep((SEQ_FIRST + unit.index) % (1 << 32), tick, tick + 1900, 7, words_of(number))
+    )
 
 
-def bridge(_first: int) -> Feed:
+def bridge() -> Feed:
     """Through a conversation."""
     conversation = greeted()
 
-    def feed(unit: Unit) -> Sequence[Reading]:
+    def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
         nonlocal conversation
         if conversation.link.state is LinkState.WAITING:  # the clock of a new start falls back
             conversation = greeted()
-        return conversation.receive(spi_sweep(unit), T0 + (unit.at + 10) * MS)
+        return conversation.receive(spi_sweep(unit, number), t_ns)
 
     return feed
 
 
-def bridge_log(_first: int) -> Feed:
-    """Through the records of a log, which must tell no other story than the line."""
+def bridge_log() -> Feed:
+    """Through the records of a log, which must give the readings of the line."""
     log = SerialLog([Path("line.serial")], FINGERS)
 
     def feed(event: LineEvent, data: bytes, t_ns: int) -> list[Reading]:
@@ -130,17 +145,15 @@ def bridge_log(_first: int) -> Feed:
     for nonce in (1, 2):
         feed(LineEvent.SENT, encode(Ping(nonce)), T0)
         feed(LineEvent.RECEIVED, encode(hello(nonce, 1000)), T0)
-    return lambda unit: feed(LineEvent.RECEIVED, spi_sweep(unit), T0 + (unit.at + 10) * MS)
+    return lambda unit, number, t_ns: feed(LineEvent.RECEIVED, spi_sweep(unit, number), t_ns)
 
 
-def messages(_first: int) -> Feed:
+def messages() -> Feed:
     stream = TactileStream(FINGERS, "right")
 
-    def feed(unit: Unit) -> Sequence[Reading]:
-        counts = counts_of(number_of(unit.index, unit.boot)).tolist()
-        by_finger = dict(zip(FINGERS, counts, strict=True))
-        data = write_message(Stamp(unit.index, None), counts=by_finger)
-        return stream.receive(data, unit.at * MS) or ()
+    def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
+        by_finger = dict(zip(FINGERS, counts_of(number).tolist(), strict=True))
+        return stream.receive(write_message(Stamp(unit.index, None), counts=by_finger), t_ns) or ()
 
     return feed
 
@@ -149,57 +162,109 @@ def messages(_first: int) -> Feed:
 class Assembler:
     """A link whose driver assembles sweeps of units."""
 
-    begin: Callable[[int], Feed]
-    units: int
-    """Units of a sweep."""
+    begin: Callable[[], Feed]
+    places: Sequence[Sequence[int]]
+    """Electrodes, from 0, of each unit of a sweep."""
     silent: int
     """Units that a board is silent after a start."""
-    late_max: int = 3
+    unit_ns: int = MS
+    start_ns: int = T0 + 10 * MS
+    age_ns: int = 0
+    """Most by which a reading is older than its last unit."""
+    boot_units: int | None = None
+    """Units that a start of the board leaves out; None: `SWEEPS_PER_BOOT` sweeps."""
     examples: int = 80
     steady_sweeps: int = 1
     """Undisturbed sweeps at the beginning."""
 
+    def number(self, unit: Unit) -> int:
+        units = len(self.places)
+        skipped = SWEEPS_PER_BOOT * units if self.boot_units is None else self.boot_units
+        return (unit.index + skipped * unit.boot) // units
+
+    def t_ns(self, unit: Unit) -> int:
+        return self.start_ns + unit.at * self.unit_ns
+
+
+ALL = [range(24)]
+PALM_SHIFT = 37
+"""Packets: a relay that starts again does so within a round."""
+PAIRS = [[], [0], *([first, first + 1] for first in range(1, 22, 2)), [23]]
+"""Electrodes of each request of a round (tactile_data_type 0x0001, 0x0003 ... 0x001B)."""
+
+
+def of_samples(sequence: str) -> Assembler:
+    """A board without a pause, of which two sweeps in a row have come."""
+    channels = SEQUENCES[sequence]
+    places = [[channel - E1] if channel >= E1 else [] for channel in channels]
+    begin, silent = samples(sequence), len(channels)
+    return Assembler(begin, places, silent, SLOT_NS, steady_sweeps=3, examples=40)
+
 
 ASSEMBLERS = {
-    "bridge": Assembler(bridge, 1, silent=11),
-    "log of a bridge": Assembler(bridge_log, 1, silent=11),
-    "datagrams": Assembler(messages, 1, silent=11),
-    "palm": Assembler(palm, ROUND, silent=25, steady_sweeps=2),  # it may begin within a round
+    "bridge": Assembler(bridge, ALL, silent=11, age_ns=10_000 * MS),
+    "log of a bridge": Assembler(bridge_log, ALL, silent=11, age_ns=10_000 * MS),
+    "datagrams": Assembler(messages, ALL, silent=11),
+    "palm": Assembler(palm, PAIRS, silent=25, boot_units=PALM_SHIFT, steady_sweeps=2),
     "log of samples": Assembler(
         bus_log,
-        24,
+        [[electrode] for electrode in range(24)],
         silent=SILENT_NS // SLOT_NS + 1,
+        unit_ns=SLOT_NS,
         steady_sweeps=3,
         examples=20,  # its stream is that of samples
     ),
-    # A board without a pause, of which two sweeps in a row have come.
-    **{
-        f"samples, {sequence}": Assembler(
-            samples(sequence),
-            len(channels),
-            silent=len(channels),
-            steady_sweeps=3,
-            examples=40,
-        )
-        for sequence, channels in SEQUENCES.items()
-    },
+    **{f"samples, {sequence}": of_samples(sequence) for sequence in SEQUENCES},
 }
 
 
 @pytest.mark.parametrize("name", ASSEMBLERS)
-def test_no_reading_mixes_two_sweeps(name: str) -> None:
+def test_no_reading_mixes_two_sweeps_or_is_newer(name: str) -> None:
     assembler = ASSEMBLERS[name]
 
     @settings(max_examples=assembler.examples)
-    @given(
-        plans(assembler.units, assembler.steady_sweeps),
-        st.sampled_from([0, 5 * ROUND + 3, (1 << 16) - 9]),
-    )
-    def holds(plan: list[Step], first: int) -> None:
-        feed, sound = assembler.begin(first), 0
-        for unit in arrivals(plan, assembler.silent, assembler.late_max):
-            sound += expect_one_sweep(feed(unit))
+    @given(plans(len(assembler.places), assembler.steady_sweeps))
+    def holds(plan: list[Step]) -> None:
+        feed, arrived_ns, sound = assembler.begin(), dict[int, list[int]](), 0
+        for unit in arrivals(plan, assembler.silent):
+            number, t_ns = assembler.number(unit), assembler.t_ns(unit)
+            arrived_ns.setdefault(number % NUMBERS, []).append(t_ns)
+            for reading in tactile(feed(unit, number, t_ns)):
+                found = number_in(reading)
+                if found is not None:
+                    sound += 1
+                    ages_ns = [at_ns - reading.t_ns for at_ns in arrived_ns[found]]
+                    assert any(0 <= age_ns <= assembler.age_ns for age_ns in ages_ns)
         assert sound, "the undisturbed sweeps at the beginning are read"
+
+    holds()
+
+
+@pytest.mark.parametrize("name", ASSEMBLERS)
+def test_each_loss_flags_its_electrodes_and_no_others(name: str) -> None:
+    assembler = ASSEMBLERS[name]
+    units = len(assembler.places)
+
+    @settings(max_examples=assembler.examples)
+    @given(losses(units))
+    def holds(plan: list[Step]) -> None:
+        feed, readings = assembler.begin(), list[TactileReading]()
+        there: dict[int, set[int]] = {}
+        for unit in arrivals(plan, assembler.silent):
+            number = assembler.number(unit)
+            there.setdefault(number, set()).update(assembler.places[unit.index % units])
+            readings += tactile(feed(unit, number, assembler.t_ns(unit)))
+        begun = {number for number, places in there.items() if places}
+        read = [reading.seq for reading in readings if there[reading.seq]]
+        assert read == sorted(begun)[: len(read)]
+        assert len(begun) - len(read) <= 1, "all but the last are over"
+        for reading in readings:
+            lost = [place for place in range(24) if place not in there[reading.seq]]
+            truth = counts_of(reading.seq)
+            truth[:, lost] = 0
+            assert (reading.counts == truth).all()
+            assert (reading.faults[:, lost] == ElectrodeFault.MISSING).all()
+            assert np.count_nonzero(reading.faults) == WIDTH * len(lost)
 
     holds()
 

@@ -35,33 +35,6 @@ def assert_of_one_sweep(reading: TactileReading) -> int:
     return int(tags.pop()) // 7
 
 
-@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("where", [0.0, 0.13, 0.5, 0.97])
-@pytest.mark.parametrize("lost", [24, 28, 54, 56, 72, 144, 162, 324])
-def test_samples_lost_by_whole_sweeps_are_counted_one_by_one(
-    sequence: str, where: float, lost: int
-) -> None:
-    """That no two sweeps are mixed, also before the period is known, is `test_one_sweep`."""
-    sweeps, counters = assembler(sequence)
-    begun = 8
-    length = len(SEQUENCES[sequence])
-    stream = concatenated([samples(n, sequence) for n in range(30)])
-    start = begun * length + round(where * length)
-    readings = feed(sweeps, stream[:start] + stream[start + lost :])
-    tags = [assert_of_one_sweep(reading) for reading in readings]
-    assert set(range(begun)) | set(range(begun + lost // length + 2, 30)) <= set(tags)
-    assert tags == sorted(set(tags)), "no sweep is told twice"
-    cut_through = {begun, (start + lost) // length}
-    for reading, tag in zip(readings, tags, strict=True):
-        assert tag in cut_through or not reading.faults.any()
-    electrodes = sum(channel >= 17 for channel, _, _ in stream[start : start + lost])
-    told = sum(np.count_nonzero(reading.faults[0]) for reading in readings)
-    untold = set(range(30)) - set(tags)
-    assert told + 24 * len(untold) == electrodes
-    assert (counters.lost_frames, counters.missed_readings) == (told, len(untold))
-    assert [reading.seq for reading in readings] == tags
-
-
 @pytest.mark.parametrize("lost", [22, 23, 24, 25, 46, 47, 48])
 def test_untouched_sensors_that_repeat_themselves_make_no_copies_of_lost_samples(lost: int) -> None:
     """The words of all sweeps are the same, so only time tells that a sample is no copy."""

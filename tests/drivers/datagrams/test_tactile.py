@@ -15,7 +15,7 @@ from graspd.drivers.link import SenderClock
 from graspd.drivers.twins.datagrams import TactileTwin
 from graspd.drivers.twins.faults import LinkFaults
 from tests.drivers.datagrams.network import FINGERS, Plan, arrivals, links, message
-from tests.drivers.one_sweep import counts_of, number_of, tactile
+from tests.drivers.one_sweep import counts_of, number_in, tactile
 from tests.drivers.palm.palm_stream import DatagramClock, Sender, flags
 from tests.drivers.test_udp_link import Receiver
 
@@ -242,7 +242,7 @@ def test_gaps_are_losses_and_new_senders_are_other_sensors(
 
 def test_a_twin_sends_what_a_driver_reads() -> None:
     faults = LinkFaults(dead_electrodes=((0, 6),), unplugged_fingers=(1,))
-    sweeps = [counts_of(number_of(number)) for number in range(3)]
+    sweeps = [counts_of(number) for number in range(3)]
     sent = [data for cycle in TactileTwin(sweeps, faults=faults).cycles() for data in cycle]
     readings, counters = received(*sent)
     assert counters == {"readings": 3, "faulty_readings": 3, "absent_fingers": 3}
@@ -267,7 +267,7 @@ def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
         driver = TactileStreamDriver(LOOPBACK, FINGERS, "right", clock=clock)
         driver.open()
         last = -1
-        for received_ns, datagram, place in arrivals(plan, lambda at: [[number_of(at)] * 24] * 3):
+        for received_ns, datagram, place in arrivals(plan, lambda at: counts_of(at).tolist()):
             clock.now_ns = start_ns + received_ns
             receiver.waiting.append(datagram)
             readings: list[Reading] = [*driver.read_ready(), *driver.read_ready()]
@@ -275,7 +275,7 @@ def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
                 return  # after 0.5 s of silence: other sensors
             for reading in tactile(readings):
                 sound = reading.faults == 0
-                assert set(reading.counts[sound].tolist()) == {number_of(place)}
+                assert number_in(reading) == place
                 assert place > last or driver.counters.as_dict()["restarts"]
                 # The first message came at once; clocks may drift by 0.1 %.
                 sent_ns = start_ns + 10 * MS * place

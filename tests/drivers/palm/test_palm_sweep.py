@@ -32,12 +32,6 @@ MISSING, HELD, NOT_A_COUNT = (
     ElectrodeFault.HELD,
     ElectrodeFault.NOT_A_COUNT,
 )
-# Electrodes, from 0, of each request of a round (tactile_data_type 0x0001, 0x0003 ... 0x001B).
-PAIRS = [[], [0], *([first, first + 1] for first in range(1, 22, 2)), [23]]
-
-
-def everywhere(electrodes: list[int]) -> list[list[int]]:
-    return [[finger, electrode] for finger in range(3) for electrode in electrodes]
 
 
 def change(packet: PalmPacket, finger: str, values: dict[str, int], **fields: int) -> PalmPacket:
@@ -57,18 +51,6 @@ def expect_no_invention(played: Played, number: int) -> None:
     assert found == sorted(set(found), key=lambda row: -1 if row is None else row)
 
 
-def test_fourteen_packets_make_one_reading_of_their_counts() -> None:
-    played = play_packets(packets(5))
-    assert [reading.seq for reading in played.readings] == [0, 1, 2, 3, 4]
-    for reading, row in zip(played.readings, rows(5), strict=True):
-        assert np.array_equal(reading.counts, row)
-        assert not reading.faults.any()
-    assert [reading.t_ns for reading in played.readings] == [13 * MS, 27 * MS, 41 * MS, 55 * MS,
-                                                             69 * MS]  # fmt: skip
-    assert played.counters.lost_packets == played.counters.faulty_readings == 0
-    assert played.counters.readings == 5
-
-
 @pytest.mark.parametrize("order", [("th", "ff"), ("mf",), ("ff", "mf", "rf", "lf", "th")])
 def test_fingers_come_in_the_order_asked_for(order: tuple[str, ...]) -> None:
     made = list(PalmTwin(rows(2)).packets())
@@ -80,20 +62,6 @@ def test_fingers_come_in_the_order_asked_for(order: tuple[str, ...]) -> None:
                 assert not reading.faults[place].any()
             else:
                 assert (reading.faults[place] == MISSING).all()
-
-
-@pytest.mark.parametrize("position", range(ROUND))
-def test_a_lost_packet_takes_its_electrodes_and_moves_no_other(position: int) -> None:
-    stream: list[PalmPacket | None] = [*packets(3)]
-    stream[ROUND + position] = None
-    played = play_packets(stream)
-    assert [reading.seq for reading in played.readings] == [0, 1, 2]
-    damaged = played.readings[1]
-    assert flags(damaged, MISSING) == everywhere(PAIRS[position])
-    assert row_of(damaged, rows(3)) == 1
-    assert (damaged.counts[damaged.faults != 0] == 0).all()
-    assert [reading.faults.any() for reading in played.readings[::2]] == [False, False]
-    assert played.counters.lost_packets == 1
 
 
 def test_a_value_that_is_not_fresh_is_held_or_missing() -> None:
