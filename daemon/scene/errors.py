@@ -19,32 +19,6 @@ SHOWN_MAX = 80
 """Most characters of a key or value in a line."""
 MESSAGE_MAX = 320
 """Most characters of an explanation, which may contain such a value."""
-FIXED = "graspd has one value for all scenes: remove the line"
-GONE = {
-    ("ReplayTactile", "faults"): "a twin (`graspd twin`) has faults: remove the section",
-    ("ReplayTactile", "speed"): "`graspd replay --speed` has it: remove the line",
-    ("ReplayTactile", "strict"): "`graspd replay --strict` has it: remove the line",
-    ("SessionSection", "file"): "[session] folder is a folder: name a new one or remove the line",
-    ("GateSection", "sweeps"): FIXED,
-    ("GateSection", "contact_counts"): FIXED,
-    ("GateSection", "contact_sigmas"): FIXED,
-    ("GateSection", "joint_rad_per_s"): FIXED,
-    ("GateSection", "joints_lost_ms"): FIXED,
-    ("GateSection", "gap_ms"): FIXED,
-    ("GateSection", "change_counts"): FIXED,
-    ("Publish", "high_water_mark"): FIXED,
-    ("Ask", "file_mode"): "[publish] file_mode is for both sockets: remove the line",
-    ("Ask", "group"): "[publish] group is for both sockets, [ask] tell says who may lift",
-    ("Realtime", "lock_memory"): FIXED,
-    ("Record", "flush_ms"): FIXED,
-    ("Record", "rotate_mb"): FIXED,
-    ("Record", "rotate_minutes"): FIXED,
-    ("Record", "keep_files"): "keep_mb alone says how much is kept: remove the line",
-    ("Record", "images_hz"): FIXED,
-    ("CanTactile", "format"): "SynTouch's is the only format: remove the line",
-    ("CanTactile", "data_bitrate"): "graspd reads classic CAN only: remove the line",
-}
-"""Keys of former scenes by the name of their section, and what to do about them."""
 
 
 def lines_of(error: ValidationError, scene: Section, path: Path) -> list[str]:
@@ -124,8 +98,6 @@ def _tags(section: Section) -> tuple[str, ...]:
 
 def _suggestion(wrong: str, section: Section | None) -> str:
     keys = list(section.model_fields) if section else []
-    if section and (gone := GONE.get((section.__name__, wrong))):
-        return f"; {gone}"
     stem = wrong.rsplit("_", 1)[0]  # for example `max_age_s` instead of `max_age_ms`
     of_unit = (f"; did you mean {name}?" for name in keys if name.rsplit("_", 1)[0] == stem)
     return did_you_mean(wrong, keys) or next(of_unit, f"; there are: {', '.join(keys)}")

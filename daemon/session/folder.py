@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 from collections.abc import Sequence
@@ -13,8 +12,6 @@ from typing import Final, Self
 
 from graspd.daemon.process.files import require_linux, sync_folder
 from graspd.daemon.session.file import KeptSession, SessionFileError, load, write
-
-log = logging.getLogger("graspd")
 
 KEPT_MAX: Final = 5
 """Most sessions that are kept, beside an empty one that runs.
@@ -65,7 +62,6 @@ class SessionFolder:
             if not self.path.is_dir():
                 self.path.mkdir()
                 sync_folder(self.path.parent)
-                _warn_of_former(self.path)
             flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
             self._lock = os.open(self.path / LOCK, flags, 0o644)
         except OSError as error:
@@ -204,9 +200,3 @@ def _path(folder: Path, number: int) -> Path:
 
 def _not_kept(folder: Path, error: OSError) -> SessionFileError:
     return SessionFileError(f"{folder}: cannot keep the session: {error.strerror}")
-
-
-def _warn_of_former(folder: Path) -> None:
-    former = folder.with_name(f"{folder.name}.json")
-    if former.exists():
-        log.warning("%s has a former format: it stays, and is not read", former)

@@ -13,7 +13,6 @@ from pydantic import BaseModel
 from graspd.daemon.scene import Scene, SceneError, load, parse
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.endpoints import check_endpoint
-from graspd.daemon.scene.errors import GONE
 from graspd.daemon.scene.scene import SCENE_MAX_BYTES
 
 GOOD = """
@@ -23,17 +22,6 @@ recordings = ["grasps.csv"]
 """
 SPI = "[tactile]\ndriver = 'spi'\nport = '/dev/ttyACM0'\n"
 CAN = "[tactile]\ndriver = 'can'\n"
-BEFORE = {
-    "ReplayTactile": GOOD,
-    "CanTactile": CAN,
-    "SessionSection": f"{CAN}[session]\n",
-    "GateSection": f"{CAN}[gate]\n",
-    "Publish": f"{CAN}[publish]\n",
-    "Ask": f"{CAN}[ask]\n",
-    "Realtime": f"{CAN}[realtime]\n",
-    "Record": f"{CAN}[record]\n",
-}
-"""Text before a key of each section that has lost some."""
 PALM = "[tactile]\ndriver = 'palm'\nsource = 'udp://127.0.0.1:5555'\n"
 
 
@@ -142,14 +130,6 @@ def test_a_mistake_is_one_line_naming_file_and_key(
     assert message.startswith(f"{path}: {key}: ")
     assert says in message
     assert "\n" not in message
-
-
-@pytest.mark.parametrize(("section", "key"), GONE)
-def test_a_key_that_is_gone_says_what_to_do(tmp_path: Path, section: str, key: str) -> None:
-    path = write(tmp_path, f"{BEFORE[section]}{key} = 1\n")
-    with pytest.raises(SceneError) as error:
-        load(path)
-    assert str(error.value).endswith(f"{key}: no such key; {GONE[section, key]}")
 
 
 def test_two_mistakes_are_two_lines(tmp_path: Path) -> None:

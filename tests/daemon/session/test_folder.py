@@ -270,18 +270,6 @@ def test_of_files_that_cannot_be_read_sixteen_stay(tmp_path: Path) -> None:
     assert left == {*range(25, 41), 41}
 
 
-def test_a_file_of_the_former_format_stays(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    former = tmp_path / "right.session.json"
-    former.write_bytes(b"{}")
-    for _ in range(2):
-        with SessionFolder(tmp_path / "right.session") as folder:
-            save(folder, 1)
-    assert former.read_bytes() == b"{}"
-    assert caplog.text.count(f"{former} has a former format") == 1
-
-
 def test_a_file_in_place_of_the_folder_stays(tmp_path: Path) -> None:
     path = tmp_path / "right"
     path.write_bytes(b"?")
