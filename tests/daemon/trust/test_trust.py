@@ -1,4 +1,4 @@
-"""Learner, risk and lift book together: outcomes late, twice, contradicting, after restarts."""
+"""Learner, risk and lift book together: what an outcome changes, and the state that is kept."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ import zlib
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from graspd.daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
 from graspd.daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
 from graspd.models.trust.learner import sigmoid
 from graspd.models.trust.residual import GRASPS_MAX
-from graspd.models.trust.risk import Permission, RiskLimits
+from graspd.models.trust.risk import RiskLimits
 from tests.daemon.trust.grasps import INPUTS, RULE, inputs, judge, named, trust
 
 
@@ -75,51 +73,6 @@ def test_a_repeated_outcome_counts_once_and_contradictions_are_refused() -> None
     }
 
 
-def test_late_outcomes_teach_what_was_judged_then() -> None:
-    late, now = trust(RiskLimits()), trust(RiskLimits())
-    for grasp in range(50):
-        judge(late, grasp, 1.0)
-    for grasp in reversed(range(50)):
-        judge(now, grasp, 1.0)
-        for part in (late, now):
-            assert part.outcome(named(grasp), slipped=grasp % 3 == 0) is OutcomeStatus.TAKEN
-    assert late.learner.state() == now.learner.state()
-
-
-def test_a_forgotten_stable_grasp_counts_as_unreported() -> None:
-    part = trust()
-    first = judge(part, 0)
-    said = [judge(part, grasp, -6.0 if grasp % 2 else 6.0) for grasp in range(1, LIFTS_MAX)]
-    assert first
-    assert part.lifts.outstanding == 1 + sum(said) > 50
-    assert part.lifts.unreported == 0
-    judge(part, LIFTS_MAX)
-    judge(part, LIFTS_MAX + 1)
-    assert part.lifts.unreported == 1 + said[0]
-    assert part.outcome(named(0), slipped=True) is OutcomeStatus.UNKNOWN
-    assert part.outcome(named(2), slipped=True) is OutcomeStatus.TAKEN
-    assert part.risk.slips == said[1]
-
-
-def test_a_lift_counts_its_first_stable_verdict_or_its_first() -> None:
-    part = trust()
-    assert not judge(part, 7, 2.0)
-    unsure = part.judge(named(8), 0.9, 2.0, inputs(8))
-    part.note(named(8), unsure, stable=False)
-    sure = part.judge(named(8), 0.01, -6.0, inputs(9))
-    part.note(named(8), sure, stable=True)
-    again = part.judge(named(8), 0.01, -5.0, inputs(10))
-    part.note(named(8), again, stable=True)
-    part.note(named(8), unsure, stable=False)
-    expected = trust()
-    expected.note(named(8), sure, stable=True)
-    for each in (part, expected):
-        assert each.outcome(named(8), slipped=True) is OutcomeStatus.TAKEN
-        each.note(named(8), again, stable=True)  # too late to be what it was lifted on
-        assert (each.risk.lifts, each.risk.slips, each.lifts.outstanding) == (1, 1, 0)
-    assert part.learner.state() == expected.learner.state()
-
-
 def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
     for limits, margin in ((RULE, 3.0), (RiskLimits(0.1, warm_up=5), -0.5)):
         part = trust(limits)
@@ -134,81 +87,6 @@ def test_what_is_no_probability_is_refused(p: float) -> None:
         trust().judge(named(0), p, 0.0, inputs(0))
     with pytest.raises(ValueError, match="not finite"):
         trust().judge(named(0), 0.5, math.nan, inputs(0))
-
-
-def test_former_lifts_after_an_exchange_are_slips_and_teach_nothing() -> None:
-    part = trust(RiskLimits(0.1, warm_up=1))
-    assert not judge(part, 0, 2.0)
-    part.outcome(named(0), slipped=False)
-    assert judge(part, 1)
-    part.sensors_exchanged()
-    assert part.outcome(named(1), slipped=True) is OutcomeStatus.TAKEN
-    assert part.outcome(named(1), slipped=True) is OutcomeStatus.REPEATED
-    assert (part.risk.lifts, part.risk.slips, part.risk.warm_up_left) == (1, 1, 1)
-    assert p_slip(part) == sigmoid(-1.0)
-    assert part.judge(named(2), 0.3, -1.0, inputs(2)).permission is Permission.UNPROVEN
-
-
-Step = tuple[str, int, float, bool]
-STEPS = st.lists(
-    st.tuples(
-        st.sampled_from(("lift", "lift", "lift", "grasp", "tell", "again", "exchange", "restart")),
-        st.integers(0, 40),
-        st.floats(-12.0, 4.0),
-        st.booleans(),
-    ),
-    max_size=120,
-)
-
-
-@settings(max_examples=80)
-@given(st.sampled_from((0.001, 0.02, 0.05, 0.2, 0.5)), st.booleans(), STEPS)
-def test_no_adversary_breaks_the_bound(
-    alpha: float, slips_if_stable: bool, steps: list[Step]
-) -> None:
-    """Late, lost, repeated, contradicting outcomes, exchanges and restarts, in any order."""
-    part = trust(RiskLimits(alpha))
-    said: dict[int, bool] = {}
-    told: dict[int, bool] = {}
-    for number, (what, back, margin, label) in enumerate(steps):
-        if what in ("lift", "grasp"):
-            said[number] = judge(part, number, margin)
-        which = number if what == "lift" else number - back
-        if what in ("lift", "tell", "again") and which in said:
-            # An adversary lets slip exactly what was called stable.
-            slipped = said[which] if slips_if_stable and which not in told else label
-            expected = OutcomeStatus.TAKEN
-            if which in told:
-                expected = (
-                    OutcomeStatus.REPEATED if told[which] == slipped else OutcomeStatus.CONTRADICTS
-                )
-            assert part.outcome(named(which), slipped=slipped) is expected
-            told.setdefault(which, slipped)
-        elif what == "exchange":
-            part.sensors_exchanged()
-        elif what == "restart":
-            kept, part = encode(part.state()), trust(RiskLimits(alpha))
-            part.restore(decode(kept))
-            assert encode(part.state()) == kept
-        lifts = [slipped for grasp, slipped in told.items() if said[grasp]]
-        assert (part.risk.lifts, part.risk.slips) == (len(lifts), sum(lifts))
-        assert part.lifts.outstanding == sum(said.values()) - len(lifts)
-        assert part.risk.bound is not None
-        assert part.risk.slips <= part.risk.bound + 1e-9
-
-
-def test_a_restart_in_the_middle_changes_nothing() -> None:
-    whole, part = trust(), trust()
-    for grasp in range(300):
-        for each in (whole, part):
-            judge(each, grasp, 3.0 * math.sin(grasp) - 3.0)
-            if grasp >= 5:
-                each.outcome(named(grasp - 5), slipped=grasp % 4 == 0)
-        if grasp % 37 == 0:
-            kept, part = encode(part.state()), trust()
-            part.restore(decode(kept))
-    assert part.state() == whole.state()
-    assert part.learner.outcomes == 295
 
 
 def test_a_state_is_not_changed_by_what_comes_later() -> None:

@@ -1,0 +1,297 @@
+"""Lifts in any order: late, lost, told twice, contradicted, taken back, restarted, killed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
+
+from graspd.daemon.trust.lift_book import NOT_ASSESSED, Peer
+from graspd.daemon.trust.trust import Trust, decode, encode
+from graspd.models.trust.assessment import Assessment
+from graspd.models.trust.learner import Learner, sigmoid
+from graspd.models.trust.risk import Permission, RiskLimits
+from tests.daemon.trust.grasps import INPUTS, inputs, named, trust
+
+BOOK = 6
+"""Grasps that are remembered here."""
+ALPHAS = st.sampled_from((None, 0.001, 0.05, 0.1, 0.5))
+PEERS = [
+    Peer(name, user)
+    for name in (b"controller-16byt1", b"controller-16byt2", b"another-16-bytes")
+    for user in (b"user 1000", b"user 1001")
+]
+MARGINS = st.sampled_from((-9.0, -9.0, -4.0, -1.0, 3.0))
+BACK = st.sampled_from((0, 0, 0, 1, 1, 2, 3, 5, 7))
+"""Which grasp, counted back from the newest."""
+
+
+@dataclass
+class Lift:
+    """One grasp, as the book should have it."""
+
+    stable: bool
+    lesson: bytes | None
+    """Its features; None once nothing is to be learned from it."""
+    slipped: bool | None = None
+    announced: bool = False
+    owner: Peer | None = None
+
+
+class Model:
+    """What a user may rely on, in plain words: the book, the budget, and what is learned."""
+
+    def __init__(self, alpha: float | None) -> None:
+        self.alpha, self.budget, self.proven = alpha, 5.0, 0
+        self.lifts: dict[int, Lift] = {}  # oldest first
+        self.lessons: list[tuple[bytes, bool]] = []
+        self.slips: list[bool] = []  # of the `stable` lifts
+        self.told: Counter[str] = Counter()
+        self.announced = self.unreported = 0
+        self.unkept: set[int] = set()
+        self.lifter: Peer | None = None
+
+    def judged(self, number: int, lesson: bytes, *, stable: bool) -> None:
+        """The first verdict counts, or the first `stable` one, or the first with features."""
+        lift = self.lifts.setdefault(number, Lift(stable, lesson))
+        is_better = (stable and not lift.stable) or (lift.lesson == NOT_ASSESSED != lesson)
+        if lift.slipped is None and is_better:
+            lift.stable, lift.lesson = lift.stable or stable, lesson
+        if len(self.lifts) > BOOK:
+            oldest = min(self.lifts)
+            lost = self.lifts.pop(oldest)
+            self.unkept.discard(oldest)
+            self.unreported += lost.stable and lost.slipped is None
+            if lost.announced and lost.slipped is None and self.alpha is not None:
+                self.ended(slipped=True)
+
+    def ended(self, *, slipped: bool) -> None:
+        self.slips.append(slipped)
+        if self.alpha is not None:
+            self.budget = min(self.budget + self.alpha - slipped, 8.0)
+
+    def tell(self, number: int, *, slipped: bool) -> str:
+        lift = self.lifts.get(number)
+        if lift is None:
+            status = "unknown"
+        elif lift.slipped is None:
+            status, lift.slipped = "taken", slipped
+            self.unkept.add(number)
+            if lift.stable:
+                self.ended(slipped=slipped)
+            if lift.lesson:
+                self.proven += 1
+                self.lessons.append((lift.lesson, slipped))
+            lift.lesson = None
+        else:
+            status = "repeated" if lift.slipped is slipped else "contradicts"
+        self.told[status] += 1
+        return status
+
+    def may_report(self, lift: Lift, peer: Peer) -> bool:
+        """The owner, by any connection; else the last lifter, of the owner's user."""
+        names = [each and (each.routing_id[:16], each.credential) for each in (lift.owner, peer)]
+        is_last = self.lifter and (self.lifter.routing_id[:16], self.lifter.credential) == names[1]
+        is_heir = lift.owner is None or lift.owner.credential == peer.credential
+        return names[0] == names[1] or bool(is_heir and is_last)
+
+    def awaited(self) -> list[int]:
+        return [n for n, lift in self.lifts.items() if lift.announced and lift.slipped is None]
+
+
+class Lifts(RuleBasedStateMachine):
+    """One hand's trust, its controllers, and the model beside it."""
+
+    @initialize(alpha=ALPHAS, most=st.sampled_from((1, 2, 5)))
+    def start(self, alpha: float | None, most: int) -> None:
+        self.most, self.number, self.late = most, 0, 0
+        self.model, self.part = Model(alpha), trust(RiskLimits(alpha, outstanding_max=most))
+        self.heard, self.expected = list[bool](), list[bool]()
+        self.part.lifts.on_announced = self.heard.append
+        self.save()
+
+    @rule()
+    def save(self) -> None:
+        """Have all on the disk, to which a kill leads back."""
+        for number in self.model.lifts:
+            self.part.lifts.keep(named(number))
+        self.model.unkept.clear()
+        self.disk = encode(self.part.state()), deepcopy(self.model), self.late
+
+    def say(self, number: int, margin: float) -> None:
+        worth = self.part.judge(named(number), sigmoid(margin), margin, inputs(number))
+        stable = worth.permission is Permission.ALLOWED and (worth.p_slip or 0.0) < 0.5
+        if stable and self.model.alpha is not None:
+            assert self.model.budget >= 1.0 - self.model.alpha - 1e-9
+            assert len(self.model.awaited()) < self.most
+        self.part.note(named(number), worth, stable=stable)
+        self.model.judged(number, worth.features, stable=stable)
+
+    @rule(margin=MARGINS, times=st.sampled_from((1, 1, 3)))
+    def judge(self, margin: float, times: int = 1) -> None:
+        for _ in range(times):
+            self.number += 1
+            self.say(self.number, margin)
+
+    @rule(margin=MARGINS, back=BACK)
+    def judge_again(self, margin: float, back: int) -> None:
+        if self.number - back in self.model.lifts:
+            self.say(self.number - back, margin)
+
+    @rule(stable=st.booleans())
+    def judge_what_cannot_be_assessed(self, stable: bool) -> None:
+        stable = stable and self.model.alpha is None
+        self.number += 1
+        self.part.note(named(self.number), Assessment(0), stable=stable)
+        self.model.judged(self.number, NOT_ASSESSED, stable=stable)
+
+    @rule(back=BACK, peer=st.sampled_from(PEERS))
+    def claim(self, back: int, peer: Peer) -> None:
+        lift = self.model.lifts.get(self.number - back)
+        user = lift and (lift.owner or peer).credential
+        is_free = lift is not None and lift.slipped is None and user == peer.credential
+        assert self.part.lifts.claim(named(self.number - back), peer) is is_free
+        if lift is not None and is_free:
+            lift.owner, self.model.lifter = lift.owner or peer, peer
+
+    @rule()
+    def announce(self) -> None:
+        self.part.lifts.announce()
+        lift = self.model.lifts.get(self.number)
+        if lift is not None and lift.stable and lift.slipped is None and not lift.announced:
+            lift.announced = True
+            self.model.announced += 1
+            self.expected.append(True)
+
+    @rule(back=st.none() | BACK)
+    def take_back(self, back: int | None) -> None:
+        number = max(self.model.awaited(), default=0) if back is None else self.number - back
+        lift = self.model.lifts.get(number)
+        is_open = lift is not None and lift.slipped is None
+        grasp = None if back is None else named(number)
+        assert self.part.lifts.take_back(grasp) is is_open
+        if lift is not None and is_open:
+            self.model.announced -= lift.announced
+            self.expected += [False] * lift.announced
+            lift.announced, lift.owner = False, None
+
+    @rule(back=BACK, slipped=st.booleans())
+    def tell(self, back: int, slipped: bool) -> None:
+        number = self.number - back
+        lift = self.model.lifts.get(number)
+        is_late = lift is not None and lift.slipped is None and lift.stable and not lift.announced
+        self.late += is_late and slipped
+        status = self.part.outcome(named(number), slipped=slipped)
+        assert status == self.model.tell(number, slipped=slipped)
+
+    @rule(slipped=st.booleans(), times=st.sampled_from((1, 2, 7)))
+    def lift_announced(self, slipped: bool, times: int) -> None:
+        for _ in range(times):
+            self.judge(-9.0)
+            self.announce()
+            self.tell(0, slipped)
+
+    @rule()
+    def exchange_sensors(self) -> None:
+        self.part.sensors_exchanged()
+        model = self.model
+        model.budget, model.proven, model.lessons = min(model.budget, 5.0), 0, []
+        for lift in model.lifts.values():
+            lift.lesson = None
+
+    @rule(killed=st.sampled_from((False, False, True)))
+    def restart(self, killed: bool) -> None:
+        if not killed:
+            self.save()
+        data, model, self.late = self.disk
+        self.model = deepcopy(model)
+        self.number = max(self.model.lifts, default=0)
+        self.begin(data)
+        assert encode(self.part.state()) == data
+
+    def begin(self, data: bytes) -> None:
+        self.part = trust(RiskLimits(self.model.alpha, outstanding_max=self.most))
+        self.part.restore(decode(data))
+        self.part.lifts.on_announced = self.heard.append
+        self.model.lifter = None
+
+    @rule(alpha=ALPHAS)
+    def restart_with_another_risk(self, alpha: float | None) -> None:
+        model = self.model
+        if alpha != model.alpha:
+            model.alpha, model.budget, model.slips, model.announced = alpha, 5.0, [], 0
+            for lift in model.lifts.values():
+                lift.announced = False
+            self.late = 0
+        self.begin(encode(self.part.state()))
+        self.save()
+
+    @invariant()
+    def book_is_as_expected(self) -> None:
+        book, model = self.part.lifts, self.model
+        stable = [lift for lift in model.lifts.values() if lift.stable]
+        assert book.outstanding == sum(lift.slipped is None for lift in stable)
+        assert (book.announced, book.awaited) == (model.announced, len(model.awaited()))
+        assert (book.unreported, book.told) == (model.unreported, model.told)
+        assert self.heard == self.expected
+        records = book.state().records
+        found = {
+            each.id.grasp: Lift(
+                each.stable, each.features, each.slipped, each.announced, each.owner
+            )
+            for each in records
+        }
+        assert list(found.items()) == list(model.lifts.items())
+        for number, lift in model.lifts.items():
+            assert book.is_stable(named(number)) is lift.stable
+            assert book.is_told(named(number)) is (lift.slipped is not None)
+            assert book.is_kept(named(number)) is (number not in model.unkept)
+
+    @invariant()
+    def no_slip_is_beyond_the_bound(self) -> None:
+        risk, model, out = self.part.risk, self.model, len(self.model.awaited())
+        lifts, slips = len(model.slips), sum(model.slips)
+        assert (risk.lifts, risk.slips, risk.proven) == (lifts, slips, model.proven)
+        assert risk.budget == pytest.approx(model.budget)
+        if model.alpha is not None:
+            assert risk.bound is not None
+            assert slips <= risk.bound + 1e-9
+            # At worst all that was announced and not told has slipped.
+            allowed = 5.0 + (self.most + self.late) * (1.0 - model.alpha)
+            assert slips + out <= model.alpha * (lifts + out) + allowed + 1e-9
+
+    @invariant()
+    def owners_and_heirs_may_report(self) -> None:
+        book, lifts = self.part.lifts, self.model.lifts
+        for peer in PEERS:
+            for number, lift in lifts.items():
+                assert book.may_report(named(number), peer) is self.model.may_report(lift, peer)
+            own = [n for n, each in lifts.items() if each.owner == peer and each.slipped is None]
+            assert book.offered(peer) == (named(max(own)) if own else None)
+
+    def teardown(self) -> None:
+        """All was learned, and nothing else."""
+        learner = Learner(INPUTS)
+        for lesson, slipped in self.model.lessons:
+            learner.learn(np.frombuffer(lesson, "<f8"), slipped=slipped)
+        assert self.part.learner.state() == learner.state()
+
+
+def test_lifts_in_any_order_are_as_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    decode(encode(Trust("model", INPUTS).state()))  # later tests read states of the usual size
+    monkeypatch.setattr("graspd.daemon.trust.lift_book.LIFTS_MAX", BOOK)
+    run_state_machine_as_test(
+        Lifts, settings=settings(derandomize=True, max_examples=100, stateful_step_count=50)
+    )
