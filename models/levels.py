@@ -7,6 +7,7 @@ Before that, and without a gate, levels show how a finger's electrodes differ fr
 from __future__ import annotations
 
 from collections import Counter
+from statistics import median  # numpy's loads modules at its first call
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,11 +67,11 @@ def fall_of(
 
     `rest` None: the median of the `sound` electrodes. The others get the median fall.
     """
-    reference = np.median(counts[sound]) if rest is None and sound.any() else rest
+    reference = median(counts[sound]) if rest is None and sound.any() else rest
     fall = np.zeros(ELECTRODES) if reference is None else reference - counts
     if sound.all():
         return fall
-    return np.where(sound, fall, np.median(fall[sound]) if sound.any() else 0.0)
+    return np.where(sound, fall, median(fall[sound]) if sound.any() else 0.0)
 
 
 def levels_of(fall: NDArray[np.float64], *, from_rest: bool) -> NDArray[np.int64]:

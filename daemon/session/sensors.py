@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from statistics import median  # numpy's loads modules at its first call: the loop stops for 40 ms
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -143,7 +144,7 @@ def moved_fingers(before: Rest, now: Rest) -> list[int]:
         if np.count_nonzero(both_known) < KNOWN_MIN:
             continue
         step = new[both_known] - old[both_known]
-        if np.median(np.abs(step - np.median(step))) > MOVED_COUNTS:
+        if median(np.abs(step - median(step))) > MOVED_COUNTS:
             moved.append(finger)
     return moved
 

@@ -13,11 +13,11 @@ import pytest
 
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.text import printable
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_TABLE, SHOW_RECORDING
 from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit import inside
 from tests.kit.crowd import SELECT_MAX, crowded
-from tests.kit.scenes import demo_scene
+from tests.kit.scenes import demo_scene, written
 
 ROOT = Path(__file__).parents[3]
 DEMO_SCENE = ROOT / "deploy" / "scenes" / "demo.toml"
@@ -70,6 +70,28 @@ atexit.register(lambda: print(gc.isenabled(), gc.get_freeze_count() > 10_000))
 def test_garbage_collection_never_looks_through_the_modules() -> None:
     result = python(FROZEN, "check", DEMO_SCENE)
     assert result.stdout.splitlines()[-1] == "True True"
+
+
+LOADED = """
+import sys
+from graspd.daemon.run.loop import Loop
+run = Loop.run
+def noting(self):
+    before = set(sys.modules)
+    ended = run(self)
+    print(sorted(set(sys.modules) - before))
+    return ended
+Loop.run = noting
+"""
+
+
+def test_the_loop_loads_no_module_while_it_runs(tmp_path: Path) -> None:
+    scene = written(
+        tmp_path,
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{SHOW_RECORDING}"]\npace = "fast"\n'
+        f'outcomes = true\n[publish]\nendpoint = "ipc://{tmp_path}/v"\n',
+    )
+    assert python(LOADED, "run", scene).stdout.splitlines() == ["[]"]
 
 
 @pytest.mark.parametrize(
