@@ -12,7 +12,7 @@ import zmq
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.publish.porter import Frames
-from graspd.daemon.publish.questions import WAITING_MAX, Questions
+from graspd.daemon.publish.questions import Questions
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.publish.doors import USER, Asked, Peers, published
@@ -89,38 +89,14 @@ def test_what_is_no_question_is_counted_and_not_answered(
     assert questions.counters["malformed"] == 1
 
 
-def test_a_flood_of_questions_keeps_each_peers_newest(
-    questions: Questions, sent: list[Frames]
+def test_before_the_first_reading_silence_is_the_answer(
+    questions: Questions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for _ in range(5):
-        questions.take([[b"%d" % peer, USER, b"judge"] for peer in range(10)], 0, Asked())
-    assert len(questions.waiting) == 10
-    assert questions.counters["given_up"] == 40
-    questions.answer(published(b"{}"))
-    assert sent == [[b"%d" % peer, b"{}"] for peer in range(10)]
-
-
-def test_the_oldest_question_makes_place_for_a_newer_one(
-    questions: Questions, sent: list[Frames]
-) -> None:
-    for peer in range(WAITING_MAX + 20):
-        questions.take([[b"%d" % peer, USER, b"judge"]], 0, Asked())
-    assert len(questions.waiting) == WAITING_MAX
-    questions.answer(published(b"{}"))
-    assert sent[0] == [b"20", b"{}"]
-
-
-def test_only_peers_that_waited_long_enough_are_answered(
-    questions: Questions, sent: list[Frames]
-) -> None:
-    questions.take([[b"first", USER, b"judge"]], 0, Asked())
-    questions.take([[b"second", USER, b"judge"]], 500, Asked())
-    questions.answer(published(b"early"), PATIENCE_NS - 1)
-    assert len(questions.waiting) == 2
-    questions.answer(published(b"late"), PATIENCE_NS)
-    assert len(questions.waiting) == 1
-    questions.answer(published(b"judged"))
-    assert sent == [[b"first", b"late"], [b"second", b"judged"]]
+    requests, silences = Asked(), list[bool]()
+    monkeypatch.setattr(requests, "silence", lambda: silences.append(True))
+    questions.take([[b"asker", USER, b"judge"]], 0, requests)
+    questions.serve([], PATIENCE_NS, requests)
+    assert silences == [True]
 
 
 def test_an_answer_that_is_dropped_is_counted() -> None:
