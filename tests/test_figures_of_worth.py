@@ -68,7 +68,7 @@ def risk_cells(one: Mapping[str, float]) -> list[str]:
     return [str(one["sessions"]), *shares, f"{one['supervised']:.0f}"]
 
 
-def test_the_scale_of_the_learner_is_told_as_it_was_fitted() -> None:
+def test_the_page_has_the_learners_fitted_scale() -> None:
     figures = WORTH["reliability"]
     scales = f"{min(figures['scales']):.2f} to {max(figures['scales']):.2f}"
     low, middle, high = figures["sessions"]
@@ -117,7 +117,7 @@ def test_the_picture_of_worth_has_the_figures_of_its_table() -> None:
     assert drawn[2:] == rows_of(MEASURED, "slips among `stable` / good lifts kept")
 
 
-def test_the_picture_of_run_times_has_the_figures_of_its_table() -> None:
+def test_the_picture_of_run_times_matches_its_table() -> None:
     """The table in MEASURED leaves out models of fewer fingers, intervals and hot times."""
     every = {row[0]: row for row in drawn_rows("error-vs-time")}
     told = rows_of(MEASURED, "model, F1 in %")

@@ -135,7 +135,7 @@ def test_the_line_that_finds_the_client_asks_for_this_version() -> None:
     assert found("deploy/clients/README.md", r"find_package\(graspd_client (\S+) ") == [MINOR]
 
 
-def test_the_changelog_begins_with_what_is_not_released_or_with_this_version() -> None:
+def test_the_changelog_begins_with_this_or_no_version() -> None:
     headings = found("deploy/CHANGELOG.md", r"^## \[(.*?)\]")
     released = [heading for heading in headings if heading != "Unreleased"]
     assert headings[0] == "Unreleased"

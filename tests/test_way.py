@@ -94,7 +94,7 @@ def rounds_of(file: Path) -> list[list[Call]]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("comes_first")
-def test_the_page_names_each_file_that_a_judged_reading_enters_once_and_in_order(
+def test_the_page_has_a_judged_readings_files_in_order(
     tmp_path: Path,
 ) -> None:
     file = tmp_path / "scene.toml"

@@ -64,7 +64,7 @@ def test_a_session_of_earlier_grasps_is_that_of_a_replay(counts: NDArray[np.floa
     assert got[0, 1] == said[40]["p_slip"]
 
 
-def test_an_electrode_at_a_rail_is_repaired_as_by_a_replay(
+def test_an_electrode_at_a_rail_is_repaired_like_replay(
     counts: NDArray[np.float64], tmp_path: Path
 ) -> None:
     table, railed = tmp_path / "railed.csv", counts.copy()
@@ -381,7 +381,7 @@ def test_the_drawing_of_the_page_is_made(
         ("read_recording", "mcap", "record"),
     ],
 )
-def test_a_missing_extra_is_an_error_that_says_how_to_install_it(
+def test_a_missing_extra_is_an_error_with_its_command(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, function: str, package: str, extra: str
 ) -> None:
     path = tmp_path / "run"

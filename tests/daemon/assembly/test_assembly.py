@@ -42,7 +42,7 @@ TRUST = {
 
 
 @pytest.mark.parametrize("text", TRUST)
-def test_outcomes_teach_and_a_risk_is_kept_as_the_scene_says(text: str) -> None:
+def test_outcomes_teach_and_a_risk_is_kept_by_scene(text: str) -> None:
     scene = scene_of(REPLAY, **tomllib.loads(text))
     trust = assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene), Clock()).trust
     if TRUST[text] is None:
@@ -69,7 +69,7 @@ def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
     assert pipeline.judge(reading(clock() - 1_500_000)).decision is Decision.UNKNOWN
 
 
-def test_a_table_is_judged_by_when_its_readings_are_handed_over() -> None:
+def test_a_table_is_judged_as_its_readings_are_handed_over() -> None:
     """By this computer's clock the reading is as old as the computer's start."""
     source = Tables([DEMO_TABLE], {})
     scene = source.scene({}, {}, None)
@@ -98,7 +98,7 @@ def hand(fingers: tuple[str, ...], tactile: dict[str, Any] = SPI, **model: str) 
     ],
     ids="-".join,
 )
-def test_a_hand_with_fewer_sensors_gets_the_model_of_just_these_fingers(
+def test_a_hand_of_fewer_sensors_gets_its_fingers_model(
     fingers: tuple[str, ...],
 ) -> None:
     in_order = sorted(fingers)  # the alphabet happens to go from the first finger to the thumb
@@ -118,7 +118,7 @@ def test_a_hand_with_fewer_sensors_gets_the_model_of_just_these_fingers(
         ("small-session", ("ff", "rf"), "small-session"),
     ],
 )
-def test_a_name_that_has_no_form_for_the_hand_is_taken_as_it_is(
+def test_a_name_without_a_form_for_the_hand_stays(
     name: str, fingers: tuple[str, ...], file: str
 ) -> None:
     assert assembly.model_path(hand(fingers, name=name)).name == f"{file}.onnx"
@@ -134,9 +134,7 @@ def test_a_name_that_has_no_form_for_the_hand_is_taken_as_it_is(
     ],
     ids=["cnn1", "two of three", "thumb", "ring finger"],
 )
-def test_a_model_of_other_fingers_is_refused_and_those_that_fit_are_named(
-    scene: Scene, says: str
-) -> None:
+def test_a_model_of_other_fingers_is_refused_with_fitting_names(scene: Scene, says: str) -> None:
     with pytest.raises(ModelError, match=r"judges the fingers .* the hand has ") as refusal:
         assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene))
     assert str(refusal.value).endswith(f": {says}")
@@ -167,9 +165,7 @@ def test_fingers_in_another_order_are_told_what_to_write_instead(
     assert (tactile | wanted.get("tactile", {})).get("sensors") == sensors
 
 
-def test_grasps_are_named_by_the_start_that_tells_of_them_also_where_a_former_scene_goes_on() -> (
-    None
-):
+def test_a_grasp_has_the_boot_id_of_its_own_start() -> None:
     scene = scene_of(REPLAY)
     parts = Parts.of(Plan.of(scene), assembly.load_model(scene))
     named = []

@@ -165,9 +165,7 @@ def test_the_running_daemon_has_what_was_measured(tmp_path: Path, measured: Meas
     assert descriptors - found["descriptors"] in {0, 1}
 
 
-def test_a_table_whose_readings_are_grasps_has_no_gate_and_no_joints(
-    tmp_path: Path, measured: Measured
-) -> None:
+def test_a_table_of_grasps_has_neither_gate_nor_joints(tmp_path: Path, measured: Measured) -> None:
     found = measured(demo_scene(tmp_path))
     assert below(GATE | JOINTS | HALL | KEPT | ASK, found["modules"]) == []
     assert len(found["judged"]) == len(found["reading"])
@@ -181,9 +179,7 @@ def test_a_model_without_a_session_brings_no_statistics(tmp_path: Path, measured
     assert set(found["modules"]) >= GATE
 
 
-def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
-    tmp_path: Path, measured: Measured
-) -> None:
+def test_joints_and_questions_cost_as_much_as_is_said(tmp_path: Path, measured: Measured) -> None:
     calibration = DEPLOY / "calibration" / "example_hand.toml"
     text = (
         '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9870"\n'
@@ -199,7 +195,7 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     assert found["judged"]
 
 
-def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training() -> None:
+def test_replay_loads_no_bus_no_port_no_training() -> None:
     code = (
         "import json, sys; from graspd.daemon.__main__ import main; sys.argv[1:] = ['replay']; "
         "main(); sys.stderr.write(json.dumps(sorted(sys.modules)))"

@@ -88,7 +88,7 @@ def published(folder: Path, wanted: int) -> list[Verdict]:
 
 
 @pytest.mark.parametrize("kind", TWINS)
-def test_a_recording_on_the_wire_is_read_as_its_replay_is(tmp_path: Path, kind: str) -> None:
+def test_a_recording_on_the_wire_reads_as_its_replay(tmp_path: Path, kind: str) -> None:
     with start("run", scene_for(kind, tmp_path)) as daemon:
         wait_for(tmp_path / "graspd")
         with twin(kind, tmp_path, "--recording", str(DEMO_TABLE), "--loop") as hardware:

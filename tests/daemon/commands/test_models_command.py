@@ -40,7 +40,7 @@ def refused(says: str, *words: object) -> None:
 
 
 @pytest.mark.parametrize("name", zoo.names())
-def test_a_card_says_what_a_model_is_worth_and_where_it_ends(name: str) -> None:
+def test_a_card_gives_a_models_worth_and_limits(name: str) -> None:
     result = graspd("models", name)
     assert result.returncode == 0, result.stderr
     card = zoo.card(name)

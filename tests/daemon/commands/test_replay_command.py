@@ -37,7 +37,7 @@ DEMO_LINE = re.compile(
 )
 
 
-def test_the_demo_shows_what_stable_is_worth_by_both_methods_on_a_day_of_drift() -> None:
+def test_the_demo_compares_both_methods_on_a_day_of_drift() -> None:
     demo, program = graspd("replay"), graspd("replay", "--json")
     assert demo.returncode == program.returncode == 0, demo.stderr
     text = demo.stdout
@@ -87,7 +87,7 @@ def test_a_table_with_outcomes_is_counted_by_25_grasps(tmp_path: Path) -> None:
     assert "against " in verbose
 
 
-def test_the_published_method_of_the_demo_is_its_network_on_every_grasp() -> None:
+def test_the_demos_published_method_is_its_network_alone() -> None:
     model, rows = TactileModel(zoo.find("cnn1")), list(read_rows(DEMO_DAY, ("ff", "mf", "th")))
     stable = []
     for row in rows:
@@ -145,7 +145,7 @@ def test_a_risk_is_kept_on_a_table_and_reported() -> None:
     assert bare["reasons"].get("unproven") is None
 
 
-def test_the_outcome_of_a_grasp_in_a_stream_is_told_once_when_it_is_over() -> None:
+def test_a_streams_outcome_is_told_once_after_its_grasp() -> None:
     result = graspd("replay", DEMO_RECORDING, "--outcomes", "--json")
     verdicts = [decode_verdict(line.encode()) for line in result.stdout.splitlines()]
     summary = json.loads(result.stderr)
@@ -247,7 +247,7 @@ def test_memory_does_not_grow_with_the_length_of_the_file(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["INT", "TERM"]
 )
-def test_a_signal_ends_a_replay_with_its_summary_and_nothing_left(
+def test_a_signal_ends_a_replay_with_its_summary(
     tmp_path: Path, number: signal.Signals, code: int
 ) -> None:
     endpoint = f"ipc://{tmp_path}/graspd"
@@ -264,7 +264,7 @@ def test_a_signal_ends_a_replay_with_its_summary_and_nothing_left(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_replay_in_which_the_computer_sleeps_goes_on_to_its_end(
+def test_a_replay_outlasts_a_sleep_of_the_computer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slept = sleep_at_will(tmp_path, monkeypatch)

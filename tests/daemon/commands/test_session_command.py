@@ -94,7 +94,7 @@ def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
     assert aside["serials"] == {"ff": "BTSP-2", "th": "BTSP-3"}
 
 
-def test_a_session_that_the_daemon_cannot_use_is_not_shown_as_calibrated(tmp_path: Path) -> None:
+def test_a_session_of_no_use_is_not_shown_as_calibrated(tmp_path: Path) -> None:
     """One that is of other fingers, and one whose electrodes all rest where no grasp is."""
     path = session_scene(tmp_path)
     shown = []

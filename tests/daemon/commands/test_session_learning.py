@@ -56,7 +56,7 @@ def live_trust(path: Path) -> Trust:
     return trust
 
 
-def test_a_table_teaches_but_ends_no_warm_up_and_counts_no_lift(tmp_path: Path) -> None:
+def test_a_table_teaches_but_counts_as_no_lift(tmp_path: Path) -> None:
     path = session_scene(tmp_path, sections="[risk]\nmax_slip_when_stable = 0.1\n")
     learned = seed(path, DEMO_TABLE)
     assert learned is not None

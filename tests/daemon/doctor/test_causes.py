@@ -49,7 +49,7 @@ from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
 
-def test_error_frames_of_a_bus_without_ours_are_a_bit_rate(tmp_path: Path) -> None:
+def test_error_frames_alone_mean_a_wrong_bit_rate(tmp_path: Path) -> None:
     silence, statistics = LinkFaults(drop_probability=1.0), ElectrodeStatistics(FINGERS)
     with LINKS["can"](Hand(100.0), tmp_path, silence) as (driver, step):
         where = driver.describe()["bus"].text.split()[1].rstrip(",")
@@ -74,7 +74,7 @@ def healthy(tmp_path: Path) -> Iterator[str]:
         thread.join()
 
 
-def test_a_port_that_is_missing_is_told_with_those_that_there_are(
+def test_a_missing_port_is_reported_with_the_present_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = computer.SerialPort("/dev/ttyACM3", "Pico - CDC", "E66", 0x2E8A, "Pico")
@@ -131,7 +131,7 @@ def holder(path: object, *locks: str) -> Iterator[int]:
         process.terminate()
 
 
-def test_a_port_that_another_program_holds_is_told_with_its_pid(tmp_path: Path) -> None:
+def test_a_held_port_is_reported_with_the_holders_pid(tmp_path: Path) -> None:
     master, slave = os.openpty()
     try:
         with holder(os.ttyname(slave), "locks") as other:
@@ -170,7 +170,7 @@ def test_a_port_that_graspd_itself_holds_is_told(tmp_path: Path, healthy: str) -
     assert told["advice"].startswith("graspd itself runs")
 
 
-def test_an_interface_that_is_missing_is_told_with_those_that_there_are(
+def test_a_missing_interface_is_reported_with_the_present_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = [computer.CanInterface("can9", "error-active", 500_000)]
@@ -195,7 +195,7 @@ def test_an_interface_that_is_missing_is_told_with_those_that_there_are(
         (("error-active", 1_000_000), "silent", "Check power and connection"),
     ],
 )
-def test_an_interface_that_is_down_or_at_another_rate_is_told_with_the_command(
+def test_a_wrong_interface_is_reported_with_the_command(
     interface: tuple[str, int | None],
     cause: str,
     advice: str,
@@ -218,7 +218,7 @@ def test_a_controller_in_trouble_is_not_said_to_be_fine(state: str) -> None:
     assert "sudo ip link set can0 down; sudo ip link set can0 up type can" in (told.advice or "")
 
 
-def test_a_board_that_is_heard_has_the_bit_rate_of_its_interface(
+def test_a_received_board_has_its_interfaces_bit_rate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = computer.CanInterface(LOOPBACK, "error-active", 500_000)
@@ -235,7 +235,7 @@ def test_a_board_that_is_heard_has_the_bit_rate_of_its_interface(
 @pytest.mark.parametrize(
     ("host", "cause"), [("127.0.0.1", "socket-held"), ("192.0.2.1", "address")]
 )
-def test_a_port_to_publish_on_that_cannot_be_had_is_told(
+def test_a_port_that_cannot_be_bound_is_reported(
     host: str, cause: str, tmp_path: Path, healthy: str, pid: int
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as held:
@@ -283,7 +283,7 @@ SURROUNDINGS: dict[str, tuple[str, str, str]] = {
 
 
 @pytest.mark.parametrize("wrong", SURROUNDINGS)
-def test_what_is_wrong_around_a_healthy_bridge_is_told_by_its_name(
+def test_each_fault_around_a_healthy_bridge_is_named(
     wrong: str, tmp_path: Path, healthy: str
 ) -> None:
     more, cause, advice = SURROUNDINGS[wrong]
@@ -322,7 +322,7 @@ def test_rights_that_a_user_lacks_are_told(
     assert "LimitRTPRIO=40" in str(told)
 
 
-def test_a_terminal_of_80_columns_is_not_overrun_and_elsewhere_a_finding_is_a_line() -> None:
+def test_findings_fit_80_columns_and_elsewhere_one_line() -> None:
     advice = "look at this and at that, " * 8
     told = [
         Finding(Level.ERROR, "something is wrong " * 6, Cause.SLOW, advice),
@@ -336,9 +336,7 @@ def test_a_terminal_of_80_columns_is_not_overrun_and_elsewhere_a_finding_is_a_li
     assert len(list(doctor.in_words(told, None))) == len(told) + 2
 
 
-def test_the_table_of_electrodes_is_shown_with_all_only_and_fits(
-    tmp_path: Path, healthy: str
-) -> None:
+def test_the_table_of_electrodes_needs_all_and_fits(tmp_path: Path, healthy: str) -> None:
     assert "mean, sd, faulty" not in asked(tmp_path, healthy).stdout
     _, table = asked(tmp_path, healthy, "--all").stdout.split("to look at\n\n")
     lines = table.splitlines()

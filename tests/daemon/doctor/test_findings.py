@@ -199,7 +199,7 @@ def test_joining_in_the_middle_of_a_sweep_is_no_trouble(number: int, findings: i
         (DeviceFault.BUS_ERROR, Level.WARNING, Cause.BUS_ERRORS, "terminators"),
     ],
 )
-def test_a_fact_is_judged_by_its_fault_and_not_by_its_words(
+def test_a_fact_is_judged_by_its_fault_alone(
     fault: DeviceFault | None, level: Level, cause: Cause | None, advice: str
 ) -> None:
     up, finding = device_findings("spi", {"link": Fact("up"), "some key": Fact("xxx", fault)})
@@ -210,7 +210,7 @@ def test_a_fact_is_judged_by_its_fault_and_not_by_its_words(
 
 
 @pytest.mark.parametrize("cause", LinkCause)
-def test_a_link_that_is_not_up_is_an_error_whose_cause_is_not_in_its_words(
+def test_a_link_down_is_an_error_of_one_cause(
     cause: LinkCause,
 ) -> None:
     """Which cause that is, test_link_faults and test_causes hold by what twins and ports do."""
@@ -236,7 +236,7 @@ def test_a_recording_has_no_link() -> None:
     assert finding.level is Level.OK
 
 
-def test_counters_that_are_told_exist_and_have_a_cause_and_advice() -> None:
+def test_reported_counters_exist_and_have_cause_and_advice() -> None:
     messages = (JointCounters, TactileCounters)
     kinds = (BridgeCounters, CanCounters, PalmCounters, *messages, ReplayCounters, McapCounters)
     told = {name for names in COUNTERS.values() for name in names}

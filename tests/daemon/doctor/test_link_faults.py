@@ -176,7 +176,7 @@ def test_a_port_that_cannot_be_opened_is_told(
     assert finding["cause"] == cause
 
 
-def test_an_address_and_a_port_that_cannot_be_had_are_told(
+def test_an_address_or_port_that_fails_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pid = os.getpid()
@@ -191,7 +191,7 @@ def test_an_address_and_a_port_that_cannot_be_had_are_told(
 
 
 @pytest.mark.parametrize("kind", LINKS)
-def test_nothing_is_wrong_with_a_healthy_twin_in_a_quarter_hour(kind: str, tmp_path: Path) -> None:
+def test_a_healthy_twin_has_no_finding_in_fifteen_minutes(kind: str, tmp_path: Path) -> None:
     sweeps, hand = int(LOOK_S * HAND_HZ), Hand(HAND_HZ)
     sweep_hz = 1000 / 14 if kind == "palm" else 100.0
     look_s = sweeps / sweep_hz

@@ -15,7 +15,7 @@ from graspd.extras import installer, needs
 from graspd.models.training.evaluating.files import markdown_table
 
 
-def test_a_file_is_replaced_with_the_mode_that_is_asked_for(tmp_path: Path) -> None:
+def test_a_replaced_file_has_the_given_mode(tmp_path: Path) -> None:
     path = tmp_path / "kept"
     write_atomically(path, b"former")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -70,7 +70,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
         read_regular(tmp_path / "nothing", 10)
 
 
-def test_a_missing_package_is_named_with_its_extra_and_a_missing_part_of_graspd_is_a_bug() -> None:
+def test_a_missing_package_is_named_with_its_extra() -> None:
     absent = ModuleNotFoundError("No module named 'rich.text'", name="rich.text")
     assert needs("watch", "watch", absent) == (
         f"watch needs the package 'rich': run {sys.executable} -m pip install '.[watch]' in the "
@@ -100,7 +100,7 @@ def test_packages_are_added_by_what_made_the_environment(
     assert installer() == command.format(environment)
 
 
-def test_a_table_is_markdown_with_numbers_to_the_right_and_bars_escaped() -> None:
+def test_a_table_is_markdown_with_numbers_to_the_right() -> None:
     assert list(markdown_table(("name", "us"), [("a|b", "1"), ("c", "20")], right={"us"})) == [
         "| name | us |",
         "| --- | ---: |",

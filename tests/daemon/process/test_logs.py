@@ -67,7 +67,7 @@ def test_a_complaint_in_the_journal_is_an_error(tmp_path: Path) -> None:
     assert "missing.toml" in log.read_text()
 
 
-def test_a_burst_passes_and_the_rest_of_the_window_is_counted() -> None:
+def test_a_burst_passes_and_the_rest_is_counted() -> None:
     now_s = 100.0
     limit = RateLimit(lambda: now_s)
     passed = [limit.filter(record(logging.WARNING, "lost %d", n)) for n in range(BURST + 7)]

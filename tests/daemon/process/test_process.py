@@ -159,9 +159,7 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
     ("allowed", "taken"),
     [("512:8192", (8192, 8192)), ("512:1000", (1000, 1000))],
 )
-def test_there_are_descriptors_for_all_peers_and_none_is_given_up(
-    tmp_path: Path, allowed: str, taken: tuple[int, int]
-) -> None:
+def test_all_peers_get_descriptors(tmp_path: Path, allowed: str, taken: tuple[int, int]) -> None:
     scene = demo_scene(tmp_path, "loop = true")
     with start("run", scene, before=("prlimit", f"--nofile={allowed}")) as process:
         wait_for(tmp_path / "v")

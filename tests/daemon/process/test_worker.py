@@ -27,7 +27,7 @@ def named_slow() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "slow"]
 
 
-def test_a_job_makes_the_descriptor_readable_and_gives_its_result_once(
+def test_a_job_wakes_the_loop_and_gives_one_result(
     worker: Worker[object],
 ) -> None:
     assert worker.filenos == []
@@ -41,9 +41,7 @@ def test_a_job_makes_the_descriptor_readable_and_gives_its_result_once(
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(5), KeyError()])
-def test_what_a_job_raises_is_its_result_and_the_next_job_runs(
-    worker: Worker[object], error: Exception
-) -> None:
+def test_a_job_that_raises_stops_no_later_one(worker: Worker[object], error: Exception) -> None:
     def fail() -> object:
         raise error
 
@@ -53,7 +51,7 @@ def test_what_a_job_raises_is_its_result_and_the_next_job_runs(
     assert worker.take(PATIENCE_S) == 1
 
 
-def test_a_job_is_refused_until_the_result_before_it_is_taken(worker: Worker[object]) -> None:
+def test_a_job_waits_for_the_result_before_it(worker: Worker[object]) -> None:
     go = threading.Event()
     assert worker.submit(go.wait)
     assert worker.take() is None
@@ -67,7 +65,7 @@ def test_a_job_is_refused_until_the_result_before_it_is_taken(worker: Worker[obj
     assert worker.take(PATIENCE_S) == 3
 
 
-def test_close_leaves_a_job_that_hangs_and_its_thread_ends_with_it() -> None:
+def test_close_leaves_a_job_that_hangs() -> None:
     worker: Worker[object] = Worker("slow")
     descriptors = set(os.listdir("/proc/self/fd"))
     go = threading.Event()
@@ -124,7 +122,7 @@ def test_where_the_system_refuses_a_thread_a_job_is_refused(
     assert worker.take(PATIENCE_S) == 1
 
 
-def test_a_job_has_neither_priority_nor_processors_of_a_realtime_loop(
+def test_a_job_has_no_realtime_priority_or_processors(
     worker: Worker[object],
 ) -> None:
     processors = os.sched_getaffinity(0)

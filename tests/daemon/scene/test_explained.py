@@ -62,7 +62,7 @@ def test_no_key_is_forgotten() -> None:
     assert {"tactile.port", "risk.warm_up", "gate.max_age_ms", "joints.calibration"} < named
 
 
-def test_the_schema_is_valid_and_the_file_of_the_editors_is_it() -> None:
+def test_the_schema_is_valid_and_committed() -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     assert (DEPLOY / "scenes" / explained.SCHEMA).read_text() == explained.schema_text(), (
         "run: python -m graspd scene --schema > deploy/scenes/scene.schema.json"

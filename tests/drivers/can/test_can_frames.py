@@ -146,7 +146,7 @@ def test_every_dropped_sample_frame_is_counted_by_its_reason(frame: CanFrame, co
         CanFrame(0x7FF, E1_SAMPLE[:1] + bytes.fromhex("A250 A8C8 94B9")),  # even parity
     ],
 )
-def test_without_an_id_that_of_the_first_sound_sample_is_taken(unsound: CanFrame) -> None:
+def test_without_an_id_the_first_sound_sample_gives_it(unsound: CanFrame) -> None:
     made, counters = decoder(None)
     made.push(unsound, 0)
     assert made.arbitration_id is None
@@ -171,7 +171,7 @@ def test_an_id_that_was_heard_is_forgotten_with_the_link(configured: int | None)
     assert counters.foreign_frames == (configured is not None)
 
 
-def test_a_board_that_pads_its_frames_is_read_when_told_so() -> None:
+def test_a_board_that_pads_frames_needs_its_option() -> None:
     made, counters = decoder(data_length=8)
     readings: list[TactileReading] = []
     for channel, words, t_ns in samples(0):

@@ -68,7 +68,7 @@ FAILURES = [
 
 @pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
 @pytest.mark.parametrize("shutdown_fails", [False, True])
-def test_whatever_python_can_raises_is_a_link_fault_that_is_recovered_from(
+def test_the_link_recovers_from_any_error_of_python_can(
     monkeypatch: pytest.MonkeyPatch, failure: Exception, shutdown_fails: bool
 ) -> None:
     first = ScriptedBus([*sweep_messages(0), *sweep_messages(1)[:10], failure])
@@ -139,7 +139,7 @@ def test_one_call_takes_a_bounded_number_of_frames(monkeypatch: pytest.MonkeyPat
         assert driver.due_ns() == clock.now_ns + POLL_NS
 
 
-def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(
+def test_python_can_gets_bit_rate_and_bounded_queue(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen: dict[str, object] = {}
@@ -150,7 +150,7 @@ def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(
     assert seen["ignore_config"] is True
 
 
-def test_a_board_that_falls_silent_is_not_up_and_comes_back_by_itself() -> None:
+def test_a_silent_board_is_down_and_comes_back() -> None:
     """No error tells of it: the bus is there, others even talk on it."""
     link = TwinLink()
     driver, clock = link.driver, link.clock
@@ -192,7 +192,7 @@ def test_slow_boards_have_ten_periods() -> None:
         assert str(link.driver.stream.link.state) == "greeting"
 
 
-def test_a_bus_with_a_descriptor_is_looked_at_when_silence_is_due(
+def test_a_bus_with_a_descriptor_wakes_when_silence_is_due(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = Clock()
@@ -213,7 +213,7 @@ def test_a_bus_with_a_descriptor_is_looked_at_when_silence_is_due(
 @pytest.mark.parametrize(
     ("stamp_s", "age_ns"), [(100.0, 500_000_000), (100.5, 0), (101.0, 0)], ids=str
 )
-def test_a_frame_is_as_old_as_its_stamp_by_the_wall_clock(
+def test_a_frame_is_as_old_as_its_stamp(
     monkeypatch: pytest.MonkeyPatch, stamp_s: float, age_ns: int
 ) -> None:
     """A stamp after now is of a wall clock that was set back meanwhile."""
@@ -228,7 +228,7 @@ def test_a_frame_is_as_old_as_its_stamp_by_the_wall_clock(
     assert bus.drain() == []
 
 
-def test_frames_stay_in_order_where_the_clocks_are_not_read_at_once(
+def test_frames_stay_in_order_if_clocks_are_read_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The wall clock is read 20 ms late the second time."""
@@ -248,7 +248,7 @@ def test_frames_stay_in_order_where_the_clocks_are_not_read_at_once(
     bus.close()
 
 
-def test_a_frame_without_a_stamp_came_since_the_bus_was_last_empty(
+def test_an_unstamped_frame_came_since_the_bus_was_empty(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scripted, clock = ScriptedBus(), Clock(1_000)

@@ -69,7 +69,7 @@ def test_a_socketcan_bus_is_read_from_its_socket(socket_bus: SocketBus) -> None:
         assert driver.read_ready() == []
 
 
-def test_a_frame_is_as_old_as_its_stay_in_the_kernel(stamped_bus: SocketBus) -> None:
+def test_a_frame_ages_in_the_kernel(stamped_bus: SocketBus) -> None:
     with over_socket() as driver:
         times_ns = [time.monotonic_ns()]
         for frame in sweep_of_frames(0):
@@ -89,7 +89,7 @@ def test_a_frame_is_as_old_as_its_stay_in_the_kernel(stamped_bus: SocketBus) -> 
 @pytest.mark.parametrize(
     ("step_ns", "age_ns"), [(3_600_000 * MS, 3_600_000 * MS), (-5_000 * MS, 0)]
 )
-def test_a_step_of_the_wall_clock_makes_frames_old_and_never_of_the_future(
+def test_a_wall_clock_step_makes_no_frame_of_the_future(
     stamped_bus: SocketBus, step_ns: int, age_ns: int
 ) -> None:
     with over_socket(wall_clock=lambda: time.time_ns() + step_ns) as driver:
@@ -103,7 +103,7 @@ def test_a_step_of_the_wall_clock_makes_frames_old_and_never_of_the_future(
     assert before_ns - between_ns <= readings[-1].t_ns + age_ns <= read_ns
 
 
-def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
+def test_bus_off_loses_the_link_and_its_sweep(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = Clock()
@@ -202,7 +202,7 @@ def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
         assert (readings[-1].counts == truth(21)).all()
 
 
-def test_the_loop_rests_until_a_millisecond_before_a_reading_and_fifteen_at_most(
+def test_the_loop_rests_fifteen_milliseconds_at_most(
     socket_bus: SocketBus,
 ) -> None:
     clock = Clock()
@@ -268,7 +268,7 @@ def slcan_line(
     unplug()
 
 
-def test_an_slcan_adapter_is_read_and_its_unplugging_leaves_nothing_open(
+def test_an_unplugged_slcan_adapter_leaves_nothing_open(
     slcan_line: tuple[str, Callable[[bytes], None], Callable[[], None]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -324,7 +324,7 @@ def unstamped(monkeypatch: pytest.MonkeyPatch, clock: Clock) -> tuple[ScriptedBu
     )
 
 
-def test_frames_without_a_time_are_as_old_as_they_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_without_a_time_have_their_greatest_age(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     bus, driver = unstamped(monkeypatch, clock)
     with driver:
@@ -353,7 +353,7 @@ def test_old_frames_make_no_fresh_reading(monkeypatch: pytest.MonkeyPatch) -> No
         assert driver.counters.readings == 0
 
 
-def test_an_adapters_own_words_are_not_the_end_of_what_it_has(
+def test_an_adapters_own_words_hide_no_frames_behind_them(
     slcan_line: tuple[str, Callable[[bytes], None], Callable[[], None]],
 ) -> None:
     """python-can returns nothing for them although frames are behind them."""

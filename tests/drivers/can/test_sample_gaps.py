@@ -36,7 +36,7 @@ def assert_of_one_sweep(reading: TactileReading) -> int:
 
 
 @pytest.mark.parametrize("lost", [22, 23, 24, 25, 46, 47, 48])
-def test_untouched_sensors_that_repeat_themselves_make_no_copies_of_lost_samples(lost: int) -> None:
+def test_repeated_words_make_no_copies_of_lost_samples(lost: int) -> None:
     """The words of all sweeps are the same, so only time tells that a sample is no copy."""
     sweeps, counters = assembler()
     stream = concatenated([samples(n) for n in range(20)])
@@ -68,9 +68,7 @@ def test_a_sender_that_stalls_looks_like_a_loss(at: int) -> None:
         (9, 2_300_000, True),
     ],
 )
-def test_before_the_period_is_known_it_is_taken_for_that_of_the_fastest_board(
-    place: int, after_ns: int, is_next: bool
-) -> None:
+def test_an_unknown_period_is_the_fastest_boards(place: int, after_ns: int, is_next: bool) -> None:
     """100 us a sample: three quarters of a sweep are 1800 us, after the time to that place."""
     sweeps, _ = assembler()
     begun, late = samples(0)[:5], samples(0)[place]
@@ -78,7 +76,7 @@ def test_before_the_period_is_known_it_is_taken_for_that_of_the_fastest_board(
     assert len(readings) == is_next
 
 
-def test_a_period_is_learned_from_two_ends_in_a_row_only() -> None:
+def test_a_period_is_learned_from_two_ends_in_succession() -> None:
     """Every second sweep has no end, and its lost samples are too few to look like a pause."""
     sweeps, _ = assembler()
     stream = [samples(n) if n < 8 or n % 2 else samples(n)[:10] for n in range(50)]
@@ -86,7 +84,7 @@ def test_a_period_is_learned_from_two_ends_in_a_row_only() -> None:
     assert sweeps.period_ns == 24 * SLOT_NS
 
 
-def test_a_period_is_learned_though_a_sample_is_lost_in_every_sweep() -> None:
+def test_a_period_is_learned_though_each_sweep_has_losses() -> None:
     sweeps, _ = assembler()
     feed(sweeps, concatenated([samples(n)[:5] + samples(n)[6:] for n in range(6)]))
     assert sweeps.period_ns == 24 * SLOT_NS
@@ -115,7 +113,7 @@ def test_a_known_loss_ends_the_sweep_at_hand(cut_at: int) -> None:
     assert counters.unsynchronised_frames == (24 - cut_at if cut_at else 0)
 
 
-def test_samples_that_may_have_come_within_a_long_time_make_no_reading() -> None:
+def test_samples_of_vague_time_make_no_reading() -> None:
     sweeps, counters = assembler()
     readings = feed(sweeps, concatenated([samples(n) for n in range(8)]) + samples(8)[:12])
     until_ns = samples(10)[12][2]
@@ -182,9 +180,7 @@ def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> Non
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
 @pytest.mark.parametrize("lost", [-1, 0, 1])
-def test_losses_of_a_sweep_in_a_rhythm_are_not_taken_for_a_longer_period(
-    sequence: str, lost: int
-) -> None:
+def test_rhythmic_losses_make_no_longer_period(sequence: str, lost: int) -> None:
     """The order looks as if nothing were missing."""
     sweeps, _ = assembler(sequence)
     length = len(SEQUENCES[sequence])

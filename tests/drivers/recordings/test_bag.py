@@ -108,9 +108,7 @@ def test_a_bag_is_judged_as_its_stream(
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
-def test_a_single_file_of_a_bag_is_read_whatever_its_name(
-    tmp_path: Path, plugin: StoragePlugin
-) -> None:
+def test_one_file_of_a_bag_is_read(tmp_path: Path, plugin: StoragePlugin) -> None:
     folder = BagOf(2).write(tmp_path / "hand", noise(30), storage_plugin=plugin)
     (storage,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
     assert len(readings_of(storage)) == 30
@@ -167,7 +165,7 @@ def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
     return found
 
 
-def test_a_hand_that_stands_still_in_the_topic_is_not_judged(tmp_path: Path) -> None:
+def test_a_hand_frozen_in_the_topic_is_not_judged(tmp_path: Path) -> None:
     sweeps = sweeps_of(demo())
     stuck = [sweeps[110]._replace(t_ns=sweep.t_ns) for sweep in sweeps[110:]]
     path = BagOf(1).write(tmp_path / "hand.bag", [*sweeps[:110], *stuck])
@@ -188,7 +186,7 @@ def test_absent_sensors_and_values_that_are_no_counts_are_broken(tmp_path: Path)
 @pytest.mark.parametrize(
     ("fingers", "name"), [(("ff", "mf"), "small-session-ff-mf"), (("ff", "th"), "ff-th")]
 )
-def test_a_hand_with_two_sensors_gets_the_name_of_its_model(
+def test_a_hand_of_two_sensors_gets_its_models_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], fingers: tuple[str, ...], name: str
 ) -> None:
     sweeps = [
@@ -289,7 +287,7 @@ def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
     assert (read_recording(left)["FFJ3"] == demo()["FFJ3"][:30]).all()
 
 
-def test_a_joint_of_both_hands_in_one_message_has_no_angle(tmp_path: Path) -> None:
+def test_a_joint_of_both_hands_has_no_angle(tmp_path: Path) -> None:
     angles = {"rh_FFJ3": 0.5, "lh_FFJ3": 0.6, "rh_THJ5": 0.7}
     sweeps = [sweep._replace(angles=angles) for sweep in noise(3)]
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps, topic="/tactile")

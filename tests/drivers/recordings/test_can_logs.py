@@ -163,9 +163,7 @@ def test_a_log_without_frames_of_a_board_is_refused(tmp_path: Path, text: str, s
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-8-sig"])
-def test_a_log_of_another_encoding_and_with_a_torn_end_is_read(
-    tmp_path: Path, encoding: str
-) -> None:
+def test_a_log_of_another_encoding_with_a_torn_end_reads(tmp_path: Path, encoding: str) -> None:
     """PowerShell writes UTF-16; a computer that lost power leaves zeros."""
     path = tmp_path / "bus.txt"
     mark = "\ufeff" if encoding == "utf-16-be" else ""

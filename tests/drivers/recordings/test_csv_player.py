@@ -85,7 +85,7 @@ def test_a_stream_plays_at_its_own_times_whatever_their_offset(tmp_path: Path) -
     assert [reading.recorded_ns for reading in readings] == [0, 10 * MS, 10 * MS, 250 * MS]
 
 
-def test_the_period_of_a_stream_is_the_shortest_step_so_far(tmp_path: Path) -> None:
+def test_a_streams_period_is_its_shortest_step(tmp_path: Path) -> None:
     clock = Clock()
     path = write(tmp_path, stream(["5", "5.02", "5.03", "35.0"]))
     with ReplayDriver([path], speed=2, clock=clock) as driver:
@@ -127,7 +127,7 @@ def test_several_files_play_in_a_row_on_one_time_axis(tmp_path: Path) -> None:
     assert sources == ["a.csv"] * 2 + ["b.csv"] * 3 + ["c.csv"] + ["d.csv"] * 2
 
 
-def test_a_loop_starts_again_with_the_first_file_and_time_goes_on(tmp_path: Path) -> None:
+def test_a_loop_starts_again_and_time_continues(tmp_path: Path) -> None:
     clock = Clock()
     paths = [
         write(tmp_path, table(2), "a.csv"),

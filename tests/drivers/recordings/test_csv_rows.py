@@ -49,7 +49,7 @@ def test_a_table_gives_its_counts_and_annotations() -> None:
         assert row.annotation.slipped == bool(index % 2)
 
 
-def test_columns_may_stand_in_any_order_and_only_those_asked_for_are_read() -> None:
+def test_columns_stand_in_any_order() -> None:
     columns = [*reversed(ELECTRODES), "slipped"]
     (row,) = rows_of(table(1, columns=columns), ("th", "ff"))
     expected = [[count(0, 48 + k) for k in range(24)], [count(0, k) for k in range(24)]]
@@ -57,7 +57,7 @@ def test_columns_may_stand_in_any_order_and_only_those_asked_for_are_read() -> N
     assert row.annotation.object_name is None
 
 
-def test_unknown_columns_are_listed_and_columns_of_other_fingers_are_not() -> None:
+def test_only_unknown_columns_are_listed() -> None:
     header = [*TABLE_HEADER, "force", "", "force", "FFJ3"]
     content = ",".join(header).encode() + b"\n" + b"0," * 77 + b"0\n"
     found = survey(PATH, io.BytesIO(content), ("mf",))
@@ -138,9 +138,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize(("content", "message"), BAD_FILES.values(), ids=BAD_FILES)
-def test_what_is_no_recording_is_refused_with_file_line_and_column(
-    content: bytes, message: str
-) -> None:
+def test_a_wrong_recording_is_refused_with_line_and_column(content: bytes, message: str) -> None:
     with pytest.raises(RecordingError) as caught:
         rows_of(content)
     assert message in str(caught.value)
@@ -184,7 +182,7 @@ def test_a_last_row_without_line_end_is_cut_off() -> None:
         rows_of(table(3).rstrip(b"\n"), strict=True)
 
 
-def test_a_value_can_be_no_count_and_cut_off_at_once() -> None:
+def test_a_value_can_be_wrong_and_cut_off() -> None:
     *_, last = rows_of(table(1, {0: {"th_biotac_24": "26x"}}).rstrip(b"\n"))
     both = ElectrodeFault.CUT_OFF | ElectrodeFault.NOT_A_COUNT
     (row,) = rows_of(stream(["0"], {"FFJ1": ["0.5"]}).rstrip(b"\n"))
@@ -249,7 +247,7 @@ def test_an_error_while_reading_is_a_recording_error() -> None:
         survey(PATH, Broken(GOOD), FINGERS)
 
 
-def test_a_sparse_file_of_many_gigabytes_without_a_line_end_is_refused_at_once(
+def test_gigabytes_without_a_line_end_are_refused_at_once(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "disk.csv"
@@ -304,7 +302,7 @@ def test_a_message_shows_forty_characters_of_a_cell(cell: str, told: str) -> Non
 
 @given(st.text(max_size=12) | st.from_regex(r"[0-9.eE+_ -]{1,8}", fullmatch=True))
 @example("1_0")
-def test_a_count_is_never_read_from_what_python_would_not_call_that_number(cell: str) -> None:
+def test_a_count_is_read_as_python_reads_it(cell: str) -> None:
     value = count_of(cell)
     if value is not None:
         assert set(cell.strip()) <= set("0123456789.eE+-")

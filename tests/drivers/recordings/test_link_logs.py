@@ -59,7 +59,7 @@ def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
 
 
 @given(st.lists(records, min_size=3, max_size=6), st.data())
-def test_damage_costs_the_record_that_is_damaged_and_the_one_after_it_at_most(
+def test_damage_costs_two_records_at_most(
     made: list[tuple[int, Record]], data: st.DataObject
 ) -> None:
     whole = bytearray(encoded(made))
@@ -132,7 +132,7 @@ def test_items_are_due_as_recorded_over_the_speed(speed: float, steps_ms: list[i
     assert player.due_ns() is None
 
 
-def test_without_a_speed_all_is_due_at_once_and_keeps_its_recorded_times() -> None:
+def test_without_a_speed_records_keep_their_times() -> None:
     clock = Clock()
     player = Player(None, clock)
     player.open()
