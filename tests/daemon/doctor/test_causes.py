@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
-import can
 import pytest
 
 from graspd.daemon.commands import doctor
@@ -26,17 +25,12 @@ from graspd.daemon.doctor.finding import Cause, Finding, Level
 from graspd.daemon.doctor.surroundings import can_finding
 from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.twins import spi as spi_twin
-from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from tests.daemon.doctor.emulated import (
     CAN,
     FINGERS,
-    LINKS,
     SPI,
-    Hand,
     asked,
-    faults_told,
-    listen,
     look,
     refused,
     scene_of,
@@ -44,22 +38,8 @@ from tests.daemon.doctor.emulated import (
 from tests.daemon.processes import start
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
 from tests.kit.clock import Clock
-from tests.kit.crowd import crowded
 from tests.kit.waiting import wait_until
 from tests.ports import free_port
-
-
-def test_error_frames_alone_mean_a_wrong_bit_rate(tmp_path: Path) -> None:
-    silence, statistics = LinkFaults(drop_probability=1.0), ElectrodeStatistics(FINGERS)
-    with LINKS["can"](Hand(100.0), tmp_path, silence) as (driver, step):
-        where = driver.describe()["bus"].text.split()[1].rstrip(",")
-        with can.Bus(interface="virtual", channel=where, ignore_config=True) as bus:
-            for _ in range(20):
-                bus.send(can.Message(arbitration_id=0x8, is_error_frame=True, dlc=8, data=bytes(8)))
-                listen(driver, step, 1, statistics)
-            (told,) = faults_told(driver, statistics, 1.0)
-    assert (told.level, told.cause) == (Level.ERROR, Cause.BITRATE), told
-    assert "20 error frames" in told.what
 
 
 @pytest.fixture
@@ -145,9 +125,15 @@ def test_a_held_port_is_reported_with_the_holders_pid(tmp_path: Path) -> None:
 
 
 def test_a_reader_without_a_lock_is_told_with_its_pid(tmp_path: Path, healthy: str) -> None:
+    found: list[dict[str, str]] = []
+
+    def is_a_warning() -> bool:  # an error while a busy computer brings no readings
+        found[:] = look(tmp_path, healthy)
+        return [(each["cause"], each["level"]) for each in found] == [("port-held", "warning")]
+
     with holder(tmp_path / "bridge") as other:
-        (told,) = look(tmp_path, healthy)
-    assert (told["cause"], told["level"]) == ("port-held", "warning")
+        wait_until(is_a_warning)
+    (told,) = found
     assert f"{tmp_path / 'bridge'} is open in another program" in told["what"]
     assert f"PID {other}, " in told["what"]
     assert told["advice"] == f"End it: kill {other}"
@@ -343,11 +329,6 @@ def test_the_table_of_electrodes_needs_all_and_fits(tmp_path: Path, healthy: str
     assert len(lines) == 25
     assert max(map(len, lines)) <= 80
     assert [line.split()[0] for line in lines[1:]] == [str(number) for number in range(1, 25)]
-
-
-def test_the_doctor_listens_above_descriptor_1024(tmp_path: Path, healthy: str) -> None:
-    with crowded():
-        assert look(tmp_path, healthy) == []
 
 
 SWEEP = json.dumps({"counts": {finger: [*range(2000, 2024)] for finger in FINGERS}})

@@ -156,18 +156,21 @@ def test_a_bus_that_is_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert finding.cause is Cause.INTERFACE_DOWN
 
 
+SLCAN = CAN + 'interface = "slcan"\n'
+
+
 @pytest.mark.parametrize(
-    ("number", "cause"),
+    ("tactile", "number", "cause"),
     [
-        (errno.ENOENT, "port-missing"),
-        (errno.EACCES, "port-denied"),
-        (errno.EBUSY, "port-held"),
-        (errno.EAGAIN, "port-held"),
-        (errno.ENODEV, "interface-missing"),
-        (errno.EIO, "link-down"),
+        (SPI, errno.ENOENT, "port-missing"),
+        (SPI, errno.EACCES, "port-denied"),
+        (SPI, errno.EBUSY, "port-held"),
+        (SPI, errno.EAGAIN, "port-held"),
+        (SPI, errno.ENODEV, "interface-missing"),
+        (SPI, errno.EIO, "link-down"),
+        (SLCAN, errno.EACCES, "port-denied"),
     ],
 )
-@pytest.mark.parametrize("tactile", [SPI, CAN + 'interface = "slcan"\n'], ids=["spi", "slcan"])
 def test_a_port_that_cannot_be_opened_is_told(
     tactile: str, number: int, cause: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

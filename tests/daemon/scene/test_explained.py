@@ -39,16 +39,17 @@ def numbers(about: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
         yield from numbers(about["items"])
 
 
-@pytest.mark.parametrize(("key", "about"), KEYS, ids=[key for key, _ in KEYS])
-def test_every_key_has_a_meaning_and_every_number_a_unit(key: str, about: dict[str, Any]) -> None:
-    assert about["description"].endswith((".", ")"))
-    assert about["description"][0].isupper() or about["description"].startswith("`")
-    for number in numbers(about):
-        assert number["unit"]
-        for ending, unit in UNITS.items():
-            if key.endswith(ending) and not key.endswith("_per_s"):
-                assert number["unit"] == unit
-        assert number["unit"] == "-" or f"Unit: {number['unit']}." in about["description"]
+def test_every_key_has_a_meaning_and_every_number_a_unit() -> None:
+    for key, about in KEYS:
+        meaning = about["description"]
+        assert meaning.endswith((".", ")")), key
+        assert meaning[0].isupper() or meaning.startswith("`"), key
+        for number in numbers(about):
+            assert number["unit"], key
+            for ending, unit in UNITS.items():
+                if key.endswith(ending) and not key.endswith("_per_s"):
+                    assert number["unit"] == unit, key
+            assert number["unit"] == "-" or f"Unit: {number['unit']}." in meaning, key
 
 
 def test_the_package_has_the_very_examples_of_deploy() -> None:

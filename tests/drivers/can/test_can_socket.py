@@ -159,18 +159,6 @@ class DownSocket(socket.socket):
         raise OSError(errno.ENETDOWN, "Network is down")
 
 
-def test_an_interface_that_goes_down_is_a_link_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus = ScriptedBus()
-    with DownSocket(socket.AF_UNIX, socket.SOCK_DGRAM) as down:
-        bus.socket = down  # type: ignore[attr-defined]
-        stand_in(monkeypatch, lambda: bus)
-        with over_socket() as driver:
-            assert driver.read_ready() == []
-            assert driver.stream.link.state is LinkState.WAITING
-            assert driver.stream.last_error is not None
-            assert "Network is down" in driver.stream.last_error
-
-
 def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -144,12 +144,9 @@ def retimed(stream: Sequence[Sample], times_ns: Sequence[int]) -> list[Sample]:
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
 @pytest.mark.parametrize("mean_ms", [2, 5])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_host_that_stalls_leaves_no_wrong_period_behind(
-    sequence: str, mean_ms: float, seed: int
-) -> None:
+def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str, mean_ms: float) -> None:
     """Half a second of samples that come late and in heaps, as from a computer without a break."""
-    chance = random.Random(seed)
+    chance = random.Random(0)
     sweeps, _ = assembler(sequence)
     count = 5000 // len(SEQUENCES[sequence])
     stream = concatenated([samples(n, sequence) for n in range(count)])
@@ -165,7 +162,7 @@ def test_a_host_that_stalls_leaves_no_wrong_period_behind(
 
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("rate_hz", [1, 5, 20, 60, 400])
+@pytest.mark.parametrize("rate_hz", [1, 60, 400])
 def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> None:
     """Nothing is known of the rate when the driver opens."""
     sweeps, _ = assembler(sequence)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import socket
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -129,10 +128,3 @@ class Sender:
 
 def joints(readings: Iterable[Reading]) -> list[JointReading]:
     return [reading for reading in readings if isinstance(reading, JointReading)]
-
-
-def rounds_of(data: Iterable[bytes]) -> Iterator[list[bytes]]:
-    """Fourteen datagrams at a time."""
-    iterator = iter(data)
-    while batch := list(itertools.islice(iterator, ROUND)):
-        yield batch

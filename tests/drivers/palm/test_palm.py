@@ -26,7 +26,6 @@ from tests.drivers.palm.palm_stream import (
     Sender,
     datagrams,
     joints,
-    rounds_of,
     rows,
 )
 
@@ -38,24 +37,6 @@ EXAMPLE = ROOT / "deploy" / "calibration" / "example_hand.toml"
 def driver(clock: DatagramClock) -> Iterator[PalmDriver]:
     with PalmDriver(LOOPBACK, clock=clock) as driver:
         yield driver
-
-
-@pytest.mark.parametrize("palm", list(Palm))
-@pytest.mark.parametrize("appended", [b"", bytes(12)])
-def test_every_count_arrives_over_udp(
-    driver: PalmDriver, clock: DatagramClock, palm: Palm, appended: bytes
-) -> None:
-    twin = PalmTwin(rows(20), palm=palm)
-    with Sender(driver) as sender:
-        readings = []
-        for batch in rounds_of(packet.to_bytes() + appended for packet in twin.packets()):
-            sender.send(*batch)
-            readings += tactile(driver.read_ready())
-            clock.now_ns += MS
-    assert [reading.seq for reading in readings] == list(range(20))
-    for reading, row in zip(readings, rows(20), strict=True):
-        assert np.array_equal(reading.counts, row)
-        assert not reading.faults.any()
 
 
 def test_who_sends_stands_for_the_serial_numbers(driver: PalmDriver, clock: DatagramClock) -> None:

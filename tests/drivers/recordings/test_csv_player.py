@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import logging
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,
     TABLE_HEADER,
-    count,
     stream,
     table,
     write,
@@ -48,20 +46,6 @@ def play(driver: ReplayDriver, clock: Clock | None = None) -> list[Reading]:
 
 def times_ms(readings: list[Reading], start_ns: int = START_NS) -> list[float]:
     return [(reading.t_ns - start_ns) / MS for reading in tactile(readings)]
-
-
-def test_every_reading_comes_once_in_order(tmp_path: Path) -> None:
-    driver = ReplayDriver([write(tmp_path, table(5))], speed=None)
-    readings = tactile(play(driver))
-    assert [reading.seq for reading in readings] == [0, 1, 2, 3, 4]
-    for index, reading in enumerate(readings):
-        expected = [count(index, electrode) for electrode in range(72)]
-        assert reading.counts.ravel().tolist() == expected
-        assert reading.annotation is not None
-        assert reading.annotation.object_name == f"thing_{index}"
-    assert driver.counters.readings == 5
-    assert driver.counters.as_dict()["faulty_readings"] == 0
-    assert driver.exhausted
 
 
 @pytest.mark.parametrize(
@@ -239,22 +223,6 @@ def test_opening_again_starts_over(tmp_path: Path) -> None:
     assert driver.due_ns() is None
     with pytest.raises(RuntimeError, match="not open"):
         driver.read_ready()
-
-
-def peak_bytes(path: Path, rows: int) -> int:
-    tracemalloc.start()
-    with ReplayDriver([path], speed=None, loop=True) as driver:
-        for _ in range(rows):
-            driver.read_ready()
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    return peak
-
-
-def test_memory_does_not_grow_with_the_rows_played(tmp_path: Path) -> None:
-    path = write(tmp_path, table(1_000))
-    peak_bytes(path, 10)
-    assert abs(peak_bytes(path, 1_500) - peak_bytes(path, 100)) < 20_000
 
 
 def test_the_whole_stability_set_plays_count_for_count(bts3_dir: Path) -> None:

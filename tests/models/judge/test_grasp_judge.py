@@ -82,8 +82,8 @@ def test_probabilities_are_in_0_to_1_and_sum_to_one(
     assert opinion.refusal == (None if sound else Refusal.MODEL_FAILED)
 
 
-@pytest.mark.parametrize("threshold", [0.3, 0.5, 0.8])
-@pytest.mark.parametrize("p_slip", [0.05, 0.4, 0.6, 0.95])
+@pytest.mark.parametrize("threshold", [0.3, 0.8])
+@pytest.mark.parametrize("p_slip", [0.05, 0.4, 0.6])
 @pytest.mark.parametrize("temperature", [1.0, 2.0, 5.0])
 def test_a_young_session_is_less_sure_on_the_same_side(
     threshold: float, p_slip: float, temperature: float
@@ -108,9 +108,9 @@ def test_a_refused_grasp_is_kept_from_the_network() -> None:
     assert model.runs == 0
 
 
-@pytest.mark.parametrize("finger", range(3))
 @pytest.mark.parametrize(
-    ("swing", "broken", "flat"), [(70, 0, False), (69, 0, True), (70, 12, False), (69, 12, True)]
+    ("finger", "swing", "broken", "flat"),
+    [(0, 70, 0, False), (0, 69, 0, True), (1, 70, 12, False), (2, 69, 12, True)],
 )
 def test_a_finger_that_reads_about_the_same_everywhere_is_flat(
     finger: int, swing: int, broken: int, flat: bool
