@@ -38,7 +38,9 @@ def main(recordings: Sequence[str]) -> None:
     for recording in recordings:
         took_s = replay([recording])[0] - start_s
         alone_s, text = replay([recording, "--json"])
-        readings = sum(json.loads(text.splitlines()[-1])["verdicts"].values())
+        summary = json.loads(text.splitlines()[-1])
+        of_stream = summary["gated"]
+        readings = of_stream["readings"] if of_stream else sum(summary["verdicts"].values())
         alone_s -= start_s
         sys.stdout.write(
             f"{recording}: {readings} readings, {took_s:.2f} s; verdicts alone, as JSON, "

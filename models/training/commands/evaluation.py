@@ -44,6 +44,7 @@ from graspd.models.training.evaluating.frame import (
 )
 from graspd.models.training.evaluating.results_table import results_table
 from graspd.models.training.making.plan import TrainingPlan, with_enough_folds
+from graspd.models.training.systems.explained import quick_seconds
 from graspd.models.training.systems.registry import (
     SYSTEMS,
     System,
@@ -164,6 +165,8 @@ def _evaluated(
         for protocol in protocols
     }
     wanted = [job for group in groups.values() for job in group]
+    if args.quick:
+        _announce(wanted, args.jobs)
     found: dict[Job, pd.DataFrame] = {}
     made: dict[tuple[str, str], Figures] = {}
     with progress_bar("starting", len(wanted), hidden=args.quiet) as on_job:
@@ -176,6 +179,17 @@ def _evaluated(
                 made[key] = Figures.of(with_probability(pd.concat(parts, ignore_index=True)))
                 _show(made[key], args)
     return [made[key] for key in groups]
+
+
+def _announce(wanted: Sequence[Job], at_once: int) -> None:
+    """Say what will run, and about what each protocol and each system takes."""
+    jobs = [(job.protocol, job.system.name, quick_seconds(job.system)) for job in wanted]
+    took = pd.DataFrame(jobs, columns=["protocol", "system", "seconds"])
+    total = f"about {took['seconds'].sum():.0f} s of processor time"
+    say("evaluate", f"{len(wanted)} trainings, {at_once} at once: {total}, less what is kept")
+    for which in ("protocol", "system"):
+        sums = took.groupby(which, sort=False)["seconds"].sum()
+        say("evaluate", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in sums.items()))
 
 
 def _show(one: Figures, args: argparse.Namespace) -> None:

@@ -119,6 +119,7 @@ def test_a_quick_run_writes_summaries_and_table(data: Path, tmp_path: Path) -> N
     ]
     assert "svm-session session (n50): F1 " in done.stdout
     assert "palm_45.csv is not the published table" in done.stderr
+    assert "graspd evaluate: 17 trainings, 1 at once: about 2 s of processor time" in done.stderr
 
 
 def test_what_is_finished_is_not_run_again(
