@@ -85,10 +85,12 @@ def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return slept
 
 
-def asked(program: Path, *words: object) -> subprocess.CompletedProcess[str]:
+def asked(program: Path, *words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
     """Run a program to its end."""
     command = [str(program), *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=200, check=False, input=typed
+    )
 
 
 def cpp_lifts(lift_gate: Path, *words: object) -> bool:

@@ -132,6 +132,12 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
     assert (told.boot_id, told.grasp) == (lifted_on.boot_id, lifted_on.grasp)
 
 
+def test_the_program_that_asked_tells_how_it_ended(lift_gate: Path, tmp_path: Path) -> None:
+    with Daemon(tmp_path, whole_grasps=True) as daemon:
+        words = "--supervised", daemon.endpoint, 1.0, daemon.ask_endpoint, "mug"
+        wait_until(lambda: asked(lift_gate, *words, typed="slipped").stdout.endswith("taken\n"))
+
+
 def test_the_second_controller_learns_who_owns_the_grasp(lift_gate: Path, tmp_path: Path) -> None:
     with Daemon(tmp_path, whole_grasps=True) as daemon:
         places = daemon.endpoint, daemon.ask_endpoint

@@ -1,9 +1,11 @@
 // Asks graspd whether a hand may lift, and says so: 0 it may, 1 it may not. Or tells it how the
 // lift ended: 0 it was taken, 1 it was not.
 //
-//     lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT]
+//     lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT [OBJECT]]
 //                                                     one question; a person watches the lift; the
-//                                                     hand must have been still for so long
+//                                                     hand must have been still for so long. With
+//                                                     OBJECT: after a yes reads held, slipped or
+//                                                     not-lifted, and tells it
 //     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]
 //                                                     shows the answer to a client that never got a
 //                                                     yes: `not yours`. A controller tells by the
@@ -33,21 +35,29 @@ int watch(const graspd::Options& options) {
     }
 }
 
+graspd::Outcome outcome(const std::string& word) {
+    if (word == "held" || word == "stable") return graspd::Outcome::held;
+    if (word == "slipped" || word == "slip") return graspd::Outcome::slipped;
+    if (word == "not-lifted") return graspd::Outcome::not_lifted;
+    throw std::invalid_argument("held, slipped or not-lifted");
+}
+
+int show(const graspd::OutcomeAnswer& answer) {
+    std::cout << (answer ? "taken" : answer.why) << '\n';
+    return answer ? 0 : 1;
+}
+
 int ask(const graspd::Options& options, double deadline_s, bool supervised,
-        std::optional<double> still_ms) {
+        std::optional<double> still_ms, const std::optional<std::string>& object) {
     graspd::Client client(options);
     const graspd::LiftAnswer answer = client.may_i_lift(deadline_s, supervised, still_ms);
     print(answer.verdict, client.counts());
     std::cout << (answer ? "lift" : "do not lift") << (answer.supervised ? " supervised" : "")
               << " after " << answer.waited_s << " s"
-              << (answer.verdict.owner.empty() ? "" : ", owner: " + answer.verdict.owner) << '\n';
-    return answer ? 0 : 1;
-}
-
-graspd::Outcome outcome(const std::string& word) {
-    if (word == "held" || word == "stable") return graspd::Outcome::held;
-    if (word == "slipped" || word == "slip") return graspd::Outcome::slipped;
-    throw std::invalid_argument("held or slipped");
+              << (answer.verdict.owner.empty() ? "" : ", owner: " + answer.verdict.owner) << std::endl;
+    std::string word;
+    if (!answer || !object || !(std::cin >> word)) return answer ? 0 : 1;
+    return show(client.tell(answer.verdict, outcome(word), *object));
 }
 
 int tell(const std::vector<std::string>& words) {
@@ -58,10 +68,7 @@ int tell(const std::vector<std::string>& words) {
     lifted_on.boot_id = words[3];
     lifted_on.grasp = std::stoll(words[4]);
     graspd::Client client(options);
-    const graspd::OutcomeAnswer answer =
-        client.tell(lifted_on, outcome(words[5]), words.size() == 7 ? words[6] : "");
-    std::cout << (answer ? "taken" : answer.why) << '\n';
-    return answer ? 0 : 1;
+    return show(client.tell(lifted_on, outcome(words[5]), words.size() == 7 ? words[6] : ""));
 }
 
 }  // namespace
@@ -84,16 +91,18 @@ int main(int count, char** given) {
         }
         if (!words.empty() && words[0] == "--tell" && (words.size() == 6 || words.size() == 7))
             return tell(words);
-        if (words.size() == 2 || words.size() == 3) {
+        if (words.size() >= 2 && words.size() <= 4) {
             options.endpoint = words[0];
-            if (words.size() == 3) options.ask_endpoint = words[2];
-            return ask(options, std::stod(words[1]), supervised, still_ms);
+            if (words.size() > 2) options.ask_endpoint = words[2];
+            std::optional<std::string> object;
+            if (words.size() == 4) object = words[3];
+            return ask(options, std::stod(words[1]), supervised, still_ms, object);
         }
     } catch (const std::exception& error) {
         std::cerr << "lift_gate: " << error.what() << '\n';
         return 2;
     }
-    std::cerr << "lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT]\n"
+    std::cerr << "lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT [OBJECT]]\n"
                  "lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]\n"
                  "lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]\n";
     return 2;
