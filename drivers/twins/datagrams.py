@@ -70,6 +70,8 @@ class DatagramTwin(ABC):
         self._injector = LinkFaultInjector(faults)
         self.injected = self._injector.injected
         """Number of faults by name; `silenced`: datagrams made while the link was broken."""
+        self._stalled_ns = 0
+        """Time for which it did not run, ns, as on a busy computer. The clock of a sender runs."""
 
     @abstractmethod
     def datagrams(self) -> Iterator[bytes]:
@@ -94,15 +96,16 @@ class DatagramTwin(ABC):
         """Send to `udp://ADDRESS:PORT` until `stop` is set or the end. Raises `ValueError`."""
         endpoint = Endpoint.parse(target)
         with socket.socket(endpoint.family, socket.SOCK_DGRAM) as sender:
-            due_ns = time.monotonic_ns()
-            for datagrams in self.cycles():
-                now_ns = time.monotonic_ns()
-                if now_ns - due_ns > BEHIND_MAX_NS:
-                    due_ns = now_ns
-                if due_ns > now_ns:
-                    time.sleep((due_ns - now_ns) / 1e9)
+            due_ns, cycles = time.monotonic_ns(), self.cycles()
+            while not stop.is_set():
+                time.sleep(max(due_ns - time.monotonic_ns(), 0) / 1e9)
+                behind_ns = time.monotonic_ns() - due_ns
+                if behind_ns > BEHIND_MAX_NS:
+                    due_ns += behind_ns
+                    self._stalled_ns += behind_ns
                 due_ns += self.period_ns
-                if stop.is_set():
+                datagrams = next(cycles, None)
+                if datagrams is None:
                     return
                 for datagram in datagrams:
                     sender.sendto(datagram, (endpoint.address, endpoint.port))
@@ -185,8 +188,10 @@ class MessageTwin(DatagramTwin):
     period_ns = round(1e9 / RATE_HZ)
 
     def _stamps(self) -> Iterator[Stamp]:
-        numbers = itertools.repeat(0) if self._faults.stuck_clock else itertools.count()
-        return (Stamp(number, number * self.period_ns / 1e9) for number in numbers)
+        if self._faults.stuck_clock:
+            yield from itertools.repeat(Stamp(0, 0.0))
+        for number in itertools.count():
+            yield Stamp(number, (number * self.period_ns + self._stalled_ns) / 1e9)
 
 
 class JointTwin(MessageTwin):
