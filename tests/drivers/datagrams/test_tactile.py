@@ -271,7 +271,7 @@ def test_the_time_of_a_twin_passes_while_it_stalls(monkeypatch: pytest.MonkeyPat
 
     def stalling() -> Iterator[Counts]:
         for number in range(4):
-            yield counts_of(number_of(number))
+            yield counts_of(number)
             clock.now_ns += 1400 * MS * (number == 1)
 
     moved = SimpleNamespace(monotonic_ns=clock, sleep=sleep)
