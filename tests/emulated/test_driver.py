@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import select
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -14,17 +12,14 @@ import pytest
 from graspd.drivers.base import TactileReading
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from graspd.drivers.spi.conversation import LineEvent
-from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
-from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.spi.bridge_c import pattern
 from tests.emulated.board import Board
 from tests.emulated.conftest import Image
-from tests.emulated.lockstep import EPOCH_NS, FINGERS, PATIENCE_S, LockStep
-from tests.kit.clock import Clock
+from tests.emulated.lockstep import EPOCH_NS, FINGERS, LockStep
 from tests.process_replay.verdicts import judged
 
+PERIOD_NS = 10_000_000
 SWEEPS = 2000
 """Twenty seconds at 100 Hz, with grasps that are stable, that slip and that are refused."""
 READINGS_APART = 3
@@ -48,59 +43,6 @@ def write_counts(path: Path, rows: Sequence[Counts]) -> Path:
     return path
 
 
-class ListeningTwin(SpiTwin):
-    """Counts what it hears: a pseudo-terminal hands bytes over when the kernel has time for it."""
-
-    heard = 0
-
-    def _hear(self, data: bytes) -> None:
-        self.heard += len(data)
-        super()._hear(data)
-
-
-def wait_for_greeting(path: Path) -> None:
-    """Until the greeting has arrived: one that comes after the driver opens is counted twice."""
-    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
-    assert select.select([descriptor], [], [], PATIENCE_S)[0]
-    os.close(descriptor)
-
-
-def read_from_a_twin(path: Path, rows: Sequence[Counts]) -> list[TactileReading]:
-    """What the driver makes of a twin on this computer, whose time passes as fast as it can."""
-    clock = Clock(EPOCH_NS)
-    readings: list[TactileReading] = []
-    sent: list[int] = []
-    said: list[int] = []
-
-    def note(event: LineEvent, data: bytes) -> None:
-        if event is LineEvent.OPENED:
-            sent.clear()  # opening throws away what had come before
-        elif event is LineEvent.SENT:
-            said.append(len(data))
-
-    twin = ListeningTwin(path, rows, clock=clock, tap=lambda data: sent.append(len(data)))
-    driver = SpiBridgeDriver(str(path), FINGERS, clock=clock)
-    driver.tap(note)
-    with twin:
-        wait_for_greeting(path)
-        with driver:
-            while len(readings) < SWEEPS:
-                twin.run_once()
-                while twin.heard < sum(said):
-                    twin.run_once(PATIENCE_S)
-                answered = len(said)
-                readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
-                while driver.counters.bytes < sum(sent):
-                    descriptor = driver.fileno()
-                    assert descriptor is not None
-                    assert select.select([descriptor], [], [], PATIENCE_S)[0]
-                    readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
-                if len(said) == answered:
-                    due_ns = [due for due in (twin.due_ns(), driver.due_ns()) if due is not None]
-                    clock.now_ns = max(min(due_ns), clock.now_ns)
-    return readings
-
-
 @pytest.fixture
 def linked(image: Image, board: Board, tmp_path: Path) -> Iterator[LockStep]:
     """The driver on a board that sweeps."""
@@ -112,7 +54,9 @@ def linked(image: Image, board: Board, tmp_path: Path) -> Iterator[LockStep]:
     link.close()
 
 
-def test_twenty_seconds_are_judged_as_a_twins(image: Image, board: Board, tmp_path: Path) -> None:
+def test_twenty_seconds_are_judged_as_exact_ones(
+    image: Image, board: Board, tmp_path: Path
+) -> None:
     rows = grasps()
     board.power(image(), write_counts(tmp_path / "counts", rows))
     link = LockStep(board, tmp_path / "port")
@@ -128,15 +72,20 @@ def test_twenty_seconds_are_judged_as_a_twins(image: Image, board: Board, tmp_pa
     assert (counters.bridge_overruns, counters.bridge_tx_dropped) == (0, 0)
     assert counters.link_losses == counters.unanswered_pings == 0
 
-    # Each at its own times, which differ by microseconds: the moment of a judgement may be that of
-    # the reading before or after.
-    expected = grasp_verdicts(read_from_a_twin(tmp_path / "twin", rows)[:SWEEPS])
+    # The board's times differ from exact ones by microseconds: the moment of a judgement may be
+    # that of the reading before or after.
+    sound = np.zeros((len(FINGERS), 24), dtype=np.uint8)
+    exact = [
+        TactileReading(EPOCH_NS + number * PERIOD_NS, number, row, sound)
+        for number, row in enumerate(rows[:SWEEPS])
+    ]
+    expected = grasp_verdicts(exact)
     found = grasp_verdicts(link.readings)
     assert {verdict for _, verdict, _ in found} == {"stable", "slip", "unknown"}
     assert [verdict for _, verdict, _ in found] == [verdict for _, verdict, _ in expected]
-    for (at, _, p_slip), (twins_at, _, twins_p_slip) in zip(found, expected, strict=True):
-        assert abs(at - twins_at) <= READINGS_APART
-        assert p_slip == pytest.approx(twins_p_slip, abs=P_SLIP_APART)
+    for (at, _, p_slip), (exact_at, _, exact_p_slip) in zip(found, expected, strict=True):
+        assert abs(at - exact_at) <= READINGS_APART
+        assert p_slip == pytest.approx(exact_p_slip, abs=P_SLIP_APART)
 
 
 def grasp_verdicts(readings: Sequence[TactileReading]) -> list[tuple[int, str, float | None]]:

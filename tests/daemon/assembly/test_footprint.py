@@ -13,7 +13,7 @@ import pytest
 
 from tests.bench.footprint import Footprint, measure
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
-from tests.kit.scenes import demo_scene
+from tests.kit.scenes import demo_scene, written
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
@@ -122,12 +122,6 @@ Measured = Callable[[Path], Footprint]
 def below(names: set[str], modules: tuple[str, ...]) -> list[str]:
     """Modules that are one of these, or below one."""
     return [m for m in modules if any(m == name or m.startswith(name + ".") for name in names)]
-
-
-def written(tmp_path: Path, text: str) -> Path:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(text)
-    return scene
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)

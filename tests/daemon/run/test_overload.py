@@ -290,31 +290,6 @@ def test_what_is_stable_in_overload_would_be_stable_without() -> None:
     assert stable <= would, sorted(stable - would)
 
 
-def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
-    """A jerk there and back, none of it seen: the verdict that stood stands no longer."""
-    clock = Clock()
-    came = [item for item in grasps(3) if item.seq < 150]
-    for seq in range(150, 250):
-        pose = POSES["other" if 205 <= seq < 209 else "grasp"]
-        counts = (pose + np.random.default_rng(seq).integers(-2, 3, (3, 24))).astype(np.uint16)
-        came.append(msgspec.structs.replace(came[0], t_ns=START_NS + seq * PERIOD_NS, seq=seq))
-        came[-1] = msgspec.structs.replace(came[-1], counts=counts)
-
-    def cost_ns() -> int:
-        return 15 * MS if 200 * PERIOD_NS < clock() - START_NS < 215 * PERIOD_NS else 0
-
-    driver = LiveDriver(came, clock)
-    bench = OverloadedLoop(driver, clock, cost_ns, hand=LIMITS)
-    said = {seen.seq: verdict for verdict, seen in bench.judged}
-    assert said[199].verdict is Decision.STABLE
-    first_skipped = min(set(range(250)) - set(said))
-    assert 200 <= first_skipped < 210
-    after_it = [verdict for seq, verdict in said.items() if first_skipped < seq < 225]
-    assert {verdict.verdict for verdict in after_it} == {Decision.UNKNOWN}
-    assert after_it[0].reasons == [Reason.SEQUENCE_GAP]
-    assert said[249].verdict is Decision.STABLE
-
-
 def test_a_repeated_finger_is_held_despite_flagged_electrodes() -> None:
     """As without the gap, where health takes no flagged electrode for a difference."""
     former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)

@@ -14,6 +14,7 @@ from graspd.daemon.scene import Scene, SceneError, load, parse
 from graspd.daemon.scene.drivers import ReplayTactile
 from graspd.daemon.scene.endpoints import check_endpoint
 from graspd.daemon.scene.scene import SCENE_MAX_BYTES
+from tests.kit.scenes import written
 
 GOOD = """
 [tactile]
@@ -25,14 +26,8 @@ CAN = "[tactile]\ndriver = 'can'\n"
 PALM = "[tactile]\ndriver = 'palm'\nsource = 'udp://127.0.0.1:5555'\n"
 
 
-def write(folder: Path, text: str) -> Path:
-    path = folder / "scene.toml"
-    path.write_text(text)
-    return path
-
-
 def test_the_smallest_scene_has_the_documented_defaults(tmp_path: Path) -> None:
-    scene = load(write(tmp_path, GOOD))
+    scene = load(written(tmp_path, GOOD))
     assert scene.hand.fingers == ("ff", "mf", "th")
     assert scene.endpoint == "ipc:///run/graspd/right.ipc"
     assert scene.max_age_ns == 100_000_000
@@ -40,7 +35,7 @@ def test_the_smallest_scene_has_the_documented_defaults(tmp_path: Path) -> None:
 
 
 def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
-    scene = load(write(tmp_path, GOOD + '[model]\npath = "mine.onnx"\n'))
+    scene = load(written(tmp_path, GOOD + '[model]\npath = "mine.onnx"\n'))
     assert isinstance(scene.tactile, ReplayTactile)
     assert scene.tactile.recordings == (tmp_path / "grasps.csv",)
     assert scene.model.path == tmp_path / "mine.onnx"
@@ -123,7 +118,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
 def test_a_mistake_is_one_line_naming_file_and_key(
     tmp_path: Path, text: str, key: str, says: str
 ) -> None:
-    path = write(tmp_path, text)
+    path = written(tmp_path, text)
     with pytest.raises(SceneError) as error:
         load(path)
     message = str(error.value)
@@ -134,7 +129,7 @@ def test_a_mistake_is_one_line_naming_file_and_key(
 
 def test_two_mistakes_are_two_lines(tmp_path: Path) -> None:
     with pytest.raises(SceneError) as error:
-        load(write(tmp_path, GOOD + "sped = 1\n[gate]\nmode = 'never'"))
+        load(written(tmp_path, GOOD + "sped = 1\n[gate]\nmode = 'never'"))
     assert len(str(error.value).splitlines()) == 2
 
 
@@ -166,7 +161,7 @@ def test_only_a_regular_file_is_read() -> None:
 
 
 def test_of_many_mistakes_twenty_are_told(tmp_path: Path) -> None:
-    path = write(tmp_path, GOOD + "".join(f"wrong{number} = 1\n" for number in range(1000)))
+    path = written(tmp_path, GOOD + "".join(f"wrong{number} = 1\n" for number in range(1000)))
     with pytest.raises(SceneError) as error:
         load(path)
     *lines, last = str(error.value).splitlines()
@@ -185,7 +180,7 @@ def test_of_many_mistakes_twenty_are_told(tmp_path: Path) -> None:
     ],
 )
 def test_a_long_value_is_cut(tmp_path: Path, text: str) -> None:
-    path = write(tmp_path, text)
+    path = written(tmp_path, text)
     with pytest.raises(SceneError) as error:
         load(path)
     assert len(str(error.value)) < len(str(path)) + 600
@@ -196,7 +191,7 @@ def test_control_characters_are_shown_and_not_sent(tmp_path: Path) -> None:
     texts = [f"loop = {escape}", f"{escape} = 1", f"[publish]\nendpoint = {escape}"]
     for text in [*(GOOD + text for text in texts), f"[tactile]\ndriver = {escape}"]:
         with pytest.raises(SceneError) as error:
-            load(write(tmp_path, text))
+            load(written(tmp_path, text))
         assert str(error.value).isprintable()
         assert "\\x1b[2J\\n\\u202e" in str(error.value)
 
@@ -212,7 +207,7 @@ RISKS: dict[str, list[float]] = {
 @pytest.mark.parametrize("key", RISKS)
 def test_numbers_out_of_range_are_mistakes_of_the_scene(tmp_path: Path, key: str) -> None:
     for value in RISKS[key]:
-        path = write(tmp_path, GOOD + f"[risk]\n{key} = {value}")
+        path = written(tmp_path, GOOD + f"[risk]\n{key} = {value}")
         with pytest.raises(SceneError, match=rf"risk\.{key}"):
             load(path)
 

@@ -80,7 +80,6 @@ def as_stream(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Verdict]:
     ("version", "name", "options", "biotac"),
     [
         (1, "hand.bag", {}, {}),
-        (1, "HAND_1", {}, {}),
         (1, "hand.bag", {}, {"biotac": WITH_ARRAY}),
         (2, "hand", {"storage_plugin": StoragePlugin.SQLITE3}, {}),
         (2, "hand", {"storage_plugin": StoragePlugin.MCAP}, {}),
@@ -350,7 +349,7 @@ def test_a_bag_without_the_topic_names_its_topics(
     assert "no topic of sr_robot_msgs/BiotacAll, but /arm/joints" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_no_damage_of_a_bag_raises_anything_else(tmp_path: Path, seed: int) -> None:
     chance = random.Random(seed)
     path = BagOf(1).write(tmp_path / "hand.bag", noise(20))
