@@ -1,17 +1,40 @@
-"""The sockets of a scene, and the keys of peers that may connect."""
+"""The sockets of a scene: the loop's end of them, and the process that has them, `porter`.
+
+The loop uses only sockets to that process: libzmq may end where a hostile peer connects. Then
+`check` starts the process again, and peers reconnect.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Self
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, Self
+
+import zmq
 
 from graspd.daemon.judge.reasons import Reason
+from graspd.daemon.process.worker import PROCESSORS
+from graspd.daemon.publish import PublishError, porter
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
-from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.listener import Listener, user_id
+from graspd.daemon.publish.porter import (
+    ASK_QUEUE,
+    CLOSE_S,
+    LINGER_MS,
+    QUESTIONS_MAX,
+    Frames,
+    Plan,
+    Socket,
+)
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Curve
 
@@ -21,12 +44,23 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("graspd")
 
+STATUS = b"status."
+"""Start of the topics that the loop also receives; `close` waits for the last of them."""
+ANSWERS_QUEUED: Final = 512
+"""Most answers that wait for the courier: to 256 questions, and to 256 outcomes."""
+SUBSCRIBES_S: Final = 0.1
+"""Longest time from a peer's handshake to its first subscription, s."""
+RECONNECT_MS: Final = 10
+"""Time between two tries to reach the process that starts, ms."""
+START_S: Final = 30.0
+"""Longest start of the process at the first time, s."""
+AGAIN_S, AGAIN_MAX_S = 0.1, 0.8
+"""Shortest and longest time between two starts, s; doubled where one follows another."""
+LATE_S: Final = 0.2
+"""Time from which a status that the loop has not received itself is late, s."""
 TACTILE = b"tactile."
 HIGH_WATER_MARK = 10
-"""Most messages that wait for a subscriber: a tenth of a second of verdicts at 100 Hz.
-
-With more a slow subscriber would read of the past.
-"""
+"""Most messages that wait for a subscriber: a tenth of a second of verdicts at 100 Hz."""
 NEVER_NS = 10**18
 """Longest period of readings, ns: one after thirty years."""
 
@@ -148,6 +182,212 @@ class Sockets(Companion):
 
     def __exit__(self, *_details: object) -> None:
         self.close()
+
+
+class Door:
+    """The loop's end of all sockets, open until `close`. Call methods in the loop's thread only."""
+
+    def __init__(
+        self,
+        listeners: Sequence[Listener],
+        high_water_mark: int = 10,
+        keys: Sequence[str] | None = None,
+    ) -> None:
+        """Raises `PublishError` if no process can serve the endpoints.
+
+        `listeners`: that of subscribers; a second one takes questions. `high_water_mark`: most
+        messages that wait for one subscriber. `keys`: as in `Plan`; None: `tcp://` is open to all.
+        """
+        try:
+            self._folder = tempfile.mkdtemp(prefix="graspd-")
+        except OSError as error:
+            raise PublishError(f"no folder for sockets: {error}") from error
+        self._listeners = listeners  # their descriptors are needed again
+        self._plan = Plan(
+            self._folder,
+            [listener.endpoint for listener in listeners],
+            [listener.fileno() for listener in listeners],
+            high_water_mark,
+            sorted(PROCESSORS),
+            keys,
+        )
+        self._context: zmq.Context[Socket] = zmq.Context()
+        self._unheard = b""
+        """Last status, until it comes back."""
+        self._due_s = 0.0
+        """Time from which that is late, monotonic s."""
+        self.is_late = False
+        """True if the loop's own subscriber received the last status late, or has not yet."""
+        self._out = self._socket(zmq.PUSH, porter.MESSAGES, sent=high_water_mark)
+        self._echo = self._socket(zmq.SUB, porter.ECHO)
+        self._echo.subscribe(STATUS)
+        self._ask = self._socket(zmq.DEALER, porter.QUESTIONS, ANSWERS_QUEUED, ASK_QUEUE)
+        self._again_s, self._pause_s = 0.0, AGAIN_S
+        """Earliest next start of the process, monotonic s, and the pause before that, s."""
+        self._told = b""
+        """Output of the process: who has connected."""
+        self._process: subprocess.Popen[bytes] | None = None
+        try:
+            self._process = self._start()
+            if not self._is_told(porter.LOOP_CAME, START_S) or not self._out.poll(
+                round(START_S * 1e3), zmq.POLLOUT
+            ):
+                raise PublishError(f"{self._plan.endpoints[0]}: libzmq does not serve it")
+        except BaseException:
+            self.close()
+            raise
+
+    def _socket(self, kind: int, name: str, sent: int = 1, received: int = 1) -> Socket:
+        """Return a socket to the process that queues at most this many messages."""
+        made = self._context.socket(kind)
+        made.linger = 0
+        made.sndhwm, made.rcvhwm = sent, received
+        # No answer waits for a process that has ended. A subscriber would lose half a message.
+        made.immediate = kind != zmq.SUB
+        made.reconnect_ivl = RECONNECT_MS
+        if name != porter.QUESTIONS or len(self._plan.endpoints) > 1:
+            made.connect(f"ipc://{self._folder}/{name}")
+        return made
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        now_s = time.monotonic()
+        follows = now_s < self._again_s + AGAIN_MAX_S
+        self._pause_s = min(2 * self._pause_s, AGAIN_MAX_S) if follows else AGAIN_S
+        self._again_s = now_s + self._pause_s
+        try:
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-m", porter.__name__],  # -P: no module of this folder
+                bufsize=0,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=self._plan.descriptors,
+                start_new_session=True,
+            )
+            _write(process, json.dumps(self._plan).encode() + b"\n")
+        except OSError as error:
+            raise PublishError(f"cannot start a process for libzmq: {error.strerror}") from error
+        return process
+
+    def fileno(self) -> int:
+        """Return a descriptor that becomes readable when a question comes.
+
+        Sending an answer makes it unreadable again, so call `receive` in each round.
+        """
+        return int(self._ask.getsockopt(zmq.FD))
+
+    def send(self, topic: bytes, payload: bytes) -> bool:
+        """Publish one message; False if it is dropped because the process is behind."""
+        if topic.startswith(STATUS):
+            self._unheard, self._due_s = payload, time.monotonic() + LATE_S
+            self.is_late = False
+        return _sent(self._out, (topic, payload))
+
+    def answer(self, frames: Sequence[bytes]) -> bool:
+        """Send an answer with its routing id; False if it is dropped."""
+        return _sent(self._ask, [porter.packed(frames)])
+
+    def receive(self) -> list[Frames]:
+        """Return at most `QUESTIONS_MAX` questions, each with its routing id."""
+        received: list[Frames] = []
+        with suppress(zmq.Again):
+            while len(received) < QUESTIONS_MAX:
+                received.append(porter.unpacked(self._ask.recv(zmq.NOBLOCK)))
+        return received
+
+    def check(self) -> None:
+        """Start the process again if it has ended; note if subscribers hear late.
+
+        Call it in each round.
+        """
+        if self._unheard:
+            self._hear_echo(0.0)
+            self.is_late |= bool(self._unheard) and time.monotonic() > self._due_s
+        ended = None if self._process is None else self._process.poll()
+        if ended is None or time.monotonic() < self._again_s:
+            return
+        if ended != porter.REVOKED:
+            log.error("libzmq's process has ended with %d: starting it again", ended)
+        try:
+            process = self._start()
+        except PublishError as error:
+            log.error("%s", error)
+            return
+        self._end_process()
+        self._process = process
+
+    def _hear_echo(self, timeout_s: float) -> None:
+        while self._echo.poll(round(timeout_s * 1e3)):
+            if self._echo.recv_multipart()[1] == self._unheard:
+                self._unheard = b""
+                return
+
+    def wait_for_subscriber(self, timeout_s: float, stop: StopSignal | None = None) -> bool:
+        """Wait for a subscriber; False after `timeout_s`, or when `stop` becomes readable."""
+        came = self._is_told(porter.SUBSCRIBER_CAME, timeout_s, stop)
+        if came:
+            time.sleep(SUBSCRIBES_S)
+        return came
+
+    def _is_told(self, what: bytes, timeout_s: float, stop: StopSignal | None = None) -> bool:
+        """Wait until the process has written it; False after `timeout_s`, or at its end."""
+        if self._process is None or (told := self._process.stdout) is None:
+            return False
+        poll = select.poll()
+        poll.register(told, select.POLLIN)
+        if stop is not None:
+            poll.register(stop, select.POLLIN)
+        until_s = time.monotonic() + timeout_s
+        while what not in self._told and (left_s := until_s - time.monotonic()) > 0:
+            ready = [descriptor for descriptor, _ in poll.poll(left_s * 1e3)]
+            if ready and ready != [told.fileno()]:
+                return False
+            more = told.read(1 << 16) if ready else b""
+            if ready and not more:
+                return False
+            self._told += more
+        return what in self._told
+
+    def close(self) -> bool:
+        """Disconnect all peers, after they had `LINGER_MS` to take what is queued.
+        False if the process had to be killed after `CLOSE_S`. May be called again."""
+        until_s = time.monotonic() + LINGER_MS / 1e3
+        # The end of the process loses what is not published yet.
+        while (
+            not self._echo.closed and self._unheard and (left_s := until_s - time.monotonic()) > 0
+        ):
+            self._hear_echo(left_s)
+        for own in (self._out, self._echo, self._ask):
+            own.close()
+        self._context.term()
+        ended = self._end_process()
+        shutil.rmtree(self._folder, ignore_errors=True)
+        return ended
+
+    def _end_process(self) -> bool:
+        process, self._process = self._process, None
+        if process is None:
+            return True
+        with process:
+            with suppress(OSError):  # it has ended
+                _write(process, porter.END)
+            try:
+                process.wait(CLOSE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                return False
+        return True
+
+
+def _write(process: subprocess.Popen[bytes], line: bytes) -> None:
+    if process.stdin is not None:
+        process.stdin.write(line)
+
+
+def _sent(to: Socket, frames: Sequence[bytes]) -> bool:
+    with suppress(zmq.Again):
+        to.send_multipart(frames, flags=zmq.NOBLOCK)
+        return True
+    return False
 
 
 def _load_keys(curve: Curve) -> tuple[str, str, str]:

@@ -20,10 +20,9 @@ from graspd.daemon import scene
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import Moment
 from graspd.daemon.publish.companion import KEPT, Answer, PublishedVerdict, Reply, at_once
-from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener
-from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
 from graspd.models.judge.grasp_judge import Opinion
 from tests.kit.messages import GOLDEN, decode_verdict

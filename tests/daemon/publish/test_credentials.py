@@ -19,11 +19,10 @@ import zmq
 
 from graspd.daemon import scene
 from graspd.daemon.publish import PublishError
-from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.porter import Frames
-from graspd.daemon.publish.sockets import Sockets
+from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for

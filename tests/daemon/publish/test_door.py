@@ -20,9 +20,9 @@ import zmq
 
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish import PublishError
-from graspd.daemon.publish.door import Door
 from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.porter import QUESTIONS_MAX, Frames, Plan
+from graspd.daemon.publish.sockets import Door
 from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message, halt, processes
 from tests.kit.waiting import wait_until
 from tests.ports import free_port
@@ -237,7 +237,7 @@ def test_peers_reconnect_after_the_end_of_its_process(tmp_path: Path, peers: Pee
 
 def test_the_process_ends_with_the_daemon_and_leaves_no_file(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from graspd.daemon.publish.door import Door;"
+        "import os, sys; from graspd.daemon.publish.sockets import Door;"
         "from graspd.daemon.publish.listener import Listener;"
         "door = Door([Listener(sys.argv[1])]);"
         "print(open(f'/proc/{os.getpid()}/task/{os.getpid()}/children').read(), flush=True);"
