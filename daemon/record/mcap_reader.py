@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, TypeGuard
 
 import lz4.frame
-import msgspec
 import zstandard
 from mcap.exceptions import EndOfFile, McapError, UnsupportedCompressionError
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
-from graspd.biotac import Finger
 from graspd.daemon.record.mcap import METADATA, RecordingHeader
-from graspd.daemon.record.topics import Topic
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.kinds import open_recording
 
@@ -31,6 +28,10 @@ CHUNK_MAX_BYTES: Final = 8 << 20
 """Largest unpacked chunk, bytes; graspd writes 1 MB, other tools 4 MB."""
 RATIO_MAX: Final = 100
 """Largest ratio of unpacked to packed bytes; held grasps have 12, zeros 36."""
+NO_HEADER: Final = (
+    "has no record `graspd`: it is of another program, or has lost it (`mcap filter` needs "
+    "--include-metadata)"
+)
 SEVERAL: Final = "is of several recordings put together: replay each alone"
 UNSORTED: Final = "is not in the order of time: `mcap sort` puts it in order"
 
@@ -65,15 +66,15 @@ class McapReader:
         self.path, self._stream = path, stream
         self._damage: Exception | None = None
         headers = (self._header_in(record) for record in self._records() if _is_header(record))
-        self.header: RecordingHeader = next(headers, None) or self._header_of_messages()
+        header = next(headers, None)
+        if header is None:
+            raise self._why_not()
+        self.header: RecordingHeader = header
 
     @property
     def cut_off(self) -> bool:
         """True if the part read so far ends in a cut or damage."""
         return self._damage is not None
-
-    def __iter__(self) -> Iterator[RecordedMessage]:
-        return self._messages(self.header.wall_minus_monotonic_ns)
 
     def _records(self) -> Iterator[McapRecord]:
         """Yield the records from the start of the file to its end or damage."""
@@ -93,21 +94,16 @@ class McapReader:
         except ValueError as error:
             raise RecordingError(self.path, "is an MCAP file of another graspd") from error
 
-    def _header_of_messages(self) -> RecordingHeader:
-        """Return the header that the messages imply. Raises `RecordingError`."""
-        damage, implied = self._damage, _Implied()
-        for message in self._messages(0):
-            implied.take(message)
-        if implied.fingers:
-            return implied.header()
-        if isinstance(damage, EndOfFile):
-            raise RecordingError(self.path, "is empty: nothing was recorded") from damage
-        if damage is not None:
-            raise RecordingError(self.path, f"is no MCAP file: {damage}") from damage
-        raise RecordingError(self.path, "is an MCAP file, but not one of graspd's")
+    def _why_not(self) -> RecordingError:
+        """Return what a file without a header is."""
+        if isinstance(self._damage, EndOfFile):
+            return RecordingError(self.path, "is empty: nothing was recorded")
+        if self._damage is not None:
+            return RecordingError(self.path, f"is no MCAP file: {self._damage}")
+        return RecordingError(self.path, NO_HEADER)
 
-    def _messages(self, offset_ns: int) -> Iterator[RecordedMessage]:
-        """Yield the messages; `offset_ns`: log time less monotonic time."""
+    def __iter__(self) -> Iterator[RecordedMessage]:
+        offset_ns = self.header.wall_minus_monotonic_ns
         kinds: dict[int, str] = {}
         """First parts of the topics by channel."""
         spare_bytes, last_ns = CHUNK_MAX_BYTES, 0
@@ -146,61 +142,6 @@ class McapReader:
         if len(content) != chunk.uncompressed_size:
             raise McapError("a chunk is not as long as it says")
         return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
-
-
-class _Made(msgspec.Struct):
-    """Part of a `tactile` message that is about its recording."""
-
-    boot_id: str
-    t_mono_ns: int
-    fingers: tuple[Finger, ...]
-
-
-class _Judge(msgspec.Struct):
-    """Part of a `verdict` message that is about its recording."""
-
-    model: str
-    model_sha: str
-
-
-@dataclass(slots=True)
-class _Implied:
-    """Header as the messages of a recording imply it."""
-
-    fingers: tuple[Finger, ...] = ()
-    joints: bool = False
-    boot_id: str = ""
-    offset_ns: int = 0
-    """Smallest difference of log time and the time of a reading, ns."""
-    model: tuple[str, str] = ("", "")
-
-    def take(self, message: RecordedMessage) -> None:
-        """Take in a message; its time is the log time. One that cannot be read tells nothing."""
-        try:
-            if message.kind == Topic.TACTILE:
-                made = msgspec.json.decode(message.payload, type=_Made)
-                offset_ns = message.at_ns - made.t_mono_ns
-                self.offset_ns = min(offset_ns, self.offset_ns) if self.fingers else offset_ns
-                self.fingers, self.boot_id = made.fingers, made.boot_id
-            elif message.kind == Topic.VERDICT and not self.model[0]:
-                judge = msgspec.json.decode(message.payload, type=_Judge)
-                self.model = judge.model, judge.model_sha
-        except ValueError:
-            return
-        self.joints = self.joints or message.kind == Topic.JOINTS
-
-    def header(self) -> RecordingHeader:
-        """Return a header without a scene."""
-        model, digest = self.model
-        return RecordingHeader(
-            fingers=self.fingers,
-            joints=self.joints,
-            boot_id=self.boot_id,
-            scene={},
-            model=model,
-            model_sha256=digest,
-            wall_minus_monotonic_ns=self.offset_ns,
-        )
 
 
 def _is_header(record: McapRecord) -> TypeGuard[Metadata]:

@@ -61,7 +61,6 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
         (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
         (["twin", "spi", "--dead", "th"], "'th' is no electrode"),
         (["twin", "palm", "--to", "nowhere"], "nowhere"),
-        (["twin", "palm", "--one-byte-at-a-time"], "cannot show the fault one-byte-at-a-time"),
         (["twin", "joints", "--unplugged", "mf"], "cannot show the fault unplugged-fingers"),
         (["twin", "spi", "--recording", "absent.csv"], "absent.csv"),
     ],

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from msgspec.structs import replace
 
 from graspd.daemon.record.mcap import METADATA, McapWriter
-from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
+from graspd.daemon.record.mcap_reader import RecordedMessage
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late
 from graspd.drivers.base import RecordingError
@@ -77,12 +77,9 @@ def test_no_order_and_no_cut_gives_readings_out_of_time(random: Random, chunk: i
         assert found == sorted(found)
 
 
-def test_a_file_without_its_metadata_tells_its_fingers() -> None:
-    reader = McapReader(Path("a.mcap"), io.BytesIO(without_metadata(WHOLE)))
-    assert reader.header.fingers == ("ff", "th")
-    assert (reader.header.boot_id, reader.header.joints) == (BOOT, True)
-    # Readings were 2 ms old when they were recorded: that is not known any more.
-    assert [m.at_ns for m in reader] == [m.at_ns - 2_000_000 for m in read(WHOLE)]
+def test_a_file_without_its_metadata_is_refused() -> None:
+    with pytest.raises(RecordingError, match=r"record `graspd`.*--include-metadata"):
+        read(without_metadata(WHOLE))
 
 
 def without_metadata(data: bytes) -> bytes:
@@ -114,10 +111,7 @@ def play(driver: McapReplayDriver) -> None:
         driver.read_ready()
 
 
-@pytest.mark.parametrize("change", [bytes, without_metadata])
-def test_readings_of_another_run_are_refused(
-    tmp_path: Path, change: Callable[[bytes], bytes]
-) -> None:
+def test_readings_of_another_run_are_refused(tmp_path: Path) -> None:
     def two(messages: list[RecordedMessage]) -> list[RecordedMessage]:
         other = [
             message._replace(payload=message.payload.replace(BOOT.encode(), b"f" * 32))
@@ -126,7 +120,7 @@ def test_readings_of_another_run_are_refused(
         return [*messages[:20], *other[20:]]
 
     path = tmp_path / "a.mcap"
-    path.write_bytes(change(packed_again(WHOLE, two)))
+    path.write_bytes(packed_again(WHOLE, two))
     with McapReplayDriver([path], ("ff", "th")) as driver:
         with pytest.raises(RecordingError, match="several recordings"):
             play(driver)
