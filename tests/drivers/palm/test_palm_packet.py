@@ -163,7 +163,7 @@ def test_a_packet_is_written_where_it_is_read(palm: Palm) -> None:
     assert status.which_motors == packet.which_motors
 
 
-@pytest.mark.parametrize("length", [0, 1, 219, 221, 231, 233, 415, 417, 429, 531, 541, 543, 65507])
+@pytest.mark.parametrize("length", [0, 1, 219, 233, 543, 65507])
 def test_a_length_that_no_palm_sends_is_counted_and_dropped(length: int) -> None:
     counters = PalmCounters()
     assert parse_packet(b"\x01" + bytes(max(length - 1, 0)), counters) is None
