@@ -121,13 +121,14 @@ class Learner:
     def learn(self, features: Vector, *, slipped: bool) -> None:
         """Take in how the lift of a grasp with these features ended; takes about 0.5 ms."""
         residual, weights = self._residual, slice(len(features))
-        mean, spread, known = self._mean, self._spread, self._known(features)
-        seen = spread @ known
+        mean, known = self._mean, self._known(features)
+        seen = self._spread @ known
         log_odds, variance = float(known @ mean), float(known @ seen) + residual.variance
         if self.inputs:
             residual.add(features[2:])
             mean, seen = np.append(mean, 0.0), np.append(seen, 1.0)
-            spread = np.pad(spread, (0, 1))
+        spread = np.zeros((len(mean), len(mean)))
+        spread[: len(self._mean), : len(self._mean)] = self._spread
         p_slip = sigmoid(log_odds)
         weight = p_slip * (1.0 - p_slip)
         gain = 1.0 / (1.0 + weight * variance)
@@ -138,7 +139,8 @@ class Learner:
         by_weights = math.sqrt(float(features @ (spread[weights, weights] @ features)))
         move[weights] /= max(abs(step) * by_weights / WEIGHTS_MOVE_MAX, 1.0)
         known_now = math.sqrt(weight * gain) * seen
-        spread = (1.0 - DRIFT) * (spread - np.outer(known_now, known_now))
+        spread -= np.outer(known_now, known_now)
+        spread *= 1.0 - DRIFT
         np.einsum("ii->i", spread)[weights] += DRIFT * self._prior
         mean = mean + move
         if len(residual.grasps) > GRASPS_MAX:

@@ -69,7 +69,8 @@ class Residual:
         row = np.delete(spread[oldest], oldest)
         crossed = np.outer(along, row + spread[oldest, oldest] / 2.0 * along)
         spread = np.delete(np.delete(spread, oldest, axis=0), oldest, axis=1)
-        return np.delete(mean, oldest) + mean[oldest] * along, spread + (crossed + crossed.T)
+        spread += crossed + crossed.T
+        return np.delete(mean, oldest) + mean[oldest] * along, spread
 
     def limited(self, mean: Vector, limit: float) -> Vector:
         """Move the mean of a state until all weights and told residuals are within +-`limit`."""
