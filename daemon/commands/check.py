@@ -1,4 +1,4 @@
-"""`graspd check SCENE`: is it right, and what is in."""
+"""`graspd check SCENE`: is it right, what is in, what is left out."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import os
 from collections.abc import Iterator, Mapping
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
+from graspd.biotac import Finger
 from graspd.daemon import scene
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan, require_mcap
@@ -40,6 +41,8 @@ from graspd.models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from graspd.daemon.judge.decision import GateLimits, HandLimits
+
+TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
 
 WRONG = 2
 USUAL_PERIOD_NS = 10_000_000
@@ -117,6 +120,7 @@ def _check(path: Path, *, as_json: bool) -> scene.Scene | None:
     document: dict[str, Any] = {
         "scene": str(path),
         "in": _what_is_in(wanted, model, plan.hand, period_ns),
+        "left_out": _what_is_left_out(wanted, model, plan.hand),
         "warnings": [*_warnings(wanted), *assembly.keep_digest(model)],
     }
     for warning in document["warnings"]:
@@ -130,8 +134,10 @@ def _check(path: Path, *, as_json: bool) -> scene.Scene | None:
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"{printable(document['scene'])}: {coloured('fine', Colour.GREEN)}"
-    for name, text in document["in"].items():
-        yield f"  {name:9} {printable(text)}"
+    for title, key in (("in", "in"), ("left out", "left_out")):
+        yield title
+        for name, text in document[key].items():
+            yield f"  {name:9} {printable(text)}"
 
 
 def _warnings(wanted: scene.Scene) -> Iterator[str]:
@@ -279,3 +285,33 @@ def _section(section: scene_drivers.Section) -> str:
     options = section.model_dump(mode="json", exclude_unset=True)
     driver = options.pop("driver")
     return f"{driver}: " + ", ".join(f"{key} {value}" for key, value in options.items())
+
+
+def _what_is_left_out(
+    wanted: scene.Scene, model: TactileModel, limits: HandLimits | None
+) -> dict[str, str]:
+    drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]
+    others = [driver for driver in drivers if driver != wanted.tactile.driver]
+    left_out = {"drivers": f"{', '.join(others)}: not imported"}
+    if wanted.joints is None and (limits is None or not limits.joints):
+        left_out["joints"] = "no joint code"
+    if limits is None:
+        left_out["gate"] = "no tare, no contact, no gate: each reading is a grasp"
+    if not isinstance(model.contract.input, SessionInput):
+        left_out["session"] = f"{model.contract.name} needs no session calibration"
+    if not wanted.learn.enabled:
+        left_out["learn"] = "what is thought of a grasp is the network's alone"
+    if wanted.risk is None:
+        left_out["risk"] = "nothing limits how many `stable` lifts slip"
+    if wanted.record is None:
+        learns = "session" not in left_out or wanted.learn.enabled or wanted.risk is not None
+        but = " but what the session has learned" if learns and wanted.keeps_session else ""
+        left_out["record"] = f"nothing is written{but}"
+    if wanted.curve is None:
+        left_out["curve"] = "no keys: sockets are for this computer alone"
+    if wanted.realtime is None:
+        left_out["realtime"] = "ordinary priority, memory not locked"
+    without = [name for name in get_args(Finger) if name not in wanted.hand.fingers]
+    if without:
+        left_out["fingers"] = f"{', '.join(without)}: no channel in image or network"
+    return left_out

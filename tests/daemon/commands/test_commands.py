@@ -83,6 +83,21 @@ def checked(folder: Path, text: str) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.parametrize(
+    ("sections", "says"),
+    [
+        ("", "nothing is written but what the session has learned"),
+        ("[session]\nkeep = false", "nothing is written"),
+        ("[model]\nname = 'cnn1'\n[learn]\nenabled = false", "nothing is written"),
+        ("[model]\nname = 'cnn1'", "nothing is written but what the session has learned"),
+    ],
+)
+def test_check_says_what_is_written_without_a_recording(
+    tmp_path: Path, sections: str, says: str
+) -> None:
+    assert checked(tmp_path, f"{CAN}{sections}\n")["left_out"]["record"] == says
+
+
 PALM_HERE = f'{PALM}source = "udp://127.0.0.1:9870"\n'
 
 
