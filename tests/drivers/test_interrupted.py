@@ -68,6 +68,7 @@ def test_counts_after_a_new_start_or_loss_interrupt() -> None:
         data = write_message(Stamp(seq, None), counts={"ff": [2602] * 24})
         readings += stream.receive(data, 0) or []
     assert interrupted(readings) == [10, 20, 21]
+    assert stream.counters.restarts == 2
 
 
 def test_each_turn_of_a_looped_stream_interrupts(tmp_path: Path) -> None:
