@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import hashlib
 import itertools
 import os
 import random
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -16,8 +14,6 @@ from unittest import mock
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from graspd.daemon.session.file import KeptSession, SessionFileError, load
@@ -33,6 +29,7 @@ from tests.daemon.session.learning import (
     judge,
     kept_in,
     observe,
+    sealed,
     tell,
     trust,
 )
@@ -110,50 +107,6 @@ def test_a_kill_at_any_step_loses_no_session(tmp_path: Path) -> None:
     assert found == {(2,), (13, 2), (14, 13, 2), (14, 13)}
 
 
-Plan = list[tuple[int | None, bool]]
-"""Of each life of a daemon: at which call its last save is killed, before or after."""
-PLANS = st.lists(
-    st.tuples(st.none() | st.integers(0, CALLS - 1), st.booleans()), min_size=1, max_size=8
-)
-
-
-@settings(max_examples=60)
-@given(PLANS)
-def test_no_kill_loses_a_kept_session(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> None:
-    path = tmp_path_factory.mktemp("session") / "right"
-    written, kept = 0, 0
-    for call, after in plan:
-        with SessionFolder(path) as folder:
-            folder.load()
-            assert kept <= max(kept_grasps(path), default=0) <= written
-            for _ in range(2):
-                written += 1
-                save(folder, written)
-            kept = written
-            with suppress(Killed), killed(CALLS if call is None else call, after=after):
-                written += 1
-                save(folder, written)
-                kept = written
-    assert kept <= max(kept_grasps(path), default=0) <= written
-
-
-def test_what_is_saved_again_unchanged_leaves_no_copy(tmp_path: Path) -> None:
-    first, *others = (KeptSession(state(each), FINGERS, {"ff": str(each)}) for each in (3, 2, 1))
-    for _ in range(4):
-        with SessionFolder(tmp_path) as folder:
-            folder.load()
-            folder.save([first, *others])
-        assert kept_grasps(tmp_path) == [3, 2, 1]
-
-
-def test_an_exchange_right_after_a_save_loses_no_session(tmp_path: Path) -> None:
-    leaving, new = (KeptSession(state(each), FINGERS, {}) for each in (1, 2))
-    with SessionFolder(tmp_path) as folder:
-        folder.save([leaving])
-        folder.save([new, leaving])
-    assert kept_grasps(tmp_path) == [2, 1]
-
-
 def test_a_count_of_the_risk_is_no_empty_session() -> None:
     """Without learning an outcome moves nothing else."""
     part = Trust("model", INPUTS, RiskLimits(0.1), learns=False)
@@ -220,12 +173,6 @@ def test_a_thousand_damaged_files_become_no_other_state(tmp_path: Path) -> None:
         else:
             assert damaged == data
     assert refused > 990
-
-
-def sealed(plain: bytes) -> bytes:
-    """A file with this content and a right checksum."""
-    content = zlib.compress(plain)
-    return hashlib.sha256(content).digest() + content
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import stat
 import threading
 from collections.abc import Callable, Iterator
@@ -25,7 +24,6 @@ from graspd.daemon.session.keeper import (
     WAITING_MAX,
     SessionKeeper,
 )
-from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.trust import Trust, TrustState
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
@@ -33,10 +31,10 @@ from tests.daemon.session.learning import (
     NOBODY,
     FakeJudge,
     calibration,
+    go_round,
     judge,
     kept_in,
     kept_trust,
-    last_kept,
     observe,
     read_once,
     sensors,
@@ -87,15 +85,6 @@ def keeper_of(folder: SessionFolder) -> Iterator[Callable[..., SessionKeeper]]:
     yield make
     for keeper in made:
         keeper.save()
-
-
-def go_round(keeper: SessionKeeper) -> None:
-    """As the loop does, until nothing is being written any more."""
-    keeper.before_wait(NOBODY)
-    while keeper.filenos:
-        ready, _, _ = select.select(keeper.filenos, [], [], 10.0)
-        assert ready
-        keeper.before_wait(NOBODY)
 
 
 def outcomes(folder: SessionFolder) -> int:
@@ -159,32 +148,6 @@ def test_a_kept_outcome_is_answered_at_once(
     assert disk.written == 1
 
 
-def test_an_outcome_on_a_full_disk_is_kept_later(
-    folder: SessionFolder, disk: Disk, caplog: pytest.LogCaptureFixture, keeper_of: KeeperOf
-) -> None:
-    part: Trust = trust()
-    found: list[Reply] = []
-    keeper = keeper_of(part)
-    judge(part, 1)
-    assert tell(part, 1) is OutcomeStatus.TAKEN
-    disk.is_full = True
-    keeper.keep(found.append)
-    go_round(keeper)
-    assert tell(part, 1) is OutcomeStatus.REPEATED
-    keeper.keep(found.append)
-    go_round(keeper)
-    where = f"{folder.path}: cannot keep the session: No space left on device"
-    assert found == [Reply(Told.NOT_KEPT, where)] * 2
-    assert caplog.text.count("No space left on device") == 1
-    assert last_kept(folder.path) is None
-    disk.is_full = False
-    assert tell(part, 1) is OutcomeStatus.REPEATED
-    keeper.keep(found.append)
-    go_round(keeper)
-    assert found[2:] == [KEPT]
-    assert kept_trust(folder) == part.state()
-
-
 def test_a_disk_that_hangs_holds_up_no_loop(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
@@ -246,41 +209,6 @@ def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> N
     assert third.state() == other.state()
 
 
-def test_a_damaged_last_file_ends_the_session_and_no_ledger(
-    folder: SessionFolder, caplog: pytest.LogCaptureFixture
-) -> None:
-    """It may have been of other sensors."""
-    _, part, keeper = taught(folder)
-    keeper.save()
-    damaged = folder.path / "9.session"
-    damaged.write_bytes(b"?")
-    again, back = calibration(), trust()
-    keeper = session_keeper(again, sensors(), folder, part=back)
-    assert f"{damaged}: not a session: its checksum is wrong; it stays" in caplog.text
-    assert (again.grasps, back.learner.outcomes, back.risk.proven) == (0, 0, 0)
-    assert (back.risk.lifts, back.risk.slips) == (part.risk.lifts, part.risk.slips)
-    assert part.risk.lifts > 0
-    observe(again, 1)
-    keeper.save()
-    assert [kept.grasps for kept in kept_in(folder.path)] == [1, 30]
-    assert damaged.read_bytes() == b"?"
-
-
-def test_a_start_with_another_model_destroys_no_ledger(folder: SessionFolder) -> None:
-    parts = trust("a"), trust("b")
-    for part in (*parts, *parts):
-        for _ in range(3):
-            restored = trust(part.state().model)
-            keeper = session_keeper(calibration(), sensors(), folder, part=restored)
-            assert restored.state() == part.state()
-            for each in (part, restored):
-                grasp = each.risk.proven
-                judge(each, grasp)
-                tell(each, grasp)
-            keeper.save()
-    assert [part.risk.proven for part in parts] == [6, 6]
-
-
 def test_a_disk_that_fails_at_the_start_is_tried_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -329,25 +257,6 @@ def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path, writes: bool
     assert kept_trust(folder) == (theirs if writes else mine).state()
 
 
-def test_announced_lifts_are_on_disk_before_the_answer(
-    folder: SessionFolder, keeper_of: KeeperOf
-) -> None:
-    part, announced = trust(), list[int]()
-    keeper = keeper_of(part)
-    while not part.lifts.outstanding:
-        judge(part, len(part.lifts.state().records))
-    part.lifts.announce()
-
-    def answer(_reply: Reply) -> None:
-        kept = kept_trust(folder)
-        assert kept is not None
-        announced.append(sum(lift.is_awaited for lift in kept.lifts.records))
-
-    keeper.keep(answer)
-    go_round(keeper)
-    assert announced == [1]
-
-
 def test_an_unexpected_error_of_the_writer_is_answered(
     folder: SessionFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -379,3 +288,27 @@ def test_an_open_grasp_is_kept_within_ten_seconds(
         go_round(keeper)
     assert disk.written == 1  # nothing is written where nothing is new
     assert kept_trust(folder) == part.state()
+
+
+def test_state_that_a_run_does_not_use_stays(folder: SessionFolder) -> None:
+    session, part = calibration(), trust()
+    observe(session, 30)
+    judge(part, 1)
+    tell(part, 1)
+    folder.save([KeptSession(session.state(), FINGERS, {"ff": "A"}, part.state())])
+    image = trust("of images", inputs=0)
+    keeper = session_keeper(None, sensors(), folder, part=image)  # a model without session
+    judge(image, 2)
+    tell(image, 2)
+    keeper.save()
+    assert [kept.statistics for kept in kept_in(folder.path)] == [None, session.state()]
+    assert kept_trust(folder) == image.state()
+    off = calibration()
+    keeper = session_keeper(off, sensors(), folder)  # learning is switched off
+    observe(off, 1, seed=5)
+    keeper.save()
+    assert kept_trust(folder) == part.state()
+    keeper = session_keeper(off, sensors(ff="B"), folder)
+    read_once(keeper)  # it has another sensor: what was learned must go
+    keeper.save()
+    assert (off.grasps, kept_trust(folder)) == (0, None)

@@ -15,7 +15,7 @@ from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.session.file import KeptSession
-from graspd.daemon.session.folder import KEPT_MAX, SessionFolder
+from graspd.daemon.session.folder import SessionFolder
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -26,67 +26,12 @@ from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
     calibration,
-    kept_in,
     last_kept,
     observe,
     read_once,
     sensors,
     session_keeper,
 )
-
-
-def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
-    clock, session, driver = Clock(), calibration(), sensors(ff="A", mf="B")
-    with SessionFolder(tmp_path / "right") as folder:
-        keeper = session_keeper(session, driver, folder, clock)
-        read_once(keeper)
-        observe(session, 30)
-        known = session.state()
-        driver.known = {"ff": "A", "mf": "X"}
-        read_once(keeper)
-        assert session.grasps == 0
-        observe(session, 7, seed=1)
-        driver.known = {"ff": "A"}  # the other one does not answer yet
-        read_once(keeper)
-        driver.known = {"ff": "A", "mf": "B"}
-        read_once(keeper)
-        assert session.state() == known
-        observe(session, 1, seed=2)
-        keeper.save()
-    again = calibration()
-    driver.known = {"ff": "A", "mf": "X"}  # between two starts
-    with SessionFolder(tmp_path / "right") as folder:
-        keeper = session_keeper(again, driver, folder, clock)
-        assert again.grasps == 31
-        read_once(keeper)
-        assert again.grasps == 7
-        driver.known = {"ff": "A", "mf": "B"}
-        read_once(keeper)
-        assert again.grasps == 31
-        keeper.save()
-
-
-def test_of_other_sensors_the_last_four_are_kept(tmp_path: Path) -> None:
-    session, driver = calibration(), sensors(ff="0")
-    with SessionFolder(tmp_path / "right") as folder:
-        keeper = session_keeper(session, driver, folder, Clock())
-        read_once(keeper)
-        for number in range(1, 8):
-            observe(session, 30 + number, seed=number)
-            driver.known = {"ff": str(number)}
-            read_once(keeper)
-            keeper.save()
-            assert session.grasps == 0
-        kept = [(each.serials["ff"], each.grasps) for each in kept_in(folder.path)]
-        assert kept == [("7", 0), *((str(6 - at), 37 - at) for at in range(4))]
-        for number in (2, 6):
-            driver.known = {"ff": str(number)}
-            read_once(keeper)
-            assert session.grasps == (37 if number == 6 else 0)
-        keeper.save()
-        assert len(list(folder.path.iterdir())) == KEPT_MAX + 1  # with the lock
-        assert folder.remove()
-        assert [path.name for path in folder.path.iterdir()] == ["lock"]
 
 
 def test_a_session_of_another_model_that_is_back_is_a_new_one(
