@@ -19,25 +19,12 @@ from graspd.daemon import scene as scenes
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.trust.lift_book import NAME_BYTES
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
-from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
+from tests.daemon.processes import TIMEOUT_S, start
 from tests.kit.inside import graspd
 from tests.kit.messages import decode_verdict
-from tests.kit.scenes import demo_scene, written
+from tests.kit.scenes import written
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
-
-
-def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
-    scene = demo_scene(tmp_path, "loop = true")
-    with start("run", scene) as process:
-        command = [sys.executable, "-c", SUBSCRIBER, f"ipc://{tmp_path}/v", "20"]
-        received = subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
-        process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=TIMEOUT_S)
-    verdicts = [decode_verdict(line) for line in received.stdout.splitlines()]
-    assert [verdict.seq - verdicts[0].seq for verdict in verdicts] == list(range(20))
-    assert process.returncode == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.toml"]
 
 
 @pytest.mark.parametrize(
