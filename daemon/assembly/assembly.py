@@ -215,9 +215,12 @@ def _tactile(plan: Plan) -> Driver:
 
 
 def player(
-    plan: Plan, options: ReplayTactile, speed: float | None
+    plan: Plan, options: ReplayTactile, speed: float | None, *, strict: bool = False
 ) -> ReplayDriver | BagDriver | McapReplayDriver:
-    """Make the driver that plays a scene's recordings; `speed` None: fast. Raises `ValueError`."""
+    """Make the driver that plays a scene's recordings; `speed` None: fast. Raises `ValueError`.
+
+    `strict`: a value that is not a count ends a table.
+    """
     fingers, kind = plan.scene.hand.fingers, recorded_kind(options)
     if kind in BAGS:
         from graspd.drivers.recordings.bag import BagDriver
@@ -243,4 +246,5 @@ def player(
         speed=speed,
         rate_hz=options.rate_hz,
         loop=options.loop,
+        strict=strict,
     )

@@ -42,6 +42,10 @@ BEGINS_WITHIN: Final = (
     "%s: begins in the middle of a run: verdicts may differ until the hand has been open for a "
     "second and grasps again"
 )
+LOST_HEADER = (
+    "%s: another tool has dropped the record `graspd` (`mcap filter` needs --include-metadata): "
+    "judged with the defaults, without session and learning, so verdicts may differ"
+)
 
 
 class Same(Companion):
@@ -78,9 +82,13 @@ class RecordedRun(Source):
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
+        recorded = self.header.scene
+        if not recorded:
+            log.warning(LOST_HEADER, paths[0])
+            recorded = {"hand": {"fingers": self.header.fingers}}
         sections: dict[str, dict[str, Any]] = {}
-        for name in filter(self.header.scene.__contains__, SECTIONS):
-            keys, known = self.header.scene[name], SECTIONS[name].model_fields
+        for name in filter(recorded.__contains__, SECTIONS):
+            keys, known = recorded[name], SECTIONS[name].model_fields
             sections[name] = {key: value for key, value in keys.items() if key in known}
             if gone := [key for key in keys if key not in known]:
                 log.warning("%s: was judged with %s, not known here", paths[0], ", ".join(gone))
@@ -105,7 +113,7 @@ class RecordedRun(Source):
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
         header = self.header
-        self._same_model = header.model_sha256 == model.sha256
+        self._same_model = header.model_sha256 == model.sha256[: len(header.model_sha256)]
         if not self._same_model:
             log.warning("%s: was judged by %s, not by this model", self._paths[0], header.model)
         if header.file > 0:

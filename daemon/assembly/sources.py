@@ -83,12 +83,14 @@ class Tables(Source):
         read_as: ReadAs | None = None,
         rate_hz: float | None = None,
         loop: bool = False,
+        strict: bool = False,
     ) -> None:
         """`sections`: of the scene, where it differs from one that plays `paths`.
 
-        `read_as`, `rate_hz`, `loop`: as of `ReplayDriver`; not for bags.
+        `read_as`, `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags.
         """
         self._paths = [path.absolute() for path in paths]
+        self._strict = strict
         tactile = {"driver": "replay", "recordings": self._paths, "loop": loop}
         changes: dict[str, dict[str, Any]] = {
             "tactile": {**tactile, "read_as": read_as, "rate_hz": rate_hz},
@@ -110,7 +112,7 @@ class Tables(Source):
             _refuse_other_fingers(error.path, error.there, model)
             raise
         options = cast(ReplayTactile, replayed.tactile)
-        driver = assembly.player(plan, options, speed)
+        driver = assembly.player(plan, options, speed, strict=self._strict)
         parts = Parts.of(plan, model, driver, lambda: driver.handed_over_ns)
         return replace(parts, boot_id=DRAWS)
 

@@ -48,6 +48,10 @@ NARROWEST = 40
 """Lines are not wrapped to fewer columns."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
 """Faults of a device that explain why no finger is felt; so does `FRAMES_LOST` as an error."""
+FINGER_COLUMNS = 25
+"""Width of a finger in the table of electrodes."""
+USUAL_COLUMNS = 80
+"""Width of that table where there is no terminal."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,11 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="time to listen (default: 3)",
     )
+    parser.add_argument("--all", action="store_true", help="a table of all electrodes too")
     parser.add_argument(
         "--json",
         action="store_true",
-        help="one JSON object on stdout, with each electrode; a finding that is not ok has a cause "
-        "and advice",
+        help="one JSON object on stdout; a finding that is not ok has a cause and advice",
     )
 
 
@@ -87,6 +91,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
         write_lines(*map(_coloured, in_words(findings, columns)))
+        if args.all and report.get("readings"):
+            write_lines(*_table(report["electrodes"], columns or USUAL_COLUMNS))
     return int(any(finding.level is Level.ERROR for finding in findings))
 
 
@@ -247,3 +253,18 @@ def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> li
         for finding in told
     ]
     return raised + [finding for finding in electrodes if finding not in absent]
+
+
+def _table(electrodes: dict[str, dict[str, list[float]]], columns: int) -> Iterator[str]:
+    """Yield mean, deviation and faulty readings, as many fingers abreast as fit."""
+    abreast = max(1, (columns - 4) // FINGER_COLUMNS)
+    fingers = list(electrodes)
+    for first in range(0, len(fingers), abreast):
+        shown = fingers[first : first + abreast]
+        yield ""
+        heads = (f"{finger}: mean, sd, faulty" for finger in shown)
+        yield "    " + "".join(f"{head:>{FINGER_COLUMNS}}" for head in heads)
+        cells = [zip(*electrodes[finger].values(), strict=True) for finger in shown]
+        for number, row in enumerate(zip(*cells, strict=True), start=1):
+            text = "".join(f"{mean:11.1f}{sd:7.1f}{faulty:7.0f}" for mean, sd, faulty in row)
+            yield f"{number:<4d}{text}"

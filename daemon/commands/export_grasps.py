@@ -12,6 +12,7 @@ from graspd.daemon.commands.arguments import UsageError
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.process.text import complain, write_lines
 from graspd.daemon.publish.messages import OBJECT_PATTERN
+from graspd.extras import needs
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
@@ -30,6 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="TABLE", help="grasp table (CSV) to write"
+    )
+    parser.add_argument(
+        "--parquet",
+        action="store_true",
+        help="write TABLE as Parquet, for `graspd.read_grasps` (extra: pandas)",
     )
     parser.add_argument("--force", action="store_true", help="replace a TABLE that is there")
     parser.add_argument(
@@ -52,10 +58,18 @@ def run(args: argparse.Namespace) -> int:
     if not export.grasps:
         complain(f"no judged grasp with an outcome: nothing is written: {_why(export)}")
         return FAILED
-    table = io.StringIO(newline="")
-    write(table, export, args.object)
     try:
-        write_atomically(args.out, table.getvalue().encode(), mode=0o644)
+        if args.parquet:
+            from graspd.daemon.record.frames import grasps_of
+
+            content = bytes(grasps_of(export, args.object).to_parquet())
+        else:
+            table = io.StringIO(newline="")
+            write(table, export, args.object)
+            content = table.getvalue().encode()
+        write_atomically(args.out, content, mode=0o644)
+    except ModuleNotFoundError as error:
+        raise UsageError(needs("--parquet", "pandas", error)) from error
     except OSError as error:
         complain(f"{args.out}: {error.strerror or error}")
         return FAILED

@@ -86,6 +86,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_reading(parser)
     parser.add_argument("--loop", action="store_true", help="start again at the end, for ever")
     parser.add_argument(
+        "--strict", action="store_true", help="stop at the first value that is not a count"
+    )
+    parser.add_argument(
         "--session",
         default=RUNNING,
         metavar="HOW",
@@ -252,7 +255,7 @@ def _day_table(args: argparse.Namespace, parts: Parts) -> DayTable:
 def _source(args: argparse.Namespace) -> Source:
     """Return what plays the recordings. Imports only what this kind of them needs."""
     kind = kind_of_all(args.recordings)
-    given = {"--loop": args.loop, "--as": args.read_as}
+    given = {"--loop": args.loop, "--strict": args.strict, "--as": args.read_as}
     refuse_options(args.recordings[0], kind, given | {"--rate-hz": args.rate_hz})
     if kind is Kind.TEXT or kind in BAGS:
         return _tables(args)
@@ -288,6 +291,7 @@ def _tables(args: argparse.Namespace) -> Tables:
         read_as=args.read_as,
         rate_hz=args.rate_hz,
         loop=args.loop,
+        strict=args.strict,
     )
 
 

@@ -7,6 +7,7 @@ import logging
 import signal
 import threading
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 
 from graspd.biotac import ELECTRODES, TABLE_FINGERS
@@ -29,6 +30,12 @@ TARGETS = {
     "datagrams": "udp://127.0.0.1:9872",
 }
 """Address to which a twin of datagrams sends by default."""
+PROBABILITIES = {
+    "bit-flip": "one random bit of it flips",
+    "drop": "it is lost",
+    "duplicate": "it comes twice",
+    "reorder": "it comes after the next one instead of before it",
+}
 KINDS = {
     "spi": "an SPI bridge on a pseudo-terminal",
     "can": "a CAN board on any python-can bus",
@@ -93,23 +100,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_faults(parser: argparse.ArgumentParser) -> None:
-    """Declare the faults."""
-    faults = parser.add_argument_group("faults, none by default")
+    """Declare the faults, each by the name of its field in `LinkFaults`."""
+    faults = parser.add_argument_group("faults, none by default; chances are per frame")
+    for name, text in PROBABILITIES.items():
+        faults.add_argument(
+            f"--{name}",
+            dest=f"{name.replace('-', '_')}_probability",
+            type=float,
+            default=0.0,
+            metavar="P",
+            help=f"chance, from 0 to 1, that {text}",
+        )
     faults.add_argument(
-        "--drop",
-        type=float,
-        default=0.0,
-        metavar="P",
-        help="chance of each frame, from 0 to 1, that it is lost",
+        "--one-byte-at-a-time", action="store_true", help="write every byte on its own (spi)"
+    )
+    faults.add_argument(
+        "--burst",
+        dest="burst_frames",
+        type=int,
+        default=1,
+        metavar="FRAMES",
+        help="collect this many frames, then send them at once",
     )
     faults.add_argument(
         "--disconnect-every",
+        dest="disconnect_every_frames",
         type=int,
         metavar="FRAMES",
         help="break the link in the middle of every such frame",
     )
     faults.add_argument(
+        "--wrong-version", action="store_true", help="speak a later version of the protocol"
+    )
+    faults.add_argument(
+        "--stuck-clock", action="store_true", help="the device's clock does not move"
+    )
+    faults.add_argument(
         "--dead",
+        dest="dead_electrodes",
         action="append",
         default=[],
         metavar="ELECTRODE",
@@ -117,10 +145,14 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
     )
     faults.add_argument(
         "--unplugged",
+        dest="unplugged_fingers",
         action="append",
         default=[],
         choices=TABLE_FINGERS,
         help="finger whose line nothing drives; may be given several times",
+    )
+    faults.add_argument(
+        "--seed", type=int, default=0, help="of chance: the same faults again (default: 0)"
     )
 
 
@@ -152,12 +184,11 @@ def _counts(args: argparse.Namespace, rate_hz: float) -> Iterator[Counts]:
 
 
 def _faults(args: argparse.Namespace) -> LinkFaults:
-    return LinkFaults(
-        drop_probability=args.drop,
-        disconnect_every_frames=args.disconnect_every,
-        dead_electrodes=tuple(map(_electrode, args.dead)),
-        unplugged_fingers=tuple(map(TABLE_FINGERS.index, args.unplugged)),
-    )
+    options = vars(args)
+    values = {field.name: options[field.name] for field in fields(LinkFaults)}
+    values["dead_electrodes"] = tuple(map(_electrode, args.dead_electrodes))
+    values["unplugged_fingers"] = tuple(map(TABLE_FINGERS.index, args.unplugged_fingers))
+    return LinkFaults(**values)
 
 
 def _electrode(text: str) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from graspd.drivers.recordings.layout import ReadAs, layout_of
 from graspd.extras import require
 
 if TYPE_CHECKING:
+    from graspd.daemon.record.export import Export
     from graspd.daemon.record.player import McapReplayDriver
     from graspd.drivers.recordings.bag import BagDriver
 
@@ -44,14 +45,7 @@ def _grasps(path: Path, read_as: ReadAs | None) -> pd.DataFrame:
         require("mcap", "read_grasps of MCAP", "record")
         from graspd.daemon.record.export import collect
 
-        export = collect([path])
-        grasps = list(export.grasps.values())
-        labels = {
-            OBJECT: [each.object_name or "unknown" for each in grasps],
-            SLIPPED: [each.slipped for each in grasps],
-        }
-        counts = np.array([each.counts for each in grasps], dtype=np.uint16)
-        return pd.concat([pd.DataFrame(labels), _table(counts, export.fingers)], axis=1)
+        return grasps_of(collect([path]), "unknown")
     if kind not in TABLES:
         raise RecordingError(path, f"is {kind.value}, which does not say how lifts ended")
     layout = layout_of(path, (), read_as)
@@ -124,6 +118,17 @@ def _readings(path: Path, read_as: ReadAs | None, rate_hz: float | None) -> pd.D
         raise RecordingError(path, "has no readings")
     times = pd.DataFrame({TIME: [reading.made_ns / 1e9 for reading in rows]})
     return pd.concat([times, _counts(rows, fingers), pd.DataFrame(joints)], axis=1)
+
+
+def grasps_of(export: Export, object_name: str) -> pd.DataFrame:
+    """Return the grasps of an export; `object_name` is for grasps without one."""
+    grasps = list(export.grasps.values())
+    labels = {
+        OBJECT: [object_name if each.object_name is None else each.object_name for each in grasps],
+        SLIPPED: [each.slipped for each in grasps],
+    }
+    counts = np.array([each.counts for each in grasps], dtype=np.uint16)
+    return pd.concat([pd.DataFrame(labels), _table(counts, export.fingers)], axis=1)
 
 
 def _counts(rows: Sequence[TactileReading | Row], fingers: Sequence[str]) -> pd.DataFrame:

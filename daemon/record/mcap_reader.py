@@ -1,45 +1,61 @@
 """Read the MCAP files of recordings, in the order of log time. Needs the extra `record`.
 
-Other tools cut and pack such files again: the metadata of graspd may stand anywhere or nowhere.
+Other tools sort, cut and pack such files again: messages may stand in any order, and the metadata
+of graspd anywhere or nowhere.
 """
 
 from __future__ import annotations
 
+import heapq
+import shutil
 import struct
+import zlib
+from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from operator import attrgetter
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple, TypeGuard
+from tempfile import TemporaryFile
+from typing import BinaryIO, Final, NamedTuple, Self
 
 import lz4.frame
+import msgspec
+import numpy as np
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError, UnsupportedCompressionError
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Message, Metadata
+from mcap.stream_reader import CRCValidationError, StreamReader
 
+from graspd.biotac import Finger
 from graspd.daemon.record.mcap import METADATA, RecordingHeader
+from graspd.daemon.record.topics import Topic
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.kinds import open_recording
+from graspd.drivers.recordings.kinds import is_packed, open_recording
 
 RECORD_MAX_BYTES: Final = 64 << 20
 """Largest record, bytes; a longer one is damaged."""
 CHUNK_MAX_BYTES: Final = 8 << 20
 """Largest unpacked chunk, bytes; graspd writes 1 MB, other tools 4 MB."""
+LOOSE_MAX_BYTES: Final = 1 << 20
+"""Size from which messages outside of chunks are a part of their own, bytes."""
+OPEN_MAX_BYTES: Final = 128 << 20
+"""Most bytes of parts whose times overlap; a part for each topic has a tenth of it."""
+PARTS_MAX: Final = 100_000
+"""Most parts of a file; an hour at 100 Hz has 250."""
 RATIO_MAX: Final = 100
 """Largest ratio of unpacked to packed bytes; held grasps have 12, zeros 36."""
-NO_HEADER: Final = (
-    "has no record `graspd`: it is of another program, or has lost it (`mcap filter` needs "
-    "--include-metadata)"
-)
 SEVERAL: Final = "is of several recordings put together: replay each alone"
-UNSORTED: Final = "is not in the order of time: `mcap sort` puts it in order"
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError, OSError),
 )
 """Exceptions for a damaged file; huge lengths cause `OverflowError` and `MemoryError`."""
+_MESSAGE: Final = struct.Struct("<HIQQ")
+"""Channel, number, log time and publish time, before the content of a message."""
 
 
 class RecordedMessage(NamedTuple):
@@ -53,38 +69,127 @@ class RecordedMessage(NamedTuple):
     """Content, JSON."""
 
 
+@dataclass(slots=True)
+class _Part:
+    """Messages that stand together: a chunk, or messages outside of chunks."""
+
+    begin_ns: int
+    """Log time, ns; no message is older."""
+    place: int
+    """First byte of the content in the file."""
+    length: int
+    compression: str = ""
+    unpacked_bytes: int = 0
+    """Size of a chunk once unpacked."""
+    crc: int = 0
+    """CRC-32 of the unpacked content; 0: not known."""
+
+    @classmethod
+    def of(cls, chunk: Chunk, end: int) -> Self:
+        """Return the part of a chunk whose record ends at byte `end`."""
+        return cls(
+            begin_ns=chunk.message_start_time,
+            place=end - len(chunk.data),
+            length=len(chunk.data),
+            compression=chunk.compression,
+            unpacked_bytes=chunk.uncompressed_size,
+            crc=chunk.uncompressed_crc,
+        )
+
+
+class _Content:
+    """The messages of an unpacked part, oldest first."""
+
+    def __init__(self, content: bytes, kinds: dict[int, str]) -> None:
+        """`kinds`: first parts of the topics by channel; those in the content are added."""
+        self._content, self._kinds = content, kinds
+        places, times_ns = array("q"), array("Q")
+        stream = ReadDataStream(BytesIO(content))
+        while stream.count < len(content):
+            kind, length = stream.read1(), stream.read8()
+            if kind == Opcode.CHANNEL:
+                _note(Channel.read(stream), kinds)
+                continue
+            if kind == Opcode.MESSAGE:
+                places.extend((stream.count, length))
+                times_ns.append(_MESSAGE.unpack_from(content, stream.count)[2])
+            stream.read(length)
+        self.size = len(content)
+        self._places, self._times_ns = places, times_ns
+        order = np.argsort(np.frombuffer(times_ns, dtype=np.uint64), kind="stable")
+        self._order: Iterator[int] = iter(array("q", order.tobytes()))
+        self._next = next(self._order, None)
+
+    @property
+    def next_ns(self) -> int | None:
+        """Log time of the next message, ns; None: there is none."""
+        return None if self._next is None else self._times_ns[self._next]
+
+    def take(self, offset_ns: int) -> RecordedMessage:
+        """Return the next message; `offset_ns`: log time less monotonic time."""
+        number = self._next or 0
+        self._next = next(self._order, None)
+        place, length = self._places[2 * number : 2 * number + 2]
+        channel, _, log_ns, _ = _MESSAGE.unpack_from(self._content, place)
+        if channel not in self._kinds:
+            raise McapError("a message is of a channel that is not known")
+        payload = self._content[place + _MESSAGE.size : place + length]
+        return RecordedMessage(self._kinds[channel], log_ns - offset_ns, payload)
+
+
 class McapReader:
     """Reader of one file: the constructor reads the header, iterating the messages. Iterate once.
 
     Messages come in the order of their log time; those of one time in the order of the file. The
     iteration ends where the file is damaged. It raises `RecordingError` if the file unpacks to
-    more than any recording of graspd, is of several recordings, or is not in the order of time.
+    more than any recording of graspd, or is of several recordings.
     """
 
     def __init__(self, path: Path, stream: BinaryIO) -> None:
         """`stream`: the opened file. Raises `RecordingError` if graspd did not write it."""
         self.path, self._stream = path, stream
+        self._parts: list[_Part] = []
+        self._loose_end = 0
+        """First byte after the last message outside of chunks."""
+        self._spare_bytes = CHUNK_MAX_BYTES
+        """Number of bytes that may still be unpacked."""
+        self._kinds: dict[int, str] = {}
         self._damage: Exception | None = None
-        headers = (self._header_in(record) for record in self._records() if _is_header(record))
-        header = next(headers, None)
-        if header is None:
-            raise self._why_not()
-        self.header: RecordingHeader = header
+        self._scan = self._find_parts()
+        header = next(self._scan, None)
+        self.header: RecordingHeader = header or self._header_of_messages()
 
     @property
     def cut_off(self) -> bool:
         """True if the part read so far ends in a cut or damage."""
         return self._damage is not None
 
-    def _records(self) -> Iterator[McapRecord]:
-        """Yield the records from the start of the file to its end or damage."""
-        self._damage = None
-        self._stream.seek(0)
+    def __iter__(self) -> Iterator[RecordedMessage]:
+        for other in self._scan:
+            if other != self.header:
+                raise RecordingError(self.path, SEVERAL)
+        yield from self._messages(self.header.wall_minus_monotonic_ns)
+
+    def _find_parts(self) -> Iterator[RecordingHeader]:
+        """Read the file once, and note where its messages are; yield each header in it."""
+        begin, stream = 0, self._stream
         reader = StreamReader(
-            self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES
+            stream, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES
         )
         try:
-            yield from reader.records
+            for record in reader.records:
+                end = stream.tell()
+                if isinstance(record, Metadata) and record.name == METADATA:
+                    yield self._header_in(record)
+                elif isinstance(record, Channel):
+                    _note(record, self._kinds)
+                elif isinstance(record, Chunk):
+                    self._parts.append(_Part.of(record, end))
+                elif isinstance(record, Message):
+                    self._add_loose(record.log_time, begin, end)
+                if len(self._parts) > PARTS_MAX:
+                    raise RecordingError(self.path, f"has more than {PARTS_MAX} chunks")
+                begin = end
         except _DAMAGE as error:
             self._damage = error
 
@@ -94,62 +199,160 @@ class McapReader:
         except ValueError as error:
             raise RecordingError(self.path, "is an MCAP file of another graspd") from error
 
-    def _why_not(self) -> RecordingError:
-        """Return what a file without a header is."""
-        if isinstance(self._damage, EndOfFile):
-            return RecordingError(self.path, "is empty: nothing was recorded")
-        if self._damage is not None:
-            return RecordingError(self.path, f"is no MCAP file: {self._damage}")
-        return RecordingError(self.path, NO_HEADER)
+    def _add_loose(self, log_ns: int, begin: int, end: int) -> None:
+        """Add a message outside of chunks, whose record is from `begin` to `end`."""
+        last = self._parts[-1] if begin == self._loose_end else None
+        self._loose_end = end
+        if last is None or last.length >= LOOSE_MAX_BYTES:
+            self._parts.append(_Part(log_ns, begin, end - begin, unpacked_bytes=end - begin))
+            return
+        last.begin_ns = min(last.begin_ns, log_ns)
+        last.length = last.unpacked_bytes = end - last.place
 
-    def __iter__(self) -> Iterator[RecordedMessage]:
-        offset_ns = self.header.wall_minus_monotonic_ns
-        kinds: dict[int, str] = {}
-        """First parts of the topics by channel."""
-        spare_bytes, last_ns = CHUNK_MAX_BYTES, 0
-        for record in self._records():
-            if _is_header(record) and self._header_in(record) != self.header:
-                raise RecordingError(self.path, SEVERAL)
-            records: Sequence[McapRecord] = (record,)
-            try:
-                if isinstance(record, Chunk):
-                    spare_bytes += RATIO_MAX * len(record.data)
-                    records = self._unpacked(record, min(spare_bytes, CHUNK_MAX_BYTES))
-                    spare_bytes -= record.uncompressed_size
-                kinds |= {each.id: _kind(each) for each in records if isinstance(each, Channel)}
-                messages = [each for each in records if isinstance(each, Message)]
-                for message in sorted(messages, key=attrgetter("log_time")):
-                    if message.log_time < last_ns:
-                        raise RecordingError(self.path, UNSORTED)
-                    last_ns = message.log_time
-                    if message.channel_id not in kinds:
-                        raise McapError("a message is of a channel that is not known")
-                    kind = kinds[message.channel_id]
-                    yield RecordedMessage(kind, last_ns - offset_ns, message.data)
-            except _DAMAGE as error:
-                self._damage = error
-                return
+    def _header_of_messages(self) -> RecordingHeader:
+        """Return the header that the messages imply. Raises `RecordingError`."""
+        damage, implied = self._damage, _Implied()
+        for message in self._messages(0):
+            implied.take(message)
+        self._spare_bytes = CHUNK_MAX_BYTES
+        if implied.fingers:
+            return implied.header()
+        if isinstance(damage, EndOfFile):
+            raise RecordingError(self.path, "is empty: nothing was recorded") from damage
+        if damage is not None:
+            raise RecordingError(self.path, f"is no MCAP file: {damage}") from damage
+        raise RecordingError(self.path, "is an MCAP file, but not one of graspd's")
 
-    def _unpacked(self, chunk: Chunk, room: int) -> list[McapRecord]:
-        """Return the records of a chunk of at most `room` bytes. Raises `RecordingError`."""
-        content = _unpack(chunk.compression, chunk.data, room + 1)
-        if content is None or len(content) > room or chunk.uncompressed_size > CHUNK_MAX_BYTES:
+    def _messages(self, offset_ns: int) -> Iterator[RecordedMessage]:
+        """Yield the messages of all parts; `offset_ns`: log time less monotonic time."""
+        parts = sorted(self._parts, key=lambda part: (part.begin_ns, part.place), reverse=True)
+        with self._in_order_of(parts):
+            yield from self._merged(parts, offset_ns)
+
+    @contextmanager
+    def _in_order_of(self, parts: Sequence[_Part]) -> Iterator[None]:
+        """Copy a packed file unpacked, if steps back in it would each begin at its start."""
+        places = [part.place for part in reversed(parts)]
+        if places == sorted(places) or not is_packed(self.path):
+            yield
+            return
+        packed = self._stream
+        with TemporaryFile() as self._stream:
+            packed.seek(0)
+            with suppress(OSError):  # damage is known already
+                shutil.copyfileobj(packed, self._stream)
+            yield
+        self._stream = packed
+
+    def _merged(self, parts: list[_Part], offset_ns: int) -> Iterator[RecordedMessage]:
+        """Yield the messages of parts, the oldest part last, in the order of time."""
+        opened: list[tuple[int, int, _Content]] = []
+        now_ns = 0
+        try:
+            while parts or opened:
+                if parts and (not opened or (parts[-1].begin_ns, parts[-1].place) < opened[0][:2]):
+                    self._open(parts.pop(), opened)
+                    continue
+                log_ns, place, content = opened[0]
+                if log_ns < now_ns:
+                    raise McapError("a chunk has messages from before its own time")
+                now_ns = log_ns
+                yield content.take(offset_ns)
+                next_ns = content.next_ns
+                if next_ns is None:
+                    heapq.heappop(opened)
+                else:
+                    heapq.heapreplace(opened, (next_ns, place, content))
+        except _DAMAGE as error:
+            self._damage = error
+
+    def _open(self, part: _Part, opened: list[tuple[int, int, _Content]]) -> None:
+        """Unpack a part, and add it to the heap of those that are being read."""
+        content = _Content(self._unpacked(part), self._kinds)
+        if content.next_ns is not None:
+            heapq.heappush(opened, (content.next_ns, part.place, content))
+        if sum(each.size for _, _, each in opened) > OPEN_MAX_BYTES:
+            raise RecordingError(
+                self.path, "is too far from the order of time: `mcap sort` puts it in order"
+            )
+
+    def _unpacked(self, part: _Part) -> bytes:
+        self._spare_bytes += RATIO_MAX * part.length
+        room = min(self._spare_bytes, CHUNK_MAX_BYTES)
+        self._stream.seek(part.place)
+        packed = self._stream.read(part.length)
+        content = _unpack(part.compression, packed, room + 1)
+        if content is None or len(content) > room or part.unpacked_bytes > CHUNK_MAX_BYTES:
             raise RecordingError(
                 self.path,
                 "unpacks to more than any recording of graspd: a chunk of "
-                f"{len(chunk.data)} bytes to more than {room}",
+                f"{part.length} bytes to more than {room}",
             )
-        if len(content) != chunk.uncompressed_size:
+        if len(content) != part.unpacked_bytes:
             raise McapError("a chunk is not as long as it says")
-        return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
+        if part.crc not in (0, zlib.crc32(content)):
+            raise McapError("a chunk is not what it was")
+        self._spare_bytes -= len(content)
+        return content
 
 
-def _is_header(record: McapRecord) -> TypeGuard[Metadata]:
-    return isinstance(record, Metadata) and record.name == METADATA
+class _Made(msgspec.Struct):
+    """Part of a `tactile` message that is about its recording."""
+
+    boot_id: str
+    t_mono_ns: int
+    fingers: tuple[Finger, ...]
 
 
-def _kind(channel: Channel) -> str:
-    return channel.topic.partition(".")[0]
+class _Judge(msgspec.Struct):
+    """Part of a `verdict` message that is about its recording."""
+
+    model: str
+    model_sha: str
+
+
+@dataclass(slots=True)
+class _Implied:
+    """Header as the messages of a recording imply it."""
+
+    fingers: tuple[Finger, ...] = ()
+    joints: bool = False
+    boot_id: str = ""
+    offset_ns: int = 0
+    """Smallest difference of log time and the time of a reading, ns."""
+    model: tuple[str, str] = ("", "")
+
+    def take(self, message: RecordedMessage) -> None:
+        """Take in a message; its time is the log time. One that cannot be read tells nothing."""
+        try:
+            if message.kind == Topic.TACTILE:
+                made = msgspec.json.decode(message.payload, type=_Made)
+                offset_ns = message.at_ns - made.t_mono_ns
+                self.offset_ns = min(offset_ns, self.offset_ns) if self.fingers else offset_ns
+                self.fingers, self.boot_id = made.fingers, made.boot_id
+            elif message.kind == Topic.VERDICT and not self.model[0]:
+                judge = msgspec.json.decode(message.payload, type=_Judge)
+                self.model = judge.model, judge.model_sha
+        except ValueError:
+            return
+        self.joints = self.joints or message.kind == Topic.JOINTS
+
+    def header(self) -> RecordingHeader:
+        """Return a header without a scene."""
+        model, digest = self.model
+        return RecordingHeader(
+            fingers=self.fingers,
+            joints=self.joints,
+            boot_id=self.boot_id,
+            scene={},
+            model=model,
+            model_sha256=digest,
+            wall_minus_monotonic_ns=self.offset_ns,
+        )
+
+
+def _note(channel: Channel, kinds: dict[int, str]) -> None:
+    kinds[channel.id] = channel.topic.partition(".")[0]
 
 
 def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:

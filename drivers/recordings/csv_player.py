@@ -59,7 +59,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     `recorded_ns` is the file's own time. No reading is skipped.
 
     `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
-    no counts, and a last row without a line end, make a reading faulty.
+    no counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
     """
 
     counters: ReplayCounters
@@ -74,6 +74,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         rate_hz: float | None = None,
         read_as: ReadAs | None = None,
         loop: bool = False,
+        strict: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`layouts`: of the files, if they are known. `speed`: factor of real time; None: fast.
@@ -86,6 +87,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         self._find = partial(layout_of, fingers=self._fingers, read_as=read_as, rate_hz=rate_hz)
         self._layouts = dict(layouts or {})
         self._loop = loop
+        self._strict = strict
 
     def reset(self) -> None:
         super().reset()
@@ -132,7 +134,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     ) -> Generator[tuple[int, tuple[Row, bool]], None, int]:
         """Yield the rows of one file; return the start time of the next file."""
         at_ns, first_s, period_ns = start_ns, None, 0
-        rows = read_rows(path, self._fingers, layout=self._layouts[path])
+        rows = read_rows(path, self._fingers, strict=self._strict, layout=self._layouts[path])
         for index, row in enumerate(rows):
             before_ns = at_ns
             if row.t_s is None:

@@ -104,7 +104,10 @@ EXPECTED: Final[dict[str, tuple[Comes, ...]]] = {
     "library-pickle": (Comes(0), Comes(1, (r"TypeError: .*graspd\.load",))),
     "library-polars": (Comes(0, (r"\[\[0\.\d",)), Comes(1, (r"ValueError: .*pandas",))),
     "mcap-metadata-at-end": (STREAM,),
-    "mcap-metadata-dropped": (Comes(None, (r"record `graspd`", r"dropped|lost|include-metadata")),),
+    "mcap-metadata-dropped": (
+        Comes(None, (r"record `graspd`", r"dropped|lost|include-metadata")),
+        Comes(0, (*STREAM.must, r"WARNING.*metadata")),
+    ),
     "mcap-ordered-by-topic": DIFFERS,
     "mcap-upper-suffix": (STREAM,),
     "quoted-newline": (Comes(0, (MADE,), (r"not CSV",)),),

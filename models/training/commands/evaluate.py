@@ -48,6 +48,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seeds", type=whole(1, 1000), metavar="N", help="split seeds (default: 3)"
     )
     parser.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="scheduler of a Dask cluster of two threads or more, tcp://HOST:PORT, to run on "
+        "instead (extra: cluster). Its computers share the folder --out. It runs what it is sent: "
+        "only in a network that you trust",
+    )
+    parser.add_argument(
         "--quick", action="store_true", help="few grasps, folds and epochs: does it run?"
     )
     parser.add_argument(

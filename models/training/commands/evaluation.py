@@ -8,10 +8,15 @@ import itertools
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
 
+import joblib
 import numpy as np
 import pandas as pd
 
+from graspd.extras import needs
+from graspd.models.runtime import one_line
 from graspd.models.training.commands.common import (
     WrongInputError,
     check_fingers,
@@ -32,6 +37,7 @@ from graspd.models.training.evaluating.figures import (
 from graspd.models.training.evaluating.files import write_whole
 from graspd.models.training.evaluating.frame import (
     Job,
+    LostWorkerError,
     evaluated,
     jobs_of,
     processes,
@@ -52,6 +58,7 @@ QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 200, 2, 1
 """Grasps, folds and epochs of `--quick`: enough to see that all runs; figures mean nothing."""
 
 
+CONNECT_TIMEOUT_S = 10
 VERDICTS = "verdicts"
 """Folder in --out of the rows of each system and protocol, as Parquet."""
 
@@ -75,7 +82,7 @@ def evaluate(args: argparse.Namespace) -> None:
     folds = QUICK_FOLDS if args.quick else FOLDS
     if args.data is None:
         folds = _enough_folds(systems, protocols, folds, grasps, _seeds(args))
-    with processes(args.jobs):
+    with _cluster(args.dask) if args.dask else processes(args.jobs):
         made = _evaluated(systems, protocols, folds, grasps, args)
     if args.json:
         scores = pd.concat(
@@ -84,6 +91,24 @@ def evaluate(args: argparse.Namespace) -> None:
         sys.stdout.write(scores.reset_index().to_json(orient="records", indent=2) + "\n")
     if args.table:
         _report(grasps, args)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[None]:
+    """Run trainings on the cluster of the Dask scheduler at this address."""
+    try:
+        from distributed import Client, KilledWorker
+    except ModuleNotFoundError as error:
+        raise WrongInputError(needs("--dask", "cluster", error)) from error
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT_S)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise WrongInputError(f"no Dask scheduler at {address}: {one_line(error)}") from error
+    try:
+        with client, joblib.parallel_config("dask"):
+            yield
+    except (KilledWorker, CancelledError) as error:
+        raise LostWorkerError(f"the cluster lost a training: {one_line(error)}") from error
 
 
 def _systems(names: Sequence[str]) -> list[System]:
@@ -211,4 +236,6 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
         yield "--quick"
     if args.jobs > 1:
         yield f"--jobs {args.jobs}"
+    if args.dask:
+        yield "--dask ADDRESS"
     yield "--table FILE"

@@ -27,7 +27,7 @@ from graspd.models.training.systems.registry import SYSTEMS, System, with_recipe
 
 DEFAULT = "small-session"
 SEED = 0
-OTHER_OPTIONS = ("data", "own", "protocol", "seeds", "table")
+OTHER_OPTIONS = ("data", "own", "protocol", "seeds", "table", "dask")
 """Options of `graspd evaluate` for tables that are both trained on and judged."""
 
 

@@ -1,6 +1,7 @@
 """Judge held-out grasps by trained systems: one table, with a row for each verdict.
 
-`joblib.Memory` keeps the verdicts. Trainings run in processes of this computer.
+`joblib.Memory` keeps the verdicts. `joblib.parallel_config` says where trainings run: in
+processes, or on a Dask cluster.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 class LostWorkerError(Exception):
-    """A process is gone. Finished trainings are kept; try again."""
+    """A process or a cluster's worker is gone. Finished trainings are kept; try again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,7 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
     split = splits(job.protocol, grasps, job.seed, job.folds)[job.fold]
     seed = fold_seed(job.seed, job.fold)
     grasps = grasps.of_fingers(job.system.fingers)
+    # A forest would otherwise send its trees back to the cluster that this job came from.
     with _ONE_AT_A_TIME, joblib.parallel_config("sequential"):
         started_s = time.perf_counter()
         trained = train(job.system, grasps.rows(split.train), seed)
@@ -125,7 +127,7 @@ def evaluated(
     of the grasp.
 
     Each result is kept in `folder` before it is yielded, so an interrupted run can continue; what
-    cannot be read there is judged again.
+    cannot be read there is judged again. On a cluster all computers share that folder.
 
     Raises what `judged` raises, `LostWorkerError`, and `OSError` if the folder cannot be used.
     """
@@ -137,6 +139,7 @@ def evaluated(
             yield job, _described(job, kept(job.causes(data), job, grasps), grasps, data)
         else:
             missing.append(job)
+    # All at once, so that computers that join later get their share.
     parallel = joblib.Parallel(return_as="generator_unordered", pre_dispatch="all", batch_size=1)
     work = (joblib.delayed(_with_job)(kept, job.causes(data), job, grasps) for job in missing)
     with closing(parallel(work)) as outcomes:  # stops what still runs

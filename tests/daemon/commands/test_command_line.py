@@ -116,7 +116,7 @@ def test_every_argument_of_every_command_has_help() -> None:
     [
         (["--verison"], "--version"),
         (["session", "shwo", "scene.toml"], "show"),
-        (["twin", "spi", "--unpluged"], "--unplugged"),
+        (["twin", "spi", "--stuk-clock"], "--stuck-clock"),
         (["replay", "--max-slip-when-stabel=0.1"], "--max-slip-when-stable"),
         (["replay", "--gate", "setled"], "settled"),
         (["models", "smal-session"], "small-session"),

@@ -48,6 +48,7 @@ DEPLOY = Path(__file__).parents[3] / "deploy"
         (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
         (["twin", "spi", "--dead", "th"], "'th' is no electrode"),
         (["twin", "palm", "--to", "nowhere"], "nowhere"),
+        (["twin", "palm", "--one-byte-at-a-time"], "cannot show the fault one-byte-at-a-time"),
         (["twin", "joints", "--unplugged", "mf"], "cannot show the fault unplugged-fingers"),
         (["twin", "spi", "--recording", "absent.csv"], "absent.csv"),
     ],

@@ -294,6 +294,9 @@ def test_a_value_that_is_no_count_is_repaired_and_said(tmp_path: Path, text: str
     first, second, *_ = (json.loads(line) for line in result.stdout.splitlines())
     assert (first["valid"], first["repaired"]) == (True, ["ff_1"])
     assert "ff_1" not in second["repaired"]
+    strict = graspd("replay", recording, "--strict", "--json")
+    assert strict.returncode == 2
+    assert f"{recording}, line 2, column ff_biotac_1: " in strict.stderr.splitlines()[-1]
 
 
 def test_the_end_of_the_reader_ends_the_replay_quietly() -> None:

@@ -322,6 +322,15 @@ def test_findings_fit_80_columns_and_elsewhere_one_line() -> None:
     assert len(list(doctor.in_words(told, None))) == len(told) + 2
 
 
+def test_the_table_of_electrodes_needs_all_and_fits(tmp_path: Path, healthy: str) -> None:
+    assert "mean, sd, faulty" not in asked(tmp_path, healthy).stdout
+    _, table = asked(tmp_path, healthy, "--all").stdout.split("to look at\n\n")
+    lines = table.splitlines()
+    assert len(lines) == 25
+    assert max(map(len, lines)) <= 80
+    assert [line.split()[0] for line in lines[1:]] == [str(number) for number in range(1, 25)]
+
+
 SWEEP = json.dumps({"counts": {finger: [*range(2000, 2024)] for finger in FINGERS}})
 UNTIMED = SWEEP.encode()
 NUMBERED = SWEEP.replace("{", '{"seq": 5, ', 1).encode()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -176,14 +177,29 @@ def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
         writer.judged(grasp, counts)
         writer.outcome(grasp, "slip" if grasp == 2 else "stable", "mug")
     writer.close()
-    out = tmp_path / "t.csv"
-    assert graspd("export-grasps", tmp_path / "a.mcap", "--out", out).returncode == 0
-    expected = read_table(out)
-    for path in (out, tmp_path / "a.mcap"):
+    out = {name: tmp_path / f"t.{name}" for name in ("csv", "parquet")}
+    for name, options in (("csv", ()), ("parquet", ("--parquet",))):
+        words = "export-grasps", tmp_path / "a.mcap", "--out", out[name], *options
+        assert graspd(*words).returncode == 0
+    expected = read_table(out["csv"])
+    for path in (*out.values(), tmp_path / "a.mcap"):
         table = read_grasps(path)
         assert table["slipped"].tolist() == expected.slipped.tolist() == [False, True, False]
         assert table["object"].tolist() == ["mug"] * 3
         assert np.array_equal(table.iloc[:, 2:], expected.counts.reshape(3, -1))
+
+
+def test_without_pandas_the_option_names_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(tmp_path / "a.mcap", sweeps(1)[0])
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.delitem(sys.modules, "graspd.daemon.record.frames", raising=False)
+    words = "export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "t.parquet", "--parquet"
+    result = graspd(*words)
+    assert result.returncode == 2
+    assert "needs the package 'pandas'" in result.stderr
+    assert not (tmp_path / "t.parquet").exists()
 
 
 def test_a_table_is_replaced_only_by_force(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import io
 import json
 from collections.abc import Callable
@@ -15,11 +16,13 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 from msgspec.structs import replace
 
+from graspd.daemon.record import mcap_reader
 from graspd.daemon.record.mcap import METADATA, McapWriter
-from graspd.daemon.record.mcap_reader import RecordedMessage
+from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late
 from graspd.drivers.base import RecordingError
+from graspd.drivers.recordings.kinds import open_recording
 from tests.daemon.record.recorded import BOOT
 from tests.daemon.record.test_mcap import OFFSET_NS, START_NS, WHOLE, header, read
 
@@ -49,20 +52,40 @@ def by_topic(messages: list[RecordedMessage]) -> list[RecordedMessage]:
     return sorted(messages, key=lambda message: message.kind)
 
 
+def in_fifths(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+    """Every fifth message, then every fifth after the first, and the like."""
+    return [message for first in range(5) for message in messages[first::5]]
+
+
 def backwards(messages: list[RecordedMessage]) -> list[RecordedMessage]:
     return messages[::-1]
 
 
+@pytest.mark.parametrize("order", [list, by_topic, backwards])
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"chunk_size": 1}])
-def test_what_is_not_in_the_order_of_time_is_refused(options: dict[str, int]) -> None:
-    assert read(packed_again(WHOLE, list, **options)) == read(WHOLE)
-    for order in (by_topic, backwards):
-        with pytest.raises(RecordingError, match="`mcap sort` puts it in order"):
-            read(packed_again(WHOLE, order, **options))
+def test_any_order_of_a_file_gives_the_order_of_time(
+    order: Callable[[list[RecordedMessage]], list[RecordedMessage]], options: dict[str, int]
+) -> None:
+    assert read(packed_again(WHOLE, order, **options)) == read(WHOLE)
 
 
-def test_messages_of_one_chunk_may_stand_in_any_order() -> None:
-    assert read(packed_again(WHOLE, backwards, chunk_size=1_000_000)) == read(WHOLE)
+def test_a_packed_file_in_any_order_is_unpacked_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps_back: list[int] = []
+    seek = gzip.GzipFile.seek
+
+    def counted(file: gzip.GzipFile, offset: int, whence: int = 0) -> int:
+        if whence == 0 and offset < seek(file, 0, 1):
+            steps_back.append(offset)
+        return seek(file, offset, whence)
+
+    monkeypatch.setattr(gzip.GzipFile, "seek", counted)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(gzip.compress(packed_again(WHOLE, backwards)))
+    with open_recording(path) as stream:
+        assert list(McapReader(path, stream)) == read(WHOLE)
+    assert steps_back == [0]
 
 
 @given(st.randoms(use_true_random=False), st.integers(1, 20_000))
@@ -72,14 +95,25 @@ def test_no_order_and_no_cut_gives_readings_out_of_time(random: Random, chunk: i
         return random.sample(messages, len(messages))
 
     data = packed_again(WHOLE, shuffled, chunk_size=chunk)
+    assert read(data) == read(WHOLE)
     with contextlib.suppress(RecordingError):
         found = [message.at_ns for message in read(data[: random.randrange(len(data))])]
         assert found == sorted(found)
 
 
-def test_a_file_without_its_metadata_is_refused() -> None:
-    with pytest.raises(RecordingError, match=r"record `graspd`.*--include-metadata"):
-        read(without_metadata(WHOLE))
+def test_times_too_far_apart_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_reader, "OPEN_MAX_BYTES", 10_000)
+    with pytest.raises(RecordingError, match="`mcap sort` puts it in order"):
+        read(packed_again(WHOLE, in_fifths))
+    assert read(packed_again(WHOLE, list)) == read(WHOLE)
+
+
+def test_a_file_without_its_metadata_tells_its_fingers() -> None:
+    reader = McapReader(Path("a.mcap"), io.BytesIO(without_metadata(WHOLE)))
+    assert reader.header.fingers == ("ff", "th")
+    assert (reader.header.boot_id, reader.header.joints) == (BOOT, True)
+    # Readings were 2 ms old when they were recorded: that is not known any more.
+    assert [m.at_ns for m in reader] == [m.at_ns - 2_000_000 for m in read(WHOLE)]
 
 
 def without_metadata(data: bytes) -> bytes:
@@ -111,7 +145,10 @@ def play(driver: McapReplayDriver) -> None:
         driver.read_ready()
 
 
-def test_readings_of_another_run_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("change", [bytes, without_metadata])
+def test_readings_of_another_run_are_refused(
+    tmp_path: Path, change: Callable[[bytes], bytes]
+) -> None:
     def two(messages: list[RecordedMessage]) -> list[RecordedMessage]:
         other = [
             message._replace(payload=message.payload.replace(BOOT.encode(), b"f" * 32))
@@ -120,7 +157,7 @@ def test_readings_of_another_run_are_refused(tmp_path: Path) -> None:
         return [*messages[:20], *other[20:]]
 
     path = tmp_path / "a.mcap"
-    path.write_bytes(packed_again(WHOLE, two))
+    path.write_bytes(change(packed_again(WHOLE, two)))
     with McapReplayDriver([path], ("ff", "th")) as driver:
         with pytest.raises(RecordingError, match="several recordings"):
             play(driver)

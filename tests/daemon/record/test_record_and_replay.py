@@ -132,12 +132,12 @@ def three_seconds(folder: Path) -> Path:
     return folder / "short.csv"
 
 
-def filtered(source: Path, path: Path, *, every: int = 1) -> Path:
-    """Write a recording again as another tool does, maybe with readings thinned."""
+def filtered(source: Path, path: Path, *, metadata: bool = True, every: int = 1) -> Path:
+    """Write a recording again as another tool does: maybe without metadata, or readings thinned."""
     with source.open("rb") as stream, path.open("wb") as target:
         writer, reader = Writer(target), make_reader(stream)
         writer.start(profile="", library="another tool")
-        for record in reader.iter_metadata():
+        for record in reader.iter_metadata() if metadata else ():
             writer.add_metadata(record.name, record.metadata)
         for schema, channel, message in reader.iter_messages():
             if channel.topic.startswith("tactile.") and message.sequence % every:
@@ -156,6 +156,18 @@ def test_verdicts_that_are_not_those_of_the_run_are_counted(lab: Lab, tmp_path: 
     assert "not those of the run" not in graspd("replay", whole).stderr
     path = filtered(lab.files[0], tmp_path / "part.mcap", every=3)
     assert "verdicts are not those of the run" in graspd("replay", path).stderr
+
+
+def test_a_filtered_recording_is_judged_with_a_warning(
+    lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As `mcap filter` leaves it: no metadata."""
+    path = filtered(lab.files[0], tmp_path / "filtered.mcap", metadata=False)
+    verdicts = list(judge(path, model="cnn1"))
+    assert "has dropped the record `graspd`" in caplog.text
+    assert "was judged by" not in caplog.text
+    said = [verdict["p_slip"] for verdict in of_kind(lab.files[0], "verdict") if verdict["judged"]]
+    assert [verdict.p_slip for verdict in verdicts if verdict.judged][:1] == said[:1]
 
 
 def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:

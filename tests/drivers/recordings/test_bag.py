@@ -213,7 +213,7 @@ def test_options_of_tables_are_never_ignored(
 ) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
     said = "is a ROS 1 bag, which is played as it is: no "
-    for options in (["--as", "table"], ["--rate-hz", "50"], ["--loop"]):
+    for options in (["--as", "table"], ["--rate-hz", "50"], ["--loop"], ["--strict"]):
         assert main(["replay", str(path), *options]) == 2
         assert f"{said}{options[0]}" in capsys.readouterr().err
     with pytest.raises(RecordingError, match=f"{said}read_as"):

@@ -197,7 +197,7 @@ def test_a_bad_row_is_raised_after_the_readings_before_it(tmp_path: Path) -> Non
         assert driver.read_ready() == ()
 
 
-def test_bad_values_are_counted(tmp_path: Path) -> None:
+def test_bad_values_are_counted_and_strict_refuses_them(tmp_path: Path) -> None:
     changes = {1: {"ff_biotac_1": "nan", "th_biotac_9": "4096"}, 2: {"mf_biotac_3": "2.5"}}
     path = write(tmp_path, table(4, changes).rstrip(b"\n"))
     driver = ReplayDriver([path], speed=None)
@@ -206,6 +206,8 @@ def test_bad_values_are_counted(tmp_path: Path) -> None:
     counters = driver.counters
     assert (counters.readings, counters.faulty_readings) == (4, 3)
     assert (counters.not_counts, counters.cut_off) == (3, 1)
+    with pytest.raises(RecordingError, match=r"line 3, column ff_biotac_1: 'nan' is not a count"):
+        play(ReplayDriver([path], speed=None, strict=True))
 
 
 def test_opening_again_starts_over(tmp_path: Path) -> None:
@@ -226,7 +228,7 @@ def test_opening_again_starts_over(tmp_path: Path) -> None:
 def test_the_whole_stability_set_plays_count_for_count(bts3_dir: Path) -> None:
     paths = [bts3_dir / f"palm_{pose}.csv" for pose in ("down", "side", "45")]
     expected = [row for path in paths for row in csv_rows(path)]
-    driver = ReplayDriver(paths, FINGERS, speed=None)
+    driver = ReplayDriver(paths, FINGERS, speed=None, strict=True)
     readings = tactile(play(driver))
     assert len(readings) == len(expected) == 1276 + 1273 + 2133
     for index, (reading, wanted) in enumerate(zip(readings, expected, strict=True)):

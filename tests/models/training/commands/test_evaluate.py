@@ -156,6 +156,23 @@ def test_wrong_input_is_one_line_and_exit_code_2(
     assert not (tmp_path / "out").exists()
 
 
+def test_no_cluster_is_exit_code_2_and_says_so(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError("Timed out")  # a real client would leave a thread running
+
+    monkeypatch.setattr(distributed, "Client", refused)
+    options = "--data", data, "--out", tmp_path, "--dask", "tcp://127.0.0.1:9"
+    done = graspd("evaluate", "svm", "--quick", *options)
+    assert done.returncode == 2
+    assert "graspd evaluate: no Dask scheduler at tcp://127.0.0.1:9" in done.stderr
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "-m pip install '.[cluster]'" in graspd("evaluate", "svm", *options).stderr
+
+
 def test_ctrl_c_ends_processes_and_leaves_their_results(data: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "graspd", "evaluate", "mlp", "--protocol", "cv"]
     options = ["--data", str(data), "--out", str(tmp_path), "--jobs", "2", "--seeds", "30"]

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import joblib
 import pandas as pd
 import pytest
 from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -33,6 +38,30 @@ SESSION_SVM = System("svm-s", SessionFeatures(), SvmConfig(3.0, 0.003))
 SESSION_JOB = Job(SESSION_SVM, "session", 0, 1, 4)
 FOREST = System("forest", VectorInput(), ForestConfig(5, None))
 JOBS = [Job(FOREST, "cv", 0, fold, 4) for fold in range(4)]
+CLUSTER = """
+import graspd.models.training.evaluating.frame  # not while the scheduler has to answer
+from distributed import LocalCluster
+with LocalCluster(
+    n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", host="127.0.0.1",
+    dashboard_address=None,
+) as cluster:
+    print(cluster.scheduler_address, flush=True)
+    input()
+"""
+
+
+@contextlib.contextmanager
+def cluster() -> Iterator[str]:
+    """The address of a scheduler and its worker, in a process of their own."""
+    words = [sys.executable, "-c", CLUSTER]
+    with subprocess.Popen(
+        words, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield process.stdout.readline().strip()
+        finally:
+            process.kill()
 
 
 def same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
@@ -117,6 +146,18 @@ def test_an_interrupted_sweep_continues_and_runs_nothing_twice(
     assert "Exception while loading results" in caplog.text
     assert len(ran) == len(JOBS) + 1
     assert all(same(again[job], results[job]) for job in JOBS)
+
+
+def test_a_cluster_gives_what_this_computer_gives(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
+    with (
+        cluster() as address,
+        distributed.Client(address),
+        joblib.parallel_config("dask"),
+    ):
+        found = dict(evaluated(JOBS, GRASPS, tmp_path / "there"))
+    here = dict(evaluated(JOBS, GRASPS, tmp_path / "here"))
+    assert all(same(found[job], here[job]) for job in JOBS)
 
 
 def test_a_killed_process_ends_the_run() -> None:
