@@ -47,7 +47,7 @@ TIMES = re.compile(r"in [0-9.]+ s| +[0-9]+ us")
 """What differs from run to run."""
 NEED_LINUX = {
     "commands.run",
-    *(f"publish.{name}" for name in ("door", "listener", "porter", "questions", "sockets")),
+    *(f"publish.{name}" for name in ("listener", "porter", "questions", "sockets")),
     "watch.terminal",
 }
 DRIVERS_THAT_NEED_IT = {"spi.driver", "twins.spi"}
