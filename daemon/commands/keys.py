@@ -38,10 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make or list; 2 if keys that are there are wrong. Raises `KeysError`."""
-    return _make(args) if args.action == "make" else _list(args)
-
-
-def _make(args: argparse.Namespace) -> int:
+    if args.action == "list":
+        return _list(args)
     public, secret = keys.make(args.dir, args.name)
     write_lines(
         f"{printable(str(public))}: public; a client's goes into {CLIENTS}/ beside the daemon's",

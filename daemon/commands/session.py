@@ -111,7 +111,10 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
     if isinstance(next(iter(found.values()), None), SessionFileError):
         calibrated = False  # it may have been of other sensors
     if as_json:
-        documents = [_document(number, kept) for number, kept in sessions.items()]
+        documents = [
+            {"file": f"{n}{ENDING}", **msgspec.to_builtins(one), "trust": _learned(one.trust)}
+            for n, one in sessions.items()
+        ]
         document = {
             "folder": str(path),
             "calibrated": calibrated,
@@ -122,11 +125,6 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
     else:
         write_lines(*_lines(path, sessions, model, calibrated))
     return 2 if len(sessions) < len(found) else 0
-
-
-def _document(number: int, kept: KeptSession) -> dict[str, Any]:
-    content = msgspec.to_builtins(kept)
-    return {"file": f"{number}{ENDING}", **content, "trust": _learned(kept.trust)}
 
 
 def _readable(found: Found) -> dict[int, KeptSession]:

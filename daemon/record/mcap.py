@@ -1,9 +1,10 @@
-"""Write the MCAP files of recordings. Needs the extra `record`."""
+"""Write the files of recordings (MCAP), and make room for them. Needs the extra `record`."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Iterator, Mapping
 from itertools import count
 from pathlib import Path
@@ -14,13 +15,20 @@ from mcap.writer import Writer
 
 from graspd.biotac import FINGERS
 from graspd.daemon.record.topics import schemas
+from graspd.daemon.scene.scene import Record
 from graspd.models.session_statistics import SessionState
 
 MODE: Final = 0o640
 """File mode of recordings; not readable for all users, as they show what a hand did."""
+ROTATE_BYTES: Final = 256_000_000
+"""Size of the files from which the next ones begin, or a quarter of what is kept, if that is less:
+small enough to copy and open."""
+FILES_MAX: Final = 1000
+"""Most recordings of a hand, so that a folder can be listed: six weeks of hours."""
 METADATA: Final = "graspd"
 """Name of the metadata record at the start of each file of graspd."""
 
+_STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 _TEXTS: Final = ("boot_id", "model", "model_sha256", "trust")
 """Fields written as text, or as base64 if they are bytes; all others are JSON."""
 
@@ -152,3 +160,40 @@ class McapWriter(RecordingFile):
             self.abandon()
             raise
         super().close()
+
+
+def make_room(options: Record, hand: str) -> int:
+    """Delete the hand's oldest recordings until another file fits; return their number.
+
+    A link log belongs to its recording. Raises `OSError`.
+    """
+    options.folder.mkdir(parents=True, exist_ok=True)
+    recordings = _recordings(options.folder, hand)
+    total_bytes = rotate_bytes(options) + sum(size for _, size in recordings.values())
+    removed = 0
+    while recordings and (len(recordings) >= FILES_MAX or total_bytes > options.keep_mb * 1e6):
+        paths, size = recordings.pop(min(recordings))
+        for path in paths:
+            path.unlink(missing_ok=True)
+        total_bytes -= size
+        removed += 1
+    return removed
+
+
+def rotate_bytes(options: Record) -> float:
+    """Return the size of the files from which the next ones begin, bytes."""
+    return min(ROTATE_BYTES, options.keep_mb * 1e6 / 4)
+
+
+def _recordings(folder: Path, hand: str) -> dict[str, tuple[list[Path], int]]:
+    """Return paths and total size, bytes, of each recording, by the stamp in its name."""
+    pattern = re.compile(rf"{re.escape(hand)}-({_STAMP})\.(mcap|can\.log|serial)")
+    recordings: dict[str, tuple[list[Path], int]] = {}
+    for path in folder.iterdir():
+        match = pattern.fullmatch(path.name)
+        if match is None:
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            paths, size = recordings.get(match[1], ([], 0))
+            recordings[match[1]] = ([*paths, path], size + path.stat().st_size)
+    return recordings

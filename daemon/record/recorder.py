@@ -5,16 +5,13 @@ The loop appends to a bounded queue, and a thread writes. A slow disk costs entr
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import re
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
@@ -24,7 +21,13 @@ from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
-from graspd.daemon.record.mcap import McapWriter, RecordingFile, RecordingHeader
+from graspd.daemon.record.mcap import (
+    McapWriter,
+    RecordingFile,
+    RecordingHeader,
+    make_room,
+    rotate_bytes,
+)
 from graspd.daemon.record.topics import EVENT, Joints, Judged, Late, Topic, flat
 from graspd.daemon.record.viewers import Viewer
 from graspd.daemon.scene.scene import Record
@@ -38,13 +41,8 @@ log = logging.getLogger("graspd")
 
 FLUSH_NS: Final = 1_000_000_000
 """Longest time whose data a killed daemon or a power cut loses, ns."""
-ROTATE_BYTES: Final = 256_000_000
-"""Size of the files from which the next ones begin, or a quarter of what is kept, if that is less:
-small enough to copy and open."""
 ROTATE_NS: Final = 3_600_000_000_000
 """Age of the files from which the next ones begin, ns: an hour."""
-FILES_MAX: Final = 1000
-"""Most recordings of a hand, so that a folder can be listed: six weeks of hours."""
 QUEUE_MAX: Final = 20_000
 """Most queued entries: 12 MB, a minute of readings. Later ones are dropped."""
 RETRY_NS: Final = 60_000_000_000
@@ -57,7 +55,6 @@ CLOSE_S: Final = 0.5
 """Longest wait of `close` for the thread, s."""
 PATIENCE_S: Final = 60.0
 """Longest wait for the disk, s, of a run as fast as possible, for which no hand waits."""
-_STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 MakeHeader = Callable[[], RecordingHeader]
 """Function that makes the header of what was copied; called in the thread."""
@@ -298,7 +295,7 @@ class Recorder(Companion):
         self._counted["recorded"] += current.unflushed
         current.unflushed = 0
         self._flush_due_ns = now_ns + round(FLUSH_NS * FLUSH_AFTER)
-        if size >= _rotate_bytes(self._options) or now_ns - current.since_ns >= ROTATE_NS:
+        if size >= rotate_bytes(self._options) or now_ns - current.since_ns >= ROTATE_NS:
             self._ask_for_turn()
 
     def _finish(self) -> None:
@@ -377,39 +374,3 @@ def _message(content: object) -> dict[str, Any]:
     if callable(content):
         return cast(dict[str, Any], msgspec.to_builtins(content()))
     return cast(dict[str, Any], msgspec.json.decode(cast(bytes, content)))
-
-
-def make_room(options: Record, hand: str) -> int:
-    """Delete the hand's oldest recordings until another file fits; return their number.
-
-    A link log belongs to its recording. Raises `OSError`.
-    """
-    options.folder.mkdir(parents=True, exist_ok=True)
-    recordings = _recordings(options.folder, hand)
-    total_bytes = _rotate_bytes(options) + sum(size for _, size in recordings.values())
-    removed = 0
-    while recordings and (len(recordings) >= FILES_MAX or total_bytes > options.keep_mb * 1e6):
-        paths, size = recordings.pop(min(recordings))
-        for path in paths:
-            path.unlink(missing_ok=True)
-        total_bytes -= size
-        removed += 1
-    return removed
-
-
-def _rotate_bytes(options: Record) -> float:
-    return min(ROTATE_BYTES, options.keep_mb * 1e6 / 4)
-
-
-def _recordings(folder: Path, hand: str) -> dict[str, tuple[list[Path], int]]:
-    """Return paths and total size, bytes, of each recording, by the stamp in its name."""
-    pattern = re.compile(rf"{re.escape(hand)}-({_STAMP})\.(mcap|can\.log|serial)")
-    recordings: dict[str, tuple[list[Path], int]] = {}
-    for path in folder.iterdir():
-        match = pattern.fullmatch(path.name)
-        if match is None:
-            continue
-        with contextlib.suppress(FileNotFoundError):
-            paths, size = recordings.get(match[1], ([], 0))
-            recordings[match[1]] = ([*paths, path], size + path.stat().st_size)
-    return recordings

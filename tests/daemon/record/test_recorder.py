@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from graspd.daemon import scene
+from graspd.daemon.record import mcap
 from graspd.daemon.record import recorder as recorder_module
-from graspd.daemon.record.mcap import McapWriter
+from graspd.daemon.record.mcap import McapWriter, make_room
 from graspd.daemon.record.mcap_reader import McapReader
-from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, ReplayRecorder, make_room
+from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, ReplayRecorder
 from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.kinds import open_recording
@@ -96,7 +97,7 @@ def test_a_file_has_the_daemons_header_and_clock(tmp_path: Path, make: Make) -> 
 def test_files_follow_each_other_by_size_without_a_loss(
     tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder_module, "ROTATE_BYTES", 100_000)
+    monkeypatch.setattr(mcap, "ROTATE_BYTES", 100_000)
     writing = make()
     for number in range(300):
         writing.send(TOPIC, payload(number, 4000))
@@ -119,7 +120,7 @@ def old(folder: Path, hour: int, size: int, ending: str = "mcap") -> Path:
 def test_the_oldest_files_make_room_and_nothing_else_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder_module, "FILES_MAX", 4)
+    monkeypatch.setattr(mcap, "FILES_MAX", 4)
     folder = tmp_path / "record"
     paths = [old(folder, hour, 10) for hour in range(5)]
     beside = old(folder, 0, 10, "can.log")
