@@ -94,20 +94,20 @@ class Model:
         kept = self.newest_of_each(self.disk)
         self.running, self.others = Session(model, ""), kept
         if kept:
-            self.others = [each for each in kept if each is not self.take_up(kept[0])]
+            running, learned = self.with_sensor(kept[0].sensor)
+            self.running, self.others = running, [each for each in kept if each is not learned]
         if is_spoiled and kept:
             self.leave()
             self.running = Session(model, self.running.sensor)
         self.known = [copy(each) for each in (self.running, *self.others)]
 
-    def take_up(self, used: Session) -> Session | None:
-        """Continue a session; return the one that holds the learning."""
-        model, sensor = self.running.model, used.sensor
-        same = (each for each in self.others if (each.model, each.sensor) == (model, sensor))
-        learned = next(same, None)
-        outcomes = 0 if learned is None else learned.outcomes
-        self.running = Session(model, sensor, used.grasps, outcomes)
-        return learned
+    def with_sensor(self, sensor: str) -> tuple[Session, Session | None]:
+        """Return what runs with a sensor, and which of the others holds the learning."""
+        model = self.running.model
+        of_it = [each for each in self.others if each.sensor == sensor]
+        learned = next((each for each in of_it if each.model == model), None)
+        grasps = of_it[0].grasps if of_it else 0
+        return Session(model, sensor, grasps, learned.outcomes if learned else 0), learned
 
     def leave(self) -> None:
         if not self.running.is_empty:
@@ -118,11 +118,9 @@ class Model:
         if self.running.sensor in ("", sensor):
             self.running.sensor = sensor
             return
+        running, _ = self.with_sensor(sensor)
         self.leave()
-        self.running = Session(self.running.model, sensor)
-        former = next((each for each in self.others if each.sensor == sensor), None)
-        if former is not None:
-            self.take_up(former)
+        self.running = running
 
 
 class Lives(RuleBasedStateMachine):
