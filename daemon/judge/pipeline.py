@@ -187,7 +187,7 @@ class Pipeline:
             self.on_exchange(known)
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
-        """Take in how the lift of a grasp has ended; takes about 0.5 ms."""
+        """Take in how the lift of a grasp has ended; takes 0.5 to 1 ms."""
         if self.trust is not None:
             return self.trust.outcome(grasp, slipped=slipped)
         return self.lifts.tell(grasp, slipped=slipped)[0]

@@ -119,7 +119,7 @@ class Learner:
         return np.concatenate((features, self._residual.shared(features[2:])))
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
-        """Take in how the lift of a grasp with these features ended; takes about 0.5 ms."""
+        """Take in how the lift of a grasp with these features ended; takes 0.5 to 1 ms."""
         residual, weights = self._residual, slice(len(features))
         mean, known = self._mean, self._known(features)
         seen = self._spread @ known
