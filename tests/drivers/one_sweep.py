@@ -88,16 +88,24 @@ def plans(sweep: int, steady_sweeps: int = 1) -> st.SearchStrategy[list[Step]]:
 
 
 def losses(sweep: int) -> st.SearchStrategy[list[Step]]:
-    """Plans that lose and copy units only, of a board whose pace is known."""
+    """Plans that lose and copy units only, of a board whose pace is known.
+
+    What is lost in a row is too little for a link to count as down.
+    """
     some = st.integers(1, 2 * sweep)
     whole = st.integers(1, 6).map(lambda sweeps: sweep * sweeps)
-    step = st.one_of(
-        st.builds(Step, st.just("send"), st.one_of(some, whole)),
-        st.builds(Step, st.just("lose"), st.one_of(some, whole)),
-        st.just(Step("again", 1)),
+    send, lose = (
+        st.builds(Step, st.just(what), st.one_of(some, whole)) for what in ("send", "lose")
+    )
+    part = st.one_of(
+        send.map(lambda step: [step]),
+        st.tuples(lose, send).map(list),
+        st.just([Step("again", 1)]),
     )
     steady = Step("send", 8 * sweep)
-    return st.lists(step, min_size=1, max_size=20).map(lambda steps: [steady, *steps, steady])
+    return st.lists(part, min_size=1, max_size=14).map(
+        lambda parts: [steady, *itertools.chain(*parts), steady]
+    )
 
 
 @dataclass(frozen=True)
