@@ -80,7 +80,7 @@ class Model:
         self.said.append((question.envelope, ("unknown", [reason])))
 
     def withdraw(self, peer: Peer, question: Waiting) -> None:
-        """What was offered and not answered is nobody's."""
+        """A grasp that was offered and not answered has no owner."""
         offer, question.offer, question.kept = question.offer, None, None
         if offer is not None and self.book.offered(peer) == named(offer[0]):
             self.book.take_back(named(offer[0]))
