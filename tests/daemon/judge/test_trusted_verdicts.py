@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
@@ -143,6 +145,14 @@ def test_what_was_permitted_and_not_said_is_asked_again() -> None:
             trust.outcome(grasp, slipped=True)
             slips += 1
     assert 0 < slips <= 0.05 * slips + 5.0
+
+
+@pytest.mark.parametrize("permission", sorted(set(Permission) - {Permission.ALLOWED}), ids=str)
+def test_a_grasp_that_was_not_allowed_stays_so(permission: Permission) -> None:
+    trust, grasp = Trust("model", 0, RiskLimits(0.05), learns=False), GraspId(BOOT, 1)
+    allowed = trust.judge(grasp, 1e-6, -13.8, NONE)
+    assert trust.review(grasp, allowed).permission is Permission.ALLOWED
+    assert trust.review(grasp, replace(allowed, permission=permission)).permission is permission
 
 
 def test_without_learning_what_was_learned_before_is_not_used() -> None:
