@@ -250,15 +250,27 @@ def test_each_loss_flags_its_electrodes_and_no_others(name: str) -> None:
     def holds(plan: list[Step]) -> None:
         feed, readings = assembler.begin(), list[TactileReading]()
         there: dict[int, set[int]] = {}
+        came: dict[int, set[int]] = {}
+        last_ns, given_ns = dict[int, int](), dict[int, int]()
         for unit in arrivals(plan, assembler.silent):
-            number = assembler.number(unit)
-            there.setdefault(number, set()).update(assembler.places[unit.index % units])
-            readings += tactile(feed(unit, number, assembler.t_ns(unit)))
+            number, t_ns = assembler.number(unit), assembler.t_ns(unit)
+            places = set(assembler.places[unit.index % units])
+            if places - there.setdefault(number, set()):
+                last_ns[number] = t_ns
+            there[number] |= places
+            came.setdefault(number, set()).add(unit.index)
+            made = tactile(feed(unit, number, t_ns))
+            given_ns.update((reading.seq, t_ns) for reading in made)
+            readings += made
         begun = {number for number, places in there.items() if places}
         read = [reading.seq for reading in readings if there[reading.seq]]
         assert read == sorted(begun)[: len(read)]
         assert len(begun) - len(read) <= 1, "all but the last are over"
         for reading in readings:
+            if len(came[reading.seq]) == units:
+                end_ns = last_ns[reading.seq]
+                assert given_ns[reading.seq] == end_ns, "its last electrode ends a sweep"
+                assert 0 <= end_ns - reading.t_ns <= assembler.age_ns
             lost = [place for place in range(24) if place not in there[reading.seq]]
             truth = counts_of(reading.seq)
             truth[:, lost] = 0

@@ -71,13 +71,6 @@ def feed(sweeps: SampleAssembler, stream: Iterable[Sample]) -> list[TactileReadi
     return [reading for sample in stream for reading in sweeps.push(*sample)]
 
 
-def assert_true(reading: TactileReading, sweep: int) -> None:
-    """Every count that is not flagged is the one that was sampled; flagged ones are 0."""
-    sound = reading.faults == 0
-    assert (reading.counts[sound] == truth(sweep)[sound]).all()
-    assert not reading.counts[~sound].any()
-
-
 def pack_frame(frame: CanFrame) -> bytes:
     """The struct that Linux would hand over."""
     word = frame.arbitration_id

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -26,7 +25,6 @@ from tests.drivers.can.can_standin import (
 )
 from tests.drivers.can.can_words import truth
 from tests.drivers.one_sweep import tactile
-from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -38,36 +36,11 @@ MS = 1_000_000
         {"rate_hz": 0.0},
         {"rate_hz": 1e6},
         {"faults": LinkFaults(one_byte_at_a_time=True)},
-        {"faults": LinkFaults(stuck_clock=True)},
-        {"faults": LinkFaults(wrong_version=True)},
     ],
 )
 def test_a_twin_refuses_what_its_frames_cannot_show(options: Mapping[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         CanTwin("virtual", "x", iter(()), **options)
-
-
-def test_a_twin_serves_at_its_rate_until_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    where, stop, clock = channel(), threading.Event(), Clock()
-    twin = CanTwin(
-        "virtual", where, GeneratedContact(), rate_hz=100.0, sequence="electrodes", clock=clock
-    )
-    readings: list[TactileReading] = []
-    with bridge(where, clock=clock, wall_clock=clock) as driver, twin:
-
-        def sleep(seconds: float) -> None:
-            readings.extend(tactile(driver.read_ready()))
-            clock.now_ns += round(seconds * 1e9)
-            if len(readings) >= 30:
-                stop.set()
-
-        monkeypatch.setattr("graspd.drivers.twins.can.time.sleep", sleep)
-        twin.serve(stop)
-        period_ns = driver.period_ns
-    assert 30 <= len(readings) <= 31
-    assert period_ns == pytest.approx(10 * MS, rel=0.2)
-    elapsed_ns = readings[29].t_ns - readings[0].t_ns
-    assert elapsed_ns == pytest.approx(290 * MS, rel=0.2)
 
 
 @pytest.mark.parametrize("make", [CanTwin, CanBridgeDriver], ids=["twin", "driver"])
@@ -158,19 +131,6 @@ def test_flipped_bits_are_counted_and_never_become_counts() -> None:
     assert counters.lost_frames == counters.unknown_commands
     assert_only_what_was_sent(link.readings, sent)
     assert_same_tail(link.readings, sent[298:])
-
-
-def test_an_unplugged_sensor_is_missing_and_the_others_are_not() -> None:
-    link = TwinLink()
-    with link.driver:
-        link.send(contact(20), LinkFaults(unplugged_fingers=(1,)))
-    assert len(link.readings) == 20
-    for reading, expected in zip(link.readings, contact(20), strict=True):
-        assert (reading.faults[1] != 0).all()
-        assert not reading.counts[1].any()
-        assert not reading.faults[[0, 2]].any()
-        assert (reading.counts[[0, 2]] == expected[[0, 2]]).all()
-    assert link.driver.counters.unplugged_words == 20 * 24
 
 
 def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import io
 import math
 import re
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -50,7 +48,6 @@ DIALECTS = {
     "UTF-16 without a mark, big end": PLAIN.decode().encode("utf-16-be"),
     "UTF-32": PLAIN.decode().encode("utf-32"),
     "titles": b"Lab A; run 3\n\nDate:,2026-05-04\n" + PLAIN,
-    "comments of MATLAB": b"% lab A\n" + PLAIN,
     "units below": PLAIN.replace(b"24\n", b"24\n,-" + b",counts" * 72 + b"\n", 1),
     "fingers above": text(
         lambda it: f",,ff{',' * 24}mf{',' * 24}th\n" + re.sub("(ff|mf|th)_biotac_", "e", it)
@@ -58,10 +55,7 @@ DIALECTS = {
     "CRLF": PLAIN.replace(b"\n", b"\r\n"),
     "blank lines": b"\n\r\n" + PLAIN.replace(b"\n", b"\n \t\n\n"),
     "spaces around": PLAIN.replace(b",", b" , "),
-    "quotes": PLAIN.replace(b"thing_0", b'"thing_0"').replace(b"slipped", b'"slipped"'),
     "semicolons": PLAIN.replace(b",", b";"),
-    "tabs": PLAIN.replace(b",", b"\t"),
-    "bars": PLAIN.replace(b",", b"|"),
     "spaces": PLAIN.replace(b",", b" "),
     "sep line": b"sep=;\r\n" + PLAIN.replace(b",", b";"),
     "a comment within": text(lambda it: it.replace("thing_2", "# later\nthing_2")),
@@ -71,13 +65,6 @@ DIALECTS = {
     "trailing commas in rows": text(lambda it: it.replace("\n", ",\n").replace(",\n", "\n", 1)),
     "trailing commas everywhere": text(lambda it: it.replace("\n", ",,\n")),
     "blank rows of commas": PLAIN + b"," * 73 + b"\n",
-    "an index of pandas": text(
-        lambda it: "".join(
-            f"{'' if number == 0 else number - 1},{line}\n"
-            for number, line in enumerate(it.splitlines())
-        )
-    ),
-    "counts with a point": text(lambda it: it.replace("\n", ".0\n").replace("_24.0", "_24")),
     "decimal comma": PLAIN.replace(b",", b";").replace(b"\n", b",0\n").replace(b"_24,0", b"_24"),
 }
 
@@ -107,35 +94,16 @@ def test_a_row_of_many_lines_is_bounded() -> None:
     assert "longer than 65536 characters" in refusal(content)
 
 
-@pytest.mark.parametrize("packed", [False, True], ids=["numbers", "floats and texts"])
-def test_parquet_reads_as_its_csv(tmp_path: Path, packed: bool) -> None:
+def test_parquet_reads_as_its_csv_unless_damaged(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas", reason="needs the extra pandas")
     frame = pandas.read_csv(io.BytesIO(PLAIN))
-    if packed:
-        frame = frame.astype(dict.fromkeys(ELECTRODES, float) | {"slipped": bool})
-    frame.to_parquet(tmp_path / "grasps")
-    assert values(list(read_rows(tmp_path / "grasps", FINGERS))) == values(rows_of(PLAIN))
-
-
-def test_a_damaged_name_in_parquet_is_refused(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas", reason="needs the extra pandas")
-    pandas.read_csv(io.BytesIO(PLAIN)).to_parquet(tmp_path / "grasps")
-    content = (tmp_path / "grasps").read_bytes()
-    (tmp_path / "grasps").write_bytes(content.replace(b"ff_biotac_1", b"\xe3f_biotac_1"))
+    frame = frame.astype(dict.fromkeys(ELECTRODES, float) | {"slipped": bool})
+    path = tmp_path / "grasps"
+    frame.to_parquet(path)
+    assert values(list(read_rows(path, FINGERS))) == values(rows_of(PLAIN))
+    path.write_bytes(path.read_bytes().replace(b"ff_biotac_1", b"\xe3f_biotac_1"))
     with pytest.raises(RecordingError, match="is damaged: 'utf-8' codec can't decode"):
-        layout_of(tmp_path / "grasps", FINGERS)
-
-
-def test_a_refused_file_in_utf16_is_closed_in_silence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[object] = []
-    monkeypatch.setattr(sys, "unraisablehook", seen.append)
-    path = write(tmp_path, PLAIN.replace(b",1,", b",1,,").decode().encode("utf-16"))
-    with pytest.raises(RecordingError, match="the row has 75 cells"):
-        list(read_rows(path, FINGERS))
-    gc.collect()
-    assert seen == []
+        layout_of(path, FINGERS)
 
 
 def renamed(name: Callable[[str, int], str], fingers: Sequence[str] = FINGERS) -> bytes:
@@ -148,7 +116,6 @@ def renamed(name: Callable[[str, int], str], fingers: Sequence[str] = FINGERS) -
 PLACES = {"ff": 0, "mf": 1, "rf": 2, "lf": 3, "th": 4}
 SCHEMES: dict[str, Callable[[str, int], str]] = {
     "BioTacSP-DoS": lambda finger, number: f"{finger}_e{number}",
-    "capital letters": lambda finger, number: f"{finger.upper()}_E{number}",
     "from 0": lambda finger, number: f"{finger}_biotac_{number - 1}",
     "a full stop": lambda finger, number: f"/hand/{finger}.e{number:02}",
     "a space": lambda finger, number: f"{finger.upper()} E{number}",
@@ -181,7 +148,6 @@ def test_one_finger_needs_no_name() -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        (lambda f, n: f"{f}_taxels_{n}", "looked for ff_biotac_1, ff_e1, ff_1, field.tactiles0"),
         (lambda f, n: f"{f}_taxels_{n}", "is nearest to ff_"),
         (lambda f, n: f"{f}_e{n}" if n < 20 else f"x{f}{n}", "ff has 19 electrodes: a BioTac"),
         (lambda f, n: f"{f}_e{n - 1}" if n < 20 else f"x{f}{n}", "another sensor than the BioTac"),
@@ -211,25 +177,24 @@ def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
 @pytest.mark.parametrize(
     ("name", "cells"),
     [
-        ("t", TIMES), ("time", TIMES), ("Timestamp", TIMES), ("stamp", TIMES), ("secs", TIMES),
-        ("Time (s)", TIMES), ("__time", TIMES), ("epoch", TIMES), ("t_sec", TIMES),
-        ("Rel. Time", TIMES), ("ros_time", TIMES), ("Zeit [s]", TIMES), ("Czas (s)", TIMES),
-        ("Elapsed Time (ms)", ["0", "10", "20", "30"]), ("millis()", ["0", "10", "20", "30"]),
+        ("Timestamp", TIMES),
+        ("Time (s)", TIMES),
+        ("__time", TIMES),
+        ("t_sec", TIMES),
+        ("Rel. Time", TIMES),
+        ("Czas (s)", TIMES),
+        ("millis()", ["0", "10", "20", "30"]),
         ("Time (\u00b5s)", ["0", "10000", "20000", "30000"]),
         ("field.header.stamp", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
-        ("%time", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
-        ("time_ms", ["5", "15", "25", "35"]), ("t_ns", ["0", "10000000", "20000000", "30000000"]),
+        ("time_ms", ["5", "15", "25", "35"]),
         ("timestamp", [f"{1.7e15 + n * 1e4:.0f}" for n in range(4)]),
-        ("time", [f"2023-11-14T22:13:20.{n}Z" for n in ("00", "01", "02", "03")]),
-        ("time", [f"2023-11-14 22:13:20.{n}0000000" for n in ("00", "01", "02", "03")]),
-        ("time", [f"22:13:20.{n}" for n in ("00", "01", "02", "03")]),
-        ("time", [f"9:05:20.{n}" for n in ("00", "01", "02", "03")]),
-        ("time", [f"1 days 00:00:20.{n}" for n in ("00", "01", "02", "03")]),
-        ("datetime_utc", [f"2023-11-14 22:13:20.{n}0 UTC" for n in ("00", "01", "02", "03")]),
+        ("time", [f"2023-11-14T22:13:20.{n:02}Z" for n in range(4)]),
+        ("time", [f"9:05:20.{n:02}" for n in range(4)]),
+        ("time", [f"1 days 00:00:20.{n:02}" for n in range(4)]),
+        ("datetime_utc", [f"2023-11-14 22:13:20.{n:02}0 UTC" for n in range(4)]),
         ("secs,nsecs", [f"1700000000,{n}0000000" for n in range(4)]),
-        ("header.stamp.sec,header.stamp.nanosec", [f"5,{n}0000000" for n in range(4)]),
     ],
-)  # fmt: skip
+)
 def test_times_are_known_by_usual_names_and_units(name: str, cells: Sequence[str]) -> None:
     rows = rows_of(timed(name, cells))
     steps = np.diff([math.nan if row.t_s is None else row.t_s for row in rows])
@@ -285,14 +250,6 @@ def test_a_rate_is_never_ignored(tmp_path: Path) -> None:
         layout_of(path, FINGERS, None, 50.0)
 
 
-def test_times_that_stand_still_are_refused(tmp_path: Path) -> None:
-    names, cells = sweeps()
-    cells[:, names.index("t")] = "1700000000"
-    with pytest.raises(RecordingError, match="most rows have the time of the row before"):
-        layout(written(names, cells), tmp_path)
-    assert layout(written(names, cells), tmp_path, "stream")
-
-
 @pytest.mark.parametrize(
     ("times", "said"),
     [
@@ -309,11 +266,10 @@ def test_times_that_no_stream_has_may_be_of_grasps(
     with pytest.raises(RecordingError, match=rf"column time: {said}.*grasps of a table \(--as tab"):
         layout_of(path, FINGERS)
     assert not layout_of(path, FINGERS, "table").is_stream
+    assert layout_of(path, FINGERS, "stream", 10.0).is_stream
 
 
-@pytest.mark.parametrize(
-    ("every", "mixed"), [(1, False), (1, True), (5, True), (10, False), (25, True)]
-)
+@pytest.mark.parametrize(("every", "mixed"), [(1, False), (10, True), (25, True)])
 def test_sweeps_without_times_are_never_a_table(tmp_path: Path, every: int, mixed: bool) -> None:
     names, cells = sweeps(2000)
     cells = cells[::every]
@@ -360,7 +316,7 @@ def noisy(cells: NDArray[np.str_], random: np.random.Generator) -> None:
     cells[:] = np.clip(values, 0.0, 4095.0).astype(int)
 
 
-@pytest.mark.parametrize("number", [2, 5, 260])
+@pytest.mark.parametrize("number", [5, 260])
 @pytest.mark.parametrize("damage", [any_value, missing, noisy])
 def test_sweeps_with_broken_electrodes_are_never_a_table(
     tmp_path: Path, number: int, damage: Callable[..., None]
@@ -371,11 +327,11 @@ def test_sweeps_with_broken_electrodes_are_never_a_table(
     content = written(names, cells)
     with pytest.raises(RecordingError, match=r"sweeps of a stream \(--as stream.*--as table"):
         layout(content, tmp_path)
-    if number > 10:
-        with pytest.raises(RecordingError, match="change as sweeps of a stream do"):
-            layout(content, tmp_path, "table")
-    else:
+    if number == 5:
         assert not layout(content, tmp_path, "table")
+        return
+    with pytest.raises(RecordingError, match="change as sweeps of a stream do"):
+        layout(content, tmp_path, "table")
 
 
 def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> None:
