@@ -18,11 +18,9 @@ SCHEMA = "scene.schema.json"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INTRODUCTION = """# The scene, key by key
 
-This page is for those who write a scene. After it you know each key.
-
-A scene is one TOML file; only `[tactile]` must be there. `graspd scene --example spi > right.toml`
-prints one to edit, and `graspd check right.toml` finds mistakes. Editors with Taplo (VS Code: Even
-Better TOML) complete the keys.
+This page is for those who write a scene: one TOML file, in which only `[tactile]` must be there.
+`graspd scene --example spi > right.toml` prints one to edit, and `graspd check right.toml` finds
+mistakes. Editors with Taplo (VS Code: Even Better TOML) complete the keys.
 
 `key = value` shows the default. A key without one may be left out, unless it is *needed*. Paths are
 relative to the folder of the scene file.
@@ -128,7 +126,7 @@ def _line(key: str, about: Mapping[str, Any], is_needed: bool) -> str:
     kind = f"list of {_type(item)}s" if item else _type(about)
     joint = " of " if item and "enum" in item else ", "
     facts = (
-        "" if default or "enum" in about else kind,
+        "" if default or "enum" in (item or about) else kind,
         "*needed*" if is_needed else "",
         _unit(about).removeprefix("-"),
         joint.join(filter(None, (_lengths(about), _range(item or about)))),

@@ -1,4 +1,4 @@
-"""How the gate and its fingers' words follow generated hands: the table of deploy/JUDGING.md.
+"""How the gate and its fingers' words follow generated hands: the figures of deploy/JUDGING.md.
 
 `python -m tests.bench.gate [EPISODES]` prints a row for sweeps as a palm holds them, at 71.43 Hz,
 and one for fresh sweeps at 100 Hz. Each figure comes from EPISODES hands: they hold, or the object
