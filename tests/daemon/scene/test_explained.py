@@ -77,7 +77,7 @@ def test_the_page_of_all_keys_is_up_to_date() -> None:
     assert text == graspd("scene", "--page").stdout
     assert "\n- `max_age_ms = 100.0` (ms, above 0 to 10_000). " in text
     assert "\n- `port` (string, *needed*). " in text
-    assert "\n- `sensors` (list of strings, 1 to 3 of `ff`, `mf`, `rf`, `lf`, `th`). " in text
+    assert "\n- `sensors` (1 to 3 of `ff`, `mf`, `rf`, `lf`, `th`). " in text
     for link in (part.split(")")[0] for part in text.split("](")[1:]):
         assert (DEPLOY / link).exists(), link
 
