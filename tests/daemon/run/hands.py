@@ -1,0 +1,165 @@
+"""The sensors of a hand in simulated time, which fail in every way."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
+from graspd.drivers.recordings.csv_player import DEMO_DAY
+from tests.daemon.fakes import FINGERS, MS, FakeDriver
+from tests.daemon.run.around import World
+
+PERIOD_NS = 10 * MS
+DEEP_COUNTS = 80
+FAULTS = (
+    *("lost", "outage", "twice", "late", "stuck", "stuck finger", "mixed", "dead", "flagged"),
+    *("wild", "again", "time back", "slide", "no joints", "joints frozen", "joints move"),
+)
+Counts = NDArray[np.int64]
+
+
+@cache
+def poses() -> tuple[Counts, list[Counts]]:
+    """The open hand, shape (3, 24), and grasps in which each finger touches."""
+    with DEMO_DAY.open(newline="") as file:
+        rows = [row for row in csv.reader(file) if row[1] == "0"][:40]
+    grasps = [np.array(row[2:], dtype=np.int64).reshape(3, 24) for row in rows]
+    rest = np.minimum(grasps[0] + 150 * (np.arange(72).reshape(3, 24) % 4), 4000)
+
+    def touches(grasp: Counts) -> bool:
+        below = np.sort(rest - grasp, axis=1)
+        return bool((below[:, -3] - below[:, 12]).min() > DEEP_COUNTS)
+
+    return rest, [grasp for grasp in grasps if touches(grasp)]
+
+
+class Fault:
+    """A fault of the sensors, from now on for a while."""
+
+    def __init__(self, kind: str, world: World, ms: int | None = None) -> None:
+        draw = world.random
+        self.kind, self.from_ns = kind, world.now_ns
+        self.until_ns = world.now_ns + (ms or draw.choice((50, 120, 400, 1500, 2500))) * MS
+        self.finger = draw.randrange(3)
+        self.first = draw.randrange(20)
+        self.where = self.finger, slice(self.first, self.first + draw.choice((1, 1, 4, 9)))
+        self.bits = draw.choice([*ElectrodeFault])
+        self.count = draw.choice((0, 4095, 1234, 2000))
+        self.share = draw.choice((0.1, 0.5, 1.0))
+        self.delay_ns = draw.choice((20, 90, 150, 400)) * MS
+        self.back = draw.choice((1, 2, 8, 64))
+
+
+class Sensors(FakeDriver):
+    """The driver of a hand that rests, grasps and slides."""
+
+    live = True
+
+    def __init__(self, world: World, *, joints: bool) -> None:
+        super().__init__([], world)
+        self.world, self.joints = world, joints
+        self.noise = np.random.default_rng(world.random.getrandbits(32))
+        self.ends = False
+        self.number, self.offset = 1, np.zeros((3, 24), dtype=np.int64)
+        self.rest, self.grasps = poses()
+        self.pose = self.rest
+        self.faults: list[Fault] = []
+        self._before: list[Fault] = []
+        self.handed_ns = self.since_ns = 0
+        """When a reading was taken, and when the faults changed."""
+        self._sent: list[NDArray[np.uint16]] = []
+        self._seq = 0
+        self._angle = 0.0
+        world.after(0, self._tick)
+
+    @property
+    def serials(self) -> dict[str, str]:
+        return {finger: f"{finger}-{self.number}" for finger in FINGERS}
+
+    def open(self) -> None:
+        super().open()
+        self.ends, self.queue = False, []
+        self.handed_ns = self.world.now_ns
+
+    def stop(self) -> None:
+        self.ends, self.queue = True, []
+
+    def read_ready(self) -> Sequence[Reading]:
+        self.world.pump()
+        arrived = [each for each in self.queue if not isinstance(each, Exception)]
+        self.queue = []
+        if any(isinstance(each, TactileReading) for each in arrived):
+            self.handed_ns = self.world.now_ns
+        return arrived
+
+    def exchange(self) -> None:
+        """Other sensors, which rest otherwise; some were there before."""
+        self.number = self.world.random.randrange(1, 4)
+        steps = np.random.default_rng(self.number).choice((-110, 110), (3, 24))
+        self.offset = steps * (self.number > 1)
+        self.faults.append(Fault("outage", self.world, 1500))
+
+    def _tick(self) -> None:
+        self.world.after(PERIOD_NS, self._tick)
+        self._seq += 1
+        faults = [each for each in self.faults if each.until_ns > self.world.now_ns]
+        if faults != self._before:
+            self.since_ns = self.world.now_ns
+        self.faults, self._before = faults, faults
+        active = {each.kind: each for each in self.faults}
+        if self.joints and "no joints" not in active:
+            self._turn(active)
+        if "slide" in active:
+            self.pose = self.pose + 2 * (np.arange(24) % 3 - 1)
+        counts = self.pose + self.offset + self.noise.integers(-2, 3, (3, 24))
+        self._sent = [*self._sent[-70:], counts.clip(1, 4094).astype(np.uint16)]
+        lost, late = active.get("lost"), active.get("late")
+        if "outage" in active or (lost and self.world.random.random() < lost.share):
+            return
+        reading = self._spoilt(self._sent[-1].copy(), self.world.now_ns, active)
+        for _ in range(1 + ("twice" in active)):
+            self.world.after(late.delay_ns if late else 0, partial(self._arrive, reading))
+
+    def _arrive(self, reading: Reading) -> None:
+        if self.is_open:
+            self.queue.append(reading)
+
+    def _spoilt(
+        self, counts: NDArray[np.uint16], t_ns: int, active: dict[str, Fault]
+    ) -> TactileReading:
+        marks = np.zeros((3, 24), dtype=np.uint8)
+        began = False
+        for kind, fault in active.items():
+            stuck = 2 + (self.world.now_ns - fault.from_ns) // PERIOD_NS
+            old = self._sent[-min(fault.back + 1, len(self._sent))]
+            first = self._sent[-min(stuck, len(self._sent))]
+            match kind:
+                case "stuck":
+                    counts = first.copy()
+                case "stuck finger":
+                    counts[fault.finger] = first[fault.finger]
+                case "mixed":
+                    counts[fault.finger] = old[fault.finger]
+                case "again":
+                    counts = old.copy()
+                case "dead":
+                    counts[fault.where] = fault.count
+                case "flagged":
+                    marks[fault.where], counts[fault.where] = fault.bits, 0
+                case "wild":
+                    counts = self.noise.integers(0, 4096, (3, 24), dtype=np.uint16)
+                case "time back":
+                    t_ns -= fault.delay_ns
+                    began = fault.share == 1.0
+        return TactileReading(t_ns, self._seq, counts, marks, interrupted=began)
+
+    def _turn(self, active: dict[str, Fault]) -> None:
+        self._angle += 0.01 * ("joints move" in active)
+        shake = 0.0 if "joints frozen" in active else self.noise.uniform(-0.0005, 0.0005)
+        angles = np.array([0.5 + self._angle + shake, 0.7 + shake / 2])
+        self._arrive(JointReading(self.world.now_ns, self._seq, ("FFJ3", "THJ5"), angles))

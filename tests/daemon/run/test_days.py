@@ -1,0 +1,23 @@
+"""Days of the whole daemon under faults: its promises hold, and it goes on when they are over.
+
+A day of three shifts has a minute. `tests/daemon/run/days.py` says what is checked.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.daemon.run import days
+
+
+@pytest.mark.parametrize("seed", [2, 5, 13])
+def test_a_day_of_faults_breaks_no_promise(seed: int) -> None:
+    day = days.run(seed)
+    assert day.said["stable"] > 0
+    assert day.lives > 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 130))
+def test_many_days_of_faults_break_no_promise(seed: int) -> None:
+    days.run(seed)
