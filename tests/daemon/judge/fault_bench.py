@@ -1,7 +1,4 @@
-"""A hand that plays a whole grasp soundly up to a state of the gate, and under a fault from there.
-
-The grasp comes in two ways: as readings at 100 Hz, and as a palm's packets, 71.43 readings/s.
-"""
+"""A hand that plays a whole grasp soundly until it is judged, and under a fault from there."""
 
 from __future__ import annotations
 
@@ -17,17 +14,13 @@ from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.drivers.twins.grasps.grasp_script import Durations
-from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, Clock
 
 START_NS = 10**12
 MAX_AGE_NS = 100 * MS
-UNDER_FAULT = 30
-"""Periods of the readings."""
-KEPT = 20
-"""Of so many states of the pipeline on the way one is kept, to go on from it later."""
 DURATIONS = Durations(
     first_rest_s=(3.0, 3.0), close_s=(0.7, 0.7), settle_s=(1.2, 1.2), rest_s=(1.0, 1.0)
 )
@@ -86,62 +79,34 @@ class _Hand:
 class Grasp:
     """One whole grasp, what is said of it, and what is said of it under faults."""
 
-    def __init__(
-        self, rate_hz: float, *, on_request: bool, durations: Durations = DURATIONS
-    ) -> None:
-        """Play it soundly. With `on_request` nobody asks, so a settled grasp stays `settled`."""
+    def __init__(self, rate_hz: float, durations: Durations = DURATIONS) -> None:
         self._period_ns = round(1e9 / rate_hz)
         self._steps = self._sound_steps(rate_hz, durations)
         clock = Clock(START_NS)
-        settling = HandLimits(on_request=on_request, joints=True)
-        pipeline = Pipeline(network(), FINGERS, Limits(MAX_AGE_NS), clock, hand=settling)
+        pipeline = Pipeline(
+            network(), FINGERS, Limits(MAX_AGE_NS), clock, hand=HandLimits(joints=True)
+        )
         # A daemon tells of silence after ten periods, and not before the age limit.
         hand = _Hand(pipeline, clock, max(MAX_AGE_NS, 10 * self._period_ns))
-        self._kept = {0: hand.copy()}
-        self._sound: list[Judgement | None] = [None]
-        for number, (_, judgement) in enumerate(hand.play(self._steps), start=1):
+        self._sound: list[Judgement] = []
+        self._at = 0
+        """Number of the first step that finds the grasp judged."""
+        for _, judgement in hand.play(self._steps):
             self._sound.append(judgement)
-            if number % KEPT == 0:
-                self._kept[number] = hand.copy()
+            if judgement.moment.state is GateState.JUDGED and not self._at:
+                self._at, self._judged = len(self._sound), hand.copy()
 
-    def under(
-        self, fault: Fault, state: GateState, *, earlier: int = 0, periods: int = UNDER_FAULT
-    ) -> list[Finding]:
-        """What is said in the 30 or so many periods after the first reading of a state.
-
-        A fault may begin so many readings `earlier`.
-        """
-        at = self._first(state)
-        begin = at - earlier
-        sound = self._steps[begin : at + periods + 1]
+    def under(self, fault: Fault, periods: int) -> list[Finding]:
+        """What is said in so many periods after the grasp was judged."""
+        sound = self._steps[self._at : self._at + periods + 1]
         return [
             Finding(judgement.decision, judgement.reasons, self._judgement_at(step.now_ns))
-            for step, judgement in self._hand_at(begin).play([sound[0], *fault(sound)])
-            if step.now_ns > self._steps[at].now_ns
+            for step, judgement in self._judged.copy().play([sound[0], *fault(sound)])
         ]
 
-    def soundly(self, state: GateState) -> list[Judgement]:
-        """What is said in these 30 periods without a fault."""
-        steps = self._steps[self._first(state) + 1 :][:UNDER_FAULT]
-        return [self._judgement_at(step.now_ns) for step in steps]
-
-    def _first(self, state: GateState) -> int:
-        if state is GateState.IDLE:  # at the end of it, when all fingers are tared
-            return self._first(GateState.CLOSING) - UNDER_FAULT - 1
-        return [None if said is None else said.moment.state for said in self._sound].index(state)
-
     def _judgement_at(self, now_ns: int) -> Judgement:
-        said = self._sound[min((now_ns - START_NS) // self._period_ns, len(self._sound) - 1)]
-        if said is None:
-            raise ValueError("nothing is said at the start")
-        return said
-
-    def _hand_at(self, number: int) -> _Hand:
-        kept = number // KEPT * KEPT
-        hand = self._kept[kept].copy()
-        for _ in hand.play(self._steps[kept : number + 1]):
-            pass
-        return hand
+        number = (now_ns - START_NS) // self._period_ns
+        return self._sound[min(number, len(self._sound)) - 1]
 
     def _sound_steps(self, rate_hz: float, durations: Durations) -> list[Step]:
         steps = []
@@ -160,9 +125,3 @@ class Grasp:
 def network() -> TactileModel:
     """A real one, by which counts that are like those of no grasp are refused."""
     return TactileModel(zoo.find("cnn1"))
-
-
-@cache
-def grasp(*, of_a_palm: bool, on_request: bool) -> Grasp:
-    """The grasp, played once."""
-    return Grasp(PALM_RATE_HZ if of_a_palm else RATE_HZ, on_request=on_request)

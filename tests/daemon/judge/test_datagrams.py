@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 from hypothesis import given, settings
 
-from graspd.daemon.judge.reasons import Decision, GateState
+from graspd.daemon.judge.reasons import Decision
 from graspd.drivers.datagrams.tactile import TactileStream
-from tests.daemon.judge.fault_bench import MAX_AGE_NS, Step, grasp
+from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ
+from tests.daemon.judge.fault_bench import MAX_AGE_NS, Grasp, Step
 from tests.drivers.datagrams.network import FINGERS, HERE, PERIOD_NS, Plan, arrivals, links
 
 CLOCK_NS = 10_000_000
 """Error of a sender's clock that is not seen in ten seconds, ns."""
+
+
+@cache
+def grasp() -> Grasp:
+    return Grasp(RATE_HZ)
 
 
 @settings(max_examples=60, deadline=None)
@@ -33,7 +40,6 @@ def test_no_stable_rests_on_counts_older_than_the_limit(plan: Plan) -> None:
                     ages_ns.append(received_ns - place * PERIOD_NS)
         return steps
 
-    hand = grasp(of_a_palm=False, on_request=False)
-    found = hand.under(spoil, GateState.JUDGED, periods=len(plan))
+    found = grasp().under(spoil, len(plan))
     for finding, age_ns in zip(found, ages_ns, strict=True):
         assert finding.decision is not Decision.STABLE or age_ns <= MAX_AGE_NS + CLOCK_NS

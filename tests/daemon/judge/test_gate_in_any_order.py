@@ -22,7 +22,7 @@ from graspd.daemon.judge.reasons import Moment, Reason
 from graspd.daemon.judge.stillness import Motion
 from tests.daemon.fakes import FINGERS, MS
 
-TOUCHES = st.sampled_from((FINGERS, ("ff", "th"), ("ff",), ()))
+TOUCHES = st.sampled_from((FINGERS, FINGERS, ("ff", "th"), ("ff",), ()))
 MOTIONS = {
     "still": (True, True, True, True),
     "trembles": (True, False, True, True),
@@ -170,6 +170,7 @@ class Readings(RuleBasedStateMachine):
         limits = HandLimits(on_request, self.required, GateLimits(early=early))
         self.gate = Gate(FINGERS, limits, cast(Motion, self.felt))
         self.read(30)
+        self.grasp()
 
     @rule(touching=TOUCHES)
     def touch(self, touching: tuple[Finger, ...]) -> None:
@@ -181,14 +182,16 @@ class Readings(RuleBasedStateMachine):
         self.felt.kind = motion
         self.read(times)
 
-    @rule()
-    def grasp(self) -> None:
-        self.touching = FINGERS
+    @rule(kept=TOUCHES)
+    def grasp(self, kept: tuple[Finger, ...] = FINGERS) -> None:
+        self.touching, self.step = FINGERS, 10
         self.move("still", 25)
+        self.touch(kept)
 
-    @rule(pressed=st.sampled_from((0, 40, 41, -40)))
+    @rule(pressed=st.sampled_from((40, 41, -40)))
     def press(self, pressed: int) -> None:
-        self.pressed = pressed
+        """Another grasp is more than 40 counts away from that of the first judgement."""
+        self.pressed += pressed
         self.read()
 
     @rule(is_broken=st.booleans())
@@ -261,13 +264,15 @@ class Readings(RuleBasedStateMachine):
             self.against = (Reason.MOVING if felt.slides else Reason.SETTLING,)
         return model.state == "settled"
 
-    @rule(after=st.sampled_from((101, 5000, -1, -60_000)))
-    def lose_readings(self, after: int) -> None:
+    @rule(after=st.sampled_from((101, 5000, -1, -60_000)), touching=st.sampled_from((FINGERS, ())))
+    def lose_readings(self, after: int, touching: tuple[Finger, ...]) -> None:
+        self.touch(touching)
         self.now += after
         self.gate.restart(self.now * MS)
         self.model.gap(self.now)
         self.against = (Reason.SEQUENCE_GAP,)
         self.look()
+        self.read(11)
 
     @rule(waits=st.booleans())
     def ask(self, waits: bool) -> None:
@@ -304,5 +309,5 @@ class Readings(RuleBasedStateMachine):
 
 def test_the_gate_in_any_order_is_as_the_model() -> None:
     run_state_machine_as_test(
-        Readings, settings=settings(derandomize=True, max_examples=100, stateful_step_count=40)
+        Readings, settings=settings(derandomize=True, max_examples=120, stateful_step_count=40)
     )
