@@ -35,6 +35,7 @@ loose limit likewise."""
 OBJECTIONS = st.sampled_from(
     ((),) * 4 + ((Reason.JOINTS_LATE,), (Reason.JOINTS_LATE, Reason.NOT_TARED))
 )
+OFTEN_FALSE = st.sampled_from((False, False, True))
 Change = tuple[int, int, str, str, str]
 """Time, ms, grasp, former state, state and cause."""
 
@@ -158,7 +159,9 @@ class Model:
 class Readings(RuleBasedStateMachine):
     """What a gate is given, and the model beside it."""
 
-    @initialize(early=st.booleans(), on_request=st.booleans(), some=st.booleans())
+    @initialize(
+        early=st.booleans(), on_request=st.sampled_from((False, False, True)), some=st.booleans()
+    )
     def begin(self, early: bool, on_request: bool, some: bool) -> None:
         self.required = ("ff", "th") if some else FINGERS
         self.against: tuple[Reason, ...] = ()
@@ -188,14 +191,12 @@ class Readings(RuleBasedStateMachine):
         self.move("still", 25)
         self.touch(kept)
 
-    @rule(pressed=st.sampled_from((40, 41, -40)))
-    def press(self, pressed: int) -> None:
+    @rule(pressed=st.sampled_from((40, 41, -40)), is_broken=st.booleans(), is_held=st.booleans())
+    def press(self, pressed: int, is_broken: bool, is_held: bool) -> None:
         """Another grasp is more than 40 counts away from that of the first judgement."""
+        if is_held:
+            self.grasp()
         self.pressed += pressed
-        self.read()
-
-    @rule(is_broken=st.booleans())
-    def break_electrodes(self, is_broken: bool) -> None:
         self.usable[0, :12] = not is_broken
         self.read()
 

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
@@ -95,42 +91,6 @@ def test_when_too_many_slipped_nothing_is_stable_any_more() -> None:
     assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.RISK_EXCEEDED,)
     assert not judgement.supervised
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    alpha=st.sampled_from([0.001, 0.02, 0.05, 0.2, 0.5]),
-    lifts=st.lists(
-        st.tuples(st.floats(0.0, 1.0), st.booleans(), st.integers(0, 5)), min_size=1, max_size=60
-    ),
-)
-def test_the_bound_holds_for_what_is_said(
-    alpha: float, lifts: Sequence[tuple[float, bool, int]]
-) -> None:
-    """Outcomes come when they come; each that is out may add one."""
-    clock, model = Clock(), FakeModel(0.1)
-    judge = trusting(model, clock, RiskLimits(alpha))
-    waiting: list[tuple[int, bool]] = []
-    said_stable: set[int] = set()
-    told = slips = 0
-    for seed, (p_slip, slipped, late) in enumerate(lifts):
-        model.answer = p_slip
-        judgement = judge.judge(reading(clock(), seed))
-        if judgement.decision is Decision.STABLE:
-            said_stable.add(judgement.moment.grasp)
-        waiting.append((judgement.moment.grasp, slipped))
-        while len(waiting) > late:
-            grasp, ended = waiting.pop(0)
-            judge.outcome(GraspId(BOOT, grasp), slipped=ended)
-            told += grasp in said_stable
-            slips += ended and grasp in said_stable
-        assert judge.trust is not None
-        report = judge.trust.report()
-        assert (report.lifts, report.slips) == (told, slips)
-        assert report.outstanding == sum(grasp in said_stable for grasp, _ in waiting)
-        assert report.bound is not None
-        assert slips <= alpha * told + 5.0 + 5.0 * (1.0 - alpha) + 1e-9
-        assert slips <= report.bound + 1e-9
 
 
 def test_what_was_permitted_and_not_said_is_asked_again() -> None:

@@ -18,7 +18,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from graspd.daemon.trust.lift_book import NOT_ASSESSED, Peer
+from graspd.daemon.trust.lift_book import NOT_ASSESSED, LiftBook, Peer
 from graspd.daemon.trust.trust import Trust, decode, encode
 from graspd.models.trust.assessment import Assessment
 from graspd.models.trust.learner import Learner, sigmoid
@@ -295,3 +295,10 @@ def test_lifts_in_any_order_are_as_the_model(monkeypatch: pytest.MonkeyPatch) ->
     run_state_machine_as_test(
         Lifts, settings=settings(derandomize=True, max_examples=100, stateful_step_count=50)
     )
+
+
+def test_the_book_remembers_256_grasps() -> None:
+    book = LiftBook()
+    for number in range(257):
+        book.note(named(number), NOT_ASSESSED, stable=False)
+    assert [named(number) in book for number in (0, 1)] == [False, True]

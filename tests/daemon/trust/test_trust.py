@@ -35,42 +35,12 @@ def test_without_outcomes_the_models_probability_is_unchanged(
         assert found.p_slip == p
 
 
-def test_an_outcome_changes_the_probability_towards_what_happened() -> None:
-    before = p_slip(trust())
-    for slipped in (True, False):
-        part = trust()
-        judge(part, 0, -1.0)
-        assert part.outcome(named(0), slipped=slipped) is OutcomeStatus.TAKEN
-        assert part.learner.outcomes == 1
-        moderated = part.judge(named(1), 0.5, -1.0, inputs(0)).p_slip or 0.0
-        assert (moderated > before) or not slipped
-    assert part.learner.outcomes == 1
-
-
 def test_with_learning_off_outcomes_move_the_risk_alone() -> None:
     part = trust(learns=False)
     assert judge(part, 0)
     assert part.outcome(named(0), slipped=True) is OutcomeStatus.TAKEN
     assert p_slip(part) == sigmoid(-1.0)
     assert (part.risk.lifts, part.risk.slips, part.risk.proven) == (1, 1, 1)
-
-
-def test_a_repeated_outcome_counts_once_and_contradictions_are_refused() -> None:
-    part = trust()
-    judge(part, 0)
-    assert part.outcome(named(0), slipped=False) is OutcomeStatus.TAKEN
-    learned, risked = part.learner.state(), part.risk.state()
-    assert part.outcome(named(0), slipped=False) is OutcomeStatus.REPEATED
-    assert part.outcome(named(0), slipped=True) is OutcomeStatus.CONTRADICTS
-    assert part.outcome(named(1), slipped=True) is OutcomeStatus.UNKNOWN
-    assert part.outcome(named(0, "f" * 32), slipped=True) is OutcomeStatus.UNKNOWN
-    assert (part.learner.state(), part.risk.state()) == (learned, risked)
-    assert part.lifts.told == {
-        OutcomeStatus.TAKEN: 1,
-        OutcomeStatus.REPEATED: 1,
-        OutcomeStatus.CONTRADICTS: 1,
-        OutcomeStatus.UNKNOWN: 2,
-    }
 
 
 def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:

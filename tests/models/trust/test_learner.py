@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from sklearn.linear_model import LogisticRegression
 
-from graspd.models.trust import learner as module
-from graspd.models.trust import residual
 from graspd.models.trust.learner import Learner, LearnerState, sigmoid
 from tests.models.trust.reference import Reference
 from tests.models.trust.streams import CLIP, Outcome, learn, lifts
@@ -56,50 +53,6 @@ def test_it_is_the_dense_filter_in_long_double(inputs: int) -> None:
     found_mean, covariance = learner.at_told()
     np.testing.assert_allclose(covariance, spread.astype(float), rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(found_mean, mean.astype(float), rtol=0.0, atol=1e-9)
-
-
-@pytest.fixture
-def linear(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leaves next to nothing to the residual."""
-    monkeypatch.setattr(residual, "SHARED_VARIANCE", 0.0)
-    monkeypatch.setattr(residual, "OWN_VARIANCE", 1e-9)
-
-
-@pytest.mark.usefixtures("linear")
-def test_without_drift_it_ends_where_a_batch_fit_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "DRIFT", 0.0)
-    learner = Learner(6)
-    stream = [(0.0, x, slipped) for _, x, slipped in lifts(3000, 6)]
-    learn(learner, iter(stream))
-    x = np.array([x for _, x, _ in stream])
-    slipped = np.array([slipped for *_, slipped in stream])
-    # The same prior as a penalty: each feature in units of its weight's standard deviation.
-    scaled = np.hstack((np.full((len(x), 1), 0.5), 0.2 * x))
-    batch = LogisticRegression(C=1.0, fit_intercept=False, tol=1e-10, max_iter=10_000)
-    batch.fit(scaled, slipped)
-    mean, covariance = learner.at_told()
-    weights = mean[1:8]
-    np.testing.assert_allclose(weights, batch.coef_[0] * ([0.5] + [0.2] * 6), atol=0.02)
-    p = scaled @ batch.coef_[0]
-    w = np.exp(-np.abs(p)) / (1.0 + np.exp(-np.abs(p))) ** 2
-    unscaled = scaled / ([0.5] + [0.2] * 6)
-    laplace = np.linalg.inv(np.diag([4.0] + [25.0] * 6) + unscaled.T @ (w[:, None] * unscaled))
-    np.testing.assert_allclose(covariance[1:8, 1:8], laplace, atol=0.05 * laplace.max())
-
-
-@pytest.mark.usefixtures("linear")
-def test_moderated_log_odds_are_those_of_the_mean_probability() -> None:
-    learner = Learner(ONE_FINGER)
-    learn(learner, lifts(40, ONE_FINGER))
-    weights = slice(ONE_FINGER + 2)
-    means, covariance = learner.at_told()
-    mean, spread = means[weights], covariance[weights, weights]
-    nodes, shares = np.polynomial.hermite_e.hermegauss(60)
-    for margin, x, _ in lifts(50, ONE_FINGER, seed=1):
-        log_odds, f = learner.judge(margin, x)
-        at = float(f @ mean) + math.sqrt(float(f @ spread @ f)) * nodes
-        expected = float(shares @ (1.0 / (1.0 + np.exp(-at))) / shares.sum())
-        assert sigmoid(log_odds / 2.8) == pytest.approx(expected, abs=0.02)
 
 
 def test_it_learns_what_the_margin_misses_and_follows_changes() -> None:
