@@ -24,7 +24,7 @@ from graspd.daemon.session.keeper import (
     WAITING_MAX,
     SessionKeeper,
 )
-from graspd.daemon.trust.trust import Trust, TrustState
+from graspd.daemon.trust.trust import Trust
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
@@ -92,24 +92,6 @@ def outcomes(folder: SessionFolder) -> int:
     return 0 if kept is None else kept.learner.outcomes
 
 
-def test_an_outcome_is_answered_once_it_is_on_disk(
-    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
-) -> None:
-    part = trust()
-    found: list[tuple[Reply, TrustState | None]] = []
-    keeper = keeper_of(part)
-    judge(part, 1)
-    tell(part, 1)
-    disk.goes_on.clear()
-    keeper.keep(lambda reply: found.append((reply, kept_trust(folder))))
-    for _ in range(3):
-        read_once(keeper)
-    assert found == []
-    disk.goes_on.set()
-    go_round(keeper)
-    assert found == [(KEPT, part.state())]
-
-
 def test_outcomes_that_come_during_a_save_share_the_next(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
@@ -131,21 +113,6 @@ def test_outcomes_that_come_during_a_save_share_the_next(
     assert [(grasp, reply) for grasp, reply, _ in found] == [(grasp, KEPT) for grasp in range(5)]
     assert disk.written == 2
     assert [outcomes for _, _, outcomes in found] == [1, 5, 5, 5, 5]
-
-
-def test_a_kept_outcome_is_answered_at_once(
-    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
-) -> None:
-    part = trust()
-    found: list[Reply] = []
-    keeper = keeper_of(part)
-    judge(part, 1)
-    tell(part, 1)
-    keeper.keep(found.append)
-    go_round(keeper)
-    keeper.keep(found.append)
-    assert found == [KEPT, KEPT]
-    assert disk.written == 1
 
 
 def test_a_disk_that_hangs_holds_up_no_loop(
@@ -286,6 +253,9 @@ def test_an_open_grasp_is_kept_within_ten_seconds(
         clock.now_ns += SAVE_PERIOD_NS
         read_once(keeper)
         go_round(keeper)
+    found: list[Reply] = []
+    keeper.keep(found.append)
+    assert found == [KEPT]
     assert disk.written == 1  # nothing is written where nothing is new
     assert kept_trust(folder) == part.state()
 

@@ -26,7 +26,6 @@ from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
     calibration,
-    last_kept,
     observe,
     read_once,
     sensors,
@@ -153,25 +152,6 @@ def test_the_mean_of_all_grasps_is_nobodys_grasp(name: str) -> None:
     pipeline = Pipeline(model, FINGERS, Limits(max_age_ns=10**18), lambda: 0, learns=False)
     judgements = judge(pipeline, centre + random.normal(0.0, 2.0, (50, 3, 24)))
     assert {judgement.decision for judgement in judgements} == {Decision.UNKNOWN}
-
-
-def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path) -> None:
-    clock = Clock()
-    seeded = calibration()
-    observe(seeded, 30)
-    with SessionFolder(tmp_path / "right") as folder:
-        folder.save([KeptSession(seeded.state(), FINGERS, {})])
-        keeper = session_keeper(calibration(), sensors(ff="A", mf="B", th="C"), folder, clock)
-        read_once(keeper)
-        keeper.save()
-        kept = last_kept(folder.path)
-        assert kept is not None
-        assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
-        later = calibration()
-        keeper = session_keeper(later, sensors(mf="X"), folder, clock)
-        read_once(keeper)
-        keeper.save()
-    assert later.grasps == 0
 
 
 def test_an_exchanged_sensor_ends_the_verdict_that_stands() -> None:
