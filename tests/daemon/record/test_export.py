@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -189,33 +188,7 @@ def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
         assert np.array_equal(table.iloc[:, 2:], expected.counts.reshape(3, -1))
 
 
-def test_without_pandas_the_option_names_its_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    record(tmp_path / "a.mcap", sweeps(1)[0])
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    monkeypatch.delitem(sys.modules, "graspd.daemon.record.frames", raising=False)
-    words = "export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "t.parquet", "--parquet"
-    result = graspd(*words)
-    assert result.returncode == 2
-    assert "needs the package 'pandas'" in result.stderr
-    assert not (tmp_path / "t.parquet").exists()
-
-
-def test_a_table_is_replaced_only_by_force(tmp_path: Path) -> None:
-    record(tmp_path / "a.mcap", sweeps(1)[0])
-    out = tmp_path / "t.csv"
-    out.write_text("of another day")
-    words = ("export-grasps", tmp_path / "a.mcap", "--out", out)
-    result = graspd(*words)
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr == f"graspd: {out} is there already: --force replaces it\n"
-    assert out.read_text() == "of another day"
-    assert graspd(*words, "--force").returncode == 0
-    assert len(read_table(out)) > 0
-
-
-@pytest.mark.parametrize("name", ["=HYPERLINK(0)", "-1+1", "@SUM(1)", "mug\n=1", "a,b"])
+@pytest.mark.parametrize("name", ["=HYPERLINK(0)", "mug\n=1"])
 def test_a_name_that_a_spreadsheet_calculates_is_refused(tmp_path: Path, name: str) -> None:
     writer = Writer(tmp_path / "a.mcap")
     writer.judged(1, sweeps(1)[0])

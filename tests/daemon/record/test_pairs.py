@@ -96,8 +96,7 @@ def sweeps(name: str | None, keep: slice, seed: int | None, scale: float) -> byt
 @pytest.mark.parametrize(
     ("keep", "seed"),
     [
-        (slice(0, 300), None), (slice(0, 1200), 1), (slice(0, 1200, 2), 2), (slice(0, 100), 3),
-        (slice(40, 340), 4), (slice(0, 1200, 7), 5), (slice(0, 1200, 20), 6), (slice(5, 8), 7),
+        (slice(0, 300), None), (slice(0, 1200), 1), (slice(0, 1200, 20), 6), (slice(5, 8), 7),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("scale", [1.0, 1e9])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import zlib
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,29 +22,50 @@ from graspd import judge, read_recording
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.models.training.data.datasets import read_table
 from tests.daemon.record.recorded import (
-    Lab,
     compared,
     files,
     messages,
-    scene,
     without_null,
-    work,
 )
 from tests.kit.inside import graspd
 from tests.process_replay.judging import Case, run
 from tests.process_replay.streams import demo
 
-GRASPS = 4
+
+@dataclass(frozen=True)
+class Lab:
+    """Recordings of a run, and the messages that it sent."""
+
+    files: list[Path]
+    messages: list[tuple[str, str]]
+
+
+def lab_of(folder: Path, **case: Any) -> Lab:  # noqa: ANN401
+    """Run the demo recording with a controller that asks and tells, and record it."""
+    sent = run(Case(readings=demo, joints=True, tells=True, asks=True, **case), folder / "record")
+    return Lab(files(folder), sent)
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    """Twelve seconds in a lab, judged by the network that knows no session."""
-    more = '[model]\nname = "cnn1"\n[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 0\n'
-    return work(tmp_path_factory.mktemp("lab"), GRASPS, more)
+    """One file, judged by the network that knows no session."""
+    model = {"model": {"name": "cnn1"}}
+    return lab_of(tmp_path_factory.mktemp("lab"), sections=model, readings_max=3000)
+
+
+@pytest.fixture(scope="module")
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    """A session model on a slow computer; files end after three seconds, whatever is held then."""
+    sections = {
+        "risk": {"max_slip_when_stable": 0.5, "warm_up": 2},
+        "gate": {"max_age_ms": 97.0},  # no reading of the stepped clock is as old to the ns
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("graspd.daemon.record.recorder.ROTATE_NS", 3_000_000_000)
+        patch.setattr("graspd.daemon.record.recorder.FLUSH_NS", 100_000_000)
+        return lab_of(tmp_path_factory.mktemp("rotated"), sections=sections, slow=True)
 
 
 def of_kind(path: Path, kind: str) -> list[dict[str, Any]]:
@@ -71,65 +92,38 @@ def again(*arguments: object) -> list[dict[str, Any]]:
 def test_a_recording_has_all_that_was_published_and_the_joints(lab: Lab) -> None:
     (path,) = lab.files
     kinds = [kind for kind, _ in messages(path)]
-    sent = {"tactile", "verdict", "gate", "outcome", "status"}
-    assert set(kinds) == sent | {"joints", "judged", "image", "log", "asked", "announced"}
+    sent = {kind for kind, _ in lab.messages} - {"answer"}
+    assert set(kinds) == sent | {"joints", "judged", "image", "log", "asked"}
     assert kinds.count("tactile") == kinds.count("joints") == len(of_readings(path)) > 0
-    recorded = {content["seq"]: content for content in of_kind(path, "verdict")}
-    published = {verdict.seq: json.loads(encode(verdict)) for verdict in lab.verdicts}
-    for seq, verdict in published.items():
-        due = {"t_mono_ns": verdict["t_mono_ns"]}  # recorded is when the row was due
-        assert recorded[seq] | due == without_null(verdict)
+    published = [json.loads(content) for kind, content in lab.messages if kind == "verdict"]
+    assert of_kind(path, "verdict") == [without_null(verdict) for verdict in published]
     last = of_kind(path, "status")[-1]
     assert last["drivers"]["record"]["dropped"] == last["drivers"]["record"]["lost"] == 0
-    assert last["drivers"]["ask"]["outcomes"] == GRASPS - 1
 
 
-def test_the_library_reads_messages_that_are_as_their_schemas_say(lab: Lab) -> None:
+def test_recorded_messages_are_as_their_schemas_say(lab: Lab) -> None:
     with lab.files[0].open("rb") as stream:
         seen: dict[str, int] = {}
-        validators: dict[int, jsonschema.Validator] = {}
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
             assert schema.encoding == "jsonschema"
             assert channel.message_encoding == "json"
             seen[channel.topic] = seen.get(channel.topic, 0) + 1
-            if schema.id not in validators:
-                told = json.loads(schema.data)
-                checks = jsonschema.validators.validator_for(told)
-                checks.check_schema(told)
-                validators[schema.id] = checks(told)
-            if seen[channel.topic] % 7 == 1:  # the first of each topic, and many more
-                validators[schema.id].validate(json.loads(message.data))
+            if seen[channel.topic] % 100 == 1:  # the first of each topic, and some more
+                jsonschema.validate(json.loads(message.data), json.loads(schema.data))
     assert set(seen) >= {"tactile.right", "joints.right", "verdict.right", "outcome.right"}
 
 
-def test_a_replay_gives_the_same_verdicts_bit_for_bit(lab: Lab) -> None:
-    (path,) = lab.files
-    before = of_readings(path)
-    now = again(path)
-    assert sum(verdict["judged"] for verdict in before) >= GRASPS
+def test_a_run_on_a_slow_computer_replays_bit_for_bit(rotated: Lab) -> None:
+    """Its readings are skipped, late, asked for and learned from, and its files rotate."""
+    assert len(rotated.files) > 2
+    before = [verdict for path in rotated.files for verdict in of_readings(path)]
+    now = again(*rotated.files)
     assert [compared(v) for v in now] == [compared(v) for v in before]
-
-
-def test_a_run_of_recorded_data_replays_the_same(tmp_path: Path) -> None:
-    path = scene(tmp_path, '[model]\nname = "cnn1"\n')
-    played = path.read_text().replace("loop = true", 'outcomes = true\npace = "fast"')
-    path.write_text(played.replace(str(DEMO_RECORDING), str(three_seconds(tmp_path))))
-    assert graspd("run", path).returncode == 0
-    (recorded,) = files(tmp_path)
-    verdicts = of_kind(recorded, "verdict")
-    times_ns = [verdict["t_mono_ns"] for verdict in verdicts]
-    assert {later - former for former, later in itertools.pairwise(times_ns)} == {10_000_000}
-    said = [compared(verdict) for verdict in verdicts]
-    assert [compared(verdict) for verdict in again(recorded)] == said
-    assert sum(verdict["judged"] for verdict in said) == 1
-
-
-def three_seconds(folder: Path) -> Path:
-    """A stream of one grasp."""
-    lines = DEMO_RECORDING.read_text().splitlines(keepends=True)
-    (folder / "short.csv").write_text("".join(lines[:300]))
-    return folder / "short.csv"
+    assert {verdict["outcomes"] for verdict in now} >= {0, 1, 2}
+    assert {verdict["risk"]["warm_up_left"] for verdict in now} == {0, 1, 2}
+    assert any(verdict["supervised"] for verdict in now)
+    assert {"stale", "sequence-gap"} <= {why for verdict in now for why in verdict["reasons"]}
 
 
 def filtered(source: Path, path: Path, *, metadata: bool = True, every: int = 1) -> Path:
@@ -170,35 +164,7 @@ def test_a_filtered_recording_is_judged_with_a_warning(
     assert [verdict.p_slip for verdict in verdicts if verdict.judged][:1] == said[:1]
 
 
-def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:
-    now = again(lab.files[0], "--model", "mlp")
-    assert {verdict["model"] for verdict in now} == {"mlp"}
-    assert len(now) == len(of_kind(lab.files[0], "tactile"))
-
-
-@pytest.fixture(scope="module")
-def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    """A session model at work, and files that end after three seconds, whatever is held then."""
-    folder = tmp_path_factory.mktemp("rotated")
-    risk = {"risk": {"max_slip_when_stable": 0.5, "warm_up": 2}}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("graspd.daemon.record.recorder.ROTATE_NS", 3_000_000_000)
-        patch.setattr("graspd.daemon.record.recorder.FLUSH_NS", 100_000_000)
-        run(Case(readings=demo, joints=True, tells=True, sections=risk), folder / "record")
-    return Lab(folder)
-
-
-def test_session_and_learning_continue_in_a_replay(rotated: Lab) -> None:
-    assert len(rotated.files) > 2
-    before = [verdict for path in rotated.files for verdict in of_readings(path)]
-    now = again(*rotated.files)
-    assert {verdict["model"] for verdict in now} == {"small-session"}
-    assert [compared(v) for v in now] == [compared(v) for v in before]
-    assert {verdict["outcomes"] for verdict in now} >= {0, 1, 2}
-    assert {verdict["risk"]["warm_up_left"] for verdict in now} == {0, 1, 2}
-    assert any(verdict["supervised"] for verdict in now)
-
-
+@pytest.mark.filterwarnings("ignore:of 12 grasps 8 were not judged")
 def test_the_library_judges_a_recording_as_a_replay_does(rotated: Lab) -> None:
     now = [json.loads(encode(verdict)) for verdict in judge(rotated.files)]
     assert [compared(v) for v in now] == [compared(v) for v in again(*rotated.files)]
@@ -216,7 +182,7 @@ def test_the_library_reads_counts_and_angles_of_a_recording(lab: Lab) -> None:
 
 def test_the_summary_of_a_replay_counts_recorded_outcomes(rotated: Lab) -> None:
     result = graspd("replay", "--json", *rotated.files)
-    summary = json.loads(result.stderr)
+    summary = json.loads(result.stderr.splitlines()[-1])
     told = [each for path in rotated.files for each in of_kind(path, "outcome")]
     assert summary["labelled"] == len(told) > 0
     assert summary["outcomes"] == max(v["outcomes"] for v in again(*rotated.files))
@@ -258,33 +224,15 @@ def test_exported_grasps_are_judged_as_then(lab: Lab, tmp_path: Path) -> None:
     table = tmp_path / "lab.csv"
     result = graspd("export-grasps", *lab.files, "--out", table, "--object", "mug")
     assert result.returncode == 0, result.stderr
-    judged_once = {v["grasp"] for v in of_kind(lab.files[0], "verdict") if v["judged"]}
-    untold = len(judged_once) - len(lab.told)
-    assert f"{untold} left out without an outcome" in result.stdout
+    ended = {content["grasp"]: content["outcome"] for content in of_kind(lab.files[0], "outcome")}
     grasps = read_table(table)
-    assert grasps.slipped.tolist() == [outcome == "slip" for outcome in lab.told.values()]
-    assert set(grasps.objects) == {"mug"}
+    assert grasps.slipped.tolist() == [outcome == "slip" for outcome in ended.values()]
     judged: dict[int, float] = {}
-    wanted = []
+    wanted: dict[int, float] = {}
     for kind, content in messages(lab.files[0]):
         if kind == "verdict" and content["judged"]:
             judged[content["grasp"]] = content["p_slip_model"]
         if kind == "outcome":
-            wanted.append(judged[content["grasp"]])  # what may be judged later is another grip
+            wanted.setdefault(content["grasp"], judged[content["grasp"]])
     found = [v["p_slip"] for v in again(table, "--model", "cnn1", "--gate", "every")]
-    assert found == wanted
-
-
-def test_a_file_cut_anywhere_is_played_to_its_end(lab: Lab, tmp_path: Path) -> None:
-    whole = lab.files[0].read_bytes()
-    before = of_readings(lab.files[0])
-    for part in (0.3, 0.61803, 0.99):
-        path = tmp_path / "cut.mcap"
-        path.write_bytes(whole[: int(len(whole) * part)])
-        now = of_readings(path)
-        assert now == before[: len(now)]
-        # A second between two flushes, at 100 readings/s; the rest is how dense a file is.
-        assert len(now) > part * len(before) - 250
-    played = [compared(verdict) for verdict in again(path)]
-    assert played[: len(now)] == [compared(verdict) for verdict in before[: len(now)]]
-    assert len(played) - len(now) in {0, 1}  # cut between a reading and its verdict
+    assert found == list(wanted.values())

@@ -21,7 +21,6 @@ from graspd.daemon.record import recorder as recorder_module
 from graspd.daemon.record.mcap import McapWriter, make_room
 from graspd.daemon.record.mcap_reader import McapReader
 from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, ReplayRecorder
-from graspd.daemon.scene import SceneError
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.kinds import open_recording
 from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, files, messages, recorder
@@ -54,23 +53,6 @@ def payload(number: int, size: int = 0) -> bytes:
 
 def numbers(folder: Path) -> list[int]:
     return [content["number"] for path in files(folder) for _, content in messages(path)]
-
-
-def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: Make) -> None:
-    writing = make()
-    for number in range(1000):
-        writing.send(TOPIC, payload(number))
-    writing.close()
-    assert numbers(tmp_path) == list(range(1000))
-    assert writing.counters["record"] == {
-        "recorded": 1000,
-        "dropped": 0,
-        "lost": 0,
-        "files": 1,
-        "removed": 0,
-        "failures": 0,
-        "writing": 0,
-    }
 
 
 def test_a_file_has_the_daemons_header_and_clock(tmp_path: Path, make: Make) -> None:
@@ -240,21 +222,6 @@ def test_a_full_disk_counts_what_it_does_not_keep(
     writing.close()
     counted = writing.counters["record"]
     assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
-
-
-@pytest.mark.parametrize(
-    ("text", "mistake"),
-    [
-        ("keep_mb = 0", "record.keep_mb"),
-        ("folder = 'x'", "record.folder: no such key"),
-        ("raw = true", "record.raw is for tactile.driver spi and can"),
-    ],
-)
-def test_a_wrong_record_section_is_named(tmp_path: Path, text: str, mistake: str) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:1"\n[record]\n{text}\n')
-    with pytest.raises(SceneError, match=mistake):
-        scene.load(path)
 
 
 def test_recordings_stand_beside_the_scene_or_with_the_state(tmp_path: Path) -> None:

@@ -16,16 +16,14 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.exchange import NOTHING_KNOWN, Exchanged
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
-from graspd.daemon.publish.messages import State
-from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
+from graspd.daemon.record.player import McapReplayDriver
 from graspd.daemon.record.topics import Topic, flat, schema_of, schemas, table
 from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
 from graspd.models.layout import D1
 from graspd.models.session_statistics import SessionState
 from graspd.models.trust.learner import LearnerState
 from tests.daemon.record.recorded import files, messages, recorder
-from tests.daemon.watch.watch_fakes import status, tactile, verdict
-from tests.kit.messages import GOLDEN
+from tests.daemon.watch.watch_fakes import tactile, verdict
 
 PLAIN = ("boolean", "string", "number", "integer")
 TIME = {"sec": "integer", "nsec": "integer"}
@@ -235,26 +233,6 @@ def test_a_verdict_is_said_when_it_changes_and_not_again() -> None:
     assert said(viewer, "verdict", {**slip, "p_slip": 0.9}) == []
 
 
-def test_gate_outcome_state_and_health_are_said() -> None:
-    viewer = Viewer()
-    gate = json.loads((GOLDEN / "gate.json").read_bytes())
-    (line,) = said(viewer, "gate", gate)
-    assert line[0] == INFO
-    assert f"{gate['former']} to {gate['state']} ({gate['cause']})" in line[2]
-    outcome = json.loads((GOLDEN / "outcome.json").read_bytes())
-    (line,) = said(viewer, "outcome", outcome)
-    assert f"grasp {outcome['grasp']}: the lift ended in {outcome['outcome']}" in line[2]
-    well, ill = json.loads(status(0, health={})), json.loads(status(1))
-    assert said(viewer, "status", well) == [(INFO, "state", "running")]
-    (line,) = said(viewer, "status", ill)
-    assert line[:2] == (WARNING, "health")
-    assert line[2].startswith("ff_7: electrode-dead: ")
-    assert said(viewer, "status", ill) == []
-    assert said(viewer, "status", well) == [(INFO, "health", "ff_7: well again")]
-    silent = json.loads(status(2, state=State.SILENT, health={"link": Reason.STALE}))
-    assert said(viewer, "status", silent)[0] == (WARNING, "state", "silent")
-
-
 def recorded(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     (path,) = files(folder)
     return [(kind, content) for kind, content in messages(path) if kind != "image"]
@@ -272,14 +250,14 @@ def test_questions_in_a_row_are_one_event(tmp_path: Path) -> None:
     assert [kind for kind, _ in found] == ["tactile", "asked", "tactile", "asked", "tactile"]
 
 
-@pytest.mark.parametrize("event", ["skipped", "exchanged"])
+@pytest.mark.parametrize("event", ["skipped", "announced", "exchanged"])
 def test_questions_around_an_event_stay_around_it(tmp_path: Path, event: str) -> None:
     writing = recorder(tmp_path)
     writing.on_event(LoopEvent.ASKED)
-    if event == "skipped":
-        writing.on_event(LoopEvent.SKIPPED)
-    else:
+    if event == "exchanged":
         writing.exchanged(NOTHING_KNOWN)
+    else:
+        writing.on_event(LoopEvent(event))
     writing.on_event(LoopEvent.ASKED)
     writing.send(b"tactile.right", tactile(0, *REST.tolist()))
     writing.close()
@@ -307,10 +285,4 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
     writing.exchanged(known)
     writing.close()
     (path,) = files(tmp_path)
-    told: list[RecordedEvent] = []
-    driver = McapReplayDriver([path], ("ff",))
-    driver.on_event = told.append
-    with driver:
-        while not driver.exhausted:
-            driver.read_ready()
-    assert told == [known]
+    assert play(path) == [known]

@@ -109,6 +109,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (SPI.replace("/dev/ttyACM0", "") + "", "tactile.port", "at least 1"),
         ("[tactile]\ndriver = 'palm'\nsource = 'hand.palm'", "tactile.source", "'^udp://'"),
         (PALM + "only_from = 'the-relay'", "tactile.only_from", "does not appear to be an IPv4"),
+        (PALM + "[record]\nraw = true", "scene", "record.raw is for tactile.driver spi and can"),
         (PALM + "heed_finger_bits = 1", "tactile.heed_finger_bits", "valid boolean"),
         (PALM + "[joints]\ndriver = 'palm'", "joints.calibration", "is missing"),
         (PALM + "[joints]\ndriver = 'stream'\nsource = 'tcp://x'", "joints.source", "pattern"),
