@@ -13,7 +13,6 @@ from graspd.daemon.judge.hand import FingerWord, HandTracker
 from graspd.daemon.judge.health import Checked
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import FingerState, GateState, Reason
-from graspd.drivers.base import ElectrodeFault
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, sound
@@ -144,16 +143,3 @@ def test_an_old_reading_tells_nothing(late_ms: int, is_known: bool) -> None:
 def test_without_a_gate_no_finger_has_a_word() -> None:
     judge = Pipeline(TactileModel(zoo.find("cnn1")), FINGERS, Limits(), lambda: 0)
     assert judge.judge(sound(np.full(ALL.shape, 2000))).moment.fingers is None
-
-
-def test_faults_of_one_finger_leave_no_touch_in_any() -> None:
-    now_ns = 0
-    model = TactileModel(zoo.find("cnn1"))
-    judge = Pipeline(model, FINGERS, Limits(), lambda: now_ns, hand=LIMITS, learns=False)
-    for t_s, reading in readings(FIRM):
-        now_ns = reading.t_ns
-        reading.faults[2] = ElectrodeFault.MISSING if t_s > 1.2 else 0
-        judgement = judge.judge(reading)
-        if t_s > 1.2:
-            assert judgement.moment.fingers == UNKNOWN
-    assert Reason.SENSOR_MISSING in judgement.reasons

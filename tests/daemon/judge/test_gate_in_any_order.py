@@ -159,9 +159,7 @@ class Model:
 class Readings(RuleBasedStateMachine):
     """What a gate is given, and the model beside it."""
 
-    @initialize(
-        early=st.booleans(), on_request=st.sampled_from((False, False, True)), some=st.booleans()
-    )
+    @initialize(early=st.booleans(), on_request=OFTEN_FALSE, some=st.booleans())
     def begin(self, early: bool, on_request: bool, some: bool) -> None:
         self.required = ("ff", "th") if some else FINGERS
         self.against: tuple[Reason, ...] = ()

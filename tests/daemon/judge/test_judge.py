@@ -6,9 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from graspd.daemon.judge.health import REASON_OF_FAULT
 from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
@@ -143,55 +140,6 @@ def test_silence_is_stale() -> None:
     assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.STALE,)
     assert judgement.t_ns == 5
-
-
-@st.composite
-def readings(draw: st.DrawFn) -> tuple[TactileReading, int]:
-    """Any reading a driver could hand over, with its age in ns."""
-    fingers = draw(st.sampled_from([1, 3]))
-    wild = hnp.arrays(np.uint16, (fingers, 24), elements=st.integers(0, 65535))
-    tame = hnp.arrays(np.uint16, (fingers, 24), elements=st.integers(LOW, HIGH))
-    faults = np.zeros((fingers, 24), dtype=np.uint8)
-    for place in draw(st.lists(st.integers(0, 24 * fingers - 1), max_size=20)):
-        faults[divmod(place, 24)] = draw(st.integers(0, 255))
-    age_ns = draw(st.sampled_from([0, 99 * MS, 101 * MS, -1, 10**12]))
-    return TactileReading(0, 0, draw(st.one_of(wild, tame)), faults), age_ns
-
-
-@given(
-    sequence=st.lists(readings(), max_size=8),
-    p_slip=st.one_of(st.floats(), st.floats(0, 1)),
-)
-@settings(max_examples=100)
-def test_stable_needs_a_fresh_healthy_seen_reading_and_a_probability(
-    sequence: list[tuple[TactileReading, int]], p_slip: float
-) -> None:
-    clock = Clock(10**15)
-    judge = pipeline(FakeModel(p_slip), clock)
-    before: TactileReading | None = None
-    for raw, age_ns in sequence:
-        given_reading = TactileReading(clock() - age_ns, 0, raw.counts, raw.faults)
-        judgement = judge.judge(given_reading)
-        assert (judgement.decision is Decision.UNKNOWN) is bool(judgement.reasons)
-        assert (judgement.p_slip is None) is (judgement.decision is Decision.UNKNOWN)
-        if judgement.decision is not Decision.UNKNOWN:
-            assert raw.counts.shape == (3, 24)
-            assert not (raw.faults & (ElectrodeFault.HELD | ElectrodeFault.CUT_OFF | 0xC0)).any()
-            broken = (raw.faults != 0) | (raw.counts == 0) | (raw.counts >= 4095)
-            assert broken.sum() <= 12
-            assert (broken.sum(axis=1) <= 8).all()
-            names = {f"{FINGERS[finger]}_{column + 1}" for finger, column in np.argwhere(broken)}
-            assert names <= set(judgement.opinion.repaired)
-            assert 0 <= age_ns <= 100 * MS
-            sound = raw.counts[~broken]
-            assert LOW - MARGIN <= sound.min() <= sound.max() <= HIGH + MARGIN
-            for finger, out in zip(raw.counts, broken, strict=True):
-                assert len(set(finger[~out].tolist())) > 1
-            assert 0.0 <= p_slip <= 1.0
-            assert (judgement.decision is Decision.STABLE) is (p_slip < 0.5)
-            if before is not None and before.counts.shape == raw.counts.shape:
-                assert not (before.counts == raw.counts).all(axis=1).any()
-        before = given_reading
 
 
 def test_a_wholly_flagged_finger_is_missing_not_frozen() -> None:

@@ -39,13 +39,6 @@ def fresh_values(values: list[int]) -> list[int]:
     return kept
 
 
-def test_median_of_three_is_that_of_numpy_on_fresh_values() -> None:
-    sweeps = never_repeating(300)
-    medians = play(FreshMedian(SHAPE), sweeps)
-    windows = np.stack([sweeps[:-2], sweeps[1:-1], sweeps[2:]])
-    np.testing.assert_array_equal(medians[2:], np.median(windows, axis=0))
-
-
 def test_first_value_stands_for_those_that_are_missing() -> None:
     sweeps, fresh = never_repeating(3), FreshMedian(SHAPE)
     assert not fresh.counts.any(), "zero where there is none"

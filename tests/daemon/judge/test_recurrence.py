@@ -112,20 +112,6 @@ def test_a_ring_of_odd_palm_packets_is_never_stable(
     assert stable >= UNDER_RING
 
 
-def test_after_a_ring_the_hand_settles_anew_and_is_judged() -> None:
-    """Ten turns of five sweeps are half a second; then 240 ms of stillness, as after any gap."""
-
-    def for_a_moment(sound: Sequence[Step]) -> list[Step]:
-        return [*ring(5)(sound[:56]), *sound[56:]]
-
-    found = held(RATE_HZ).under(for_a_moment, 110)
-    decisions = [finding.decision for finding in found]
-    assert decisions[:5] == [Decision.STABLE] * 5
-    assert decisions[5:55] == [Decision.UNKNOWN] * 50
-    assert decisions[55:79] == [Decision.UNKNOWN] * 24
-    assert decisions[-20:] == [Decision.STABLE] * 20
-
-
 @pytest.mark.parametrize(("equal", "is_frozen"), [(19, False), (20, True), (23, True)])
 def test_a_sweep_of_twenty_equal_electrodes_comes_again(equal: int, is_frozen: bool) -> None:
     health, random = Health(3), np.random.default_rng(4)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections import deque
-from collections.abc import Iterator
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.decision import Limits
-from graspd.daemon.judge.pipeline import Judgement, Pipeline
+from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import ElectrodeFault
-from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.models import zoo
 from graspd.models.judge.session import SessionCalibration
@@ -26,72 +21,8 @@ from graspd.models.runtime import TactileModel
 from graspd.models.trust.risk import RiskLimits
 from tests.daemon.fakes import MS, Clock, sound
 from tests.daemon.judge.felt_hand import HELD, Feel, Flaw, Hand, limits, tared
-from tests.kit.drifting import drifting
 
-PERIOD_NS = 14 * MS
-"""Of a palm's electrodes, 71.43 Hz."""
-SWEEPS = 1000
-"""Rest, closing, a second of holding, five of drift and some more."""
 BOOT = "b" * 32
-
-
-class Direct:
-    """The network alone, run by onnxruntime on the median of the last three sweeps."""
-
-    def __init__(self, model: TactileModel) -> None:
-        self._inputs = model.inputs
-        self._batch = np.zeros((1, *model.inputs.shape), dtype=np.float32)
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = 1
-        self._session = ort.InferenceSession(model.path, options)
-        self._sweeps: deque[Counts] = deque(maxlen=3)
-        self.said: list[float] = []
-        """Of each sweep."""
-
-    def take(self, counts: Counts) -> None:
-        self._sweeps.append(counts)
-        median = np.median(np.array(self._sweeps), axis=0).astype(np.uint16)
-        self._inputs.build(median, self._batch[0])
-        (found,) = self._session.run(["probability"], {self._inputs.name: self._batch})
-        self.said.append(float(found[0, 1]))
-
-
-def never_twice(sweeps: Iterator[Counts]) -> Iterator[Counts]:
-    """The sweeps, so that no electrode repeats what it read: then the last three are fresh."""
-    last = next(sweeps)
-    yield last
-    for sweep in sweeps:
-        last = np.where(sweep == last, sweep + 1, sweep)
-        yield last
-
-
-@pytest.mark.parametrize(("on_request", "early"), [(False, False), (True, True)])
-def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool) -> None:
-    model, clock = TactileModel(zoo.find("cnn1")), Clock()
-    hand = limits(on_request=on_request, early=early)
-    judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=hand)
-    direct = Direct(model)
-    told: list[Judgement] = []
-    asked, ages = False, []
-    for number, counts in zip(range(SWEEPS), never_twice(drifting()), strict=False):
-        clock.now_ns += PERIOD_NS
-        direct.take(counts)
-        asked = asked or number % 25 == 0
-        if number % 25 == 0:
-            judge.ask()
-        told.append(judge.judge(sound(counts, clock())))
-        if told[-1].p_slip is not None and not told[-1].opinion.repaired:
-            age = direct.said[::-1].index(told[-1].p_slip)  # to the bit
-            assert age * PERIOD_NS <= 100 * MS
-            assert not (asked and age), "a question is answered by the newest counts"
-            ages.append(age)
-        asked = asked and told[-1].p_slip is None
-    assert len(ages) > 300
-    assert max(direct.said[-100:]) > 0.7
-    decisions = [each.decision for each in told if each.decision is not Decision.UNKNOWN]
-    turns = sum(a is not b for a, b in itertools.pairwise(decisions))
-    assert (decisions[0], decisions[-1], turns) == (Decision.STABLE, Decision.SLIP, 1)
-    assert {each.moment.grasp for each in told} == {0, 1}
 
 
 def test_a_grasp_stays_judged_and_is_one() -> None:

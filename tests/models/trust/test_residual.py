@@ -11,7 +11,7 @@ from graspd.models.trust import learner as learner_module
 from graspd.models.trust.learner import Learner
 from graspd.models.trust.residual import GRASPS_MAX, Residual
 from tests.models.trust.reference import Reference
-from tests.models.trust.streams import learn, lifts
+from tests.models.trust.streams import lifts
 
 INPUTS = 26
 LENGTH = 0.5 * INPUTS**0.5
@@ -89,20 +89,6 @@ def test_rounding_of_many_outcomes_does_not_add_up(monkeypatch: pytest.MonkeyPat
         reference.learn(len(told), slipped)
         told = window[-kept:]
         state = reference.state(list(range(len(window)))[-kept:])
-
-
-def test_outcomes_of_grasps_alike_say_what_linear_weights_cannot() -> None:
-    """Slips lie within a ball, and what holds lies around it."""
-    random = np.random.default_rng(0)
-    stream = []
-    for _ in range(400):
-        slipped = bool(random.random() < 0.5)
-        x = random.normal(0.0, 0.2 if slipped else 0.8, INPUTS).astype(np.float32)
-        stream.append((0.0, x, slipped))
-    learner = Learner(INPUTS)
-    learn(learner, stream[:300])
-    right = [(learner.judge(m, x)[0] > 0.0) == slipped for m, x, slipped in stream[300:]]
-    assert sum(right) > 90
 
 
 def test_a_thousandfold_repeated_grasp_leaves_a_covariance() -> None:
