@@ -20,11 +20,7 @@ from graspd.drivers.datagrams.joints import (
 )
 from graspd.drivers.datagrams.messages import Order, Stamp
 from graspd.drivers.link import LinkState
-from graspd.drivers.twins.datagrams import JointTwin
-from graspd.drivers.twins.faults import LinkFaults
 from tests.drivers.palm.palm_stream import DatagramClock, Sender, joints
-
-DATAGRAM_BYTES_MAX = 4096
 
 LOOPBACK = "udp://127.0.0.1:0"
 
@@ -60,42 +56,19 @@ def test_the_example_of_the_documentation_is_read() -> None:
 
 
 def test_a_hand_prefix_and_other_fields_do_no_harm() -> None:
-    found, counters = parse('{"v": 3, "joints": {"rh_WRJ1": 0, "lh_LFJ5": 1}, "note": [1, {}]}')
+    found, counters = parse(
+        '{"v": 3, "joints": {"rh_WRJ1": -3.4906, "lh_LFJ5": 3.4906}, "note": [1, {}]}'
+    )
     assert found is not None
     assert found.names == ("WRJ1", "LFJ5")
+    assert found.position_rad.tolist() == [-3.4906, 3.4906], "200 degrees at most"
     assert not any(counters.as_dict().values())
 
 
 @pytest.mark.parametrize(
-    "data",
-    [
-        b"\xff\xfe\x00",
-        b"null",
-        b"[]",
-        b"{}",
-        b'{"joints": []}',
-        b'{"joints": {"FFJ3": 0.5}',
-        b'{"joints": {"FFJ3": 0.5}} x',
-        b'{"joints": {"FFJ3": 0.5, "FFJ3": 0.6}}',
-        b'{"joints": {"FFJ3": 0.5}, "seq": true}',
-        b'{"joints": {"FFJ3": 0.5}, "t": 1e999}',
-        b'{"joints": {"FFJ3": 0.5}}'.decode().encode("utf-16"),
-        b"[" * DATAGRAM_BYTES_MAX,
-        b'{"joints":' * 400,
-        b'{"seq": ' + b"9" * 4080 + b"}",
-    ],
-)
-def test_what_is_no_message_is_counted_and_dropped(data: bytes) -> None:
-    found, counters = parse(data)
-    assert found is None
-    assert counters.bad_messages == 1
-
-
-@pytest.mark.parametrize(
     "angle",
-    ["NaN", "Infinity", "-Infinity", "1e999", "true", "false", "null", '"0.5"', "[0.5]", "{}",
-     "3.6", "-3.6", "90", "1" + "0" * 400],
-)  # fmt: skip
+    ["NaN", "1e999", "true", "null", '"0.5"', "3.4908", "-3.4908", "1" + "0" * 400],
+)
 def test_an_impossible_angle_is_nan_and_costs_no_other(angle: str) -> None:
     found, counters = parse('{"joints": {"FFJ3": 0.5, "FFJ4": ' + angle + ', "THJ5": 0}}')
     assert found is not None
@@ -105,7 +78,7 @@ def test_an_impossible_angle_is_nan_and_costs_no_other(angle: str) -> None:
     assert counters.bad_angles == 1
 
 
-@pytest.mark.parametrize("name", ["FFJ5", "ffj3", "xx_FFJ3", "rh_rh_FFJ3", "", "THJ0", "elbow"])
+@pytest.mark.parametrize("name", ["ffj3", "elbow"])
 def test_an_unknown_name_is_left_out_and_counted(name: str) -> None:
     found, counters = parse(json.dumps({"joints": {name: 0.1, "FFJ3": 0.5}}))
     assert found is not None
@@ -119,12 +92,6 @@ def test_one_joint_under_two_names_has_no_angle() -> None:
     assert found.names == ("FFJ3",)
     assert math.isnan(found.position_rad[0])
     assert counters.bad_angles == 1
-
-
-@given(st.binary(max_size=300) | st.text(max_size=200).map(str.encode))
-def test_whatever_is_fed_nothing_is_raised(data: bytes) -> None:
-    found, counters = parse(data)
-    assert (found is None) == counters.bad_messages
 
 
 @given(
@@ -153,21 +120,6 @@ def test_a_message_is_written_as_it_is_read() -> None:
         JointMessage(Stamp(7, 1.5), ("FFJ3",), np.array([math.nan])).to_bytes()
 
 
-@pytest.mark.parametrize(("length", "taken"), [(4096, True), (4097, False)])
-def test_a_datagram_has_at_most_four_kilobytes(length: int, taken: bool) -> None:
-    found, counters = parse(message(1).ljust(length))
-    assert (found is not None) == taken
-    assert counters.bad_messages == (not taken)
-
-
-@pytest.mark.parametrize(
-    ("seq", "taken"), [(0, True), ((1 << 63) - 1, True), (1 << 63, False), (-1, False)]
-)
-def test_a_number_fits_into_a_signed_integer_of_64_bits(seq: int, taken: bool) -> None:
-    found, counters = parse(message(seq))
-    assert (found is not None, counters.bad_messages) == (taken, int(not taken))
-
-
 @pytest.mark.parametrize(("step", "missed", "restarts"), [(1001, 1000, 0), (1002, 0, 1)])
 def test_a_jump_above_a_thousand_is_a_new_start(step: int, missed: int, restarts: int) -> None:
     counters = JointCounters()
@@ -175,16 +127,6 @@ def test_a_jump_above_a_thousand_is_a_new_start(step: int, missed: int, restarts
     for seq in (5, 5 + step):
         assert order.admits(Stamp(seq, None))
     assert (counters.missed_readings, counters.restarts) == (missed, restarts)
-
-
-@pytest.mark.parametrize(
-    ("degrees", "angle"), [(200.0, True), (-200.0, True), (200.01, False), (-200.01, False)]
-)
-def test_no_joint_turns_further_than_200_degrees(degrees: float, angle: bool) -> None:
-    found, counters = parse(message(FFJ0=math.radians(degrees)))
-    assert found is not None
-    assert math.isnan(found.position_rad[0]) == (not angle)
-    assert counters.bad_angles == (not angle)
 
 
 def taken(driver: JointStreamDriver, *data: bytes) -> list[JointReading]:
@@ -204,8 +146,3 @@ def test_a_message_is_a_reading_and_a_gap_a_loss(driver: JointStreamDriver) -> N
 def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:
     assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
     assert driver.link.state is LinkState.UP
-
-
-def test_a_twin_refuses_a_fault_that_it_cannot_show() -> None:
-    with pytest.raises(ValueError, match="burst-frames"):
-        JointTwin(faults=LinkFaults(burst_frames=2))

@@ -60,20 +60,14 @@ def problems(data: dict[str, object]) -> tuple[str, ...]:
 @pytest.mark.parametrize(
     ("joint", "raw", "expected_deg"),
     [
-        *(("FFJ1", raw, angle) for raw, angle in FFJ1),
         ("FFJ1", 2891, 11.25),  # half way from 3109 to 2673
         ("FFJ1", 1595, 45 + 22.5 * (1942 - 1595) / (1942 - 1247)),
         ("FFJ1", 4095, 0 - 22.5 * (4095 - 3109) / (3109 - 2673)),  # beyond, by the first segment
         ("FFJ1", 100, 90 + 22.5 * (649 - 100) / (1247 - 649)),  # and by the last one
-        ("FFJ3", 2487, 0),
+        ("FFJ1", 1942, 45),
         ("FFJ3", 946, 90),
         ("FFJ4", 591, -20),
-        ("FFJ4", 1884, 0),
-        ("FFJ4", 2092, 20),
-        ("THJ4", 1403, 0),
         ("THJ4", 2260, 67.5),
-        ("THJ5", (3633, 3633), -60),
-        ("THJ5", (1063, 1063), 60),
         ("THJ5", (4029, 1668), -60 + 120 * (3633 - 2848.5) / 2570),
     ],
 )
@@ -258,12 +252,10 @@ def test_a_square_grid_agrees_with_an_independent_interpolation() -> None:
     [
         # As shipped with three hands: a digit too many.
         ("LFJ1", [[22361, 0.0], [1942, 45.0], [649, 90.0]], "raw 22361 is not in 1..4095"),
-        ("THJ5", [[3633, -60.0], [10397, 60.0]], "raw 10397 is not in 1..4095"),
         ("RFJ2", [[0, 0.0], [0, 22.5], [0, 45.0]], "raw 0 is a placeholder"),
         ("RFJ2", [[-5, 0.0], [900, 45.0]], "raw -5 is not in 1..4095"),
         ("LFJ3", [[2500, 0.0], [1800, 45.0], [1200, 40.0], [700, 90.0]], "is not monotone"),
         ("THJ3", [[2500, 0.0], [1800, 0.0]], "is not monotone"),
-        ("WRJ1", [], "has 0 points"),
         ("WRJ2", [[2500, 0.0], [2500, 10.0]], "raw 2500 stands twice"),
         ("FFJ3", [[2500, 0.0], [2510, 45.0]], "4.50 degrees per count from raw 2500 to 2510"),
         ("FFJ3", [[2500, 0.0], [900, 900.0]], "900.0 degrees is out of reach"),
@@ -272,7 +264,6 @@ def test_a_square_grid_agrees_with_an_independent_interpolation() -> None:
         ("THJ1", FFJ1, "stand in [coupled]"),
         ("FFJ1", [[1000, 0.0, 1], [2000, 45.0]], "must be a list of points of 2 numbers"),
         ("FFJ1", [[1000, True], [2000, 45.0]], "must be a list of points"),
-        ("FFJ1", [[1000, "0"], [2000, 45.0]], "must be a list of points"),
         ("FFJ1", [[1000, math.nan], [2000, 45.0]], "must be a list of points"),
         ("FFJ1", [[10**400, 0.0], [2000, 45.0]], "must be a list of points"),
         ("FFJ1", 7, "must be a list of points"),
@@ -287,7 +278,6 @@ def test_a_wrong_table_is_refused_by_name(joint: str, rows: object, reason: str)
     ("data", "reason"),
     [
         ({"joints": {"FFJ1": FFJ1}}, "version is None, must be 1"),
-        ({"version": 2, "joints": {"FFJ1": FFJ1}}, "version is 2"),
         ({"version": True, "joints": {"FFJ1": FFJ1}}, "version is True"),
         ({"version": 1}, "joints: is empty"),
         ({"version": 1, "joints": 3}, "joints: must be a table"),
@@ -295,7 +285,6 @@ def test_a_wrong_table_is_refused_by_name(joint: str, rows: object, reason: str)
         ({"version": 1, "coupled": {"THJ1": COUPLED}}, "THJ1: no such key; there is: THJ1_THJ2"),
         (coupled([[0, 0, 0, 0]] * 25), "THJ1_THJ2: raw 0 is a placeholder"),
         (coupled([*COUPLED, COUPLED[0]]), "stands twice"),
-        (coupled([*COUPLED, [901, 800, 0, -40]]), "is steeper than 0.5"),
         (coupled([*COUPLED, [4096, 800, 0, -40]]), "raw 4096 is not in 1..4095"),
         (coupled([*COUPLED, [3500, 300, 120, -40]]), "THJ1: 120 degrees is out of reach"),
         (coupled([[1000 + 90 * i, 2000 + 90 * i, i, i] for i in range(9)]), "span a triangle"),
@@ -315,9 +304,7 @@ def test_every_mistake_of_a_file_has_its_line() -> None:
     ("content", "reason"),
     [
         (b"version = ", "is not TOML"),
-        (b"\xff\xfe", "is not TOML"),
         (b"#" * 262_145, "is longer than 262144 bytes"),
-        (b"x = " + b"[" * 5000, "is not TOML"),
         (None, "cannot be read"),
     ],
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,11 +13,9 @@ import pytest
 from graspd.drivers.palm.calibration import CalibrationError
 from graspd.drivers.palm.packet import Palm
 from graspd.drivers.palm.stream import PalmDriver
-from graspd.drivers.twins.datagrams import PalmTwin
 from tests.conftest import ROOT
 from tests.drivers.one_sweep import tactile
 from tests.drivers.palm.palm_stream import (
-    FINGERS,
     MS,
     ROUND,
     DatagramClock,
@@ -37,22 +33,6 @@ EXAMPLE = ROOT / "deploy" / "calibration" / "example_hand.toml"
 def driver(clock: DatagramClock) -> Iterator[PalmDriver]:
     with PalmDriver(LOOPBACK, clock=clock) as driver:
         yield driver
-
-
-def test_who_sends_stands_for_the_serial_numbers(driver: PalmDriver, clock: DatagramClock) -> None:
-    """Two relays may run on one computer, so the port tells them apart too."""
-    assert driver.serials == {}
-    with Sender(driver) as sender, Sender(driver) as stranger:
-        sender.send(*datagrams(1))
-        driver.read_ready()
-        first = driver.serials
-        assert first == dict.fromkeys(FINGERS, f"udp://127.0.0.1:{sender.port}")
-        clock.now_ns += 200 * MS
-        driver.read_ready()
-        assert driver.serials == first  # nobody else has come yet
-        stranger.send(*datagrams(2)[ROUND:])
-        driver.read_ready()
-        assert driver.serials == dict.fromkeys(FINGERS, f"udp://127.0.0.1:{stranger.port}")
 
 
 def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver) -> None:
@@ -110,16 +90,6 @@ def test_joints_come_calibrated_at_their_own_rate(
     assert np.isnan(angles["MFJ1"])
 
 
-def test_a_raw_value_that_is_no_count_gives_no_angle() -> None:
-    packet = next(iter(PalmTwin(rows(1)).packets()))
-    broken = dataclasses.replace(packet, sensors=(5000, *packet.sensors[1:]))
-    with PalmDriver(LOOPBACK, calibration=EXAMPLE) as driver, Sender(driver) as sender:
-        sender.send(broken.to_bytes())
-        (reading,) = joints(driver.read_ready())
-        assert np.isnan(reading.position_rad[reading.names.index("FFJ1")])
-        assert driver.stream.counters.bad_angles == 1
-
-
 def test_a_wrong_calibration_keeps_the_driver_from_opening(tmp_path: Path) -> None:
     path = tmp_path / "hand.toml"
     path.write_text("version = 1\n[joints]\nLFJ1 = [[22361, 0.0], [649, 90.0]]\n")
@@ -127,18 +97,3 @@ def test_a_wrong_calibration_keeps_the_driver_from_opening(tmp_path: Path) -> No
     with pytest.raises(CalibrationError, match=r"hand\.toml: LFJ1: raw 22361"):
         driver.open()
     assert driver.fileno() is None
-
-
-def test_an_address_of_the_other_family_is_listened_on_too(clock: DatagramClock) -> None:
-    try:
-        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
-            probe.bind(("::1", 0))
-    except OSError:
-        pytest.skip("this machine has no IPv6")
-    with (
-        PalmDriver("udp://[::1]:0", clock=clock) as driver,
-        socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sender,
-    ):
-        for data in datagrams(1):
-            sender.sendto(data, ("::1", driver.port or 0))
-        assert len(driver.read_ready()) == 1

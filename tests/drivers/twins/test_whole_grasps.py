@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import csv
-import itertools
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from graspd.drivers.recordings.csv_player import (
@@ -16,25 +14,12 @@ from graspd.drivers.recordings.csv_player import (
     DEMO_TABLE,
     SHOW_RECORDING,
 )
-from graspd.drivers.twins.grasps.grasp_script import EndPoint
 from graspd.drivers.twins.grasps.whole_grasps import (
-    GraspRow,
-    WholeGrasps,
     synthetic_grasps,
 )
 from tests.drivers.recordings.tables import rows_of
-from tests.drivers.twins.signals import played
 from tests.kit import demos
 from tests.kit.demos import STREAM_DURATIONS
-
-REST = np.full((3, 24), 3000.0)
-
-
-def test_held_values_come_at_the_rate_of_recordings_only() -> None:
-    with pytest.raises(ValueError, match="must be positive"):
-        WholeGrasps(REST, [], rate_hz=0.0)
-    with pytest.raises(ValueError, match="held values come at 100 Hz"):
-        WholeGrasps(REST, [], held=True, rate_hz=50.0)
 
 
 def test_the_demo_has_twelve_synthetic_grasps_and_six_slips() -> None:
@@ -52,33 +37,6 @@ def test_the_demo_has_twelve_synthetic_grasps_and_six_slips() -> None:
         row = rows[round(timetable.lift_s * 100.0)]
         assert row.annotation.slipped is timetable.slipped
         assert row.annotation.object_name == timetable.object_name
-
-
-PAIRS = [(0,), *((first, first + 1) for first in range(1, 23, 2)), (23,)]
-"""Electrodes sampled by one request, from 0: E1 (with TDC), E2/E3 ... E22/E23, E24."""
-
-
-def counts_of(moments: list[GraspRow]) -> NDArray[np.float64]:
-    return np.array([moment.counts for moment in moments], dtype=np.float64)
-
-
-def test_held_values_follow_the_palms_requests() -> None:
-    numbers = np.broadcast_to(np.arange(1000.0)[:, np.newaxis, np.newaxis], (1000, 3, 24))
-    for seed in range(20):
-        grasps = WholeGrasps(
-            np.ones((3, 24)),
-            [EndPoint(np.ones((3, 24), dtype=np.uint16), False, "")],
-            held=True,
-            noise=played(numbers),
-            seed=seed,
-        )
-        rows = counts_of(list(itertools.islice(grasps, 100)))
-        if rows[0, 0, 0] < 800:  # the loop does not begin again within these rows
-            break
-    for row, counts in enumerate(rows):
-        for place, pair in enumerate(PAIRS, 1):
-            rounds_ago = (10 * row - place) // 14 + 1
-            assert (counts[:, list(pair)] == rows[0, 0, 0] + rounds_ago).all()
 
 
 def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
