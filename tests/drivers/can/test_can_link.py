@@ -88,6 +88,7 @@ def test_the_link_recovers_from_any_error_of_python_can(
     with driver:
         (reading,) = tactile(driver.read_ready())
         assert (reading.counts == truth(0)).all()
+        assert not reading.interrupted
         assert driver.describe()["link"].text == "waiting"
         assert str(failure) in driver.describe()["why"].text
         assert driver.fileno() is None
@@ -99,6 +100,7 @@ def test_the_link_recovers_from_any_error_of_python_can(
             readings = tactile(driver.read_ready())
         (reading,) = readings
         assert (reading.counts == truth(3)).all()
+        assert reading.interrupted
         assert not reading.faults.any()
         known = driver.describe()
         assert (known["link"].text, "why" in known) == ("up", False)

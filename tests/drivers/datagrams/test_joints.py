@@ -146,3 +146,11 @@ def test_a_message_is_a_reading_and_a_gap_a_loss(driver: JointStreamDriver) -> N
 def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:
     assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
     assert driver.link.state is LinkState.UP
+
+
+def test_joint_messages_of_a_new_start_interrupt() -> None:
+    stream, readings = JointStream(), list[JointReading]()
+    for seq in (*range(50, 60), *range(20), 5000):
+        readings += stream.receive(message(seq), 0) or []
+    # Ten of the old numbers are dropped; 5000 is more than a thousand ahead.
+    assert [at for at, reading in enumerate(readings) if reading.interrupted] == [10, 20]

@@ -191,6 +191,16 @@ def test_a_restart_may_have_another_zero_of_time(zero_s: float, made_ms: float) 
     assert made_ns / MS == pytest.approx(made_ms, abs=0.03)
 
 
+def test_counts_after_a_new_start_or_loss_interrupt() -> None:
+    stream, readings = TactileStream(FINGERS, "right"), list[TactileReading]()
+    for place, seq in enumerate((*range(50, 60), *range(20), 5000, 5001)):
+        if place == 31:
+            stream.interrupt()
+        readings += stream.receive(message(seq=seq), 0) or []
+    assert [at for at, reading in enumerate(readings) if reading.interrupted] == [10, 20, 21]
+    assert stream.counters.restarts == 2
+
+
 def test_messages_that_waited_stay_old_after_many_losses() -> None:
     stream = TactileStream(FINGERS, "right")
     ages_ms: list[float] = []

@@ -240,6 +240,7 @@ def test_a_palm_whose_words_stand_still_is_read() -> None:
             for _ in range(2):
                 readings += stream.receive(packet.to_bytes(), outage_ns + cycle * MS) or ()
         assert len(readings) == 10
+        assert [each.interrupted for each in readings] == [outage_ns > 0, *[False] * 9]
         assert not any(reading.faults.any() for reading in tactile(readings))
     assert stream.counters.duplicate_packets == 2 * 10 * ROUND
     assert stream.counters.unsynchronised_packets == 0

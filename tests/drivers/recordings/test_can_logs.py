@@ -162,12 +162,11 @@ def test_a_log_without_frames_of_a_board_is_refused(tmp_path: Path, text: str, s
         played([path])
 
 
-@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-8-sig"])
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig"])
 def test_a_log_of_another_encoding_with_a_torn_end_reads(tmp_path: Path, encoding: str) -> None:
     """PowerShell writes UTF-16; a computer that lost power leaves zeros."""
     path = tmp_path / "bus.txt"
-    mark = "\ufeff" if encoding == "utf-16-be" else ""
-    path.write_text(mark + "".join(lines_of(3)) + "\0" * 100, encoding)
+    path.write_text("".join(lines_of(3)) + "\0" * 100, encoding)
     readings, _ = played([path])
     assert len(readings) == 3
 

@@ -9,12 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.drivers.base import (
-    JointReading,
-    Reading,
-    RecordingError,
-    TactileReading,
-)
+from graspd.drivers.base import JointReading, Reading, RecordingError, TactileReading
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from tests.drivers.one_sweep import tactile
 from tests.drivers.recordings.tables import (
@@ -125,6 +120,8 @@ def test_a_loop_starts_again_and_time_continues(tmp_path: Path) -> None:
         assert not driver.exhausted
     assert times_ms(readings) == [0, 10, 20, 40, 60, 70, 80, 100, 120]
     assert [reading.seq for reading in readings] == list(range(9))
+    begins = [at for at, reading in enumerate(readings) if reading.interrupted]
+    assert begins == [2, 6], "a stream does not follow what was before"
 
 
 def test_a_schedule_does_not_drift_by_rounding(tmp_path: Path) -> None:

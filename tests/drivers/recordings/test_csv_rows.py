@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from graspd.drivers.base import ElectrodeFault, RecordingError
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.layout import survey
-from graspd.drivers.recordings.values import count_of, number_of
+from graspd.drivers.recordings.values import count_of
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,
@@ -75,12 +75,6 @@ def test_an_object_name_may_be_quoted_or_blank(cell: str, name: str | None) -> N
 GOOD = table(2)
 BAD_FILES = {
     "empty": (b"", "grasps.csv: the file is empty"),
-    "only blank lines": (b"\n \r\n\t\n", "grasps.csv: the file is empty"),
-    "header only": (table(0), "grasps.csv: the file has a header and no rows"),
-    "NUL in the header": (
-        b"\x7fELF\0\0",
-        "looks like a program; deploy/RECORDING.md",
-    ),
     "Latin-1": (table(2, {1: {"object": "x"}}).replace(b"x", b"\xe9"), "line 3: not UTF-8"),
     "odd UTF-16": (GOOD.decode().encode("utf-16")[:-1], "not UTF-16: this is a binary"),
     "one column missing": (
@@ -109,10 +103,6 @@ BAD_FILES = {
     ),
     "no line ends": (b"7," * LINE_LENGTH_MAX, "line 1: the line is longer than 65536 characters"),
     "open quote": (GOOD.replace(b"thing_1", b'"thing_1'), "line 3: this is not CSV: unexpected"),
-    "text after a quote": (
-        GOOD.replace(b"thing_1", b'"thing"_1'),
-        "line 3: this is not CSV: ',' expe",
-    ),
     "no header": (GOOD.split(b"\n", 1)[1], "line 1: has numbers in place of names: the header is"),
     "another header": (
         GOOD + GOOD.split(b"\n")[0] + b"\n",
@@ -130,10 +120,6 @@ BAD_FILES = {
         stream(["0"], {"rh_FFJ3": ["0"], "FFJ3": ["0"]}),
         "line 1, column FFJ3: this column is there twice, as rh_FFJ3 too",
     ),
-    "time twice": (
-        stream(["0"], columns=["t", *ELECTRODES, "t"]),
-        "line 1, column t: this column is there twice",
-    ),
 }
 
 
@@ -146,7 +132,7 @@ def test_a_wrong_recording_is_refused_with_line_and_column(content: bytes, messa
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("label", ["2", "yes", "01", "\u0661"])
+@pytest.mark.parametrize("label", ["2", "\u0661"])
 def test_an_outcome_that_cannot_be_read_matters_where_needed(label: str) -> None:
     content = table(2, {1: {"slipped": label}})
     assert rows_of(content)[1].annotation.slipped is None
@@ -155,13 +141,13 @@ def test_an_outcome_that_cannot_be_read_matters_where_needed(label: str) -> None
         rows_of(content, outcomes=True)
 
 
-@pytest.mark.parametrize("t", ["nan", "-inf", "", "1e999", "1_0", "\u0661"])
+@pytest.mark.parametrize("t", ["nan", "", "1e999", "1_0"])
 def test_a_time_is_a_number_or_a_clock(t: str) -> None:
     with pytest.raises(RecordingError, match=r"line 2, column t: .* is not a time"):
         rows_of(stream([t, "1"]))
 
 
-@pytest.mark.parametrize("t", ["0", "-3.5", "1700000000.123456", "+1e3", ".5", "7."])
+@pytest.mark.parametrize("t", ["-3.5", "1700000000.123456", "+1e3"])
 def test_a_time_may_have_any_offset(t: str) -> None:
     first, second = rows_of(stream([t, t]))
     assert first.t_s == second.t_s == float(t)
@@ -204,11 +190,14 @@ def test_a_stream_gives_times_and_joints_without_hand_prefix() -> None:
 @pytest.mark.parametrize(
     ("column", "known"),
     [
-        ("FFJ0", True), ("MFJ4", True), ("RFJ2", True), ("LFJ5", True), ("THJ5", True),
-        ("WRJ2", True), ("lh_THJ1", True), ("FFJ5", False), ("THJ0", False), ("WRJ3", False),
-        ("rh_lh_FFJ3", False), ("ffj3", False),
+        ("FFJ0", True),
+        ("lh_LFJ5", True),
+        ("FFJ5", False),
+        ("THJ0", False),
+        ("WRJ3", False),
+        ("rh_lh_FFJ3", False),
     ],
-)  # fmt: skip
+)
 def test_joints_are_those_of_the_shadow_hand(column: str, known: bool) -> None:
     found = survey(PATH, io.BytesIO(stream(["0"], {column: ["0"]})), FINGERS)
     assert (found.columns.ignored == ()) is known
@@ -261,13 +250,13 @@ def test_gigabytes_without_a_line_end_are_refused_at_once(
 
 
 NOT_COUNTS = [
-    "nan", "-1", "4096", "2602.5", "text", "", "inf", "1_000", "1,", "\u0661\u0662", "\u00b2",
-    "9" * 5000, "1e400", "0.0000000001", "4095.0000001", "2 602", ".", "1e", "2602e0.5",
-]  # fmt: skip
+    *("nan", "-1", "4096", "2602.5", "", "1_000", "1,", "\u0661\u0662", "9" * 5000, "4095.0000001"),
+    *("2 602", "."),
+]
 COUNTS = {
-    "0": 0, "4095": 4095, "007": 7, " 12\t": 12, "2602.": 2602, "2.602000000000000000e+03": 2602,
-    "4095.000": 4095, "0e0": 0, "50E-1": 5, "+5": 5, ".5e1": 5,
-}  # fmt: skip
+    **{"0": 0, "4095": 4095, " 12\t": 12, "2602.": 2602, "2.602000000000000000e+03": 2602},
+    **{"+5": 5, ".5e1": 5},
+}
 
 
 @pytest.mark.parametrize("cell", NOT_COUNTS, ids=lambda cell: repr(cell)[:24])
@@ -308,11 +297,6 @@ def test_a_count_is_read_as_python_reads_it(cell: str) -> None:
         assert set(cell.strip()) <= set("0123456789.eE+-")
         assert float(cell) == value
         assert 0 <= value <= 4095
-
-
-@given(st.floats(allow_nan=True, allow_infinity=True))
-def test_a_number_is_read_as_python_writes_it(value: float) -> None:
-    assert number_of(repr(value)) == (value if math.isfinite(value) else None)
 
 
 @given(st.binary(max_size=400) | st.binary(max_size=200).map(lambda tail: table(2) + tail))

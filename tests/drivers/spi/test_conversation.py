@@ -90,17 +90,17 @@ def test_silence_is_ten_missing_sweeps_and_100_ms(period_ms: int, silence_ms: in
     assert conversation.link.cause is LinkCause.TIMEOUT
 
 
-def test_a_bridge_slower_than_once_a_second_is_refused() -> None:
-    conversation = greeted(hello(0, period_ms=1001))
-    assert conversation.link.reason == "port: the bridge sweeps once in 1.001 s only"
-    assert conversation.link.cause is LinkCause.SETTINGS
-    assert conversation.counters.refused_bridges == 1
-
-
-def test_a_bridge_with_too_few_sensors_is_refused() -> None:
-    conversation = greeted(hello(0, sensors=2))
-    why = "port: the bridge has 2 sensors, the scene needs 3"
+@pytest.mark.parametrize(
+    ("period_ms", "sensors", "why"),
+    [
+        (1001, 3, "port: the bridge sweeps once in 1.001 s only"),
+        (10, 2, "port: the bridge has 2 sensors, the scene needs 3"),
+    ],
+)
+def test_a_bridge_too_slow_or_too_small_is_refused(period_ms: int, sensors: int, why: str) -> None:
+    conversation = greeted(hello(0, period_ms=period_ms, sensors=sensors))
     assert (conversation.link.reason, conversation.counters.refused_bridges) == (why, 1)
+    assert conversation.link.cause is LinkCause.SETTINGS
 
 
 def test_a_board_reset_by_opening_is_asked_again() -> None:
@@ -150,7 +150,6 @@ def words_of(conversation: Conversation) -> dict[str, str]:
         (("A", "B", "C"), Fact("A, B, C"), Fact("0, 0, 0")),
         (("A", "B", "A"), Fact("A, B, A", DeviceFault.SENSOR_TWICE), Fact("0, 0, 0")),
         (("A", "", "C"), Fact("A, none, C", DeviceFault.SENSOR_ABSENT), Fact("0, -, 0")),
-        (("A", "", "A"), Fact("A, none, A", DeviceFault.SENSOR_TWICE), Fact("0, -, 0")),
         (("", "", ""), Fact("none, none, none", DeviceFault.NO_SENSOR), Fact("-, -, -")),
     ],
 )
@@ -248,7 +247,7 @@ def test_a_bridges_counters_are_shown_and_echoes_are_unknown() -> None:
     assert (*shown, counters.unknown_frames) == (3, 4, 5, 1)
 
 
-@pytest.mark.parametrize(("kind", "bad"), [(1, 1), (2, 1), (3, 1), (4, 0), (0x80, 0), (0x84, 0)])
+@pytest.mark.parametrize(("kind", "bad"), [(1, 1), (2, 1), (3, 1), (4, 0), (0x84, 0)])
 def test_a_frame_makes_no_sense_or_its_type_is_unknown(kind: int, bad: int) -> None:
     conversation = opened()
     digest = 0 if kind == 1 else DIGEST
@@ -267,11 +266,9 @@ def test_a_high_first_number_is_no_loss(first: int, missed: int) -> None:
 @pytest.mark.parametrize(
     ("first", "step", "taken", "missed", "duplicates", "reordered"),
     [
-        (900, 1, 1, 0, 0, 0),
         ((1 << 32) - 1, 2, 1, 1, 0, 0),
         (900, (1 << 31) - 1, 1, (1 << 31) - 2, 0, 0),
         (900, 1 << 31, 0, 0, 0, 1),
-        (900, (1 << 32) - 1, 0, 0, 0, 1),
         (900, 0, 0, 0, 1, 0),
     ],
 )
@@ -299,7 +296,6 @@ BY_FINGER = {"ff": "A", "mf": "B", "th": "C"}
         ([SERIALS, SERIALS], "B"),
         ([MISREAD, SERIALS], None),
         ([MISREAD, SERIALS, SERIALS], "B"),
-        ([SERIALS, ("A", "", "C")], None),
         ([("A", "", "C"), SERIALS, SERIALS], "B"),
         ([MISREAD, SERIALS, MISREAD, SERIALS], None),
     ],

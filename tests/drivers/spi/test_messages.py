@@ -102,23 +102,17 @@ def test_damage_is_counted_and_the_next_frame_is_found(wire: str, counter: str) 
     assert parser.feed(encode_frame(0x31, b"next")) == [(0x31, b"next")]
 
 
-def test_an_overlong_frame_is_dropped_and_never_held() -> None:
-    parser = FrameParser()
-    for _ in range(100):
-        assert parser.feed(b"\x55" * 1000) == []
-        assert parser.held_bytes <= ENCODED_MAX_BYTES
-    assert parser.counters.too_long == 1
-    assert parser.feed(b"\0" + encode_frame(1, b"x")) == [(1, b"x")]
-    assert parser.feed(b"\x55" * 100_000 + b"\0" + encode_frame(1, b"y")) == [(1, b"y")]
-    assert parser.counters.too_long == 2
-
-
-def test_a_frame_one_byte_too_long_is_dropped() -> None:
+def test_a_frame_one_byte_too_long_is_dropped_and_never_held() -> None:
     parser = FrameParser()
     parser.feed(b"\xff" * ENCODED_MAX_BYTES + b"\0")
     assert parser.counters.too_long == 0
     parser.feed(b"\xff" * (ENCODED_MAX_BYTES + 1) + b"\0")
     assert parser.counters.too_long == 1
+    for _ in range(3):
+        assert parser.feed(b"\x55" * 1000) == []
+        assert parser.held_bytes <= ENCODED_MAX_BYTES
+    assert parser.counters.too_long == 2
+    assert parser.feed(b"\0" + encode_frame(1, b"x")) == [(1, b"x")]
     longest = bytes(1019)  # each zero takes one byte, type and checksum five
     assert len(encode_frame(1, longest[:-1])) == ENCODED_MAX_BYTES + 1
     with pytest.raises(ValueError, match="1025 bytes, more than 1024"):
@@ -184,14 +178,8 @@ def test_a_message_has_its_golden_bytes_and_comes_back(
 @pytest.mark.parametrize(
     "changes",
     [
-        {"version": 2},
-        {"tick_hz": 999},
-        {"period_ticks": 0},
-        {"sensors": 0},
-        {"sensors": 6},
-        {"slots": 0},
-        {"slots": 65},
-        {"command": 0xA1},
+        *({"version": 2}, {"tick_hz": 999}, {"period_ticks": 0}, {"sensors": 0}, {"sensors": 6}),
+        *({"slots": 0}, {"slots": 65}, {"command": 0xA1}),
     ],
     ids=str,
 )

@@ -7,6 +7,7 @@ import pytest
 
 from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.biotac import E1, PAC, SEQUENCES, TDC
+from graspd.drivers.spi.sweeps import BridgeCounters, DeviceClock, SweepDecoder
 from tests.drivers.spi.bridge_bench import T0, greeted, hear, hello, opened, sweep, words
 
 
@@ -92,3 +93,14 @@ def test_a_sweep_unlike_the_hello_is_bad() -> None:
     conversation = greeted()
     assert hear(conversation, sweep(0, 10_000, read=words(slots=23)), T0) == []
     assert conversation.counters.bad_frames == 1
+
+
+def test_a_bridge_that_is_started_again_interrupts() -> None:
+    counters, interrupted = BridgeCounters(), []
+    for _ in range(2):
+        decoder = SweepDecoder(hello(0), (0, 1, 2), counters, DeviceClock(1_000_000, 0, 0, 0))
+        for number in range(3):
+            reading = decoder.reading(sweep(number, number * 10_000), (number + 1) * 10_000_000)
+            assert reading is not None
+            interrupted.append(reading.interrupted)
+    assert interrupted == [False, False, False, True, False, False]
