@@ -139,6 +139,8 @@ def test_a_silent_board_is_down_and_comes_back() -> None:
     link = TwinLink()
     driver, clock = link.driver, link.clock
     with driver:
+        assert driver.read_ready() == []
+        assert str(driver.stream.link.state) == "greeting"
         link.send(contact(8))
         assert driver.stream.link.state is LinkState.UP
         with can.Bus(interface="virtual", channel=link.where, ignore_config=True) as bus:

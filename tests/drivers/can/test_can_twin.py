@@ -170,6 +170,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         {"fingers": ("ff", "mf", "rf", "th")},
         {"data_length": 6},
         {"data_length": 9},
+        {"options": {"no_such_option": 1}},
     ],
 )
 def test_arguments_out_of_range_are_refused(options: Mapping[str, Any]) -> None:

@@ -89,7 +89,8 @@ def test_a_period_is_the_median_of_five_to_fifteen() -> None:
 
 
 def test_a_period_is_two_seconds_at_most() -> None:
-    assert periods([0, -1, 2_000 * MS + 1] * 5) == [None] * 15
+    for gap_ns in (0, -1, 2_000 * MS + 1):
+        assert periods([gap_ns] * 5) == [None] * 5
     assert periods([2_000 * MS] * 5)[-1] == 2_000 * MS
 
 

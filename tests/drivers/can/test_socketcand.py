@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 import time
@@ -45,6 +46,7 @@ class Server:
             except OSError:
                 return
             client.settimeout(None)  # the driver's thread sets a default while it connects
+            self.client = client
             with client:
                 if self._greets:
                     client.sendall(b"< hi >")
@@ -55,7 +57,6 @@ class Server:
             while asked := client.recv(256).decode():
                 client.sendall(ANSWERS[asked].encode())
                 if asked == "< rawmode >":
-                    self.client = client
                     self.ready.set()
         except OSError:
             pass
@@ -74,7 +75,11 @@ class Server:
     def close(self) -> None:
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
-        self._thread.join()
+        while self._thread.is_alive():
+            with contextlib.suppress(OSError):
+                if self.client is not None:
+                    self.client.shutdown(socket.SHUT_RDWR)  # a driver that failed left it open
+            self._thread.join(0.1)
 
 
 @pytest.fixture

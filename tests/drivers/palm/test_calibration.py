@@ -285,7 +285,7 @@ def test_a_wrong_table_is_refused_by_name(joint: str, rows: object, reason: str)
         ({"version": 1, "coupled": {"THJ1": COUPLED}}, "THJ1: no such key; there is: THJ1_THJ2"),
         (coupled([[0, 0, 0, 0]] * 25), "THJ1_THJ2: raw 0 is a placeholder"),
         (coupled([*COUPLED, COUPLED[0]]), "stands twice"),
-        (coupled([*COUPLED, [4096, 800, 0, -40]]), "raw 4096 is not in 1..4095"),
+        (coupled([*COUPLED, [800, 4096, 0, -40]]), "raw 4096 is not in 1..4095"),
         (coupled([*COUPLED, [3500, 300, 120, -40]]), "THJ1: 120 degrees is out of reach"),
         (coupled([[1000 + 90 * i, 2000 + 90 * i, i, i] for i in range(9)]), "span a triangle"),
     ],

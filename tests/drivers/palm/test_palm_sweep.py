@@ -230,19 +230,21 @@ def test_how_long_no_round_can_end() -> None:
     assert left == [0, *range(13, -1, -1), *range(13, -1, -1)]
 
 
-def test_a_palm_whose_words_stand_still_is_read() -> None:
+@pytest.mark.parametrize(("copies", "batch"), [(2, 1), (1, 4)])
+def test_a_palm_whose_words_stand_still_is_read(copies: int, batch: int) -> None:
     """Each round of such a palm equals the one before, and is not its copy."""
     stream, steady = PalmStream(FINGERS), packets(1)
     for outage_ns in (0, 300 * MS):
         stream.interrupt()
         readings: list[Reading] = []
         for cycle, packet in enumerate(steady * 10):
-            for _ in range(2):
-                readings += stream.receive(packet.to_bytes(), outage_ns + cycle * MS) or ()
+            t_ns = outage_ns + cycle // batch * batch * MS
+            for _ in range(copies):
+                readings += stream.receive(packet.to_bytes(), t_ns) or ()
         assert len(readings) == 10
         assert [each.interrupted for each in readings] == [outage_ns > 0, *[False] * 9]
         assert not any(reading.faults.any() for reading in tactile(readings))
-    assert stream.counters.duplicate_packets == 2 * 10 * ROUND
+    assert stream.counters.duplicate_packets == 2 * 10 * ROUND * (copies - 1)
     assert stream.counters.unsynchronised_packets == 0
 
 

@@ -13,7 +13,7 @@ import pytest
 from graspd.drivers.base import RecordingError, TactileReading
 from graspd.drivers.biotac import sample_command
 from graspd.drivers.can.frames import CanFrame
-from graspd.drivers.recordings.can_log import CanLog, line_of, read_log
+from graspd.drivers.recordings.can_log import CanLog, Survey, line_of, read_log
 from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
@@ -169,6 +169,16 @@ def test_a_log_of_another_encoding_with_a_torn_end_reads(tmp_path: Path, encodin
     path.write_text("".join(lines_of(3)) + "\0" * 100, encoding)
     readings, _ = played([path])
     assert len(readings) == 3
+
+
+def test_a_log_of_endless_ids_fills_no_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("graspd.drivers.recordings.can_log.IDS_MAX", 3)
+    path = tmp_path / "bus.log"
+    path.write_text("".join(f"(1.0) can0 {number:03X}#00\n" for number in range(4)) * 2)
+    frames = Survey.of(path).frames
+    assert frames == {("can0", number): 2 for number in range(3)}
 
 
 def test_an_id_that_no_frame_has_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
