@@ -6,8 +6,9 @@ What boards must number and how long links may hold frames back, so that this ho
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from numpy.typing import NDArray
 
-from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
+from graspd.drivers.base import DriverCounters, ElectrodeFault, Reading, TactileReading
 from graspd.drivers.biotac import E1, SEQUENCES
 from graspd.drivers.can.frames import CanFrame, encode_sample
 from graspd.drivers.can.stream import CanStream
@@ -63,6 +64,9 @@ SWEEPS_PER_BOOT = 700
 
 Feed = Callable[[Unit, int, int], Sequence[Reading]]
 """A driver that takes a unit, of a sweep of this number, at this time in ns."""
+Link = tuple[Feed, DriverCounters]
+COPIES = ("duplicates", "duplicate_frames", "duplicate_packets", "old_messages")
+"""Names of the counter of copies."""
 
 
 def words_of(number: int) -> NDArray[np.uint16]:
@@ -80,26 +84,30 @@ def sample(number: int, slot: int, channels: Sequence[int]) -> CanFrame:
     return CanFrame(BASE_ID, encode_sample(channel, words))
 
 
-def palm() -> Feed:
+def palm() -> Link:
     stream = PalmStream(FINGERS)
 
     def feed(unit: Unit, _number: int, t_ns: int) -> Sequence[Reading]:
         data = PACKETS[unit.index + PALM_SHIFT * unit.boot]
         return stream.receive(data, t_ns) or ()
 
-    return feed
+    return feed, stream.counters
 
 
-def samples(sequence: str) -> Callable[[], Feed]:
-    def begin() -> Feed:
+def samples(sequence: str) -> Callable[[], Link]:
+    def begin() -> Link:
         stream = CanStream("bus", FINGERS, arbitration_id=BASE_ID, sequence=sequence)
         channels = SEQUENCES[sequence]
-        return lambda unit, number, t_ns: stream.push(sample(number, unit.index, channels), t_ns)
+
+        def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
+            return stream.push(sample(number, unit.index, channels), t_ns)
+
+        return feed, stream.counters
 
     return begin
 
 
-def bus_log() -> Feed:
+def bus_log() -> Link:
     """Through the lines of a log, which must give the readings of the bus."""
     log = CanLog([Path("bus.log")], FINGERS, arbitration_id=BASE_ID, sequence="electrodes")
 
@@ -111,7 +119,7 @@ def bus_log() -> Feed:
         assert logged.frame is not None
         return log.feed(logged.t_ns, logged.frame)
 
-    return feed
+    return feed, log.counters
 
 
 def spi_sweep(unit: Unit, number: int) -> bytes:
@@ -121,7 +129,7 @@ def spi_sweep(unit: Unit, number: int) -> bytes:
     )
 
 
-def bridge() -> Feed:
+def bridge() -> Link:
     """Through a conversation."""
     conversation = greeted()
 
@@ -131,38 +139,42 @@ def bridge() -> Feed:
             conversation = greeted()
         return conversation.receive(spi_sweep(unit, number), t_ns)
 
-    return feed
+    return feed, conversation.counters
 
 
-def bridge_log() -> Feed:
+def bridge_log() -> Link:
     """Through the records of a log, which must give the readings of the line."""
     log = SerialLog([Path("line.serial")], FINGERS)
 
-    def feed(event: LineEvent, data: bytes, t_ns: int) -> list[Reading]:
+    def play(event: LineEvent, data: bytes, t_ns: int) -> list[Reading]:
         records = parse_records(FrameParser(), encode_records(event, t_ns, data))
         return [reading for record in records for reading in log.feed(*record)]
 
     for nonce in (1, 2):
-        feed(LineEvent.SENT, encode(Ping(nonce)), T0)
-        feed(LineEvent.RECEIVED, encode(hello(nonce, 1000)), T0)
-    return lambda unit, number, t_ns: feed(LineEvent.RECEIVED, spi_sweep(unit, number), t_ns)
+        play(LineEvent.SENT, encode(Ping(nonce)), T0)
+        play(LineEvent.RECEIVED, encode(hello(nonce, 1000)), T0)
+
+    def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
+        return play(LineEvent.RECEIVED, spi_sweep(unit, number), t_ns)
+
+    return feed, log.counters
 
 
-def messages() -> Feed:
+def messages() -> Link:
     stream = TactileStream(FINGERS, "right")
 
     def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
         by_finger = dict(zip(FINGERS, counts_of(number).tolist(), strict=True))
         return stream.receive(write_message(Stamp(unit.index, None), counts=by_finger), t_ns) or ()
 
-    return feed
+    return feed, stream.counters
 
 
 @dataclass(frozen=True)
 class Assembler:
     """A link whose driver assembles sweeps of units."""
 
-    begin: Callable[[], Feed]
+    begin: Callable[[], Link]
     places: Sequence[Sequence[int]]
     """Electrodes, from 0, of each unit of a sweep."""
     silent: int
@@ -225,7 +237,8 @@ def test_no_reading_mixes_two_sweeps_or_is_newer(name: str) -> None:
     @settings(max_examples=assembler.examples, derandomize=True)
     @given(plans(len(assembler.places), assembler.steady_sweeps))
     def holds(plan: list[Step]) -> None:
-        feed, arrived_ns, sound = assembler.begin(), dict[int, list[int]](), 0
+        feed, _ = assembler.begin()
+        arrived_ns, sound = dict[int, list[int]](), 0
         for unit in arrivals(plan, assembler.silent):
             number, t_ns = assembler.number(unit), assembler.t_ns(unit)
             arrived_ns.setdefault(number % NUMBERS, []).append(t_ns)
@@ -240,6 +253,18 @@ def test_no_reading_mixes_two_sweeps_or_is_newer(name: str) -> None:
     holds()
 
 
+@dataclass
+class Came:
+    """What came of a sweep."""
+
+    units: set[int] = field(default_factory=set)
+    places: set[int] = field(default_factory=set)
+    end_ns: int = 0
+    """When the last of these places came."""
+    given_ns: int = 0
+    """When its reading was given."""
+
+
 @pytest.mark.parametrize("name", ASSEMBLERS)
 def test_each_loss_flags_its_electrodes_and_no_others(name: str) -> None:
     assembler = ASSEMBLERS[name]
@@ -248,35 +273,45 @@ def test_each_loss_flags_its_electrodes_and_no_others(name: str) -> None:
     @settings(max_examples=assembler.examples, derandomize=True)
     @given(losses(units))
     def holds(plan: list[Step]) -> None:
-        feed, readings = assembler.begin(), list[TactileReading]()
-        there: dict[int, set[int]] = {}
-        came: dict[int, set[int]] = {}
-        last_ns, given_ns = dict[int, int](), dict[int, int]()
+        feed, counters = assembler.begin()
+        readings, copies = list[TactileReading](), list[bool]()
+        sweeps = defaultdict[int, Came](Came)
         for unit in arrivals(plan, assembler.silent):
             number, t_ns = assembler.number(unit), assembler.t_ns(unit)
-            places = set(assembler.places[unit.index % units])
-            if places - there.setdefault(number, set()):
-                last_ns[number] = t_ns
-            there[number] |= places
-            came.setdefault(number, set()).add(unit.index)
-            made = tactile(feed(unit, number, t_ns))
-            given_ns.update((reading.seq, t_ns) for reading in made)
-            readings += made
-        begun = {number for number, places in there.items() if places}
-        read = [reading.seq for reading in readings if there[reading.seq]]
-        assert read == sorted(begun)[: len(read)]
+            places, sweep = assembler.places[unit.index % units], sweeps[number]
+            if unit.index in sweep.units:
+                copies.append(bool(places))
+            elif places:
+                sweep.end_ns = t_ns
+            sweep.units.add(unit.index)
+            sweep.places.update(places)
+            for reading in tactile(feed(unit, number, t_ns)):
+                sweeps[reading.seq].given_ns = t_ns
+                readings.append(reading)
+        begun = [number for number in sorted(sweeps) if sweeps[number].places]
+        read = [reading.seq for reading in readings if sweeps[reading.seq].places]
+        assert read == begun[: len(read)]
         assert len(begun) - len(read) <= 1, "all but the last are over"
         for reading in readings:
-            if len(came[reading.seq]) == units:
-                end_ns = last_ns[reading.seq]
-                assert given_ns[reading.seq] == end_ns, "its last electrode ends a sweep"
-                assert 0 <= end_ns - reading.t_ns <= assembler.age_ns
-            lost = [place for place in range(24) if place not in there[reading.seq]]
+            sweep = sweeps[reading.seq]
+            if len(sweep.units) == units:
+                assert sweep.given_ns == sweep.end_ns, "its last electrode ends a sweep"
+                assert 0 <= sweep.end_ns - reading.t_ns <= assembler.age_ns
+            lost = [place for place in range(24) if place not in sweep.places]
             truth = counts_of(reading.seq)
             truth[:, lost] = 0
             assert (reading.counts == truth).all()
             assert (reading.faults[:, lost] == ElectrodeFault.MISSING).all()
             assert np.count_nonzero(reading.faults) == WIDTH * len(lost)
+        counted, number = counters.as_dict(), readings[-1].seq + 1
+        assert counted["readings"] == len(readings)
+        assert counted["missed_readings"] == number - len(readings)
+        assert counted["faulty_readings"] == sum(bool(each.faults.any()) for each in readings)
+        assert sum(copies) <= sum(counted.get(name, 0) for name in COPIES) <= len(copies)
+        flagged = sum(np.count_nonzero(each.faults[0]) for each in readings)
+        assert counted.get("lost_frames", flagged) == flagged
+        lost_units = sum(units - len(sweeps[each].units) for each in range(number))
+        assert counted.get("lost_packets", lost_units) == lost_units
 
     holds()
 

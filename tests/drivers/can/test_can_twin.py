@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import can
 import pytest
 
-from graspd.drivers.base import DriverError, TactileReading
+from graspd.drivers.base import DriverError
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.link import LinkState
 from graspd.drivers.twins.can import CanTwin
 from graspd.drivers.twins.faults import LinkFaults
-from graspd.drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_standin import (
     TwinLink,
     bridge,
@@ -74,50 +73,6 @@ def test_an_interface_without_its_package_is_refused(
         CanBridgeDriver(interface, "can0")
 
 
-@pytest.mark.parametrize(
-    "faults",
-    [
-        LinkFaults(drop_probability=0.02),
-        LinkFaults(duplicate_probability=0.05),
-        LinkFaults(reorder_probability=0.05),
-        LinkFaults(burst_frames=6),
-        LinkFaults(disconnect_every_frames=50),
-    ],
-    ids=["drop", "duplicate", "reorder", "burst", "disconnect"],
-)
-def test_link_faults_are_counted_one_by_one_and_invent_nothing(faults: LinkFaults) -> None:
-    link = TwinLink()
-    before, during, after = contact(2, 1), contact(200, 2), contact(2, 3)
-    with link.driver:
-        link.send(before)
-        twin = link.send(during, faults)
-        link.send(after)
-    injected, counters = twin.injected, link.driver.counters
-    sent = [*before, *during, *after]
-    assert_only_what_was_sent(link.readings, sent)
-    assert [reading.seq for reading in link.readings] == list(range(len(sent)))
-    late = counters.late_frames
-    assert counters.duplicate_frames == injected["duplicate"]
-    assert counters.lost_frames == injected["drop"] + injected["disconnect"] + late
-    assert counters.reordered_frames + late == injected["reorder"]
-    assert counters.faulty_readings == sum(bool(r.faults.any()) for r in link.readings)
-    assert injected.total() > 10
-    assert_same_tail(link.readings, after)
-
-
-def assert_only_what_was_sent(readings: Sequence[TactileReading], sent: Sequence[Counts]) -> None:
-    """Every sound electrode holds the count of its own sweep."""
-    for reading in readings:
-        sound = reading.faults == 0
-        assert (reading.counts[sound] == sent[reading.seq][sound]).all()
-
-
-def assert_same_tail(readings: Sequence[TactileReading], counts: Sequence[Counts]) -> None:
-    for reading, expected in zip(readings[-len(counts) :], counts, strict=True):
-        assert not reading.faults.any()
-        assert (reading.counts == expected).all()
-
-
 def test_flipped_bits_are_counted_and_never_become_counts() -> None:
     link = TwinLink()
     sent = contact(300)
@@ -129,8 +84,10 @@ def test_flipped_bits_are_counted_and_never_become_counts() -> None:
     words = counters.parity_words + counters.error_words + counters.unplugged_words
     assert words + counters.unknown_commands == twin.injected["bit_flip"] > 100
     assert counters.lost_frames == counters.unknown_commands
-    assert_only_what_was_sent(link.readings, sent)
-    assert_same_tail(link.readings, sent[298:])
+    for reading in link.readings:
+        sound = reading.faults == 0
+        assert (reading.counts[sound] == sent[reading.seq][sound]).all()
+    assert not any(reading.faults.any() for reading in link.readings[-2:])
 
 
 def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:

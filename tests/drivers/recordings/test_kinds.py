@@ -93,7 +93,7 @@ def test_a_file_is_what_it_holds_whatever_its_name(
     assert kind_of(made(tmp_path / "RUN.XYZ", content)) is kind
 
 
-def test_a_packed_file_is_what_it_holds_a_folder_a_bag(tmp_path: Path) -> None:
+def test_a_packed_file_is_what_it_holds(tmp_path: Path) -> None:
     assert kind_of(write(tmp_path, gzip.compress(b"LOGG\x90\0\0\0"))) is Kind.BLF
     (tmp_path / "metadata.yaml").touch()
     assert kind_of(tmp_path) is Kind.ROS2_BAG

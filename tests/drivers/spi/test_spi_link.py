@@ -10,17 +10,14 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from graspd.drivers.base import TactileReading
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.driver import SerialLine, SpiBridgeDriver
 from graspd.drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.spi import SpiTwin
-from tests.drivers.one_sweep import tactile
 from tests.drivers.spi.bridge_bench import FINGERS, MS, Rig, ScriptedBridge, hello, run, sweep, take
 from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
@@ -164,80 +161,8 @@ def test_frames_that_find_no_room_are_counted(rig: Rig, monkeypatch: pytest.Monk
     assert rig.driver.counters.host_tx_dropped == len([Stop, Ping])
 
 
-SWEEPS = 600
-RATE_HZ = 10_000.0
-
-
-def generated(sweeps: int = SWEEPS, seed: int = 3) -> list[Counts]:
+def generated(sweeps: int, seed: int = 3) -> list[Counts]:
     return list(itertools.islice(GeneratedContact(len(FINGERS), seed=seed), sweeps))
-
-
-def together(
-    folder: Path, rows: list[Counts], faults: LinkFaults
-) -> tuple[SpiTwin, SpiBridgeDriver, list[TactileReading]]:
-    """All rows through twin and driver, each when the one before is read."""
-    wire, clock = bytearray(), Clock()
-    readings: list[TactileReading] = []
-    path = folder / "bridge"
-    twin = SpiTwin(path, rows, rate_hz=RATE_HZ, faults=faults, tap=wire.extend, clock=clock)
-    driver = SpiBridgeDriver(str(path), FINGERS, clock=clock)
-    with twin:
-        wire.clear()  # what is on the line before it is opened is thrown away
-        with driver:
-            while not twin.exhausted or driver.counters.bytes < len(wire):
-                if driver.counters.bytes >= len(wire):
-                    clock.now_ns += round(1e9 / RATE_HZ)
-                    twin.run_once()
-                readings += tactile(driver.read_ready())
-            readings += tactile(driver.read_ready())
-    return twin, driver, readings
-
-
-LOSING = {"bit_flip_probability", "drop_probability", "reorder_probability"}
-
-
-@pytest.mark.parametrize(
-    "faults",
-    [
-        {},
-        {"bit_flip_probability": 0.3},
-        {"drop_probability": 0.2},
-        {"duplicate_probability": 0.2},
-        {"reorder_probability": 0.2},
-        {"one_byte_at_a_time": True},
-        {
-            "bit_flip_probability": 0.05,
-            "drop_probability": 0.1,
-            "duplicate_probability": 0.1,
-            "reorder_probability": 0.1,
-            "burst_frames": 3,
-        },
-    ],
-    ids=lambda faults: "+".join(faults) or "none",
-)
-def test_faults_are_counted_and_no_reading_is_invented(
-    tmp_path: Path, faults: dict[str, float]
-) -> None:
-    rows = generated()
-    twin, driver, readings = together(tmp_path, rows, LinkFaults(seed=1, **faults))  # type: ignore[arg-type]
-    counters, injected = driver.counters, twin.injected_in_sweeps
-    for reading in readings:  # the number of a reading is that of the sweep it was made from
-        assert np.array_equal(reading.counts, rows[reading.seq]), reading.seq
-        assert not reading.faults.any()
-    seqs = [reading.seq for reading in readings]
-    assert seqs == sorted(set(seqs))
-    lost_at_end = SWEEPS - 1 - seqs[-1]
-    assert counters.readings + counters.missed_readings + lost_at_end == twin.sweeps_made == SWEEPS
-    lost = counters.missed_readings + lost_at_end
-    if len(faults) == 1:
-        flips, drops = injected["bit_flip"], injected["drop"]
-        # A flipped delimiter joins two frames: both are lost.
-        assert drops + flips <= lost - counters.reordered <= drops + 2 * flips
-        assert counters.duplicates == injected["duplicate"]
-        assert abs(injected["reorder"] - counters.reordered) <= 1  # the last may stay behind
-    if not set(faults) & LOSING:
-        assert lost == 0
-        assert counters.clock_faults == 0
 
 
 def test_a_link_broken_within_a_frame_comes_back(tmp_path: Path) -> None:
