@@ -248,6 +248,24 @@ def test_a_palm_whose_words_stand_still_is_read(copies: int, batch: int) -> None
     assert stream.counters.unsynchronised_packets == 0
 
 
+@pytest.mark.parametrize(
+    ("position", "after_ns", "is_copy"),
+    [
+        (2, 1_500_000 - 1, True),
+        (2, 1_500_000, False),  # the third of the next round
+        (ROUND - 1, 8 * MS, True),
+    ],
+)
+def test_an_equal_packet_within_half_its_time_is_a_copy(
+    position: int, after_ns: int, is_copy: bool
+) -> None:
+    stream, steady = PalmStream(FINGERS), packets(1)
+    for cycle, packet in enumerate(steady):
+        stream.receive(packet.to_bytes(), cycle * MS)
+    stream.receive(steady[position].to_bytes(), 13 * MS + after_ns)
+    assert stream.counters.duplicate_packets == is_copy
+
+
 def test_a_palm_that_stands_still_may_lose_packets() -> None:
     steady: list[PalmPacket | None] = [*packets(1) * 10]
     lost = {ROUND - 1, *range(4 * ROUND - 2, 4 * ROUND + 3), 5 * ROUND + 3}
