@@ -13,8 +13,9 @@ from graspd.daemon.judge.joint_motion import JointMotion
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import JointReading
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS
-from tests.daemon.judge.fault_bench import network
 
 MS = 1_000_000
 START_NS = 10**12
@@ -297,7 +298,8 @@ def test_after_time_went_back_angles_have_a_second_to_change() -> None:
 
 def test_the_health_says_that_joints_are_frozen_until_one_changes() -> None:
     hand = HandLimits(joints=True)
-    pipeline = Pipeline(network(), FINGERS, Limits(), lambda: START_NS, hand=hand)
+    model = TactileModel(zoo.find("cnn1"))
+    pipeline = Pipeline(model, FINGERS, Limits(), lambda: START_NS, hand=hand)
     for ms in range(0, 1501, 10):
         angles = np.array([0.8, 0.4 + (ms == 1500)])
         pipeline.observe_joints(JointReading(START_NS + ms * MS, 0, ("FFJ3", "THJ1"), angles))
