@@ -7,15 +7,12 @@ BioTacSP-DoS, of which nothing is kept here).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import ELECTRODES
-from graspd.drivers.twins.grasps.grasps import Counts
-from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, Sampler
 
 NOISE_COUNTS = (3.0, 4.5)
 """Standard deviation of an electrode, another one for each finger, counts. With the wander,
@@ -64,8 +61,6 @@ STEP_S = 0.005
 """Between two points of the way, s; it is straight between them."""
 SECONDS = 3.0
 """Length of a stream, s."""
-LEVEL_COUNTS = 2000.0
-"""What every electrode reads where a hold begins."""
 
 
 class Hold:
@@ -123,28 +118,6 @@ class HeldNoise:
         spiking = self._rng.random(noise.shape) < SPIKE_PROBABILITY
         noise -= spiking * self._rng.uniform(*SPIKE_COUNTS, noise.shape)
         return noise
-
-
-def held(
-    sliding: Sequence[bool],
-    *,
-    seconds: float = SECONDS,
-    rate_hz: float = RATE_HZ,
-    rest_s: float = 0.0,
-    late: bool = False,
-    seed: int = 0,
-) -> Iterator[tuple[float, Counts]]:
-    """Times, s, and counts, shape (fingers, 24), of fingers that hold, or along which it slides.
-
-    Nothing moves for the first `rest_s`. The same seed gives the same stream. `late`: electrodes
-    are sampled as `Sampler` does with `held`.
-    """
-    rng = np.random.default_rng([seed, 3])
-    hold, noise = Hold(sliding, rng, seconds, rest_s), HeldNoise(len(sliding), rng)
-    level = np.full((len(sliding), ELECTRODES), LEVEL_COUNTS)
-    sampler = Sampler(level, noise.sweep, held=late)
-    for row in range(math.ceil(seconds * rate_hz)):
-        yield row / rate_hz, sampler.sample(hold.deviation, row / rate_hz)
 
 
 Way = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -55,26 +55,6 @@ def test_it_is_the_dense_filter_in_long_double(inputs: int) -> None:
     np.testing.assert_allclose(found_mean, mean.astype(float), rtol=0.0, atol=1e-9)
 
 
-def test_it_learns_what_the_margin_misses_and_follows_changes() -> None:
-    learner = Learner(ONE_FINGER)
-
-    def right(stream: list[Outcome]) -> float:
-        says = [learner.judge(m, x)[0] > 0.0 for m, x, _ in stream]
-        return sum(a == y for a, (*_, y) in zip(says, stream, strict=True)) / len(stream)
-
-    stream = list(lifts(1300, ONE_FINGER, strength=3.0))
-    before = right(stream[800:])
-    learn(learner, iter(stream[:800]))
-    after = right(stream[800:])
-    inverted = [(m, x, not y) for m, x, y in stream]
-    fooled = right(inverted[800:])
-    learn(learner, iter(inverted[:800]))
-    assert before < 0.7
-    assert after > 0.85
-    assert fooled < 0.15
-    assert right(inverted[800:]) > 0.8
-
-
 Stream = Callable[[np.random.Generator, int], Iterator[Outcome]]
 
 
@@ -154,18 +134,6 @@ def test_what_is_not_finite_or_of_another_shape_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=r"not finite|of shape"):
         Learner(3).judge(margin, inputs)
-
-
-def test_no_mean_exceeds_its_limit_whatever_is_told() -> None:
-    learner = Learner(2)
-    for index in range(1000):
-        sign = -1.0 if index % 2 else 1.0
-        # In turns so far on one side that the learner is sure, and wrong.
-        found, features = learner.judge(30.0 * sign, np.array([-1000.0 * sign, 3.0]))
-        learner.learn(features, slipped=found < 0.0)
-    assert (np.abs(learner.at_told()[0]) <= 25.0 * (1.0 + 1e-12)).all()
-    assert np.isfinite(learner.judge(0.0, np.array([1000.0, 0.0]))[0])
-    Learner(2).restore(learner.state())
 
 
 @pytest.mark.parametrize("margin", [12.0, 16.0, 27.6, 30.0])
@@ -264,3 +232,6 @@ def test_a_state_that_no_outcomes_lead_to_is_refused() -> None:
         with pytest.raises(ValueError, match=why):
             learner.restore(state)
         assert learner.state() == before
+    largest = np.frombuffer(before.mean).copy()
+    largest[2] = 25.0
+    learner.restore(replace(before, mean=largest.tobytes()))
