@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 
 from tests.process_replay import commands, messages, verdicts
 from tests.process_replay.__main__ import KINDS, SHOWN_MAX
 from tests.process_replay.commands import lines_apart
-from tests.process_replay.verdicts import P_SLIP_TOLERANCE, entries_apart, is_near, reference
+from tests.process_replay.verdicts import entries_apart, is_near, reference
 
 ALL = [(kind, name) for kind in KINDS for name in KINDS[kind].NAMES]
 
@@ -27,45 +25,29 @@ def test_every_reference_is_compared() -> None:
     assert set(verdicts.FOLDER.rglob("*.*")) == known
 
 
-@pytest.mark.parametrize("name", ["demo", "twin_faults", "request_risk", "mcap", "serial_log"])
-def test_a_reference_has_judged_and_unjudged_grasps(name: str) -> None:
-    known = reference(name)
-    assert sum(entry["n"] for entry in known) > 2500  # readings of the demo recording: 2836
-    assert {entry["verdict"] for entry in known} >= {"stable", "slip", "unknown"}
-    assert sum(entry["judged"] for entry in known) >= 12  # grasps of the demo recording
-
-
-@pytest.mark.parametrize("name", verdicts.NAMES)
-def test_every_reference_judges_some_grasp(name: str) -> None:
-    assert any(entry["judged"] and entry["valid"] for entry in reference(name))
+def test_every_reference_judges_some_grasp() -> None:
+    for name in verdicts.NAMES:
+        assert any(entry["judged"] and entry["valid"] for entry in reference(name)), name
+    said = {entry["verdict"] for entry in reference("demo")}
+    assert said >= {"stable", "slip", "unknown"}
 
 
 def test_a_replayed_recording_is_judged_as_before() -> None:
     assert verdicts.path_of("mcap").read_text() == verdicts.path_of("request_risk").read_text()
 
 
-def test_under_faults_electrodes_are_repaired() -> None:
+def test_the_references_show_faults_overload_outcomes_and_exit_codes() -> None:
     repaired = {name for entry in reference("twin_faults") for name in entry["repaired"]}
     assert {"ff_7", "th_16"} <= repaired  # those that the twin's faults name, counted from 1
-
-
-def test_a_slow_computer_skips_readings_is_overloaded_and_late() -> None:
-    text = messages.path_of("slow").read_text()
-    assert '"overloaded":true' in text
-    assert '"stale"' in text
-    assert text.rpartition('"skipped_readings":')[2].partition(",")[0] != "0"
-
-
-def test_outcomes_are_taken_and_refused_in_the_references() -> None:
+    slow = messages.path_of("slow").read_text()
+    assert '"overloaded":true' in slow
+    assert '"stale"' in slow
+    assert slow.rpartition('"skipped_readings":')[2].partition(",")[0] != "0"
     lines = messages.path_of("request_risk").read_text().splitlines()
     answers = {line.partition(": ")[2].partition(":")[0] for line in lines if " answer " in line}
     assert answers == {"None", "contradicts", "unknown boot_id"}
-
-
-@pytest.mark.parametrize("code", [0, 1, 2])
-def test_the_references_have_each_exit_code(code: int) -> None:
-    texts = [commands.path_of(name).read_text() for name in commands.NAMES]
-    assert any(f"\nexit code {code}\n" in text for text in texts)
+    texts = "".join(commands.path_of(name).read_text() for name in commands.NAMES)
+    assert all(f"\nexit code {code}\n" in texts for code in (0, 1, 2))
 
 
 def test_no_reference_is_near_the_threshold() -> None:
@@ -74,32 +56,12 @@ def test_no_reference_is_near_the_threshold() -> None:
             assert entry.get("near", False) == is_near(entry)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("verdict", "stable"),
-        ("p_slip", 0.5 + 2 * P_SLIP_TOLERANCE),
-        ("reasons", ["moving"]),
-        ("repaired", ["ff_1"]),
-        ("gate", "settled"),
-        ("contact", ["ff"]),
-        ("n", 3),
-        ("grasp", 7),
-    ],
-)
-def test_a_verdict_that_changes_is_found(field: str, value: object) -> None:
-    was = [
-        entry for entry in reference("demo") if entry.get("p_slip") is not None and entry["n"] != 3
-    ][:2]
-    now = copy.deepcopy(was)
-    now[1][field] = value
-    (line,) = entries_apart(was, now)
-    assert line.startswith(f"1: {field}: ")
-
-
-def test_a_stream_that_ends_early_is_found() -> None:
-    known = reference("demo")
-    assert entries_apart(known, known[:-1]) == [f"{len(known)} entries became {len(known) - 1}"]
+def test_a_verdict_that_changes_is_found() -> None:
+    was = [entry for entry in reference("demo") if entry.get("p_slip") is not None][:2]
+    for field, value in (("verdict", "none"), ("p_slip", 0.7), ("n", 3), ("reasons", ["moving"])):
+        (line,) = entries_apart(was, [was[0], was[1] | {field: value}])
+        assert line.startswith(f"1: {field}: ")
+    assert entries_apart(was, was[:1]) == ["2 entries became 1"]
 
 
 def test_only_so_near_to_the_threshold_the_verdict_may_turn() -> None:
@@ -110,30 +72,13 @@ def test_only_so_near_to_the_threshold_the_verdict_may_turn() -> None:
     assert entries_apart([far], [far | {"verdict": "stable"}]) != []
 
 
-def test_a_reference_reads_as_it_was_written() -> None:
-    text = (
-        '{"n": 2, "grasp": 1, "gate": "idle", "p_slip": 0.25}\n'
-        '{"n": 1, "p_slip": null}\n'
-        '{"n": 1, "grasp": 2}\n'
-    )
-    assert verdicts.parsed(text) == [
-        {"n": 2, "grasp": 1, "gate": "idle", "p_slip": 0.25},
-        {"n": 1, "grasp": 1, "gate": "idle"},
-        {"n": 1, "grasp": 2, "gate": "idle"},
-    ]
-
-
-@pytest.mark.parametrize(
-    ("now", "differs"),
-    [
-        ('1 verdict {"seq":3,"p_slip":0.2501,"gate":null}', False),
-        ('1 verdict {"seq":3,"p_slip":0.2509,"gate":null}', True),
-        ('1 verdict {"seq":4,"p_slip":0.25,"gate":null}', True),
-        ('1 verdict {"p_slip":0.25,"seq":3,"gate":null}', True),
-        ('1 verdict {"seq":3,"p_slip":0.25, "gate":null}', True),
-        ('1 verdict {"seq":3,"p_slip":null,"gate":null}', True),
-    ],
-)
-def test_only_numbers_with_a_point_may_differ_slightly(now: str, *, differs: bool) -> None:
+def test_only_numbers_with_a_point_may_differ_slightly() -> None:
     was = '1 verdict {"seq":3,"p_slip":0.25,"gate":null}'
-    assert bool(lines_apart([was], [now], 2e-4)) == differs
+    for before, after, differs in (
+        ("0.25", "0.2501", False),
+        ("0.25", "0.2509", True),
+        ("3", "4", True),
+        ("0.25", "null", True),
+    ):
+        now = was.replace(f":{before},", f":{after},")
+        assert bool(lines_apart([was], [now], 2e-4)) == differs

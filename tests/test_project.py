@@ -18,12 +18,16 @@ from graspd.drivers.spi.messages import FIRMWARE
 ROOT = Path(__file__).parents[1]
 VERSION = "0.1.0"
 """The release that the changelog begins with."""
-MINOR = VERSION.rpartition(".")[0]
 PLACES = {
-    "CITATION.cff": r"^version: (\S+)$",
-    "deploy/clients/cpp/CMakeLists.txt": r"^project\(graspd_client VERSION (\S+) ",
+    ("CITATION.cff", r"^version: (\S+)$"): VERSION,
+    ("deploy/clients/cpp/CMakeLists.txt", r"^project\(graspd_client VERSION (\S+) "): VERSION,
+    ("deploy/clients/README.md", r"find_package\(graspd_client (\S+) "): VERSION.rpartition(".")[0],
+    ("deploy/CHANGELOG.md", r"^\| firmware of the bridge \| (\S+) \|$"): (
+        f"{FIRMWARE >> 8}.{FIRMWARE & 0xFF}"
+    ),
+    (".pre-commit-config.yaml", r"repo: (\S+)"): "local",
 }
-"""Where the version stands once more, and how."""
+"""By file and pattern what stands there, once."""
 
 
 def found(name: str, pattern: str) -> list[str]:
@@ -126,13 +130,10 @@ def test_a_version_follows_tag_and_commit(after: str, expected: str, tmp_path: P
     assert re.fullmatch(expected, shell(tmp_path, script))
 
 
-@pytest.mark.parametrize(("name", "pattern"), PLACES.items())
-def test_the_version_is_the_same_everywhere(name: str, pattern: str) -> None:
-    assert found(name, pattern) == [VERSION]
-
-
-def test_the_line_that_finds_the_client_asks_for_this_version() -> None:
-    assert found("deploy/clients/README.md", r"find_package\(graspd_client (\S+) ") == [MINOR]
+def test_the_version_is_the_same_everywhere() -> None:
+    assert {place: found(*place) for place in PLACES} == {
+        place: [each] for place, each in PLACES.items()
+    }
 
 
 def test_the_changelog_begins_with_this_or_no_version() -> None:
@@ -143,11 +144,6 @@ def test_the_changelog_begins_with_this_or_no_version() -> None:
         assert released[0] == VERSION
     else:
         assert f"becomes {VERSION}." in (ROOT / "deploy/CHANGELOG.md").read_text()
-
-
-def test_the_firmware_has_one_version() -> None:
-    told = f"{FIRMWARE >> 8}.{FIRMWARE & 0xFF}"
-    assert found("deploy/CHANGELOG.md", r"^\| firmware of the bridge \| (\S+) \|$") == [told]
 
 
 def test_the_hooks_run_what_ci_runs() -> None:
@@ -173,25 +169,19 @@ def heading_anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_of_a_page_lead_somewhere(page: Path) -> None:
-    links = re.findall(r"\]\((?!https?://)([^)\s]+)\)", page.read_text())
+def test_links_of_pages_lead_somewhere() -> None:
     lost = []
-    for link in links:
-        name, _, anchor = link.partition("#")
-        target = page.parent / name if name else page
-        if not target.exists() or (anchor and anchor not in heading_anchors(target)):
-            lost.append(link)
+    for page in PAGES:
+        for link in re.findall(r"\]\((?!https?://)([^)\s]+)\)", page.read_text()):
+            name, _, anchor = link.partition("#")
+            target = page.parent / name if name else page
+            if not target.exists() or (anchor and anchor not in heading_anchors(target)):
+                lost.append((page.name, link))
     assert lost == []
 
 
-@pytest.mark.parametrize("page", [".github/CONTRIBUTING.md", "deploy/ARCHITECTURE.md"])
-def test_files_that_contributors_are_sent_to_are_there(page: str) -> None:
-    named = found(page, r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`")
-    assert len(named) > 10
-    assert [name for name in named if not (ROOT / name).exists()] == []
-
-
-def test_the_hooks_need_no_revision_of_their_own() -> None:
-    assert found(".pre-commit-config.yaml", r"repo: (\S+)") == ["local"]
-    assert found(".pre-commit-config.yaml", r"^\s+(rev|additional_dependencies):") == []
+def test_files_that_contributors_are_sent_to_are_there() -> None:
+    for page in (".github/CONTRIBUTING.md", "deploy/ARCHITECTURE.md"):
+        named = found(page, r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`")
+        assert len(named) > 10
+        assert [name for name in named if not (ROOT / name).exists()] == []

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from tests.words import INSTEAD, check_file, check_subjects, checked_files
+from tests.words import check_file, check_subjects, checked_files
 
 SOURCE = '''\
 """Drop old sweeps.
@@ -41,21 +39,6 @@ def test_phrases_of_python_are_found_with_their_lines(tmp_path: Path) -> None:
         (12, "as far as"),
         (13, "anew"),
     ]
-
-
-@pytest.mark.parametrize("phrase", INSTEAD)
-def test_each_phrase_is_found_in_a_page(tmp_path: Path, phrase: str) -> None:
-    path = tmp_path / "page.md"
-    path.write_text(f"# Title\n\nThe hand, {phrase.replace(' ', chr(10))} rests.\n")
-    assert phrases(path) == [(3, phrase)]
-
-
-def test_plain_words_and_names_are_let_through(tmp_path: Path) -> None:
-    path = tmp_path / "module.py"
-    path.write_text(
-        '"""Return the newest so. Wait long; what follows is new."""\nso_many = "anew"\n'
-    )
-    assert phrases(path) == []
 
 
 def test_a_subject_may_have_72_characters() -> None:

@@ -1,0 +1,144 @@
+"""Write the figures that pages share with the models' cards: `python -m tests.figures`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from graspd.models import zoo
+
+ROOT: Final = Path(__file__).parents[1]
+RESULTS: Final = (ROOT / "models/RESULTS.md").read_text()
+CARDS: Final = {name: zoo.card(name) for name in zoo.names()}
+WORTH: Final[Mapping[str, Any]] = CARDS["small-session"]["worth"]
+"""Figures of `graspd report worth`."""
+PUBLISHED: Final = "published: loops, Keras predict"
+"""The published code around the weights of `cnn1`, which judge as they do in graspd."""
+PROTOCOLS: Final = {
+    "known objects": ("cv",),
+    "other objects": ("objects", "objects-whole"),
+    "another day": ("session",),
+}
+"""Protocols of a column with F1, by its title: the first that the card has."""
+
+Rows = list[list[str]]
+"""Cells of a table."""
+
+
+def table(text: str, title: str) -> tuple[list[str], Rows, tuple[int, int]]:
+    """Return titles and rows of the one table that begins with `title`, and its rows' place."""
+    pattern = rf"^(\| {re.escape(title)}.*\|)\n\|[-| :]*\n((?:\|.*\n)+)"
+    (found,) = re.finditer(pattern, text, re.MULTILINE)
+    (head,), rows = _cells([found[1]]), _cells(found[2].splitlines())
+    return [each.partition("[^")[0] for each in head], rows, found.span(2)
+
+
+def _cells(lines: Iterable[str]) -> Rows:
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+
+
+def _f1(titles: list[str], rows: Rows, *, spread: bool) -> Rows:
+    """Write the models' F1, except means over seeds, which RESULTS has."""
+    systems = RESULTS.partition("\n## 2. ")[2].partition("\n## ")[0]
+    of_seeds = {cell.partition(" (s.e.")[0] for row in _cells(systems.splitlines()) for cell in row}
+    for row in rows:
+        named = re.match(r"`([\w-]+)`", row[0])
+        protocols = CARDS["cnn1" if row[0] == PUBLISHED else named[1] if named else ""]["protocols"]
+        for at, title in enumerate(titles):
+            has = [each for each in PROTOCOLS.get(title, ()) if each in protocols]
+            if has and row[at] not in {"-", *of_seeds}:
+                f1 = protocols[has[0]]["spreads"]["f1"]
+                row[at] = _percent(f1["mean"]) + f" +- {_percent(f1['std'])}" * spread
+    return rows
+
+
+def _percent(fraction: float, digits: int = 1) -> str:
+    return f"{100 * fraction:.{digits}f}"
+
+
+def _sealed(_titles: list[str], rows: Rows) -> Rows:
+    of_results = table(RESULTS, "model | F1 of judged")[1]
+    return [[row[0], *result[1:]] for row, result in zip(rows, of_results, strict=True)]
+
+
+def _curves(_titles: list[str], _rows: Rows) -> Rows:
+    return [
+        [name]
+        + [
+            f"{_percent(one['slips_among_stable'], 0)} / {_percent(one['coverage'], 0)}"
+            for one in points
+        ]
+        for name, points in WORTH["curves"].items()
+    ]
+
+
+def _warm_up(_titles: list[str], _rows: Rows) -> Rows:
+    return [
+        [str(one["warm_up"])]
+        + [_percent(one[key]) for key in ("kept", "slips", "above")]
+        + [f"{one['supervised']:.0f}"]
+        for one in WORTH["warm_up"]
+    ]
+
+
+def _reliability(_titles: list[str], _rows: Rows) -> Rows:
+    return [
+        [f"{one['low']:g} to {one['high']:g}", str(one["grasps"])]
+        + [_percent(one[key]) for key in ("said", "slipped")]
+        for one in WORTH["reliability"]["parts"]
+        if one["high"] <= 0.5
+    ]
+
+
+def _broken(titles: list[str], rows: Rows) -> Rows:
+    study = CARDS["small-session"]["broken"]
+    dead = {str(each["number"]): each for each in study["broken"] if each["reads"] == "at 0"}
+    for row, key in zip(rows, ("unnoticed", "known"), strict=True):
+        row[1:] = [_percent(dead[n][key] if n in dead else study["sound"]) for n in titles[1:]]
+    return rows
+
+
+def _risk(_titles: list[str], rows: Rows) -> Rows:
+    """Write the least and the most of each figure, over the sessions' kinds."""
+    for row in rows:
+        several = [one for one in WORTH["risk"] if one["target"] == float(row[0])]
+        for at, key in enumerate(("kept", "slips", "above", "supervised"), 1):
+            scale, digits = 1 if key == "supervised" else 100, int(key == "slips")
+            ends = (scale * choose(one[key] for one in several) for choose in (min, max))
+            row[at] = " to ".join(f"{end:.{digits}f}" for end in ends)
+    return rows
+
+
+TABLES: Final[Mapping[str, Mapping[str, Callable[[list[str], Rows], Rows]]]] = {
+    "README.md": {
+        "model | known objects": partial(_f1, spread=True),
+        "model | F1 of judged": _sealed,
+    },
+    "deploy/MEASURED.md": {
+        "model, F1 in %": partial(_f1, spread=False),
+        "slips among `stable` / good lifts kept": _curves,
+        "warm-up, target 0.05": _warm_up,
+        "`p_slip` | grasps": _reliability,
+        "dead electrodes": _broken,
+    },
+    "deploy/CHOOSING.md": {"target | good lifts": _risk},
+}
+"""By page and first title: the rows as the cards have them."""
+
+
+def renewed(page: str) -> str:
+    """Return the text of a page with the figures of the cards."""
+    text = (ROOT / page).read_text()
+    for title, rows_of in TABLES[page].items():
+        titles, rows, (begin, end) = table(text, title)
+        lines = (f"| {' | '.join(row)} |\n" for row in rows_of(titles, rows))
+        text = text[:begin] + "".join(lines) + text[end:]
+    return text
+
+
+if __name__ == "__main__":
+    for page in TABLES:
+        (ROOT / page).write_text(renewed(page))
