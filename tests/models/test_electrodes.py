@@ -58,28 +58,24 @@ def conditional(
     return expected, np.diag(variance)
 
 
-@pytest.mark.parametrize("number", [1, 2, 7, 12, 24])
+@pytest.mark.parametrize("number", [1, 12])
 def test_a_broken_electrode_is_repaired_by_its_conditional_mean(number: int) -> None:
     mean, covariance, seen = correlated()
     random = np.random.default_rng(number)
     values = random.multivariate_normal(mean, covariance)
     out = np.zeros(72, dtype=np.bool_)
     out[random.permutation(72)[:number]] = True
-    repaired = Electrodes(seen).repaired(values.reshape(SHAPE), out.reshape(SHAPE)).ravel()
+    electrodes = Electrodes(seen)
+    repaired = electrodes.repaired(values.reshape(SHAPE), out.reshape(SHAPE)).ravel()
     np.testing.assert_array_equal(repaired[~out], values[~out])
     expected, _ = conditional(mean, covariance, values, out)
     np.testing.assert_allclose(repaired[out], expected, rtol=1e-6)
-
-
-def test_mean_and_spread_are_those_of_the_contract() -> None:
-    mean, covariance, seen = correlated()
-    electrodes = Electrodes(seen)
     np.testing.assert_allclose(electrodes.centre.ravel(), mean)
     np.testing.assert_allclose(electrodes.spread.ravel(), np.sqrt(np.diag(covariance)), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("deviations", "found"), [(0.98, False), (1.02, True), (-1.02, True)])
-def test_an_electrode_is_implausible_from_eight_conditional_deviations_on(
+def test_an_electrode_is_implausible_from_eight_deviations_on(
     deviations: float, found: bool
 ) -> None:
     mean, covariance, seen = correlated()
@@ -93,7 +89,7 @@ def test_an_electrode_is_implausible_from_eight_conditional_deviations_on(
     assert marked.ravel()[30] == found
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_search_takes_out_the_worst_first(seed: int) -> None:
     mean, covariance, seen = correlated(seed)
     random = np.random.default_rng(seed)

@@ -36,7 +36,6 @@ def image_input(composition: Composition) -> ImageInput:
     [
         (image_input(Composition.CHANNELS), "image", (12, 11, 3)),
         (ImageInput("D3", "least-contact", "electrodes", "channels"), "image", (4, 7, 3)),
-        (image_input(Composition.HORIZONTAL), "image", (12, 33, 1)),
         (ImageInput("D2a", "neighbour-mean", "filled-image", "vertical"), "image", (18, 5, 1)),
         (VectorInput(), "vector", (72,)),
         (CountsInput(), "counts", (72,)),

@@ -15,7 +15,7 @@ from graspd.models.contract import ModelError
 onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
 DecodeError = pytest.importorskip("google.protobuf.message").DecodeError
 text_format = pytest.importorskip("google.protobuf.text_format")
-DAMAGED = 20_000
+DAMAGED = 10_000
 SEED = 7
 
 
@@ -58,22 +58,15 @@ TREES: dict[str, list[Any]] = {
 """Two trees: 0 asks twice, 1 once."""
 
 
-def trees(changed: dict[str, list[Any]] | None = None, given: str = "x") -> Any:  # noqa: ANN401
+def trees(**changed: list[Any]) -> Any:  # noqa: ANN401
     return onnx.helper.make_node(
         "TreeEnsembleRegressor",
-        [given],
+        ["x"],
         ["margin"],
         domain="ai.onnx.ml",
         n_targets=1,
-        **{**TREES, **(changed or {})},
+        **(TREES | changed),
     )
-
-
-def with_trees(node: Any) -> bytes:  # noqa: ANN401
-    model = small()
-    model.graph.node[2].CopyFrom(node)
-    content: bytes = model.SerializeToString()
-    return content
 
 
 def leaves(tree: Any) -> int:  # noqa: ANN401
@@ -125,29 +118,9 @@ def is_sound(model: Any) -> bool:  # noqa: ANN401
     )
 
 
-@pytest.mark.parametrize("name", zoo.names())
-def test_the_zoo_may_be_used(name: str) -> None:
-    onnx_file.check(zoo.find(name).read_bytes())
-
-
-def test_operators_of_zoo_and_training_may_be_used() -> None:
-    """The zoo has no network with pooling, no blend and no boosting; training has."""
-    pytest.importorskip("torch", reason="needs the extra `train`")
-    from graspd.models.training.fitting.trained import fit
-    from graspd.models.training.systems.registry import SYSTEMS, with_recipes
-
-    models = [onnx.load(zoo.find(name)) for name in zoo.names()]
-    draw = np.random.default_rng(SEED)
-    for name, shape in (("cnn2", (12, 11, 3)), ("blend-electrodes", (72,)), ("hgb-session", (78,))):
-        inputs = draw.normal(size=(60, *shape)).astype(np.float32)
-        system = with_recipes(SYSTEMS[name], epochs=1)
-        models.append(fit(system, inputs, draw.random(60) < 0.5, seed=0).to_onnx(1.0, "x"))
-    used = {(node.domain, node.op_type) for model in models for node in model.graph.node}
-    allowed = {(domain, name) for domain, names in onnx_file.OPERATORS.items() for name in names}
-    assert used < allowed
-
-
-def test_a_small_model_may_be_used() -> None:
+def test_zoo_and_a_small_model_may_be_used() -> None:
+    for name in zoo.names():
+        onnx_file.check(zoo.find(name).read_bytes())
     onnx_file.check(small().SerializeToString())
 
 
@@ -156,11 +129,8 @@ def test_a_small_model_may_be_used() -> None:
     [
         ("initializer { external_data { key: 'location' } }", "weights in another file"),
         ("initializer { data_location: EXTERNAL }", "weights in another file"),
-        ("node { attribute { t { data_location: EXTERNAL } } }", "weights in another file"),
         ("node { attribute { tensors { data_location: EXTERNAL } } }", "weights in another file"),
         ("node { op_type: 'Loop' }", "no model may use: 'Loop'"),
-        ("node { op_type: 'RandomNormalLike' }", "no model may use: 'RandomNormalLike'"),
-        ("node { op_type: 'Scaler' }", "no model may use: 'Scaler'"),
         ("node { op_type: 'Gemm' domain: 'com.example' }", "another domain, 'com.example'"),
         ("node { attribute { g { name: 'inner' } } }", "a graph within its graph"),
         ("node { attribute { graphs { name: 'inner' } } }", "a graph within its graph"),
@@ -170,12 +140,6 @@ def test_a_small_model_may_be_used() -> None:
         ("} functions { name: 'Gemm'", "functions or training"),
         ("} training_info { algorithm { name: 'a' }", "functions or training"),
         ("node { op_type: 'Reshape' input: 'x' input: 'z' }", "size depends on the counts"),
-        ("node { op_type: 'If' }", "no model may use: 'If'"),
-        ("node { op_type: 'Einsum' }", "no model may use: 'Einsum'"),
-        (
-            "node { op_type: 'TreeEnsemble' domain: 'ai.onnx.ml' }",
-            "no model may use: 'TreeEnsemble'",
-        ),
         ("node { attribute { name: 'a' i: 1 f: 1 } }", "a of two kinds"),
         ("node { attribute { name: 'a' i: 1 } attribute { name: 'a' i: 2 } }", "a twice"),
     ],
@@ -191,7 +155,6 @@ def test_what_may_not_be_is_named(more: str, says: str) -> None:
     ("changed", "says"),
     [
         ({"nodes_truenodeids": [1, 0, 0, 0, 0, 1, 0, 0]}, "with a cycle"),
-        ({"nodes_falsenodeids": [2, 0, 2, 0, 0, 2, 0, 0]}, "with a cycle"),
         ({"nodes_falsenodeids": [2, 0, 1, 0, 0, 2, 0, 0]}, "with a cycle"),
         ({"nodes_falsenodeids": [2, 0, 5, 0, 0, 2, 0, 0]}, "a node which it lacks"),
         ({"nodes_falsenodeids": [-1, 0, 4, 0, 0, 2, 0, 0]}, "a node which it lacks"),
@@ -202,7 +165,6 @@ def test_what_may_not_be_is_named(more: str, says: str) -> None:
         ({"nodes_nodeids": [0, 1, 2, 3, 3, 0, 1, 2]}, "list a node twice"),
         ({"nodes_treeids": [0, 0, 0, 1, 0, 1, 1, 1]}, "list a node twice"),
         ({"nodes_treeids": [0, 0, 0, 0, 0, 1, 1]}, "differ in length"),
-        ({"nodes_values": [1.0]}, "differ in length"),
         ({"target_weights": [1.0]}, "differ in length"),
         ({"target_nodeids": [0, 3, 4, 1, 2]}, "not one of a leaf"),
         ({"target_nodeids": [9, 3, 4, 1, 2]}, "not one of a leaf"),
@@ -210,14 +172,18 @@ def test_what_may_not_be_is_named(more: str, says: str) -> None:
     ],
 )
 def test_trees_are_checked_as_trees(changed: dict[str, list[Any]], says: str) -> None:
+    model = small()
+    model.graph.node[2].CopyFrom(trees(**changed))
     with pytest.raises(ModelError, match=says):
-        onnx_file.check(with_trees(trees(changed)))
+        onnx_file.check(model.SerializeToString())
 
 
 def test_trees_take_the_models_input_alone() -> None:
     """Another value may be narrower than the features that they read."""
+    model = small()
+    model.graph.node[2].input[0] = "y"
     with pytest.raises(ModelError, match="does not compare an input"):
-        onnx_file.check(with_trees(trees(given="y")))
+        onnx_file.check(model.SerializeToString())
 
 
 def test_a_second_piece_of_the_graph_is_looked_at_too() -> None:
@@ -239,16 +205,11 @@ def test_a_location_of_more_bits_than_there_are_is_one() -> None:
         onnx_file.check(b"\x3a" + bytes([len(graph)]) + graph)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        *(b"\x3a\x05\x0a", b"\x3a", b"\x3b", b"\x00\x00", b"\xff" * 20, b"\x38\xff", b"\x3d\x01"),
-        b"\x08" + b"\xff" * 9 + b"\x02",
-    ],
-)
-def test_what_is_no_message_is_said(content: bytes) -> None:
-    with pytest.raises(ModelError, match="not a usable ONNX model"):
-        onnx_file.check(content)
+def test_what_is_no_message_is_refused() -> None:
+    cut_off = (b"\x3a\x05\x0a", b"\x3a", b"\x38\xff", b"\x3d\x01")
+    for content in (*cut_off, b"\x3b", b"\x00\x00", b"\xff" * 20, b"\x08" + b"\xff" * 9 + b"\x02"):
+        with pytest.raises(ModelError, match="not a usable ONNX model"):
+            onnx_file.check(content)
 
 
 def test_damage_raises_nothing_else_and_gets_nothing_by() -> None:

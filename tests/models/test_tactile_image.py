@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import graspd
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS
-from graspd.models.layout import D1, LAYOUTS, Layout
+from graspd.models.layout import D1, LAYOUTS
 from graspd.models.tactile_image import Fill, Normalisation, TactileImager, fill_matrix
 
 Image = list[list[float]]
@@ -77,14 +77,14 @@ def real_counts(bts3_dir: Path) -> list[list[int]]:
 
 @pytest.mark.parametrize("fill", Fill)
 @pytest.mark.parametrize("normalisation", Normalisation)
-def test_every_fifth_real_grasp_equals_the_plain_implementation(
+def test_real_grasps_equal_the_plain_implementation(
     bts3_dir: Path, fill: Fill, normalisation: Normalisation
 ) -> None:
     grasps = real_counts(bts3_dir)
     assert len(grasps) == 2549
-    counts = np.array(grasps[::5], dtype=np.uint16).reshape(-1, 3, 24)
+    counts = np.array(grasps[::20], dtype=np.uint16).reshape(-1, 3, 24)
     images, _ = TactileImager(3, D1, fill, normalisation).build_batch(counts)
-    assert images.shape == (510, 12, 11, 3)
+    assert images.shape == (128, 12, 11, 3)
     worst = 0.0
     for image, reading in zip(images, counts, strict=True):
         plain = [
@@ -109,28 +109,19 @@ def test_d1_has_108_empty_pixels_and_two_passes_fill_them() -> None:
     assert (matrix.sum(axis=1) > 0).all()
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=lambda layout: layout.name)
-@pytest.mark.parametrize("fill", Fill)
-def test_rows_of_every_fill_matrix_sum_to_one(layout: Layout, fill: Fill) -> None:
-    np.testing.assert_allclose(fill_matrix(layout, fill).sum(axis=1), 1.0, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("name", "shape"), [("D1", (12, 11)), ("D2a", (6, 5)), ("D2b", (6, 5)), ("D3", (4, 7))]
-)
-def test_layouts_have_the_published_sizes_and_no_pixel_twice(
-    name: str, shape: tuple[int, int]
-) -> None:
-    layout = LAYOUTS[name]
-    assert layout.shape == shape
-    assert len(set(zip(layout.rows, layout.columns, strict=True))) == 24
+def test_layouts_have_the_published_sizes_and_no_pixel_twice() -> None:
+    shapes = {"D1": (12, 11), "D2a": (6, 5), "D2b": (6, 5), "D3": (4, 7)}
+    assert {name: layout.shape for name, layout in LAYOUTS.items()} == shapes
+    for layout in LAYOUTS.values():
+        assert len(set(zip(layout.rows, layout.columns, strict=True))) == 24
+        for fill in Fill:
+            np.testing.assert_allclose(fill_matrix(layout, fill).sum(axis=1), 1.0, atol=1e-15)
 
 
 counts_of_three_fingers = hnp.arrays(np.uint16, (3, 24), elements=st.integers(0, 4095))
 
 
 @given(counts=counts_of_three_fingers)
-@settings(max_examples=200)
 def test_any_counts_give_a_finite_image_or_zeros(counts: np.ndarray) -> None:
     image = np.full((12, 11, 3), np.nan, dtype=np.float32)
     spread = TactileImager(3).build(counts, image)
@@ -176,26 +167,21 @@ def test_images_of_a_user_are_the_filled_ones(fill: str) -> None:
         np.testing.assert_allclose(image, np.moveaxis(np.array(plain), 0, 2), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("layout", "shape"), [("D2a", (6, 5)), ("D2b", (6, 5)), ("D3", (4, 7))])
-def test_images_have_the_size_of_their_layout(layout: str, shape: tuple[int, int]) -> None:
+def test_a_finger_without_counts_has_no_image_of_any_layout() -> None:
     counts = np.full((1, 2, 24), 2000.0)
     counts[0, 1] = np.nan
-    images = graspd.tactile_images(counts, layout)
-    assert images.shape == (1, *shape, 2)
+    images = graspd.tactile_images(counts, "D3")
+    assert images.shape == (1, 4, 7, 2)
     np.testing.assert_allclose(images[..., 0], 2000.0)
     assert np.isnan(images[..., 1]).all()
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"layout": "D4"}, "'D4': they are D1, D2a, D2b, D3"),
-        ({"fill": "mean"}, "'mean': they are least-contact, neighbour-mean"),
-    ],
-)
-def test_another_layout_or_fill_is_refused_by_name(wrong: dict[str, str], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        graspd.tactile_images(np.zeros((1, 3, 24)), **wrong)
+def test_another_layout_or_fill_is_refused_by_name() -> None:
+    counts = np.zeros((1, 3, 24))
+    with pytest.raises(ValueError, match="'D4': they are D1, D2a, D2b, D3"):
+        graspd.tactile_images(counts, "D4")
+    with pytest.raises(ValueError, match="'mean': they are least-contact, neighbour-mean"):
+        graspd.tactile_images(counts, fill="mean")
 
 
 def test_a_drawing_has_each_electrodes_number_on_its_pixel() -> None:

@@ -73,37 +73,20 @@ def test_a_session_model_comes_with_its_card(data: Path, tmp_path: Path) -> None
     assert card["same_seed_same_margins"] is True
     assert list(card["protocols"]) == ["cv", "objects-whole", "session", "days"]
     assert [m["protocol"] for m in card["contract"]["measured"]] == list(card["protocols"])
-    assert [file["rows"] for file in card["contract"]["datasets"]] == [GRASPS, GRASPS]
     digest = hashlib.sha256((data / "palm_side.csv").read_bytes()).hexdigest()
     assert card["contract"]["datasets"][1]["sha256"] == digest
-    assert card["data"]["not_published"] == ["palm_down", "palm_side", "palm_45"]
     assert set(card["protocols"]["objects-whole"]["objects"]) == set(OBJECTS)
     assert "running" in card["protocols"]["session"]["calibrated_by"]
-    days = card["protocols"]["days"]
-    assert {"A palm_45", "B palm_side", "C palm_down", "A and C", "all"} < set(days["days"])
-    assert days["days"]["all"]["every"]["grasps"] == 5 * GRASPS
-    assert any("of what it calls stable slips" in point for point in card["weak_points"])
+    days = card["protocols"]["days"]["days"]
+    assert {"A palm_45", "B palm_side", "C palm_down", "A and C", "all"} < set(days)
+    assert days["all"]["every"]["grasps"] == 5 * GRASPS
     assert done.stdout.startswith(f"{out / SYSTEM}.onnx: cv F1 ")
-    assert done.stdout.count("\n") == 1
-    assert done.stderr.splitlines() == [
-        f"graspd train: warning: {name}.csv is not the published table; "
-        "the figures are of this data only"
-        for name in ("palm_down", "palm_side", "palm_45")
-    ]
+    assert done.stderr.count("is not the published table; the figures are of this data only") == 3
     session = model.contract.input
     assert isinstance(session, SessionInput)
     sharpness = [step.temperature for step in session.sharpness]
     assert sharpness == sorted(sharpness, reverse=True)
     assert sharpness[-1] >= 1.0
-
-
-def test_a_model_of_the_later_session_needs_its_table(data: Path, tmp_path: Path) -> None:
-    missing = data / "palm_45.csv"
-    missing.unlink()
-    done = train("--data", data, "--out", tmp_path / "out", system="small-session")
-    assert last_error(done) == f"graspd train: {missing}: is missing, small-session needs it"
-    assert done.stdout == ""
-    assert not (tmp_path / "out").exists()
 
 
 def test_an_own_table_is_used_beside_the_published(data: Path, tmp_path: Path) -> None:
@@ -113,11 +96,8 @@ def test_an_own_table_is_used_beside_the_published(data: Path, tmp_path: Path) -
     assert done.returncode == 0
     card = json.loads((tmp_path / "out" / "svm-lab-1.json").read_text())
     assert card["command"] == "graspd train svm --data DIR --own 'lab 1.csv' --seed 0 --folds 2"
-    assert [(file["name"], file["rows"]) for file in card["contract"]["datasets"]] == [
-        ("palm_down", GRASPS),
-        ("palm_side", GRASPS),
-        ("lab 1", 60),
-    ]
+    rows = [(file["name"], file["rows"]) for file in card["contract"]["datasets"]]
+    assert rows == [("palm_down", GRASPS), ("palm_side", GRASPS), ("lab 1", 60)]
     # Of the 220 grasps of the objects that were left out, 50 are the fewest to tell an accuracy.
     coverages = [step["coverage"] for step in card["contract"]["confidence"]]
     assert coverages[0] == 1.0
@@ -129,49 +109,29 @@ def test_an_own_table_is_used_beside_the_published(data: Path, tmp_path: Path) -
         "session": {"palm_45"},
         "days": {"palm_down", "palm_side", "palm_45"},
     }
-    assert card["data"]["licence"].startswith("MIT")
     assert "lab 1" in card["data"]["not_published"]
-    assert {
-        "The data is of 20 objects in 3 tables. Not published: lab 1.",
-        "The figures of another day are of the published tables alone.",
-    } < set(card["weak_points"])
     assert "lab 1.csv is not" not in done.stderr
 
 
-def test_the_smallest_own_table_makes_a_model(
-    tmp_path: Path,
-) -> None:
+def test_the_smallest_own_table_makes_a_model(tmp_path: Path) -> None:
     write(tmp_path / "lab.csv", smallest())
     done = train("--own", tmp_path / "lab.csv", "--out", tmp_path, "--folds", "2")
     assert done.returncode == 0
     contract = TactileModel(tmp_path / f"{SYSTEM}-lab.onnx").contract
     assert [(file.name, file.rows) for file in contract.datasets] == [("lab", 20)]
-    assert isinstance(contract.input, SessionInput)
     assert contract.confidence == ()  # 20 grasps say nothing of how sure one may be
     card = json.loads((tmp_path / f"{SYSTEM}-lab.json").read_text())
-    assert card["command"] == f"graspd train {SYSTEM} --own lab.csv --seed 0 --folds 2"
     assert list(card["protocols"]) == ["cv", "objects"]
     assert card["calibrated_by"] == "objects"
     assert card["broken"]["grasps"] > 0
-    assert card["data"] == {
-        "licence": "whatever the owner of the tables says",
-        "repository": None,
-        "cite": [],
-        "not_published": ["lab"],
-    }
-    assert card["weak_points"][1:3] == [
-        "The data is of 2 objects in 1 table. Not published: lab.",
-        "What it is worth on another day than those of its data was not measured.",
-    ]
-    assert card["weak_points"][3].startswith("20 grasps, 10 of which slipped, are few: the daemon")
+    assert (card["data"]["repository"], card["data"]["cite"]) == (None, [])
+    assert any("on another day" in point for point in card["weak_points"])
     assert done.stderr.startswith("graspd train: warning: 20 grasps are few")
 
 
 def test_grasps_of_one_object_measure_known_objects_alone(tmp_path: Path) -> None:
     write_table(tmp_path / "lab.csv", *separable_counts(GRASPS))
     options = "--own", tmp_path / "lab.csv", "--out", tmp_path / "out", "--folds", "2"
-    last = last_error(train(*options))
-    assert last == "graspd train: 2 folds need 2 objects, there are 1 (see --folds and --only)"
     assert train(*options, "--only", "cv").returncode == 0
     card = json.loads((tmp_path / "out" / f"{SYSTEM}-lab.json").read_text())
     assert card["never_seen"]["held_out_object"] is None
@@ -233,23 +193,15 @@ def test_limits_of_a_model_are_named_before_it_is_trained(
     assert warnings(train(*enough, *options)) == []
 
 
-@pytest.mark.parametrize(
-    ("options", "folds", "why"),
-    [
-        ([], 2, "10 folds need 10 grasps of each class, one has 9"),
-        (["--only", "cv"], 9, "10 folds need 10 grasps of each class, one has 9"),
-    ],
-)
-def test_as_many_folds_are_taken_as_grasps_are_enough_for(
-    options: list[str], folds: int, why: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("options", "folds"), [([], 2), (["--only", "cv"], 9)])
+def test_few_grasps_take_fewer_folds(options: list[str], folds: int, tmp_path: Path) -> None:
     made, lab = smallest(), tmp_path / "lab.csv"
     slipped = made.slipped.copy()
     slipped[np.flatnonzero(slipped)[0]] = False  # nine slipped, so ten folds are too many
     write(lab, dataclasses.replace(made, slipped=slipped))
     words = "--own", lab, "--out", tmp_path / "out", *options
     assert last_error(train(*words, "--folds", "10")).endswith("(see --folds and --only)")
-    assert f"graspd train: takes {folds} folds: {why}\n" in train(*words).stderr
+    assert f"graspd train: takes {folds} folds: 10 folds need" in train(*words).stderr
     card = json.loads((tmp_path / "out" / f"{SYSTEM}-lab.json").read_text())
     assert f"--folds {folds}" in card["command"]
 
@@ -269,12 +221,6 @@ def test_a_named_model_says_how_a_scene_gets_it(tmp_path: Path) -> None:
         assert command.endswith(" ".join(("--only cv", *words)))
 
 
-@pytest.mark.parametrize("name", ["svm", "small-session-ff", "a/b", ".hidden", "x.onnx", "a" * 65])
-def test_a_name_that_a_scene_could_not_use_is_refused(name: str) -> None:
-    last = last_error(train("--data", "anywhere", "--name", name))
-    assert "graspd ships a model" in last or "is no name" in last
-
-
 def test_a_system_of_fingers_that_a_table_lacks_is_refused(tmp_path: Path) -> None:
     counts, slipped = separable_counts(30)
     write_table(tmp_path / "two.csv", counts[:, [0, 2]], slipped, fingers=("ff", "th"))
@@ -284,22 +230,25 @@ def test_a_system_of_fingers_that_a_table_lacks_is_refused(tmp_path: Path) -> No
     assert "small-session-ff-th" in refused.stderr
 
 
-def test_without_any_data_there_is_nothing_to_train_on() -> None:
-    assert last_error(train()) == "graspd train: needs --data DIR, --own FILE, or both"
-
-
-def test_an_output_folder_that_is_a_file_is_refused(data: Path) -> None:
-    out = data / "palm_45.csv"
-    assert last_error(train("--data", data, "--out", out)) == f"graspd train: {out}: File exists"
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("--folds", "1"), ("--jobs", "0"), ("--seed", "-1"), ("--seed", "1e3"), ("--folds", "")],
-)
-def test_a_number_out_of_range_is_exit_code_2(option: str, value: str) -> None:
-    last = last_error(train("--data", "anywhere", f"{option}={value}"))
-    assert f"argument {option}: '{value}' is not a whole number from" in last
+def test_what_cannot_be_trained_is_one_line(data: Path, tmp_path: Path) -> None:
+    missing, own, some = data / "palm_45.csv", tmp_path / "lab.csv", ("--data", data)
+    write_table(own, *separable_counts(GRASPS))
+    missing.unlink()
+    for system, arguments, message in (
+        ("small-session", some, f"{missing}: is missing, small-session needs it"),
+        (SYSTEM, (), "needs --data DIR, --own FILE, or both"),
+        (SYSTEM, ("--own", own, "--only", "cv", "--out", own), f"{own}: File exists"),
+        (SYSTEM, ("--own", own, "--folds", "2"), "2 folds need 2 objects, there are 1 (see"),
+        (SYSTEM, (*some, "--name", "svm"), "graspd ships a model"),
+        (SYSTEM, (*some, "--name", "a/b"), "is no name"),
+        (SYSTEM, (*some, "--name", "x.onnx"), "is no name"),
+        (SYSTEM, (*some, "--folds=1"), "argument --folds: '1' is not a whole number from"),
+        (SYSTEM, (*some, "--seed=-1"), "argument --seed: '-1' is not a whole number from"),
+    ):
+        done = train("--out", tmp_path / "out", *arguments, system=system)
+        assert message in last_error(done)
+        assert done.stdout == ""
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_that_judges_otherwise_is_exit_code_1(

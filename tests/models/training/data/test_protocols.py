@@ -109,7 +109,7 @@ def test_each_day_is_judged_by_other_days_and_other_objects(real: Grasps) -> Non
     assert Counter(counted.values()) == {1: 2133, 2: 2549}
 
 
-@pytest.mark.parametrize("protocol", ["cv", *GROUPED])
+@pytest.mark.parametrize("protocol", ["cv", "session"])
 def test_the_seed_alone_decides_the_split(protocol: EvalProtocol) -> None:
     grasps = sessions(200)
     first, again, other = (splits(protocol, grasps, seed) for seed in (0, 0, 1))
@@ -120,7 +120,7 @@ def test_the_seed_alone_decides_the_split(protocol: EvalProtocol) -> None:
     )
 
 
-@pytest.mark.parametrize("protocol", ["objects", "session", "days"])
+@pytest.mark.parametrize("protocol", ["objects", "days"])
 def test_a_protocol_whose_table_is_missing_is_refused(protocol: EvalProtocol) -> None:
     with pytest.raises(TooFewGraspsError, match="the data lack palm_side"):
         splits(protocol, table("palm_down", 40, 0), seed=0)
@@ -174,10 +174,10 @@ def test_readings_of_one_grasp_stay_in_one_fold() -> None:
         folds_of(grasps, 40, seed=0)
 
 
-@pytest.mark.parametrize(("rows", "step"), [(300, 4.0), (300, 12.0), (300, 100.0)])
-def test_readings_of_a_grasp_are_joined_near_by_near(rows: int, step: float) -> None:
+@pytest.mark.parametrize("step", [4.0, 12.0])
+def test_readings_of_a_grasp_are_joined_near_by_near(step: float) -> None:
     """As by scipy from all distances: RMS 8 counts over 72 electrodes."""
-    random = np.random.default_rng(4)
+    random, rows = np.random.default_rng(4), 300
     walk = np.cumsum(random.normal(0.0, step / np.sqrt(2), (rows, 72)), axis=0) % 4096
     counts = random.permutation(walk).astype(np.uint16)
     near = squareform(pdist(counts.astype(float))) <= 8.0 * np.sqrt(72)

@@ -14,7 +14,6 @@ import graspd
 from graspd.models.training.estimators.configs import (
     CNN0,
     CNN1,
-    CNN2,
     CNN3,
     NetworkConfig,
     SecondConvolution,
@@ -59,15 +58,12 @@ def _unsettled(config: NetworkConfig, shape: tuple[int, ...]) -> nn.Sequential:
         (CNN1, IMAGE, 2_955_170),  # the published network
         # convolution + its norm + hidden layer + its norm + last layer, by hand
         (CNN0, IMAGE, 864 + 64 + (2880 * 128 + 128) + 256 + 258),
-        (CNN2, IMAGE, 864 + 64 + (640 * 1024 + 1024) + 2048 + 2050),
         (CNN3, IMAGE, 864 + 64 + (32 * 64 + 128) + (1280 * 1024 + 1024) + 2048 + 2050),
         (
             NetworkConfig(32, 1024, pool=True, second=SecondConvolution(64, kernel=3)),
             IMAGE,
             864 + 64 + (32 * 64 * 9 + 128) + (384 * 1024 + 1024) + 2048 + 2050,
         ),
-        (CNN0, (12, 33, 1), 288 + 64 + (10 * 31 * 32 * 128 + 128) + 256 + 258),
-        (CNN0, (4, 7, 3), 864 + 64 + (2 * 5 * 32 * 128 + 128) + 256 + 258),
         (NetworkConfig(16, 64), FEATURES, 432 + 32 + (1446 * 64 + 64) + 128 + 130),
         (NetworkConfig(8, 32), VECTOR, 216 + 16 + (720 * 32 + 32) + 64 + 66),
         (NetworkConfig(8, 32, batch_norm=False), IMAGE, 216 + 8 + (720 * 32 + 32) + 66),
@@ -81,23 +77,12 @@ def test_a_network_has_the_parameters_of_its_layers(
     assert network(torch.zeros(2, *shape)).shape == (2, 2)
 
 
-@pytest.mark.parametrize(
-    ("config", "shape", "problem"),
-    [
-        (
-            NetworkConfig(4, 8, pool=True, second=SecondConvolution(kernel=3)),
-            (4, 7, 3),
-            "too small",
-        ),
-        (TINY, (2, 5, 3), "too small"),
-        (TINY, (77,), "not those of whole fingers"),
-    ],
-)
-def test_a_network_that_does_not_fit_its_input_is_refused(
-    config: NetworkConfig, shape: tuple[int, ...], problem: str
-) -> None:
-    with pytest.raises(ValueError, match=problem):
-        build(config, shape)
+def test_a_network_that_does_not_fit_its_input_is_refused() -> None:
+    for config, shape in ((DEEP, (4, 7, 3)), (TINY, (2, 5, 3))):
+        with pytest.raises(ValueError, match="too small"):
+            build(config, shape)
+    with pytest.raises(ValueError, match="not those of whole fingers"):
+        build(TINY, (77,))
 
 
 def test_weights_start_as_in_keras() -> None:
@@ -152,10 +137,10 @@ def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
         (NetworkConfig(4, 8, batch_norm=False), VECTOR),
     ],
 )
-@pytest.mark.parametrize("temperature", [0.5, 2.5])
 def test_folding_batch_norm_and_temperature_changes_no_probability(
-    config: NetworkConfig, shape: tuple[int, ...], temperature: float
+    config: NetworkConfig, shape: tuple[int, ...]
 ) -> None:
+    temperature = 2.5
     inputs = np.random.default_rng(6).normal(size=(50, *shape)).astype(np.float32)
     network = _unsettled(config, shape)
     layers = len(network)

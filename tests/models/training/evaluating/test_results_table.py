@@ -26,10 +26,9 @@ from graspd.models.training.evaluating.figures import (
     with_probability,
     write,
 )
-from graspd.models.training.evaluating.findings import HOW_SURE
 from graspd.models.training.evaluating.frame import Job, evaluated, jobs_of
 from graspd.models.training.evaluating.metrics import confusion
-from graspd.models.training.evaluating.results_table import ONE_ROW, difference, results_table
+from graspd.models.training.evaluating.results_table import difference, results_table
 from graspd.models.training.systems.registry import SYSTEMS, digest
 from tests.models.training.samples import sessions
 
@@ -184,32 +183,6 @@ def test_every_published_row_is_there_even_if_nothing_was_run() -> None:
     shown = rows(results_table([], GRASPS, *MADE), 1)
     for system, protocol, figure, paper in PUBLISHED:
         assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-"] in shown
-
-
-def test_the_document_says_itself_how_one_row_is_made_again() -> None:
-    kept = (Path(__file__).parents[4] / "models/RESULTS.md").read_text()
-    made = results_table([], GRASPS, *MADE)
-    for text in (kept, made):
-        command, sentence, *_ = text.split("## How this was made\n\n")[1].split("\n\n")
-        assert command.startswith("    graspd evaluate ")
-        assert sentence == ONE_ROW
-    in_words = made[made.index("## 7.") : made.index("## How")]
-    assert in_words in kept
-    assert HOW_SURE in kept
-
-
-def test_the_minutes_are_those_of_the_trainings() -> None:
-    kept = (Path(__file__).parents[4] / "models/RESULTS.md").read_text()
-    seconds = {(row[0], row[1]): float(row[-1]) for row in rows(kept, 7)[1:]}
-    for system, _, _, _, command, minutes in rows(kept, 8)[1:]:
-        protocol = command.split(" --protocol ")[1].split()[0]
-        took = seconds.get((system, f"`{protocol}`"))
-        if took is None:
-            assert "small-session-" in system
-        elif protocol == "unknown":  # one training
-            assert float(minutes) == pytest.approx(max(1.0, took / 60.0), abs=0.51)
-        else:  # ten trainings, two at a time
-            assert float(minutes) == pytest.approx(max(1.0, took * 10 / 2 / 60.0), abs=0.51)
 
 
 def test_a_finding_has_the_figures_of_the_tables() -> None:

@@ -132,9 +132,3 @@ def test_candidates_take_turns_and_each_reading_is_timed() -> None:
     assert times["b"]["paced_p50_us"] > 0.0
     assert order[-6:] == ["a", "b"] * 3
     assert order[40:44] == ["a", "a", "b", "b"], "after the warm-up: two of each per round"
-
-
-def test_a_folder_without_tables_is_one_line(tmp_path: Path) -> None:
-    refused = graspd("report", "error-vs-time", "--data", tmp_path)
-    assert (refused.returncode, refused.stdout) == (2, "")
-    assert len(refused.stderr.splitlines()) == 1

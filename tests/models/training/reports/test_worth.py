@@ -20,10 +20,9 @@ pytest.importorskip("matplotlib", reason="needs the extra `report`")
 from graspd.models import zoo
 from graspd.models.training.arrays import Bools, Floats, Floats32, Ints
 from graspd.models.training.data.datasets import Grasps, read_all
-from graspd.models.training.data.protocols import object_folds
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.reports import streams as module
-from graspd.models.training.reports.reliability import after_outcomes, fitted_scales, slope
+from graspd.models.training.reports.reliability import fitted_scales, slope
 from graspd.models.training.reports.streams import Stream, judged, live, streams
 from graspd.models.training.reports.worth import (
     ALLOWED,
@@ -35,7 +34,7 @@ from graspd.models.training.reports.worth import (
     measured,
     risk_figures,
 )
-from graspd.models.training.systems.registry import SYSTEMS, System, with_recipes
+from graspd.models.training.systems.registry import System
 from graspd.models.trust.learner import SCALE
 from graspd.models.trust.risk import RiskLimits
 from tests.kit.inside import graspd
@@ -183,26 +182,6 @@ def test_a_scale_is_fitted_on_other_objects_of_its_split() -> None:
     assert former[0, 0] == later[0, 0]
     assert former[0, 1] != later[0, 1]
     assert former[1, 0] == later[1, 0] == SCALE
-
-
-def test_p_slip_is_honest_on_a_new_day(bts3_dir: Path) -> None:
-    """Over all days and folds nine in ten sessions have a slope from 0.8 to 1.35."""
-    grasps = read_all(bts3_dir)
-    names = np.array([file.name for file in grasps.files])[grasps.table_of]
-    fold_of = object_folds(grasps.objects, 4, 0)
-    later = names == "palm_45"
-    trained = train(
-        with_recipes(SYSTEMS["small-session"], epochs=8),
-        grasps.rows(np.flatnonzero(~later & (fold_of != 0))),
-        0,
-    )
-    rows = np.random.default_rng(0).permutation(np.flatnonzero(later & (fold_of == 0)))
-    margins, features, refused = judged(trained, grasps, rows)
-    one = stream_of(margins, features, grasps.slipped[rows], 0, refused)
-    ended = after_outcomes(live(one, RiskLimits(), every=True))
-    assert 0.7 < slope(ended) < 1.4
-    surely = ended[ended["p_slip"] < 0.1]
-    assert surely["slipped"].mean() == pytest.approx(surely["p_slip"].mean(), abs=0.05)
 
 
 @pytest.fixture(scope="module")
