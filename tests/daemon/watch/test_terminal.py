@@ -10,7 +10,7 @@ import time
 import pytest
 from msgspec import structs
 
-from graspd.daemon.judge.reasons import ADVICE, Decision, FingerState, Reason
+from graspd.daemon.judge.reasons import ADVICE, Decision, Reason
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.watch.snapshot import FingerMotion, Snapshot, Tone
 from graspd.daemon.watch.terminal import STYLES, Keyboard
@@ -91,17 +91,6 @@ def test_a_bar_of_motion_has_the_limit_in_its_middle(now: float | None, bar: str
     assert row.split(maxsplit=1)[1].startswith(bar)
 
 
-def test_a_finger_is_shown_in_a_known_word() -> None:
-    seen = a_full_hand()
-    for state in (FingerState.SLIDE, None):
-        first = structs.replace(seen.fingers[0], state=state)
-        (row,) = [
-            line for line in text_of(structs.replace(seen, fingers=[first])) if line[:3] == "ff "
-        ]
-        assert (", slide" in row) is (state is not None)
-        assert "None" not in row
-
-
 @pytest.mark.parametrize("width", [60, 80, 200])
 def test_figures_of_a_dead_daemon_are_dim_and_dated(width: int) -> None:
     view = after((b"status.right", status(0)), (b"verdict.right", verdict(0, Decision.STABLE)))
@@ -115,16 +104,6 @@ def test_figures_of_a_dead_daemon_are_dim_and_dated(width: int) -> None:
         drawn = "\n".join(text_of(seen, width, colours=True))
         styles = re.search(r"(\x1b\[[0-9;]*m)age 0.2 ms", drawn)
         assert bool(styles and styles[1] == "\x1b[2;3m") is dims  # dim and italic (ECMA-48)
-
-
-def test_the_header_has_the_wall_clock_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TZ", "CET-1")
-    time.tzset()
-    header = text_of(a_full_hand())[1]
-    monkeypatch.undo()
-    time.tzset()
-    # date -u -d @1790000000: 14:13:20
-    assert header.startswith("15:13:20 details of right: running (q ends)")
 
 
 @pytest.mark.parametrize("width", [1, 10, 40])
@@ -161,14 +140,6 @@ def test_lines_that_do_not_fit_are_shown_by_space() -> None:
     last = (len(whole) - 3) // 21
     assert pages[last][2:-1] == whole[-21:]
     assert pages[last + 1] == pages[0]
-
-
-def test_another_hand_shows_its_dead_electrode_beside_its_verdict() -> None:
-    hands = [a_full_hand(Decision.STABLE, "left"), a_full_hand(Decision.SLIP, "right")]
-    assert text_of(hands, 80)[1].rstrip() == (
-        "right  SLIP  slip probability 75 %, do not lift; not well: ff_7 electrode-dead"
-    )
-    assert "ff_7 electrode-dead" in " ".join(" ".join(text_of(hands, 60)[2:4]).split())
 
 
 def test_several_hands_all_show_their_verdicts() -> None:

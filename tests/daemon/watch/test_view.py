@@ -185,24 +185,6 @@ def test_a_stable_without_evidence_only_leans_to_it(change: dict[str, Any], why:
 
 
 @pytest.mark.parametrize(
-    ("still_ms", "words"),
-    [
-        (None, "-"),
-        (0.0, "0 ms"),
-        (100.0, "100 ms, may slide"),
-        (239.999999, "239 ms, may slide"),
-        (240.0, "240 ms"),
-        (9999.9, "9999 ms"),
-        (75_600.0, "75 s"),
-    ],
-)
-def test_stillness_is_told_in_words(still_ms: float | None, words: str) -> None:
-    view = after((b"verdict.right", verdict(0, Decision.STABLE, still_ms=still_ms)))
-    assert view.snapshot(0).still == words
-    assert view.snapshot(101 * MS).still == "-"  # silent
-
-
-@pytest.mark.parametrize(
     ("decision", "reasons", "tone"),
     [
         (Decision.UNKNOWN, [Reason.UNPROVEN], Tone.LEARNING),

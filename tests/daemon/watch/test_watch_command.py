@@ -148,14 +148,6 @@ def test_ctrl_z_does_not_leave_an_old_verdict(endpoint: str) -> None:
         assert terminal.end() == 0
 
 
-def test_a_terminal_that_cannot_be_drawn_on_is_said(endpoint: str) -> None:
-    terminal = Terminal("--connect", endpoint)
-    terminal.kind = "dumb"
-    with terminal:
-        assert terminal.end() == 2
-        assert b"watch cannot draw on this terminal" in terminal.output
-
-
 def two_scenes(tmp_path: Path) -> list[str]:
     paths = []
     for hand in ("left", "right"):
@@ -213,14 +205,3 @@ def test_what_is_wrong_is_said_in_a_line(
     result = graspd("watch", *arguments)
     assert result.returncode == 2
     assert said in result.stderr
-
-
-def test_a_port_that_is_taken_is_said(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "nice", lambda _more: 0)
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        result = graspd("watch", "--connect", endpoint, "--web", "--port", port)
-    assert result.returncode == 1
-    assert f"cannot serve a page on port {port}: Address already in use; --port takes another" in (
-        result.stderr
-    )

@@ -18,6 +18,7 @@ from graspd.daemon.watch.terminal import draw
 from graspd.daemon.watch.view import View
 from tests.daemon.publish.doors import Publisher
 from tests.kit.messages import GOLDEN, GOLDEN_STATUS, GOLDEN_VERDICT, decode_tactile
+from tests.kit.waiting import wait_until
 
 RISK = RiskReport(
     target=0.1,
@@ -139,6 +140,8 @@ class Talker:
         """What the verdicts are; none come if None."""
         self.more: dict[str, Any] = {}
         """What else they say."""
+        self.sent = 0
+        """How often status, counts and verdict were sent."""
         self._publisher = Publisher(endpoint)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._talk)
@@ -152,6 +155,11 @@ class Talker:
         self._thread.join()
         self._publisher.close()
 
+    def wait_for(self, number: int) -> None:
+        """Wait until so many more verdicts were sent."""
+        last = self.sent + number
+        wait_until(lambda: self.sent >= last)
+
     def _talk(self) -> None:
         seq = 0
         while not self._over.wait(PERIOD_S):
@@ -164,3 +172,4 @@ class Talker:
             self._publisher.send(b"tactile.right", tactile(seq, counts, counts, faulty=(6,)))
             self._publisher.send(b"verdict.right", verdict(seq, decision, **self.more))
             seq += 1
+            self.sent = seq
