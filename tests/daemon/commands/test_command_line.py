@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 
 import pytest
 import zmq
@@ -18,7 +17,6 @@ from tests.conftest import ROOT
 from tests.daemon.commands.shell_files import parsers
 from tests.daemon.processes import GRASPD
 from tests.kit.inside import graspd
-from tests.kit.scenes import written
 
 EXTRAS = (
     "torch", "sklearn", "scipy", "joblib", "threadpoolctl", "onnx", "onnxscript", "skl2onnx",
@@ -73,31 +71,6 @@ def test_a_command_without_its_extra_says_how_to_have_it(arguments: list[str], e
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert f"run {sys.executable} -m pip install '.[{extra}]' in " in line
-
-
-@pytest.mark.parametrize("command", ["check", "run"])
-def test_a_scene_that_plays_mcap_without_its_reader_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    (tmp_path / "run").write_bytes(b"\x89MCAP0\r\n")
-    scene = written(tmp_path, '[tactile]\ndriver = "replay"\nrecordings = ["run"]\n')
-    done = graspd(command, scene)
-    assert done.returncode == 2
-    assert done.stderr.startswith("graspd: replaying MCAP needs the package 'mcap': run ")
-
-
-def test_a_bag_without_its_reader_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    path = tmp_path / "hand.bag"
-    path.write_bytes(b"#ROSBAG V2.0\n")
-    done = graspd("replay", path)
-    assert done.returncode == 2
-    assert done.stderr.startswith(
-        f"graspd: {path}: reading a ROS bag needs the package 'rosbags': run "
-    )
 
 
 def test_every_argument_of_every_command_has_help() -> None:

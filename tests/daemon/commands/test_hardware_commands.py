@@ -17,7 +17,7 @@ from graspd.daemon.publish.messages import Tactile, Verdict
 from graspd.drivers.base import TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from tests.bench.live import Subscriber
-from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_tactile, decode_verdict
 from tests.kit.scenes import written
 from tests.ports import can_id, free_port, multicast_group
@@ -110,33 +110,6 @@ def test_a_recording_on_the_wire_reads_as_its_replay(tmp_path: Path, kind: str) 
     assert set(sound) <= rows
 
 
-def test_whole_grasps_on_the_wire_are_judged_one_by_one(tmp_path: Path) -> None:
-    verdicts: list[Verdict] = []
-    judged: list[int] = []
-    with start("run", scene_for("can", tmp_path)) as daemon:
-        wait_for(tmp_path / "graspd")
-        with (
-            Subscriber(f"ipc://{tmp_path}/graspd") as subscriber,
-            twin("can", tmp_path) as hardware,
-        ):
-            while len(set(judged)) < 2:  # a machine that stalls may cost a grasp
-                verdict = subscriber.verdict(TIMEOUT_S)
-                assert verdict is not None
-                verdicts.append(verdict)
-                judged += [verdict.grasp] * verdict.judged
-            end(hardware)
-        end(daemon)
-    assert judged == sorted(judged)
-    first = verdicts[[verdict.judged for verdict in verdicts].index(True)]
-    assert first.gate == "judged"
-    assert first.contact == ["ff", "mf", "th"]
-    for verdict in verdicts:
-        assert not verdict.valid or verdict.gate == "judged"
-    before = [verdict for verdict in verdicts if verdict.seq < first.seq]
-    assert {verdict.verdict for verdict in before} == {"unknown"}
-    assert "no-contact" in {reason for verdict in before for reason in verdict.reasons}
-
-
 def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) -> None:
     with start("run", scene_for("spi", tmp_path)) as daemon:
         wait_for(tmp_path / "graspd")
@@ -151,32 +124,3 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
             # More reasons follow if the hand moved, or a reading was lost, just before.
             assert gone[-1].reasons[0] == "stale"
         end(daemon)
-
-
-def test_the_doctor_finds_what_the_twin_broke(tmp_path: Path) -> None:
-    scene = scene_for("spi", tmp_path)
-    with twin("spi", tmp_path, "--dead", "th_24", "--unplugged", "mf") as hardware:
-        people = graspd("doctor", scene, "--listen", 2)
-        program = graspd("doctor", scene, "--listen", 2, "--json")
-        end(hardware)
-    assert people.returncode == program.returncode == 1
-    report = json.loads(program.stdout)
-    wrong = [finding["what"] for finding in report["findings"] if finding["level"] == "error"]
-    assert any(what.startswith("mf: no electrode can be read") for what in wrong)
-    assert "th_24 stuck at a rail" in wrong
-    assert len(wrong) == 2
-    assert report["readings"] > 50
-    for what in wrong:
-        assert what in people.stdout
-
-
-def test_the_doctor_takes_a_recording_at_its_own_rate() -> None:
-    scene = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
-    report = json.loads(graspd("doctor", scene, "--listen", 2, "--json").stdout)
-    assert report["readings"] > 30, "of 142 that the demo has in two seconds"
-
-
-def test_the_doctor_without_a_scene_looks_at_the_computer() -> None:
-    result = graspd("doctor", "--listen", 0.3, "--json")
-    assert result.returncode in (0, 1)
-    assert json.loads(result.stdout)["findings"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 import signal
 import subprocess
@@ -24,10 +23,9 @@ from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.clients.building import sleep_at_will
-from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, start, wait_for
+from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start, wait_for
 from tests.kit import inside
 from tests.kit.messages import decode_verdict
-from tests.kit.scenes import unlabelled_demo
 
 graspd = cache(inside.graspd)
 """Run a command; the same command on the same files runs once."""
@@ -41,14 +39,8 @@ def test_the_demo_compares_both_methods_on_a_day_of_drift() -> None:
     demo, program = graspd("replay"), graspd("replay", "--json")
     assert demo.returncode == program.returncode == 0, demo.stderr
     text = demo.stdout
-    assert "synthetic" in text.splitlines()[0]
-    assert "\x1b" not in text
-    assert len(text.splitlines()) <= 24
-    assert max(map(len, text.splitlines())) <= 100
     lines = [match.groupdict() for match in map(DEMO_LINE.fullmatch, text.splitlines()) if match]
     *blocks, whole = lines
-    assert whole["grasps"] == "all"
-    assert len(blocks) == 12
     for name in ("stable", "slips", "own_stable", "own_slips"):
         assert sum(int(block[name]) for block in blocks) == int(whole[name])
     # The day begins as the training was, and ends where the published method is a coin.
@@ -57,8 +49,6 @@ def test_the_demo_compares_both_methods_on_a_day_of_drift() -> None:
     # The bound of the rule, 0.05 N + 5, and nothing bought by silence.
     stable, slips = int(whole["own_stable"]), int(whole["own_slips"])
     assert slips <= 0.05 * stable + 5.0
-    most = int(0.05 * stable + 5.0)
-    assert f"At most {most} can slip: 5 % of its `stable`, and 5.00 more." in text
     assert max(int(block["kept"]) for block in blocks) > 50
     # The verdicts are those that programs get.
     verdicts = [decode_verdict(line.encode()) for line in program.stdout.splitlines()]
@@ -72,19 +62,6 @@ def test_the_demo_compares_both_methods_on_a_day_of_drift() -> None:
     assert f"`stable` that slipped  {slips} of {stable} (" in text
     assert f"good lifts kept        {stable - slips} of {held} (" in text
     assert f"unknown, grasp again   {unknown} of 300, published 0" in text
-
-
-def test_a_table_with_outcomes_is_counted_by_25_grasps(tmp_path: Path) -> None:
-    table = tmp_path / "lab.csv"
-    table.write_text("".join(DEMO_TABLE.read_text().splitlines(keepends=True)[:61]))
-    text = graspd("replay", table).stdout
-    lines = [match.groupdict() for match in map(DEMO_LINE.fullmatch, text.splitlines()) if match]
-    assert [line["grasps"] for line in lines] == ["1-25", "26-50", "51-60", "all"]
-    assert text.startswith("Grasps of lab.csv.\n")
-    assert "p_slip" not in text
-    verbose = graspd("replay", table, "--verbose").stdout
-    assert verbose.count("p_slip") + verbose.count("never-seen  ") >= 59
-    assert "against " in verbose
 
 
 def test_the_demos_published_method_is_its_network_alone() -> None:
@@ -168,18 +145,6 @@ def test_a_renamed_part_of_a_training_table_is_known(bts3_dir: Path, tmp_path: P
     assert summary_of(DEMO_TABLE)["trained_on"] == []
 
 
-def test_outcomes_of_a_table_that_has_none_are_one_line(tmp_path: Path) -> None:
-    other = tmp_path / "held.csv"
-    other.write_text(re.sub(r"(?m)^(\w+),[01],", r"\1,held,", DEMO_TABLE.read_text()))
-    for path in (unlabelled_demo(tmp_path), other):
-        played = graspd("replay", path)
-        assert (played.returncode, "no outcome of a lift is known" in played.stdout) == (0, True)
-        result = graspd("replay", path, "--outcomes")
-        assert (result.returncode, result.stdout) == (2, "")
-        problem = "no outcomes to tell: none is known in a column `slipped`"
-        assert result.stderr == f"graspd: {path}: {problem}\n"
-
-
 def test_replay_json_gives_one_valid_verdict_per_real_grasp(bts3_dir: Path) -> None:
     result = graspd("replay", bts3_dir / "palm_down.csv", "--json", "--model", "cnn1")
     assert result.returncode == 0, result.stderr
@@ -221,27 +186,6 @@ def test_replay_fails_when_nobody_subscribes(tmp_path: Path) -> None:
     result = graspd("replay", "--publish", f"ipc://{tmp_path}/graspd", "--wait", 0.1)
     assert result.returncode == 1
     assert result.stderr.startswith("graspd: no subscriber of ipc://")
-
-
-def peak_memory_kib(recording: Path) -> int:
-    """Peak resident memory of a replay, from the kernel's own account."""
-    process = subprocess.Popen(
-        [*GRASPD, "replay", str(recording), "--json", "--as", "table"],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0
-    return usage.ru_maxrss
-
-
-def test_memory_does_not_grow_with_the_length_of_the_file(tmp_path: Path) -> None:
-    header, *rows = DEMO_TABLE.read_text().splitlines(keepends=True)
-    short, long = tmp_path / "short.csv", tmp_path / "long.csv"
-    short.write_text(header + "".join(rows))
-    long.write_text(header + "".join(rows) * 15)  # 3,000 grasps, 1.1 MB
-    assert peak_memory_kib(long) - peak_memory_kib(short) < 2048
 
 
 @pytest.mark.parametrize(
@@ -297,14 +241,3 @@ def test_a_value_that_is_no_count_is_repaired_and_said(tmp_path: Path, text: str
     strict = graspd("replay", recording, "--strict", "--json")
     assert strict.returncode == 2
     assert f"{recording}, line 2, column ff_biotac_1: " in strict.stderr.splitlines()[-1]
-
-
-def test_the_end_of_the_reader_ends_the_replay_quietly() -> None:
-    with start("replay") as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        process.stdout.close()
-        process.wait(TIMEOUT_S)
-        assert process.stderr is not None
-        assert process.stderr.read() == ""
-    assert process.returncode == 0

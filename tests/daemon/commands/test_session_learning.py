@@ -69,21 +69,8 @@ def test_a_table_teaches_but_counts_as_no_lift(tmp_path: Path) -> None:
     report = trust.report()
     assert (report.lifts, report.slips, report.outstanding) == (0, 0, 0)
     assert (trust.risk.budget, trust.risk.bound) == (fresh.risk.budget, fresh.risk.bound)
-    document = shown(path)
-    assert document["session"]["trust"] == {
-        "model": learned.model,
-        "outcomes": learned.learner.outcomes,
-        "told": {},
-        "max_slip_when_stable": None,
-        "lifts": 0,
-        "slips": 0,
-        "outstanding": 0,
-        "unreported": 0,
-        "proven": 0,
-    }
-    text = graspd("session", "show", path).stdout
-    assert f"  learned  {learned.learner.outcomes} outcomes, by the model" in text
-    assert "  stable   0 lifts reported, 0 slipped, 0 outstanding, 0 never reported" in text
+    told = shown(path)["session"]["trust"]
+    assert (told["outcomes"], told["lifts"]) == (learned.learner.outcomes, 0)
 
 
 def test_a_seed_keeps_where_the_recorded_sensors_rest(tmp_path: Path) -> None:
