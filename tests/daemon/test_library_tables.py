@@ -28,9 +28,7 @@ def test_a_stream_is_judged_as_replay_judges_it() -> None:
     assert got == expected
 
 
-@pytest.mark.parametrize(
-    "given", ["columns by name", "Arrow", "polars", "pandas of its own integers"]
-)
+@pytest.mark.parametrize("given", ["columns by name", "Arrow", "pandas of its own integers"])
 def test_a_table_is_judged_as_its_file(
     counts: NDArray[np.float64], tmp_path: Path, given: str
 ) -> None:
@@ -106,16 +104,6 @@ def test_times_that_mean_little_are_refused(
     stream = graspd.read_recording(DEMO_RECORDING)[:100]
     with pytest.raises(ValueError, match=words):
         list(graspd.judge(stream.assign(t=times(stream.t.to_numpy()))))
-
-
-def test_blank_labels_make_no_grasps_of_few_slow_sweeps() -> None:
-    pytest.importorskip("pandas", reason="needs the extra `pandas`")
-    every = graspd.read_recording(DEMO_RECORDING)[1250:1550:25].drop(columns="t")
-    blank = every.assign(object=np.nan, slipped=np.nan)
-    model = graspd.load("mlp")
-    for sweeps in (every, blank, blank.assign(slipped=[None, 1.0] * 6)):
-        with pytest.raises(ValueError, match="most of 12 rows are much like another"):
-            model.predict(sweeps)
 
 
 def test_sweeps_without_times_are_never_grasps() -> None:

@@ -81,7 +81,7 @@ def test_nothing_that_is_staged_names_the_stage(pristine: Path) -> None:
     assert program.startswith(f"#!/opt/graspd/{environment}/bin/python")
 
 
-def test_the_byte_code_is_there_before_the_service_may_not_write_it(pristine: Path) -> None:
+def test_byte_code_is_installed_before_the_service_starts(pristine: Path) -> None:
     assert list(pristine.glob("opt/graspd/venv/lib/*/site-packages/graspd/__pycache__/__main__*"))
 
 
@@ -101,16 +101,7 @@ def test_a_scene_is_never_overwritten(staged: Path, wheels: Path) -> None:
     assert not scene.exists(), "an example was put beside a scene that is in use"
 
 
-def test_an_environment_is_made_anew_on_demand(staged: Path, wheels: Path) -> None:
-    former = (staged / "opt/graspd/venv").readlink()
-    install(staged, wheels, "--rebuild")
-    assert (staged / "opt/graspd/venv").readlink() != former
-    assert version_below(staged) == "graspd 0.1.0"
-
-
-def test_a_newer_graspd_takes_the_place_of_the_former_once_that_has_ended(
-    staged: Path, tmp_path: Path
-) -> None:
+def test_a_newer_graspd_replaces_the_former_once_that_ended(staged: Path, tmp_path: Path) -> None:
     folder = staged / "opt/graspd"
     former = folder / (folder / "venv").readlink()
     newer = wheelhouse(tmp_path / "second", "0.2.0")
@@ -197,16 +188,12 @@ def test_another_prefix_is_named_everywhere_and_remembered(wheels: Path, tmp_pat
 @pytest.mark.parametrize(
     ("prefix", "why"),
     [
-        ("/tmp/hand", "cannot see /tmp/hand"),
         ("/home/hand", "cannot see"),
-        ("/dev/shm/hand", "/dev/shm/hand is on no disk"),
         ("/opt/../dev/shm/hand", "/dev/shm/hand is on no disk"),
         ("/srv/a/../../tmp/hand", "cannot see /tmp/hand"),
-        ("/tmp/../srv/hand", "cannot see"),
         ("/srv/../../hand", "leads out of"),
         ("/srv/link/hand", "others may write /srv/link, on the way"),
         ("/srv/away/hand", "leads out of"),
-        ("/srv/shared/hand", "others may write /srv/shared, on the way to /srv/shared/hand"),
         ("/srv/shared/below/hand", "others may write /srv/shared,"),
         ("/srv/shared/below/../../hand", "others may write /srv/shared"),
         ("/srv/to-shared/hand", "others may write /srv/shared, on the way"),
@@ -364,7 +351,6 @@ def test_wheels_without_graspd_are_refused(tmp_path: Path) -> None:
     "arguments",
     [
         ["--unknown"],
-        ["--prefix"],
         ["--prefix", "relative"],
         ["--prefix", "/"],
         ["--prefix", "/opt/with space"],
@@ -380,12 +366,3 @@ def test_a_wrong_command_line_is_refused(arguments: list[str]) -> None:
     done = installer(*arguments)
     assert done.returncode == 2, done.stdout + done.stderr
     assert "--help" in done.stderr
-
-
-def test_the_help_tells_every_option() -> None:
-    done = installer("--help")
-    assert done.returncode == 0
-    options = {word for word in INSTALLER.read_text().split() if word.startswith("--")}
-    ours = {option.rstrip(")") for option in options if option.endswith(")")} - {"--help"}
-    assert "--uninstall" in ours
-    assert {option for option in ours if option not in done.stdout} == set()

@@ -61,7 +61,7 @@ def leaves(layout: Any) -> Iterator[str]:  # noqa: ANN401
         yield from leaves(layout["second"])
 
 
-def test_every_panel_has_its_place_and_a_kind_that_there_is() -> None:
+def test_every_panel_has_a_place_and_a_known_kind() -> None:
     placed = list(leaves(LICHTBLICK["layout"]))
     assert sorted(placed) == sorted(LICHTBLICK["configById"])
     assert {name.partition("!")[0] for name in placed} == PANELS

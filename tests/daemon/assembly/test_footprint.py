@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -12,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from tests.bench.footprint import Footprint, measure
-from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start
 from tests.kit.scenes import demo_scene, written
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
@@ -139,24 +137,6 @@ def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measur
     # Three seconds with some grasps, each judged as it settles and then twenty times a second.
     assert len(cost["reading"]) == 300
     assert 5 <= len(cost["judged"]) <= 4 + 60
-
-
-def test_the_running_daemon_has_what_was_measured(tmp_path: Path, measured: Measured) -> None:
-    scene = demo_scene(tmp_path, "loop = true")
-    found = measured(scene)
-    with start("run", scene) as process:
-        command = [sys.executable, "-c", SUBSCRIBER, f"ipc://{tmp_path}/v", "40"]
-        subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
-        status = Path(f"/proc/{process.pid}/status").read_text().splitlines()
-        descriptors = len(os.listdir(f"/proc/{process.pid}/fd"))
-        process.terminate()
-        process.communicate(timeout=TIMEOUT_S)
-    words = [line.split() for line in status]
-    running = {word[0].rstrip(":"): word[1] for word in words if len(word) > 1}
-    assert int(running["Threads"]) == found["threads"]
-    assert int(running["VmRSS"]) == pytest.approx(found["rss_kib"], rel=0.05)
-    # A subscriber has one connection; whether it has gone by now is a matter of time.
-    assert descriptors - found["descriptors"] in {0, 1}
 
 
 def test_a_table_of_grasps_has_neither_gate_nor_joints(tmp_path: Path, measured: Measured) -> None:

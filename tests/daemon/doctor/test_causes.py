@@ -54,18 +54,6 @@ def healthy(tmp_path: Path) -> Iterator[str]:
         thread.join()
 
 
-def test_a_missing_port_is_reported_with_the_present_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    port = computer.SerialPort("/dev/ttyACM3", "Pico - CDC", "E66", 0x2E8A, "Pico")
-    monkeypatch.setattr(computer, "serial_ports", lambda: [port])
-    text = SPI.format(tmp_path / "absent")
-    (told,) = look(tmp_path, text)
-    assert told["cause"] == "port-missing"
-    people = asked(tmp_path, text).stdout
-    assert "ok serial port /dev/ttyACM3: Pico - CDC, serial number E66\n" in people
-
-
 @pytest.mark.parametrize(
     ("group", "advice"),
     [

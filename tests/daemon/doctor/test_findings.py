@@ -63,14 +63,6 @@ def statistics(
     return found
 
 
-def nothing(_counts: Counts, _faults: object, _number: int) -> None:
-    pass
-
-
-def test_healthy_sensors_have_no_findings() -> None:
-    assert statistics(nothing).findings() == []
-
-
 def test_the_running_figures_are_those_of_numpy() -> None:
     kept: list[Counts] = []
 
@@ -165,10 +157,6 @@ def test_hardware_is_accused_by_two_signs_only(
     assert "replace" not in (finding.advice or "")
 
 
-def test_no_readings_is_no_electrode_finding() -> None:
-    assert statistics(nothing, readings=0).findings() == []
-
-
 @pytest.mark.parametrize(
     ("readings", "period_ns", "level"),
     [
@@ -182,12 +170,6 @@ def test_the_rate_is_judged_by_its_nominal(
     readings: int, period_ns: int | None, level: Level
 ) -> None:
     assert rate_finding("spi", readings, 3.0, period_ns).level is level
-
-
-def test_only_counters_of_trouble_are_findings() -> None:
-    counters = {"readings": 300, "bytes": 9, "accepted_frames": 9, "bad_crc": 2, "too_long": 0}
-    findings = counter_findings("spi", counters)
-    assert [finding.what for finding in findings] == ["spi: 2 bad crc"]
 
 
 @pytest.mark.parametrize(("number", "findings"), [(0, 0), (13, 0), (108, 0), (109, 1)])
@@ -239,11 +221,6 @@ def test_the_page_names_every_cause_once_and_nothing_else() -> None:
     page = (Path(__file__).parents[3] / "deploy/CONNECT.md").read_text()
     _, causes = page.split("texts may change.\n")
     assert sorted(re.findall(r"`([^`]+)`", causes)) == sorted(Cause)
-
-
-def test_a_recording_has_no_link() -> None:
-    (finding,) = device_findings("replay", {"recordings": Fact("a.csv")})
-    assert finding.level is Level.OK
 
 
 def kinds_of(kind: type[DriverCounters]) -> Iterator[type[DriverCounters]]:

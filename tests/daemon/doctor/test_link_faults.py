@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import socket
 from pathlib import Path
 
@@ -177,20 +176,6 @@ def test_a_port_that_cannot_be_opened_is_told(
     monkeypatch.setattr("serial.serial_for_url", refused(number))
     (finding,) = look(tmp_path, tactile.format(tmp_path / "port"))
     assert finding["cause"] == cause
-
-
-def test_an_address_or_port_that_fails_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pid = os.getpid()
-    monkeypatch.setattr("os.getpid", lambda: 1)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
-        held.bind(("127.0.0.1", 0))
-        here = f"127.0.0.1:{held.getsockname()[1]}"
-        for source, cause in ((here, "port-held"), ("192.0.2.1:9870", "address")):
-            (finding,) = look(tmp_path, f'[tactile]\ndriver = "palm"\nsource = "udp://{source}"\n')
-            assert finding["cause"] == cause
-            assert (f"PID {pid}, " in finding["what"]) == (cause == "port-held")
 
 
 @pytest.mark.parametrize("kind", LINKS)

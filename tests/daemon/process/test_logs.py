@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from graspd.daemon.process.logs import (
     BURST,
     KINDS_MAX,
@@ -24,23 +22,12 @@ def record(level: int, text: str, *values: object) -> logging.LogRecord:
     return logging.LogRecord("graspd", level, __file__, 1, text, values, None)
 
 
-@pytest.mark.parametrize(
-    ("level", "number"),
-    [
-        (logging.CRITICAL, 3),
-        (logging.ERROR, 3),
-        (logging.WARNING, 4),
-        (logging.INFO, 6),
-        (logging.DEBUG, 7),
-    ],
-)
-def test_the_journal_gets_syslog_priorities(level: int, number: int) -> None:
+def test_each_line_in_the_journal_has_a_syslog_priority() -> None:
     """As in syslog(3): LOG_ERR 3, LOG_WARNING 4, LOG_INFO 6, LOG_DEBUG 7."""
-    assert JournalFormatter().format(record(level, "link lost")) == f"<{number}>link lost"
-
-
-def test_every_line_has_its_priority() -> None:
-    assert JournalFormatter().format(record(logging.ERROR, "a\nb")) == "<3>a\n<3>b"
+    levels = {"CRITICAL": 3, "ERROR": 3, "WARNING": 4, "INFO": 6, "DEBUG": 7}
+    for name, number in levels.items():
+        line = JournalFormatter().format(record(logging.getLevelNamesMapping()[name], "a\nb"))
+        assert line == f"<{number}>a\n<{number}>b"
 
 
 def test_a_pipe_is_no_journal_and_the_named_stream_is() -> None:
