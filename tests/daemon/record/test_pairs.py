@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from graspd import load, read_grasps, read_recording
-from graspd.drivers.base import DriverError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.drivers.recordings.layout import layout_of
 from graspd.models.training.data.datasets import read_table
@@ -75,46 +72,6 @@ def test_a_stream_is_not_judged_as_grasps_by_the_library() -> None:
             load("small-session").predict(stream, session=stream)
 
 
-RENAMED = ("t", "time", "%time", "stamp", "secs", "number", None)
-"""Names of the column of times; None: it is cut off."""
-
-
-def sweeps(name: str | None, keep: slice, seed: int | None, scale: float) -> bytes:
-    """A part of the demo's stream, its times called `name`; with a seed, columns are mixed."""
-    frame = pd.read_csv(io.BytesIO(DEMO_RECORDING.read_bytes()), nrows=1200).iloc[keep]
-    frame["t"] = frame["t"] * scale if scale == 1.0 else (frame["t"] * scale).round().astype(int)
-    frame = frame.drop(columns="t") if name is None else frame.rename(columns={"t": name})
-    if seed is not None:
-        random = np.random.default_rng(seed)
-        frame = frame[random.permutation(frame.columns)]
-        frame = frame if name in RENAMED[:5] else frame.sample(frac=1.0, random_state=seed)
-    text: str = frame.to_csv(index=False)
-    return text.encode()
-
-
-@pytest.mark.parametrize("name", RENAMED)
-@pytest.mark.parametrize(
-    ("keep", "seed"),
-    [
-        (slice(0, 300), None), (slice(0, 1200), 1), (slice(0, 1200, 20), 6), (slice(5, 8), 7),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("scale", [1.0, 1e9])
-def test_a_sweep_of_an_open_hand_is_never_stable(
-    tmp_path: Path, name: str | None, keep: slice, seed: int | None, scale: float
-) -> None:
-    path = tmp_path / "sweeps.csv"
-    path.write_bytes(sweeps(name, keep, seed, scale))
-    places = range(1200)[keep]
-    try:
-        layout = layout_of(path, ("ff", "mf", "th"))
-    except DriverError:
-        return
-    assert layout.is_stream, "a table: each sweep would be judged"
-    step_s = layout.unit_s * scale
-    assert step_s == pytest.approx(1.0) or len(places) < 10
-
-
 @pytest.mark.parametrize(
     "words", [["replay"], ["session", "seed", "scene.toml"], ["train", "svm", "--own"]]
 )
@@ -124,7 +81,8 @@ def test_no_command_takes_sweeps_without_times_for_grasps(
     if words[0] == "train":
         pytest.importorskip("onnx", reason="needs the extra `train`")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "sweeps.csv").write_bytes(sweeps(None, slice(0, 1200), None, 1.0))
+    sweeps = pd.read_csv(DEMO_RECORDING, nrows=1200).drop(columns="t")
+    sweeps.to_csv(tmp_path / "sweeps.csv", index=False)
     (tmp_path / "scene.toml").write_text(
         '[tactile]\ndriver = "replay"\nrecordings = ["sweeps.csv"]\n'
         '[session]\nkeep = true\nfolder = "session"\n'

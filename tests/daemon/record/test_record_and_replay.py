@@ -199,7 +199,9 @@ def test_files_that_do_not_follow_each_other_are_named(
     rotated: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
     first, second, third = rotated.files[:3]
-    RecordedRun([first, second, third])
+    recorded = RecordedRun([first, second, third])
+    wanted = recorded.scene({}, {}, None)
+    recorded.restore(recorded.parts(wanted, assembly.load_model(wanted), None).pipeline)
     assert not caplog.records
     RecordedRun([first, third])
     assert f"{third}: does not go on where the file before it ends" in caplog.text
@@ -218,6 +220,7 @@ def test_learning_of_another_graspd_is_left_out_with_a_warning(
     assert pipeline.trust is not None
     assert pipeline.trust.learner.outcomes == 0
     assert "what was learned is of format 1; this graspd reads 2 and 3" in caplog.text
+    assert f"{rotated.files[1]}: begins in the middle of a run" in caplog.text
 
 
 def test_exported_grasps_are_judged_as_then(lab: Lab, tmp_path: Path) -> None:

@@ -275,17 +275,3 @@ def test_late_readings_are_late_again_in_the_replay(
     assert len(late) == 1000 // 50 * 4
     assert {each.moment.judges for each in late} == {False, True}
     assert again(*files(tmp_path)) == expected
-
-
-def test_a_file_from_within_a_run_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    daemon = Daemon(tmp_path, monkeypatch)
-    for reading in sweeps()[:500]:
-        daemon.judge(reading)
-    daemon.recorder.close()
-    first, later = files(tmp_path)[:2]
-    again(first)
-    assert not [each for each in caplog.records if each.levelno >= logging.WARNING]
-    again(later)
-    assert f"{later}: begins in the middle of a run" in caplog.text

@@ -74,6 +74,12 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 
 @pytest.fixture
+def folder(tmp_path: Path) -> Iterator[SessionFolder]:
+    with SessionFolder(tmp_path / "right") as folder:
+        yield folder
+
+
+@pytest.fixture
 def keeper_of(folder: SessionFolder) -> Iterator[Callable[..., SessionKeeper]]:
     """Makes keepers, and ends them."""
     made: list[SessionKeeper] = []
@@ -92,7 +98,7 @@ def outcomes(folder: SessionFolder) -> int:
     return 0 if kept is None else kept.learner.outcomes
 
 
-def test_outcomes_that_come_during_a_save_share_the_next(
+def test_a_disk_that_hangs_holds_up_no_loop(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
@@ -103,39 +109,20 @@ def test_outcomes_that_come_during_a_save_share_the_next(
         found.append((grasp, reply, outcomes(folder)))
 
     disk.goes_on.clear()
-    for grasp in range(5):
-        judge(part, grasp)
-        tell(part, grasp)
-        keeper.keep(partial(answer, grasp))
-    assert (found, disk.written) == ([], 0)
-    disk.goes_on.set()
-    go_round(keeper)
-    assert [(grasp, reply) for grasp, reply, _ in found] == [(grasp, KEPT) for grasp in range(5)]
-    assert disk.written == 2
-    assert [outcomes for _, _, outcomes in found] == [1, 5, 5, 5, 5]
-
-
-def test_a_disk_that_hangs_holds_up_no_loop(
-    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
-) -> None:
-    part = trust()
-    found: list[tuple[int, Reply]] = []
-    keeper = keeper_of(part)
-
-    def answer(grasp: int, reply: Reply) -> None:
-        found.append((grasp, reply))
-
-    disk.goes_on.clear()
     told = WAITING_MAX + 6
     for grasp in range(told):
         judge(part, grasp)
         tell(part, grasp)
         keeper.keep(partial(answer, grasp))
         keeper.before_wait(NOBODY)
-    assert found == [(grasp, BUSY) for grasp in range(6)]
+    assert found == [(grasp, BUSY, 0) for grasp in range(6)]
     disk.goes_on.set()
     go_round(keeper)
-    assert found[6:] == [(grasp, KEPT) for grasp in range(6, told)]
+    assert [(grasp, reply) for grasp, reply, _ in found[6:]] == [
+        (grasp, KEPT) for grasp in range(6, told)
+    ]
+    # Each outcome is on the disk before its answer; those during the first save share the next.
+    assert {on_disk for _, _, on_disk in found[7:]} == {told}
     assert disk.written == 2
     assert kept_trust(folder) == part.state()
 

@@ -68,7 +68,7 @@ def test_another_sensor_is_told_once_and_before_its_readings(
 
 
 @pytest.mark.parametrize("keep", ["true", "false"])
-def test_tare_and_grasp_are_forgotten_whether_or_not_a_session_is_kept(
+def test_an_exchange_is_noticed_with_or_without_a_session(
     tmp_path: Path, keep: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "scene.toml"
@@ -103,7 +103,7 @@ def tables(bts3_dir: Path) -> dict[str, NDArray[np.uint16]]:
     }
 
 
-def test_every_published_day_rests_otherwise_and_no_half_of_one_does(
+def test_each_published_day_rests_otherwise_and_no_half(
     tables: dict[str, NDArray[np.uint16]],
 ) -> None:
     for grasps in tables.values():

@@ -33,7 +33,7 @@ from tests.daemon.session.learning import (
 )
 
 
-def test_a_session_of_another_model_that_is_back_is_a_new_one(
+def test_a_returning_session_of_another_model_is_new(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     session, driver = calibration(), sensors(ff="A")
@@ -76,7 +76,7 @@ def judge(pipeline: Pipeline, rows: NDArray[np.generic], fault: int = 0) -> list
         (0, 0, False),
     ],
 )
-def test_a_session_learns_nothing_from_what_is_not_of_now_or_if_it_must_not(
+def test_a_session_learns_only_from_present_readings_if_allowed(
     bts3_dir: Path, fault: int, age_ns: int, learns: bool
 ) -> None:
     pipeline = session_pipeline(age_ns, learns=learns)
