@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -64,33 +65,40 @@ def _sealed(_titles: list[str], rows: Rows) -> Rows:
     return [[row[0], *result[1:]] for row, result in zip(rows, of_results, strict=True)]
 
 
-def _curves(_titles: list[str], _rows: Rows) -> Rows:
+def _curves(titles: list[str], _rows: Rows) -> Rows:
     return [
         [name]
         + [
             f"{_percent(one['slips_among_stable'], 0)} / {_percent(one['coverage'], 0)}"
             for one in points
+            if str(one["grasps"]) in titles
         ]
         for name, points in WORTH["curves"].items()
     ]
 
 
-def _warm_up(_titles: list[str], _rows: Rows) -> Rows:
-    return [
-        [str(one["warm_up"])]
-        + [_percent(one[key]) for key in ("kept", "slips", "above")]
-        + [f"{one['supervised']:.0f}"]
-        for one in WORTH["warm_up"]
-    ]
+def _warm_up() -> str:
+    one_a_warm_up = WORTH["warm_up"]
+    numbers = ", ".join(str(one["warm_up"]) for one in one_a_warm_up)
+    kept = ", ".join(_percent(one["kept"], 0) for one in one_a_warm_up)
+    slips = ", ".join(_percent(one["slips"]) for one in one_a_warm_up)
+    lifts = ", ".join(f"{one['supervised']:.0f}" for one in one_a_warm_up)
+    return (
+        f"With a target of 0.05 and a warm-up of {numbers} outcomes {kept} % of the good lifts are "
+        f"kept, {slips} % of `stable` slip, and a session has {lifts} supervised lifts."
+    )
 
 
-def _reliability(_titles: list[str], _rows: Rows) -> Rows:
-    return [
-        [f"{one['low']:g} to {one['high']:g}", str(one["grasps"])]
-        + [_percent(one[key]) for key in ("said", "slipped")]
-        for one in WORTH["reliability"]["parts"]
-        if one["high"] <= 0.5
-    ]
+def _reliability() -> str:
+    parts = WORTH["reliability"]["parts"]
+    off = [one["said"] - one["slipped"] for one in parts]
+    (part,) = (one for one in parts if one["low"] == 0.05)
+    return (
+        f"After outcomes `p_slip` was at most {_percent(max(off))} points above the share that "
+        f"slipped, and {_percent(-min(off))} below it, in {len(parts)} parts from 0 to 1; of "
+        f"{part['low']:g} to {part['high']:g} it said {_percent(part['said'])} %, and "
+        f"{_percent(part['slipped'])} % slipped."
+    )
 
 
 def _broken(titles: list[str], rows: Rows) -> Rows:
@@ -120,13 +128,15 @@ TABLES: Final[Mapping[str, Mapping[str, Callable[[list[str], Rows], Rows]]]] = {
     "deploy/MEASURED.md": {
         "model, F1 in %": partial(_f1, spread=False),
         "slips among `stable` / good lifts kept": _curves,
-        "warm-up, target 0.05": _warm_up,
-        "`p_slip` | grasps": _reliability,
         "dead electrodes": _broken,
     },
     "deploy/CHOOSING.md": {"target | good lifts": _risk},
 }
 """By page and first title: the rows as the cards have them."""
+PARAGRAPHS: Final[Mapping[str, Mapping[str, Callable[[], str]]]] = {
+    "deploy/MEASURED.md": {"With a target of": _warm_up, "After outcomes": _reliability}
+}
+"""By page and first words: the paragraph as the cards have it."""
 
 
 def renewed(page: str) -> str:
@@ -136,6 +146,10 @@ def renewed(page: str) -> str:
         titles, rows, (begin, end) = table(text, title)
         lines = (f"| {' | '.join(row)} |\n" for row in rows_of(titles, rows))
         text = text[:begin] + "".join(lines) + text[end:]
+    for words, written in PARAGRAPHS.get(page, {}).items():
+        begin = text.index(f"\n\n{words}") + 2
+        paragraph = textwrap.fill(written(), 128, break_on_hyphens=False)
+        text = text[:begin] + paragraph + text[text.index("\n\n", begin) :]
     return text
 
 

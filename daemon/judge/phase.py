@@ -57,8 +57,6 @@ class Phase:
 
 
 def lines() -> Iterator[str]:
-    """Yield the transitions as a table of Markdown, for deploy/wire/README.md."""
-    yield "| from | when | to | `cause` |"
-    yield "|---|---|---|---|"
+    """Yield the transitions as a list of Markdown, for deploy/wire/README.md."""
     for states, when, to, cause in TRANSITIONS:
-        yield f"| {', '.join(f'`{state}`' for state in states)} | {when} | `{to}` | `{cause}` |"
+        yield f"- {', '.join(f'`{state}`' for state in states)} to `{to}`, `{cause}`: {when}"
