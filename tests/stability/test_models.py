@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -31,7 +30,6 @@ from graspd.models.training.reports.stability.readings import (
     RANDOM,
     READINGS,
     Raw,
-    likely_grasps,
 )
 from graspd.models.training.reports.stability.row import Row
 from tests.kit.inside import graspd
@@ -91,12 +89,6 @@ def test_a_wrong_input_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> None
     assert "input" in Comparison(model, None).row("made up", random).broken
 
 
-def test_a_judged_reading_breaks_the_bound_of_none() -> None:
-    model = TactileModel(zoo.find(DEFAULT))
-    likely = np.array(READINGS["counts like the training's"](likely_grasps(model.contract.seen)))
-    assert Comparison(model, None).row("likely", likely, never_judged=True).broken == ["judged"]
-
-
 def test_a_figure_that_is_not_a_number_is_broken() -> None:
     row = Row(
         "mlp", "made up", {"p_slip": float("nan"), "flips": 0.0}, {"p_slip": 1.0, "flips": 0.0}
@@ -126,15 +118,6 @@ def test_the_report_names_computer_and_broken_rows(monkeypatch: pytest.MonkeyPat
     broken = graspd("report", "stability", "small-session-mf", "--quick", "--json")
     assert broken.returncode == 1
     assert json.loads(broken.stdout)["broken"] == 27
-
-
-def test_without_onnx_the_other_rows_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    made = graspd("report", "stability", "mlp", "--quick")
-    assert made.returncode == 0
-    assert "input" in made.stdout
-    assert "p_slip 0," not in made.stdout
-    assert "onnx is not installed" in made.stdout
 
 
 def test_a_missing_model_or_table_is_one_line(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ TOUCH_COUNTS, LET_GO = 20.0, 0.6
 rest than its median electrode."""
 TARE_COUNTS = 5.0
 """What the judge's own tare may differ by, for it follows the rest and has noise."""
+LET_GO_COUNTS = LET_GO * TOUCH_COUNTS - TARE_COUNTS
 JOINT_RAD_PER_S = 0.1
 JOINTS_LATE_MS, JOINTS_LOST_MS = 150, 1000
 JOINTS_FROZEN_MS = 1000
@@ -85,19 +86,13 @@ class Necessity:
         required: Sequence[str],
         still_ms: int = STILL_MS,
         *,
-        touch_counts: float = TOUCH_COUNTS,
         moved_counts: float = MOVED_COUNTS,
-        joint_rad_per_s: float = JOINT_RAD_PER_S,
-        joints_lost_ms: float = JOINTS_LOST_MS,
     ) -> None:
         """`rest`, shape (fingers, 24), is also what was read before the first reading.
 
         A gap has one limit, `GAP_MS`: no key of a scene changes that.
         """
-        self._let_go_counts = LET_GO * touch_counts - TARE_COUNTS
         self._moved_counts = moved_counts
-        self._joint_rad_per_s = joint_rad_per_s
-        self._lost_ns = round(joints_lost_ms * MS)
         self._still_ns = still_ms * MS
         self._rest = rest
         self._required = [fingers.index(finger) for finger in required]
@@ -216,7 +211,7 @@ class Necessity:
     def _lacks_contact(self) -> list[str]:
         now_ns = self._used[-1].t_ns
         for used in self._used:
-            if used.t_ns > now_ns - self._still_ns and used.depth < self._let_go_counts:
+            if used.t_ns > now_ns - self._still_ns and used.depth < LET_GO_COUNTS:
                 return ["contact of all required fingers for as long as it must be still"]
         return []
 
@@ -237,7 +232,7 @@ class Necessity:
         """Leave out joints that are lost, and those of a time that is over."""
         for valid, angles in list(self._joints.items()):
             age_ns = t_ns - angles[-1].t_ns
-            if not -JOINTS_LATE_MS * MS <= age_ns <= self._lost_ns:
+            if not -JOINTS_LATE_MS * MS <= age_ns <= JOINTS_LOST_MS * MS:
                 del self._joints[valid]
                 self._without_joints_since_ns = min(angles[-1].t_ns, t_ns)
         if self._without_joints_since_ns is not None:
@@ -246,12 +241,12 @@ class Necessity:
     def _lacks_joints(self) -> list[str]:
         t_ns = self._used[-1].t_ns
         since_ns = self._without_joints_since_ns
-        if not self._joints and since_ns is not None and t_ns - since_ns <= self._lost_ns:
+        if not self._joints and since_ns is not None and t_ns - since_ns <= JOINTS_LOST_MS * MS:
             return ["joint angles, or to have waited for them"]
         for angles in self._joints.values():
             if t_ns - angles[-1].t_ns > JOINTS_LATE_MS * MS:
                 return ["joint angles in time"]
-            if not _may_be_still(angles, self._joint_rad_per_s):
+            if not _may_be_still(angles):
                 return ["joints that are still"]
         latest_ns = max((one[-1].t_ns for one in self._joints.values()), default=0)
         changed_ns = latest_ns if self._changed_ns is None else self._changed_ns
@@ -260,14 +255,14 @@ class Necessity:
         return []
 
 
-def _may_be_still(angles: Sequence[_Angles], rad_per_s: float) -> bool:
+def _may_be_still(angles: Sequence[_Angles]) -> bool:
     last_ns = angles[-1].t_ns
     before = [one for one in angles if last_ns - one.t_ns >= WINDOW_MS * MS]
     lately = [one for one in angles if last_ns - one.t_ns < LEFT_OUT_NS]
     then = [one for one in before if before[-1].t_ns - one.t_ns < 2 * LEFT_OUT_NS]
     return any(
         np.abs(now.angles_rad - one.angles_rad).max()
-        <= rad_per_s * (now.t_ns - one.t_ns + LEFT_OUT_NS) / 1e9
+        <= JOINT_RAD_PER_S * (now.t_ns - one.t_ns + LEFT_OUT_NS) / 1e9
         for one in then
         for now in lately
     )

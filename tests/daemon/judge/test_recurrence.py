@@ -34,7 +34,7 @@ HELD = Durations(first_rest_s=(3.0, 3.0), settle_s=(4.0, 4.0))
 
 
 @pytest.mark.parametrize(("sweeps", "live"), [(2, 0), (64, 4), (128, 0), (129, 0)])
-def test_a_ring_of_up_to_128_is_frozen_from_its_first_repeat(sweeps: int, live: int) -> None:
+def test_a_ring_of_128_sweeps_is_frozen_from_its_repeat(sweeps: int, live: int) -> None:
     """The first `live` electrodes differ by one count from turn to turn."""
     health = Health(3)
     old = np.random.default_rng(2).integers(500, 3500, (sweeps, 3, 24))
@@ -46,9 +46,7 @@ def test_a_ring_of_up_to_128_is_frozen_from_its_first_repeat(sweeps: int, live: 
 
 
 @pytest.mark.parametrize("packets", [15, 896])
-def test_a_ring_of_odd_palm_packets_is_never_stable(
-    packets: int,
-) -> None:
+def test_a_ring_of_odd_palm_packets_is_never_stable(packets: int) -> None:
     """Where it begins anew a packet is lost, or two contradict each other: a round lacks those."""
     clock, stream = Clock(), PalmStream(FINGERS)
     model = TactileModel(zoo.find("cnn1"))
