@@ -235,21 +235,18 @@ def test_a_count_has_the_word_of_the_manual() -> None:
     assert not faults.any()
 
 
-@pytest.mark.parametrize("word", [0xA52D, 0xA558, 0xA552, 0xA545, 0xA53F, 0xA52E, 0xA55F, 0xA557])
-def test_an_error_word_never_becomes_a_reading(word: int) -> None:
-    assert word in ERROR_WORDS
-    counts, faults = decode_words(words(word))
-    assert faults.tolist() == [ElectrodeFault.ERROR_WORD]
-    assert counts.tolist() == [0]
-    # What a decoder without parity would make of it: a perfectly plausible electrode.
-    assert 2629 <= (word >> 9) * 32 + ((word & 0xFF) >> 3) <= 2635
+def test_an_error_word_never_becomes_a_reading() -> None:
+    codes = {0xA52D, 0xA558, 0xA552, 0xA545, 0xA53F, 0xA52E, 0xA55F, 0xA557}
+    assert set(ERROR_WORDS) == codes
+    counts, faults = decode_words(words(*codes))
+    assert faults.tolist() == [ElectrodeFault.ERROR_WORD] * 8
+    assert not counts.any()
 
 
-@pytest.mark.parametrize("word", [0x0000, 0xFFFF])
-def test_a_line_that_nothing_drives_is_a_missing_sensor(word: int) -> None:
-    counts, faults = decode_words(words(word))
-    assert faults.tolist() == [ElectrodeFault.MISSING]
-    assert counts.tolist() == [0]
+def test_a_line_that_nothing_drives_is_a_missing_sensor() -> None:
+    counts, faults = decode_words(words(0x0000, 0xFFFF))
+    assert faults.tolist() == [ElectrodeFault.MISSING] * 2
+    assert not counts.any()
 
 
 def test_every_count_and_no_damaged_bit_survives_the_way() -> None:

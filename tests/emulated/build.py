@@ -24,7 +24,6 @@ EMULATOR_FOLDER: Final = ROOT / "build" / "emulated"
 COMPILER: Final = "arm-none-eabi-gcc"
 NEEDED: Final = {
     COMPILER: "gcc-arm-none-eabi",
-    "arm-none-eabi-size": "binutils-arm-none-eabi",
     "cmake": "cmake",
     "ninja": "ninja-build",
 }
@@ -34,8 +33,6 @@ HOST: Final = BRIDGE / "host"
 _ADDON: Final = (EMULATOR / "sensors.c", HOST / "sim_sensor.c", HOST / "counts.c")
 _PARTS: Final = (EMULATOR / "package-lock.json", *_ADDON, HOST / "sim_sensor.h", HOST / "counts.h")
 SUBSET: Final = "pico-sdk-*-subset.tar.xz"
-RAM: Final = range(0x20000000, 0x20042000)
-"""Addresses of the RP2040's RAM (datasheet section 2.6.2)."""
 
 
 class MissingError(Exception):
@@ -106,16 +103,6 @@ def check_tools() -> None:
     found = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
     if not Path(found).is_absolute():
         raise MissingError("no C library for ARM: install libnewlib-arm-none-eabi")
-
-
-def flash_and_ram(image: Path) -> tuple[int, int]:
-    """Bytes that an image takes of the flash, and of the RAM while it runs, without its stacks."""
-    elf = str(image.with_suffix(".elf"))
-    asked = ["arm-none-eabi-size", "-A", "-d", elf]
-    told = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
-    rows = [row for line in told.splitlines() if len(row := line.split()) == 3 and row[2].isdigit()]
-    held = (int(size) for name, size, at in rows if int(at) in RAM and "stack" not in name)
-    return image.stat().st_size, sum(held)
 
 
 def pico_sdk() -> Path:

@@ -7,7 +7,6 @@ from itertools import groupby
 import pytest
 
 from tests.drivers.spi.bridge_c import START, STOP, SWEEP, StartBridge, frame
-from tests.emulated import build
 from tests.emulated.board import BOARD_ID, Board
 from tests.emulated.conftest import Image
 
@@ -71,9 +70,3 @@ def test_the_light_tells_idle_sweeping_and_a_missing_sensor_apart(
     board.send(frame(STOP))
     board.run(100)
     assert blinking(500, turns(board, 2500)), "stopped"
-
-
-def test_an_image_leaves_most_of_the_chip_free(image: Image) -> None:
-    flash, ram = build.flash_and_ram(image())
-    assert 10_000 < flash < 64 * 1024, "of 2 MB"
-    assert 4_000 < ram < 64 * 1024, "of 264 kB"

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
+from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.frames import ERROR, CanFrame
 from graspd.drivers.link import LinkState
@@ -25,10 +25,9 @@ from tests.drivers.can.can_standin import (
     contact,
     message,
     stand_in,
-    sweep_messages,
     sweep_of_frames,
 )
-from tests.drivers.can.can_words import SLOT_NS, pack_frame, truth
+from tests.drivers.can.can_words import pack_frame, truth
 from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
@@ -207,36 +206,6 @@ def test_real_socketcan_plays_count_for_count() -> None:
     assert len(readings) == len(counts)
     for reading, expected in zip(readings, counts, strict=True):
         assert (reading.counts == expected).all()
-
-
-def paced(bus: ScriptedBus, clock: Clock, driver: CanBridgeDriver, sweeps: int) -> list[Reading]:
-    """Sweeps from an adapter that is read after every sample."""
-    readings: list[Reading] = []
-    for sweep in range(sweeps):
-        for sent in sweep_messages(sweep):
-            clock.now_ns += SLOT_NS
-            bus.script = [sent]
-            readings += driver.read_ready()
-    return readings
-
-
-def unstamped(monkeypatch: pytest.MonkeyPatch, clock: Clock) -> tuple[ScriptedBus, CanBridgeDriver]:
-    bus = ScriptedBus()
-    stand_in(monkeypatch, lambda: bus)
-    return bus, CanBridgeDriver(
-        "robotell", "x", arbitration_id=SAMPLE_ID, sequence="electrodes", clock=clock
-    )
-
-
-def test_frames_without_a_time_have_their_greatest_age(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock()
-    bus, driver = unstamped(monkeypatch, clock)
-    with driver:
-        readings = tactile(paced(bus, clock, driver, 10))
-        assert [reading.seq for reading in readings] == list(range(10))
-        assert not any(reading.faults.any() for reading in readings)
-        ends_ns = [10**12 + 24 * SLOT_NS * (n + 1) for n in range(10)]
-        assert [end - r.t_ns for end, r in zip(ends_ns, readings, strict=True)] == [SLOT_NS] * 10
 
 
 def test_old_frames_make_no_fresh_reading(monkeypatch: pytest.MonkeyPatch) -> None:

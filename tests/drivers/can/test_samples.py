@@ -179,21 +179,6 @@ def test_the_first_sweep_may_end_on_time_after_a_loss() -> None:
     assert (counters.late_frames, counters.lost_frames) == (0, 19)
 
 
-@pytest.mark.parametrize("cut_at", [0, 12])
-def test_a_known_loss_ends_the_sweep_at_hand(cut_at: int) -> None:
-    """So few are lost that neither order nor time would show where."""
-    sweeps, counters = assembler()
-    readings = feed(sweeps, concatenated([samples(n) for n in range(8)]) + samples(8)[:cut_at])
-    readings += sweeps.cut()
-    readings += feed(sweeps, samples(8)[cut_at:] + samples(9) + samples(10))
-    tags = [sweep_of(reading) for reading in readings]
-    assert tags == [*range(11)]
-    assert [reading.seq for reading in readings] == tags
-    assert np.count_nonzero(readings[8].faults[0]) == (24 - cut_at if cut_at else 0)
-    assert counters.cut_sweeps == (cut_at > 0)
-    assert counters.unsynchronised_frames == (24 - cut_at if cut_at else 0)
-
-
 def test_samples_of_vague_time_make_no_reading() -> None:
     sweeps, counters = assembler()
     readings = feed(sweeps, concatenated([samples(n) for n in range(8)]) + samples(8)[:12])
@@ -254,21 +239,3 @@ def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> Non
         sweep_of(reading)
     assert [r.faults.any() for r in readings[-30:]] == [False] * 30
     assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])
-
-
-@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("lost", [-1, 0, 1])
-def test_rhythmic_losses_make_no_longer_period(sequence: str, lost: int) -> None:
-    """The order looks as if nothing were missing."""
-    sweeps, _ = assembler(sequence)
-    length = len(SEQUENCES[sequence])
-    stream = concatenated([samples(n, sequence) for n in range(200)])
-    rhythm = 5 * length // 2 + 1
-    kept = [
-        sample
-        for at, sample in enumerate(stream)
-        if at < 20 * length or at % rhythm >= length + lost
-    ]
-    for reading in feed(sweeps, kept):
-        sweep_of(reading)
-    assert sweeps.period_ns == length * SLOT_NS

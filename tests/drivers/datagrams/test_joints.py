@@ -110,16 +110,6 @@ def test_a_damaged_message_gives_no_impossible_angle(
         assert not (np.abs(found.position_rad) > math.radians(200)).any()
 
 
-def test_a_message_is_written_as_it_is_read() -> None:
-    sent = JointMessage(Stamp(7, 1.5), ("FFJ3", "WRJ2"), np.array([0.1, -0.2]))
-    found, _ = parse(sent.to_bytes())
-    assert found is not None
-    assert (found.stamp, found.names) == ((7, 1.5), ("FFJ3", "WRJ2"))
-    assert np.array_equal(found.position_rad, sent.position_rad)
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        JointMessage(Stamp(7, 1.5), ("FFJ3",), np.array([math.nan])).to_bytes()
-
-
 @pytest.mark.parametrize(("step", "missed", "restarts"), [(1001, 1000, 0), (1002, 0, 1)])
 def test_a_jump_above_a_thousand_is_a_new_start(step: int, missed: int, restarts: int) -> None:
     counters = JointCounters()

@@ -103,14 +103,6 @@ def test_a_raw_value_over_12_bits_gives_no_angle(raw: tuple[int, int]) -> None:
     assert math.isnan(degrees(both, FFJ1=4096, FFJ2=2000)["FFJ0"])
 
 
-def test_impossible_angles_are_counted_and_not_changed() -> None:
-    angles = load_calibration(EXAMPLE).angles_rad(SNAPSHOT)  # another hand's snapshot
-    by_name = dict(zip(JOINTS, np.degrees(angles), strict=True))
-    assert by_name["FFJ3"] == pytest.approx(-90 * (3205 - 2487) / (2487 - 946))  # -41.9
-    assert by_name["THJ4"] == pytest.approx(67.5 * (2496 - 1403) / (2260 - 1403))  # 86.1
-    assert impossible_angles(angles) == 2
-
-
 # Shadow's documentation, md_ranges.rst; J0 is the sum of J1 and J2.
 RANGES_DEG = {
     **{f"{finger}J0": (0, 180) for finger in ("FF", "MF", "RF", "LF")},
@@ -205,14 +197,6 @@ def test_a_table_beyond_its_limits_is_refused() -> None:
         assert any(problem in line for line in problems(data)), data
 
 
-def test_the_coupled_table_is_met_at_each_of_its_points() -> None:
-    thumb = parse_calibration(coupled(COUPLED), FILE)
-    for (raw_1, raw_2), (first, second) in zip(RAW_PAIRS, ANGLES, strict=True):
-        angles = degrees(thumb, THJ1=raw_1, THJ2=raw_2)
-        assert angles["THJ1"] == pytest.approx(first)
-        assert angles["THJ2"] == pytest.approx(second)
-
-
 def test_the_coupled_table_agrees_with_an_independent_interpolation() -> None:
     interpolate = pytest.importorskip("scipy.interpolate", reason="needs the extra `test`")
     raws = np.random.default_rng(5).uniform(500, 3500, (25, 2))
@@ -258,7 +242,6 @@ def test_a_square_grid_agrees_with_an_independent_interpolation() -> None:
         ("THJ3", [[2500, 0.0], [1800, 0.0]], "is not monotone"),
         ("WRJ2", [[2500, 0.0], [2500, 10.0]], "raw 2500 stands twice"),
         ("FFJ3", [[2500, 0.0], [2510, 45.0]], "4.50 degrees per count from raw 2500 to 2510"),
-        ("FFJ3", [[2500, 0.0], [900, 900.0]], "900.0 degrees is out of reach"),
         ("ffj1", FFJ1, "no such joint"),
         ("FFJ0", FFJ1, "is the sum of FFJ1 and FFJ2"),
         ("THJ1", FFJ1, "stand in [coupled]"),

@@ -127,14 +127,6 @@ def packet_of(palm: Palm) -> PalmPacket:
     return packet
 
 
-@palms
-def test_the_independent_description_has_the_documented_length(palm: Palm) -> None:
-    status = STRUCTURES[palm]
-    assert ctypes.sizeof(status) == LENGTHS[palm]
-    places = [Biotac.pac, Biotac.other_0, Biotac.data_valid, Biotac.other_1]
-    assert [place.offset for place in places] == [0, 4, 6, 8]
-
-
 @pytest.mark.parametrize("appended", [b"", bytes(CanBridge(1, 3, 0x215, (1, 2, 3)))])
 @palms
 def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None:
@@ -150,17 +142,6 @@ def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None
         TactileSlot(biotac.pac[0], biotac.pac[1], biotac.other_0, biotac.data_valid, biotac.other_1)
         for biotac in biotacs
     )
-
-
-@palms
-def test_a_packet_is_written_where_it_is_read(palm: Palm) -> None:
-    packet = packet_of(palm)
-    data = packet.to_bytes()
-    assert len(data) == LENGTHS[palm]
-    assert parse(data) == packet
-    status = STRUCTURES[palm].from_buffer_copy(data)
-    assert status.tactile[4].biotac.other_1 == packet.tactile[4].other_1
-    assert status.which_motors == packet.which_motors
 
 
 @pytest.mark.parametrize("length", [0, 1, 219, 233, 543, 65507])

@@ -221,15 +221,6 @@ def test_a_packet_of_the_round_before_is_late() -> None:
     assert (played.counters.late_packets, played.counters.lost_packets) == (1, 1)
 
 
-def test_how_long_no_round_can_end() -> None:
-    sweeps = PalmStream(FINGERS)
-    left = [sweeps.cycles_to_go]
-    for at, packet in enumerate(packets(2)):
-        sweeps.push(packet, at * MS)
-        left.append(sweeps.cycles_to_go)
-    assert left == [0, *range(13, -1, -1), *range(13, -1, -1)]
-
-
 @pytest.mark.parametrize(("copies", "batch"), [(2, 1), (1, 4)])
 def test_a_palm_whose_words_stand_still_is_read(copies: int, batch: int) -> None:
     """Each round of such a palm equals the one before, and is not its copy."""

@@ -182,19 +182,6 @@ def test_absent_sensors_and_values_that_are_no_counts_are_broken(tmp_path: Path)
         readings_of(path, ("ff", "rf"))
 
 
-def test_a_hand_of_two_sensors_gets_its_models_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sweeps = noise(30)
-    for sweep in sweeps:
-        del sweep.electrodes["mf"]
-    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
-    assert main(["replay", str(path)]) == 2
-    said = capsys.readouterr().err
-    assert "has ff, th" in said
-    assert "small-session-ff-th" in said
-
-
 def test_a_packed_bag_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
     path.write_bytes(gzip.compress(path.read_bytes()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from graspd.drivers.base import JointReading, Reading, RecordingError, TactileRe
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from tests.drivers.one_sweep import tactile
 from tests.drivers.recordings.tables import (
-    ELECTRODES,
-    FINGERS,
     TABLE_HEADER,
     stream,
     table,
@@ -220,22 +217,3 @@ def test_opening_again_starts_over(tmp_path: Path) -> None:
     assert driver.due_ns() is None
     with pytest.raises(RuntimeError, match="not open"):
         driver.read_ready()
-
-
-def test_the_whole_stability_set_plays_count_for_count(bts3_dir: Path) -> None:
-    paths = [bts3_dir / f"palm_{pose}.csv" for pose in ("down", "side", "45")]
-    expected = [row for path in paths for row in csv_rows(path)]
-    driver = ReplayDriver(paths, FINGERS, speed=None, strict=True)
-    readings = tactile(play(driver))
-    assert len(readings) == len(expected) == 1276 + 1273 + 2133
-    for index, (reading, wanted) in enumerate(zip(readings, expected, strict=True)):
-        assert reading.seq == index
-        assert reading.counts.ravel().tolist() == [int(wanted[name]) for name in ELECTRODES]
-        assert reading.annotation is not None
-        assert reading.annotation.slipped is (wanted["slipped"] == "1")
-    assert driver.counters.faulty_readings == 0
-
-
-def csv_rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))

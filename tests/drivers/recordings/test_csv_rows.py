@@ -177,16 +177,6 @@ def test_a_value_can_be_wrong_and_cut_off() -> None:
     assert (last.faults.ravel()[:-1] == ElectrodeFault.CUT_OFF).all()
 
 
-def test_a_stream_gives_times_and_joints_without_hand_prefix() -> None:
-    joints = {"rh_FFJ3": ["0.25", "1e-3"], "rh_WRJ1": ["-0.5", " 0.5 "]}
-    content = stream(["10.0", "10.5"], joints)
-    first, second = rows_of(content)
-    assert first.joint_names == ("FFJ3", "WRJ1")
-    assert (first.t_s, second.t_s) == (10.0, 10.5)
-    assert first.position_rad.tolist() == [0.25, -0.5]
-    assert second.position_rad.tolist() == [1e-3, 0.5]
-
-
 @pytest.mark.parametrize(
     ("column", "known"),
     [
@@ -234,19 +224,6 @@ def test_an_error_while_reading_is_a_recording_error() -> None:
 
     with pytest.raises(RecordingError, match=r"grasps.csv: input/output error"):
         survey(PATH, Broken(GOOD), FINGERS)
-
-
-def test_gigabytes_without_a_line_end_are_refused_at_once(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "disk.csv"
-    with path.open("wb") as file:
-        file.truncate(1 << 36)
-    with (
-        open_recording(path) as opened,
-        pytest.raises(RecordingError, match="of a kind that is not known"),
-    ):
-        survey(path, opened, FINGERS)
 
 
 NOT_COUNTS = [

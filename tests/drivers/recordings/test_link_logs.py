@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd.drivers.base import JointReading, RecordingError
-from graspd.drivers.recordings.player import RecordedDriver
+from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.serial_log import (
     Record,
     SerialLog,
@@ -92,44 +91,9 @@ def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content:
         SerialLog([path], ("ff", "mf", "th")).open()
 
 
-RECORDED_NS = (500 * MS, 510 * MS, 530 * MS)
-
-
-class Player(RecordedDriver[str]):
-    def __init__(self, speed: float | None, clock: Clock) -> None:
-        super().__init__([Path("x.csv")], speed, clock)
-
-    def open(self) -> None:
-        self.start(items())
-
-
-def items() -> Generator[tuple[int, str], None, None]:
-    yield from ((at_ns, f"at {at_ns // MS}") for at_ns in RECORDED_NS)
-
-
-@pytest.mark.parametrize(("speed", "steps_ms"), [(1.0, [0, 10, 30]), (2.0, [0, 5, 15])])
-def test_items_are_due_as_recorded_over_the_speed(speed: float, steps_ms: list[int]) -> None:
-    clock = Clock()
-    player = Player(speed, clock)
-    player.open()
-    assert player.due_ns() == clock.now_ns, "the first one begins the run"
-    began_ns = clock.now_ns
-    assert player.take() is not None
-    for at_ns, step_ms in list(zip(RECORDED_NS, steps_ms, strict=True))[1:]:
-        due_ns = began_ns + step_ms * MS
-        assert player.due_ns() == due_ns
-        clock.now_ns = due_ns - 1
-        assert player.take() is None
-        clock.now_ns = due_ns + 2
-        assert player.take() == (at_ns, f"at {at_ns // MS}")
-        assert player.played_ns(at_ns) == due_ns
-    assert player.exhausted
-    assert player.due_ns() is None
-
-
 def test_a_reading_is_handed_over_as_old_as_it_was() -> None:
     clock = Clock()
-    player = Player(None, clock)
+    player = ReplayDriver([Path("x.csv")], clock=clock)
     clock.now_ns += 5 * MS
     made = JointReading(480 * MS, 3, (), np.zeros(0))
     given = player.hand_over(made, 500 * MS)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
-import pty
 import termios
 
 import pytest
@@ -176,26 +174,3 @@ def test_who_taps_a_line_gets_all_that_comes_and_goes(monkeypatch: pytest.Monkey
         (LineEvent.OPENED, b""),
     ]
     assert [int(event) for event in LineEvent] == [1, 2, 3], "as serial link logs hold them"
-
-
-def test_a_terminal_gives_everything_before_it_ends(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    master, slave = pty.openpty()
-    line = SerialLine(os.ttyname(slave), 115_200)
-    line.open()
-    try:
-        assert line.read() == b""
-        for size in (1, 170, 3000):
-            os.write(master, b"\x85" * size)
-            assert len(line.read()) == size
-        with monkeypatch.context() as patch:
-            patch.setattr(serial.Serial, "read", None)  # takes several times as long
-            os.write(master, b"\x85")
-            assert line.read() == b"\x85"
-        os.close(master)
-        with pytest.raises(LinkError, match="the device went away"):
-            line.read()
-    finally:
-        line.close()
-        os.close(slave)

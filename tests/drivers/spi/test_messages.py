@@ -61,20 +61,6 @@ def test_a_frame_has_its_golden_bytes(kind: int, payload: bytes, wire: str) -> N
     assert FrameParser().feed(bytes.fromhex(wire)) == [(kind, payload)]
 
 
-@pytest.mark.parametrize("size", [1, 7, 4096])
-def test_frames_come_out_however_the_bytes_are_cut(size: int) -> None:
-    sent = [(kind, bytes([kind]) * kind) for kind in range(1, 60)]
-    stream = b"\0" + b"".join(encode_frame(*frame) for frame in sent)
-    parser = FrameParser()
-    got = []
-    for at in range(0, len(stream), size):
-        got += parser.feed(stream[at : at + size])
-    assert got == sent
-    counters = parser.counters
-    assert (counters.frames, counters.bytes) == (59, len(stream))
-    assert counters.bad_cobs == counters.bad_crc == counters.too_long == 0
-
-
 def test_a_frame_of_another_layout_fails() -> None:
     parser = FrameParser(0x1234)
     assert parser.feed(encode_frame(0x02, b"abc", 0x1235)) == []

@@ -53,23 +53,6 @@ def test_electrodes_that_are_not_in_the_sequence_are_missing() -> None:
     assert (counters.faulty_readings, counters.unplugged_words) == (1, 0)
 
 
-def test_bad_words_are_flagged_and_counted_and_never_a_count() -> None:
-    read = words()
-    read[3, 0] = 0xA52D  # insufficient sampling delay
-    read[4, 1] ^= 0x0100
-    read[5, 2] = 0xFFFF
-    read[6, 2] = 0x0000
-    conversation = greeted()
-    (reading,) = hear(conversation, sweep(0, 100, read=read), T0)
-    assert reading.faults[0, 3] == ElectrodeFault.ERROR_WORD
-    assert reading.faults[1, 4] == ElectrodeFault.PARITY
-    assert reading.faults[2, [5, 6]].tolist() == [ElectrodeFault.MISSING] * 2
-    assert np.count_nonzero(reading.faults) == 4
-    assert not reading.counts[reading.faults != 0].any()
-    counters = conversation.counters
-    assert (counters.error_words, counters.parity_words, counters.unplugged_words) == (1, 1, 2)
-
-
 def test_a_board_may_have_more_sensors_than_fingers_are_named() -> None:
     conversation = greeted(hello(0, sensors=5))
     (reading,) = hear(conversation, sweep(0, 100, 31, words(1000, 24, 5)), T0)
