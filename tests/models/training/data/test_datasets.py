@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from graspd.models.bts3 import TABLES
@@ -42,28 +42,25 @@ REAL = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", REAL)
-def test_a_published_table_is_read_whole(bts3_dir: Path, name: str) -> None:
-    rows, stable, slip, sha256 = REAL[name]
-    path = bts3_dir / f"{name}.csv"
-    grasps = read_table(path)
-    assert len(grasps) == rows
-    assert (int((~grasps.slipped).sum()), int(grasps.slipped.sum())) == (stable, slip)
-    assert len(set(grasps.objects)) == 41
-    assert grasps.counts.dtype == np.uint16
-    assert [(file.name, file.sha256, file.rows) for file in grasps.files] == [(name, sha256, rows)]
-    assert hashlib.sha256(path.read_bytes()).hexdigest() == sha256
-    assert unpublished(grasps.files) == []
+def test_a_published_table_is_read_whole(bts3_dir: Path) -> None:
+    for name, (rows, stable, slip, sha256) in REAL.items():
+        path = bts3_dir / f"{name}.csv"
+        grasps = read_table(path)
+        assert len(grasps) == rows
+        assert (int((~grasps.slipped).sum()), int(grasps.slipped.sum())) == (stable, slip)
+        assert len(set(grasps.objects)) == 41
+        (file,) = grasps.files
+        assert (file.name, file.sha256, file.rows) == (name, sha256, rows)
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+        assert unpublished(grasps.files) == []
 
 
 def test_counts_stand_by_finger_and_electrode(bts3_dir: Path) -> None:
     grasps = read_table(bts3_dir / "palm_side.csv")
-    with (bts3_dir / "palm_side.csv").open(newline="") as file:
-        for index, row in enumerate(csv.DictReader(file)):
-            for finger, name in enumerate(("ff", "mf", "th")):
-                expected = [int(row[f"{name}_biotac_{n}"]) for n in range(1, 25)]
-                assert grasps.counts[index, finger].tolist() == expected
-            assert grasps.slipped[index] == (row["slipped"] == "1")
+    rows = pd.read_csv(bts3_dir / "palm_side.csv")
+    names = [f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)]
+    np.testing.assert_array_equal(grasps.counts.reshape(-1, 72), rows[names])
+    np.testing.assert_array_equal(grasps.slipped, rows["slipped"])
 
 
 def test_tables_of_a_folder_have_their_order(bts3_dir: Path) -> None:
@@ -181,16 +178,14 @@ def test_readings_of_one_grasp_are_not_more_grasps(tmp_path: Path) -> None:
         read_with_lab_tables(None, [path], "table")
 
 
-@pytest.mark.parametrize("beside", ["palm_45", "monday"])
-def test_a_grasp_that_is_in_two_tables_is_refused(beside: str, tmp_path: Path) -> None:
-    data = tmp_path / "data"
+def test_a_grasp_that_is_in_two_tables_is_refused(tmp_path: Path) -> None:
+    data, monday, both = (tmp_path / name for name in ("data", "monday.csv", "both.csv"))
     write_sessions(data, 40)
-    monday, both = tmp_path / "monday.csv", tmp_path / "both.csv"
     write(monday, table("monday", 40, 3))
-    first = monday if beside == "monday" else data / "palm_45.csv"
-    both.write_bytes(first.read_bytes())
-    said = f"has counts that are in {beside}, too: the same grasp counts once"
-    assert refusal([monday, both], data) == f"{both}: {said}"
+    for first in (monday, data / "palm_45.csv"):
+        both.write_bytes(first.read_bytes())
+        said = f"has counts that are in {first.stem}, too: the same grasp counts once"
+        assert refusal([monday, both], data) == f"{both}: {said}"
 
 
 def test_two_lab_tables_have_two_names(tmp_path: Path) -> None:

@@ -100,20 +100,6 @@ def test_weights_start_as_in_keras() -> None:
             assert layer.eps == 1e-3
 
 
-def test_a_deep_network_has_its_layers_in_the_papers_order() -> None:
-    layers = [type(layer).__name__ for layer in build(DEEP)]
-    assert layers == [
-        "ChannelsFirst",
-        *("Conv2d", "BatchNorm2d", "ReLU", "MaxPool2d"),
-        *("Conv2d", "BatchNorm2d", "ReLU", "Flatten"),
-        *("Dropout", "Linear", "BatchNorm1d", "ReLU"),
-        *("Dropout", "Linear"),
-    ]
-    image = torch.arange(12 * 11 * 3.0).reshape(1, 12, 11, 3)
-    first = build(DEEP)[0](image)
-    assert torch.equal(first[0, 2], image[0, :, :, 2])
-
-
 def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
     features = np.random.default_rng(5).integers(1, 4096, (3, 78)).astype(np.float32)
     network = _unsettled(NetworkConfig(filters=4, hidden=8), FEATURES)

@@ -117,9 +117,6 @@ def test_days_are_judged_with_refusals_and_session_ages() -> None:
     assert rows["refused"].notna().all()
     for _, ages in rows.groupby("variant")["age"]:
         assert ages.is_unique  # one table, each grasp learned
-    plain = judged(Job(SYSTEMS["svm"], "days", 0, 1, 2), GRASPS)
-    assert set(plain["variant"]) == {"none"}
-    assert plain["age"].isna().all()
 
 
 def test_an_interrupted_sweep_continues_and_runs_nothing_twice(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -183,20 +182,6 @@ def test_every_published_row_is_there_even_if_nothing_was_run() -> None:
     shown = rows(results_table([], GRASPS, *MADE), 1)
     for system, protocol, figure, paper in PUBLISHED:
         assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-"] in shown
-
-
-def test_a_finding_has_the_figures_of_the_tables() -> None:
-    tried = [("cnn1", 0.1), ("svm", 0.05), ("mlp", 0.2), ("rf", 0.3)]
-    made = {name: figures_of(name, "cv", wrong) for name, wrong in tried}
-    text = results_table(list(made.values()), GRASPS, *MADE)
-    (finding,) = re.findall(r"^- \*\*.*$", text, re.MULTILINE)
-    for name, one in made.items():
-        f1 = one.spread()
-        assert f"`{name}` {100 * f1.mean:.1f} +- {100 * f1.std:.1f}" in finding
-    mean, _ = difference(made["svm"], made["cnn1"]) or (0.0, None)
-    assert f"`svm` {100 * mean:+.1f} +- " in finding
-    assert "94.2 +- 0.8" in finding
-    assert "88.0 +- 2.9" in finding
 
 
 def test_sessions_are_told_by_the_number_of_grasps() -> None:
