@@ -36,6 +36,7 @@ class World(Clock):
         self.away_ns = 0
         """Time in all in which the computer did something else."""
         self._worked_ns = 0
+        self.has_trouble = False
         self.kill_ns: int | None = None
         self._due: list[tuple[int, int, Callable[[], object]]] = []
         self._numbers = itertools.count()
@@ -67,6 +68,10 @@ class World(Clock):
             raise KilledError
         self.now_ns = max(self.now_ns, until_ns)
         self.pump()
+
+    def kill_soon(self) -> None:
+        if self.has_trouble:
+            self.kill_ns = self.now_ns + self.random.randrange(20) * MS
 
     def stall(self, ns: int) -> None:
         self.now_ns += ns
@@ -196,6 +201,7 @@ class Controller:
             self.world.after(S, partial(self.tell, grasp, again))
         self.kept.setdefault(grasp, outcome)
         self.offers.discard(grasp)
+        self._may_kill()
 
     def _hear_verdict(self, answer: dict[str, Any]) -> None:
         self.check_answered()
@@ -206,11 +212,17 @@ class Controller:
             return
         assert answer["verdict"] == "stable" or answer["supervised"], "an offer of what is unknown"
         self.offers.add(grasp)
+        self._may_kill()
         draw = self.world.random
         if draw.random() < 0.9:  # else it hangs
             outcome = draw.choice(("stable", "stable", "stable", "slip"))
             after_ms = draw.choice((100, 800, 800, 5000))
             self.world.after(after_ms * MS, partial(self.tell, grasp, outcome))
+
+    def _may_kill(self) -> None:
+        """Now something could be lost."""
+        if self.world.random.random() < 0.1:
+            self.world.kill_soon()
 
     def check_answered(self) -> None:
         if self.asked_ns is not None:
@@ -232,6 +244,9 @@ class Door:
             Controller(world, self, b"another-16-bytes", b"user 0"),
             Controller(world, self, b"stranger-16bytes", b"user 9"),
         ]
+        self.evening = Controller(world, self, b"in-the-evening-1", b"user 0")
+        """Asks only once all works again."""
+        self.all = [*self.peers, self.evening]
         self.hear: Callable[[bytes, bytes], None] = lambda _topic, _payload: None
         """Called with each message."""
 
@@ -243,7 +258,7 @@ class Door:
         """Have peers see that the daemon is gone: they tell again, and do not wait."""
         self.is_open = False
         self.questions.clear()
-        for peer in self.peers:
+        for peer in self.all:
             if peer.told is not None:
                 self.world.after(S, partial(peer.tell, *peer.told))
             peer.told = peer.asked_ns = None
@@ -260,7 +275,7 @@ class Door:
         return True
 
     def answer(self, frames: Sequence[bytes]) -> bool:
-        for peer in self.peers:
+        for peer in self.all:
             if self.is_open and peer.known.routing_id == frames[0]:
                 peer.hear(json.loads(frames[-1]))
         return True

@@ -40,7 +40,7 @@ from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.necessity import EARLY_MS, STILL_MS, Necessity
 from tests.daemon.run.around import SLACK_NS, Disk, Door, KilledError, S, Selector, World
-from tests.daemon.run.hands import FAULTS, Counts, Fault, Sensors
+from tests.daemon.run.hands import FAULTS, Fault, Sensors
 from tests.kit.messages import decode_status, decode_verdict
 
 AGE_NS = 100 * MS
@@ -48,6 +48,8 @@ MOVED_COUNTS = 40.0
 """Certainly motion: grasps are further apart."""
 SAID_AFTER_NS = 1300 * MS
 """A fault that lasts this long is in the status."""
+ROUNDS_MAX = 1000
+"""Rounds at one time: a flood of questions takes forty."""
 TROUBLE_NS, CALM_NS = 12 * S, 9 * S
 WITHHELD = {"low-confidence", "unproven", "risk-exceeded", "not-calibrated", "never-seen"}
 """Reasons for which a sound grasp may be `unknown`: outcomes and grasps before it."""
@@ -67,14 +69,15 @@ class Watch(Companion):
         self._see_sensors()
         self._said_ns = self._status_ns = self.world.worked_ns
         self._silence_ns = AGE_NS
-        self._seq = -1
+        self._seq = self._round_ns = -1
+        self._rounds = self._given = self._judged = 0
         self._began_ns = -S
         day.door.hear = self._hear
 
     def _see_sensors(self) -> None:
-        self._offset = self.sensors.offset
+        self._rest = self.sensors.rest
         self.necessity = Necessity(
-            self.sensors.rest + self._offset,
+            self._rest,
             FINGERS,
             self.day.scene.gate.fingers or FINGERS,
             self._still_ms,
@@ -85,18 +88,21 @@ class Watch(Companion):
         """All is open."""
 
     def on_reading(self, reading: Reading) -> None:
-        if self._offset is not self.sensors.offset:
+        if self._rest is not self.sensors.rest:
             self._see_sensors()
         if reading.interrupted:
             self._began_ns = reading.t_ns
         if isinstance(reading, JointReading):
             self.necessity.observe_joints(reading)
+        else:
+            self._given += 1
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         verdict, reading = published.verdict, published.reading
         self.day.said[verdict.verdict] += 1
         self.day.judged += verdict.judged
         if reading is not None:
+            self._judged += 1
             self.necessity.observe(reading)
         unknown = verdict.verdict == "unknown"
         assert unknown is bool(verdict.reasons) is (verdict.p_slip is None) is not verdict.valid
@@ -126,8 +132,11 @@ class Watch(Companion):
             yield "outcomes of the lifts before"
 
     def after_round(self) -> None:
+        self._rounds = self._rounds + 1 if self._round_ns == self.world.now_ns else 0
+        self._round_ns = self.world.now_ns
+        assert self._rounds < ROUNDS_MAX, "it does not wait"
         self._check_time()
-        for peer in self.day.door.peers:
+        for peer in self.day.door.all:
             peer.check_answered()
 
     def _check_time(self) -> None:
@@ -149,7 +158,9 @@ class Watch(Companion):
             self._check_health(decode_status(payload))
 
     def _check_health(self, status: Status) -> None:
-        """What has lasted for a while is said."""
+        """What was lost is counted, and what has lasted for a while is said."""
+        lost = self._given - self._judged - status.skipped_readings
+        assert not lost or self.day.slept_ns, f"{lost} readings are not judged"
         now_ns = self.world.now_ns
         if status.state == "stopping":
             return
@@ -207,9 +218,9 @@ class Day:
         while not self.is_over:
             with self._replaced():
                 self._live()
-            self.world.wait(0)
             away_ns = self.world.now_ns + self.world.random.choice((100, 800, 3000)) * MS
             while self.world.now_ns < away_ns:
+                self.world.kill_ns = None
                 self.world.wait(away_ns - self.world.now_ns)
 
     def _live(self) -> None:
@@ -220,6 +231,7 @@ class Day:
         with closing(Runner(parts, no_signal, manager=cast(Systemd, Watch(self)))) as runner:
             try:
                 runner.open()
+                self.world.kill_ns = None
                 self._check_kept(parts)
                 runner.run()
             except KilledError:
@@ -256,7 +268,7 @@ class Day:
     def _check_kept(self, parts: Parts) -> None:
         """What was acknowledged is known again."""
         lifts = parts.pipeline.lifts
-        for peer in self.door.peers:
+        for peer in self.door.all:
             for grasp in peer.kept:
                 assert lifts.is_told(grasp), f"the outcome of {grasp} was lost"
             for grasp in peer.offers:
@@ -280,14 +292,15 @@ class Day:
 
     def _have_trouble(self) -> None:
         world, draw = self.world, self.world.random
-        t_ns = 0
+        world.has_trouble, t_ns = True, 0
         while (close_ns := t_ns + draw.choice((400, 1300, 1300)) * MS) < TROUBLE_NS:
-            world.after(t_ns, partial(self._take, self.sensors.rest))
-            world.after(close_ns, partial(self._take, self._draw_grasp()))
-            t_ns = close_ns + draw.choice((300, 900, 1500)) * MS
-        self._some(8, lambda: self.sensors.faults.append(Fault(draw.choice(FAULTS), world)))
+            world.after(t_ns, self._open)
+            world.after(close_ns, self._grasp)
+            world.after(close_ns + draw.choice((100, 400)) * MS, draw.choice(self.door.peers).ask)
+            t_ns = close_ns + draw.choice((300, 900, 1500, 2500)) * MS
+        self._some(5, lambda: self.sensors.faults.append(Fault(draw.choice(FAULTS), world)))
         self._some(2, lambda: setattr(self.disk, draw.choice(("is_full", "is_slow")), True))
-        self._some(1, lambda: setattr(world, "kill_ns", world.now_ns + draw.randrange(30) * MS))
+        self._some(1, world.kill_soon)
         self._some(1, self.sensors.stop)
         self._some(2, lambda: world.stall(draw.choice((30, 150, 700, 3000)) * MS))
         self._some(1, self.sensors.exchange)
@@ -295,36 +308,40 @@ class Day:
         self._some(1, lambda: setattr(self, "cost_ns", draw.choice((4, 12, 25)) * MS))
         self._some(1, lambda: setattr(self, "slept_ns", self.slept_ns + S * (draw.random() < 0.2)))
         for peer in self.door.peers:
-            self._some(5, partial(peer.ask, lifts=draw.random() < 0.8))
+            self._some(2, partial(peer.ask, lifts=draw.random() < 0.8))
 
-    def _draw_grasp(self) -> Counts:
+    def _open(self) -> None:
+        self.sensors.take(self.sensors.rest)
+
+    def _grasp(self) -> None:
+        """Grasp; now and then a finger does not touch."""
         draw = self.world.random
-        grasp = draw.choice(self.sensors.grasps)
-        if draw.random() < 0.2:
+        grasp = draw.choice(self.sensors.grasps).copy()
+        if draw.random() < 0.1:
             free = draw.randrange(3)
-            grasp = grasp.copy()
             grasp[free] = self.sensors.rest[free]
-        return grasp
+        self.sensors.take(grasp)
 
-    def _take(self, pose: Counts) -> None:
-        self.sensors.pose = pose
+    def _grasp_well(self) -> None:
+        self.sensors.take(self.sensors.grasps[0])
 
     def _be_calm(self) -> None:
-        """All works again, and the hand opens, then grasps."""
+        """All works again. The sensors are switched off once: a wrong tare lasts half a minute."""
+        self.world.has_trouble, self.world.kill_ns = False, None
         self.sensors.faults.clear()
+        self.sensors.switch_off()
         self.disk.is_full = self.disk.is_slow = False
         self.cost_ns, before = 0, [0]
-        self._take(self.sensors.rest)
         close_ns = 6 * S
-        self.world.after(close_ns, partial(self._take, self.sensors.grasps[0]))
+        self.world.after(close_ns, self._grasp_well)
         self.world.after(close_ns, lambda: before.append(self.judged))
-        self.world.after(close_ns + 600 * MS, self.door.peers[0].ask)
+        self.world.after(close_ns + 600 * MS, self.door.evening.ask)
         self.world.after(CALM_NS - S, lambda: self._check_going(self.judged - before[-1]))
 
     def _check_going(self, judged: int) -> None:
         assert self.door.is_open, "the daemon has ended"
         assert judged, "a sound grasp was not judged"
-        said = self.door.peers[0].last
+        said = self.door.evening.last
         assert set(said["reasons"]) <= WITHHELD, f"a sound grasp is {said['reasons']}"
 
 
@@ -345,7 +362,8 @@ def main() -> None:
     for seed in range(first, last[0] if last else first + 1):
         try:
             day = run(seed)
-            found = f"{day.lives} lives, {dict(day.said)}"
+            kept = sum(len(peer.kept) for peer in day.door.all)
+            found = f"{day.lives} lives, {kept} outcomes, {dict(day.said)}"
         except Exception as error:
             if not last:
                 raise

@@ -27,7 +27,7 @@ Counts = NDArray[np.int64]
 def poses() -> tuple[Counts, list[Counts]]:
     """The open hand, shape (3, 24), and grasps in which each finger touches."""
     with DEMO_DAY.open(newline="") as file:
-        rows = [row for row in csv.reader(file) if row[1] == "0"][:40]
+        rows = [row for row in csv.reader(file) if row[1] == "0"][:9]
     grasps = [np.array(row[2:], dtype=np.int64).reshape(3, 24) for row in rows]
     rest = np.minimum(grasps[0] + 150 * (np.arange(72).reshape(3, 24) % 4), 4000)
 
@@ -65,7 +65,7 @@ class Sensors(FakeDriver):
         self.world, self.joints = world, joints
         self.noise = np.random.default_rng(world.random.getrandbits(32))
         self.ends = False
-        self.number, self.offset = 1, np.zeros((3, 24), dtype=np.int64)
+        self.number = 1
         self.rest, self.grasps = poses()
         self.pose = self.rest
         self.faults: list[Fault] = []
@@ -75,6 +75,7 @@ class Sensors(FakeDriver):
         self._sent: list[NDArray[np.uint16]] = []
         self._seq = 0
         self._angle = 0.0
+        self._open_until_ns = 0
         world.after(0, self._tick)
 
     @property
@@ -84,7 +85,20 @@ class Sensors(FakeDriver):
     def open(self) -> None:
         super().open()
         self.ends, self.queue = False, []
-        self.handed_ns = self.world.now_ns
+        self.handed_ns = self.since_ns = self.world.now_ns
+        self.rest_for(2000)
+
+    def rest_for(self, ms: int) -> None:
+        """Open the hand, to be tared."""
+        self.pose, self._open_until_ns = self.rest, self.world.now_ns + ms * MS
+
+    def take(self, pose: Counts) -> None:
+        if self.world.now_ns >= self._open_until_ns:
+            self.pose = pose
+
+    def switch_off(self, ms: int = 1500) -> None:
+        self.faults.append(Fault("outage", self.world, ms))
+        self.rest_for(ms + 2000)
 
     def stop(self) -> None:
         self.ends, self.queue = True, []
@@ -100,9 +114,9 @@ class Sensors(FakeDriver):
     def exchange(self) -> None:
         """Other sensors, which rest otherwise; some were there before."""
         self.number = self.world.random.randrange(1, 4)
-        steps = np.random.default_rng(self.number).choice((-110, 110), (3, 24))
-        self.offset = steps * (self.number > 1)
-        self.faults.append(Fault("outage", self.world, 1500))
+        steps = np.random.default_rng(self.number).choice((0, 140), (3, 24))
+        self.rest = poses()[0] + steps * (self.number > 1)
+        self.switch_off()
 
     def _tick(self) -> None:
         self.world.after(PERIOD_NS, self._tick)
@@ -110,13 +124,13 @@ class Sensors(FakeDriver):
         faults = [each for each in self.faults if each.until_ns > self.world.now_ns]
         if faults != self._before:
             self.since_ns = self.world.now_ns
-        self.faults, self._before = faults, faults
+        self.faults, self._before = faults, [*faults]
         active = {each.kind: each for each in self.faults}
         if self.joints and "no joints" not in active:
             self._turn(active)
         if "slide" in active:
             self.pose = self.pose + 2 * (np.arange(24) % 3 - 1)
-        counts = self.pose + self.offset + self.noise.integers(-2, 3, (3, 24))
+        counts = self.pose + self.noise.integers(-2, 3, (3, 24))
         self._sent = [*self._sent[-70:], counts.clip(1, 4094).astype(np.uint16)]
         lost, late = active.get("lost"), active.get("late")
         if "outage" in active or (lost and self.world.random.random() < lost.share):
