@@ -1,7 +1,4 @@
-"""A daemon at work, for soaks and attacks: real processes and links, only the hardware is a twin.
-
-`python -m tests.bench.live PLAN` is the process of a twin.
-"""
+"""A daemon at work, for soaks and attacks: real processes, only the hardware is a twin."""
 
 from __future__ import annotations
 
@@ -10,26 +7,19 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-import msgspec
-import numpy as np
 import zmq
-from numpy.typing import NDArray
 
 from graspd.daemon.publish.keys import load_pair
 from graspd.daemon.publish.messages import Verdict
-from graspd.drivers.spi.messages import Message, Sweep
-from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasp_script import Durations
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, synthetic_grasps
-from graspd.drivers.twins.spi import SpiTwin
 from tests.daemon.processes import GRASPD, graspd_with
 from tests.kit.messages import decode_verdict
 
@@ -41,70 +31,12 @@ SEED = 1
 """A synthetic grasp that `cnn1` judges."""
 HELD = Durations(first_rest_s=(1.5, 1.5), settle_s=(600.0, 600.0))
 """A grasp that is closed once and then held."""
-DRAIN_S = 0.5
-"""How long a twin that was told to stop stays there, s, so that all it sent is read."""
-
-Tally = NDArray[np.int64]
-"""What a twin's processes did so far, in the order of `TALLIED`, in shared memory."""
-TALLIED = ("sweeps", "disconnect", "drop", "bit_flip", "duplicate", "unsent")
-"""Sweeps made, faults put in by name, and frames that the link did not take."""
-
-
-class TwinPlan(msgspec.Struct, frozen=True, kw_only=True):
-    """What a twin's process shall do."""
-
-    path: str
-    """Of the pseudo-terminal."""
-    tally: str
-    """File of a `Tally`; each process goes on where the one before it ended."""
-    ends: str
-    """File for the time of each sweep's end, monotonic ns, 64-bit integers, in its place by the
-    tally."""
-    rate_hz: float
-    faults: LinkFaults
 
 
 def held_grasp(rate_hz: float = RATE_HZ) -> Iterator[Counts]:
     """Counts of a grasp that is held for ten minutes."""
     moments = synthetic_grasps(1, rate_hz=rate_hz, durations=HELD, seed=SEED)
     return (moment.counts for moment in moments)
-
-
-class TimedSpiTwin(SpiTwin):
-    """Notes when each sweep ends."""
-
-    def __init__(self, plan: TwinPlan) -> None:
-        counts = (moment.counts for moment in synthetic_grasps(rate_hz=plan.rate_hz, loop=True))
-        super().__init__(Path(plan.path), counts, rate_hz=plan.rate_hz, faults=plan.faults)
-        self.ends_ns: list[int] = []
-
-    def _send(self, message: Message, *, waits: bool = True) -> None:
-        boot_ns = self._boot_ns
-        super()._send(message, waits=waits)
-        if isinstance(message, Sweep):
-            self.ends_ns.append(boot_ns + message.tick_end * 1000)  # ticks of 1 us
-
-
-def serve_twin(plan: TwinPlan) -> None:
-    """Be a twin until SIGTERM."""
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
-    tally: Tally = np.memmap(plan.tally, dtype=np.int64, mode="r+", shape=len(TALLIED))
-    ends_ns = np.memmap(plan.ends, dtype=np.int64, mode="r+")
-    before = tally.copy()
-    twin = TimedSpiTwin(plan)
-
-    def is_over() -> bool:
-        known = {**twin.injected, "sweeps": twin.sweeps_made, "unsent": twin.tx_dropped}
-        tally[:] = before + [known.get(name, 0) for name in TALLIED]
-        made = int(tally[0])
-        ends_ns[made - len(twin.ends_ns) : made] = twin.ends_ns
-        twin.ends_ns.clear()
-        return stop.is_set()
-
-    with twin:
-        twin.serve(is_over)
-        time.sleep(DRAIN_S)
 
 
 def spi_section(folder: Path) -> str:
@@ -251,7 +183,3 @@ def peak_mib(pid: int) -> float:
 def end_children_at_sigterm() -> None:
     """Have SIGTERM end the blocks of this process, and so the processes that it started."""
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
-
-
-if __name__ == "__main__":
-    serve_twin(msgspec.json.decode(sys.argv[1], type=TwinPlan))

@@ -1,14 +1,14 @@
-"""Whether graspd lives for months: a daemon under faults and outages, watched for what it loses.
+"""Whether graspd lives for months: a daemon under faults and outages, watched for what it holds.
 
 `python -m tests.bench.soak --seconds 120` prints what was found beside its limits, and exits 1 if
 one is broken. The daemon, the SPI twin and a second subscriber are processes of their own. With
-`--rate 1000` an hour's worth of readings takes six minutes.
+`--rate 1000` an hour's worth of readings takes six minutes. What is said when, and what is lost,
+is checked in simulated time: `tests/daemon/run/days.py`.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import random
 import signal
@@ -22,17 +22,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-import numpy as np
-
-from graspd.drivers.twins.faults import LinkFaults
 from graspd.models.training.evaluating.files import markdown_table
 from tests.bench.live import (
     PATIENCE_S,
     STOP_S,
-    TALLIED,
     Child,
-    TwinPlan,
     Usage,
     end_children_at_sigterm,
     running,
@@ -40,29 +34,22 @@ from tests.bench.live import (
     usage,
 )
 from tests.bench.soak_judge import Found, Heard, judge
-from tests.daemon.processes import before_others
+from tests.daemon.processes import GRASPD, before_others
 
 SAMPLE_S = 0.5
 IDLE_S = 0.05
 """Longest that nobody looks what is due."""
-SETTLED_S = 0.3
-"""Until everything has arrived."""
 BETWEEN_S = (1.0, 8.0)
 """Between two outages."""
 HURRY_S = 60.0
 """A shorter run has shorter outages, so that it has some of each kind."""
-QUIET_END_S = 3.0
-"""No outage begins so late that its end would not be seen."""
 AWAY_S = (0.1, 2.0)
 """How long a killed twin stays away."""
 STOPPED_S = (1.0, 5.0)
 """How long a subscriber is stopped: less than its queue holds at 100 Hz."""
-FAULTS = LinkFaults(
-    bit_flip_probability=0.002,
-    drop_probability=0.002,
-    duplicate_probability=0.002,
-    disconnect_every_frames=500,
-    dead_electrodes=((0, 3), (2, 17)),
+FAULTS = (
+    *("--bit-flip", "0.002", "--drop", "0.002", "--duplicate", "0.002"),
+    *("--disconnect-every", "500", "--dead", "ff_3", "--dead", "th_17"),
 )
 QUEUE = 1000
 """Messages that wait for a subscriber: on a busy computer, where it is slow, it loses none."""
@@ -95,35 +82,26 @@ class Soak:
         self._plan = plan
         self._folder = folder
         self._random = random.Random(plan.seed)
-        self._tally, self._ends_ns = (
-            np.memmap(folder / name, dtype=np.int64, mode="w+", shape=shape)
-            for name, shape in (
-                ("tally", len(TALLIED)),
-                ("ends", round(plan.rate_hz * (plan.seconds + PATIENCE_S))),
-            )
-        )
         self._heard = Heard()
         self._samples: list[Usage] = []
         self._sample_s = time.monotonic()
         self._deeds: deque[tuple[float, Callable[[], None]]] = deque()
-        self._kills = self._stops = 0
+        self._outages = 0
 
     def run(self) -> Found:
         """Do it. Raises `RuntimeError` if the daemon does not start, with what it said."""
         sections = f'{spi_section(self._folder)}[session]\nfolder = "{self._folder}/session"\n'
-        endpoint = f"ipc://{self._folder}/v"
-        listener = [sys.executable, "-c", LISTENER, endpoint]
-        topics = ("verdict.", "status.")
+        listener = [sys.executable, "-c", LISTENER, f"ipc://{self._folder}/v"]
         with (
-            running(self._folder, sections, high_water_mark=QUEUE, topics=topics) as (
+            running(self._folder, sections, high_water_mark=QUEUE) as (
                 self._daemon,
                 self._subscriber,
             ),
             Child(listener, stdout=subprocess.PIPE) as self._other,
             ExitStack() as self._twins,
         ):
-            self._hear(lambda: self._has_begun() or self._has_ended(), PATIENCE_S)
-            if not self._has_begun():
+            self._hear(lambda: self._heard.messages > 1 or self._has_ended(), PATIENCE_S)
+            if self._heard.messages < 2:
                 said = (self._folder / "log").read_text()
                 raise RuntimeError(f"no word of the daemon: {said}")
             if self._other.stdout is not None:
@@ -134,13 +112,15 @@ class Soak:
             self._plan_deeds()
             self._hear(self._has_ended, self._plan.seconds)
             ended_early = self._has_ended()
-            self._twin.terminate()
-            self._hear(lambda: self._twin.poll() is not None, STOP_S)
-            self._hear(lambda: False, SETTLED_S)
-            return self._end(ended_early)
-
-    def _has_begun(self) -> bool:
-        return self._heard.status is not None and self._heard.messages > 1
+            self._daemon.terminate()
+            return Found(
+                samples=self._samples,
+                heard=self._heard,
+                outages=self._outages,
+                exit_code=self._daemon.wait(STOP_S),
+                planned=self._plan.rate_hz * self._plan.seconds,
+                ended_early=ended_early,
+            )
 
     def _has_ended(self) -> bool:
         return self._daemon.poll() is not None
@@ -149,40 +129,20 @@ class Soak:
         """Listen, do what is due and look at the daemon, so long at most."""
         until_s = time.monotonic() + seconds
         while (now_s := time.monotonic()) < until_s and not done():
-            message = self._subscriber.take(min(until_s - now_s, IDLE_S))
-            if message is not None:
-                self._heard.add(*message, self._subscriber.received_ns)
+            verdict = self._subscriber.verdict(min(until_s - now_s, IDLE_S))
+            if verdict is not None:
+                self._heard.add(verdict)
             while self._deeds and self._deeds[0][0] <= now_s:
                 self._deeds.popleft()[1]()
             if now_s >= self._sample_s and not self._has_ended():
                 self._samples.append(usage(self._daemon.pid))
                 self._sample_s = now_s + SAMPLE_S
 
-    def _end(self, ended_early: bool) -> Found:
-        began_s = time.monotonic()
-        self._daemon.terminate()
-        code = self._daemon.wait(STOP_S)
-        stop_s = time.monotonic() - began_s
-        self._hear(lambda: False, SETTLED_S)
-        status = self._heard.status
-        return Found(
-            samples=self._samples,
-            heard=self._heard,
-            twin=dict(zip(TALLIED, map(int, self._tally), strict=True)),
-            ends_ns=self._ends_ns[self._ends_ns > 0],
-            driver={} if status is None else status.drivers["spi"],
-            outages=self._kills + self._stops,
-            exit_code=code,
-            stop_s=stop_s,
-            planned=self._plan.rate_hz * self._plan.seconds,
-            ended_early=ended_early,
-        )
-
     def _plan_deeds(self) -> None:
         """Each outage and its end, in the order of time, both kinds in turn."""
-        end_s = time.monotonic() + self._plan.seconds - QUIET_END_S
+        at_s = time.monotonic()
+        end_s = at_s + self._plan.seconds
         pace = min(self._plan.seconds / HURRY_S, 1.0)
-        at_s = time.monotonic() + pace * self._random.uniform(*BETWEEN_S)
         kinds = itertools.cycle(
             [
                 (self._kill_twin, self._add_twin, AWAY_S),
@@ -190,11 +150,12 @@ class Soak:
             ]
         )
         for begin, end, lasts_s in kinds:
+            at_s += pace * self._random.uniform(*BETWEEN_S)
             back_s = at_s + pace * self._random.uniform(*lasts_s)
             if back_s >= end_s:
                 return
             self._deeds += [(at_s, begin), (back_s, end)]
-            at_s = back_s + pace * self._random.uniform(*BETWEEN_S)
+            at_s = back_s
 
     def _kill_twin(self) -> None:
         # As with a real adapter its path goes with it: else it leads to the next terminal that gets
@@ -203,31 +164,22 @@ class Soak:
         (self._folder / "bridge").unlink(missing_ok=True)
         self._twin.kill()
         self._twin.wait()
-        self._kills += 1
+        self._outages += 1
 
     def _add_twin(self) -> None:
-        plan = TwinPlan(
-            path=f"{self._folder}/bridge",
-            tally=f"{self._folder}/tally",
-            ends=f"{self._folder}/ends",
-            rate_hz=self._plan.rate_hz,
-            faults=dataclasses.replace(FAULTS, seed=self._plan.seed + self._kills),
-        )
-        command = [sys.executable, "-m", "tests.bench.live", msgspec.json.encode(plan).decode()]
-        self._twin = self._twins.enter_context(Child(command))
+        path, rate_hz = self._folder / "bridge", self._plan.rate_hz
+        seed = self._plan.seed + self._outages
+        command = [*GRASPD, "twin", "spi", "--path", path, "--rate", rate_hz, "--seed", seed]
+        quiet = subprocess.DEVNULL
+        child = Child([*map(str, command), *FAULTS], stdout=quiet, stderr=quiet)
+        self._twin = self._twins.enter_context(child)
 
     def _stop_other(self) -> None:
         self._other.send_signal(signal.SIGSTOP)
-        self._stops += 1
+        self._outages += 1
 
     def _wake_other(self) -> None:
         self._other.send_signal(signal.SIGCONT)
-
-
-def soak(plan: Plan) -> Found:
-    """Do one. Raises `RuntimeError` if the daemon does not start, with what it said."""
-    with tempfile.TemporaryDirectory() as folder:
-        return Soak(Path(folder), plan).run()
 
 
 def main() -> int:
@@ -238,8 +190,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     end_children_at_sigterm()
-    with before_others():
-        rows = judge(soak(Plan(given.seconds, given.rate, given.seed)))
+    with before_others(), tempfile.TemporaryDirectory() as folder:
+        rows = judge(Soak(Path(folder), Plan(given.seconds, given.rate, given.seed)).run())
     head = ("", "found", "at most")
     lines = markdown_table(head, [row.cells() for row in rows], right=head[1:])
     sys.stdout.write("\n".join(lines) + "\n")
