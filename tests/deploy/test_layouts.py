@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from graspd.daemon.record.topics import schemas
 
 LAYOUTS = Path(__file__).parents[2] / "deploy" / "layouts"
@@ -35,11 +33,11 @@ def paths() -> Iterator[str]:
         yield from (path["value"] for path in config.get("paths", []))
 
 
-@pytest.mark.parametrize("path", list(paths()))
-def test_a_path_of_the_lichtblick_layout_is_in_the_schema(path: str) -> None:
-    match = QUOTED.fullmatch(path)
-    assert match is not None
-    assert has(match[1], match[2], in_list=match[3] is not None)
+def test_paths_of_the_lichtblick_layout_are_in_the_schemas() -> None:
+    for path in paths():
+        match = QUOTED.fullmatch(path)
+        assert match is not None, path
+        assert has(match[1], match[2], in_list=match[3] is not None), path
 
 
 def test_image_and_log_panels_show_topics_of_theirs() -> None:

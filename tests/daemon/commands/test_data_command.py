@@ -6,7 +6,6 @@ import functools
 import hashlib
 import http.server
 import os
-import shlex
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -65,26 +64,6 @@ def test_data_that_was_changed_is_refused(mirror: tuple[Path, str], tmp_path: Pa
     assert result.returncode == 1
     assert "SHA-256 differs" in result.stderr
     assert list((tmp_path / "data").iterdir()) == []
-
-
-def test_data_that_is_not_there_is_said(mirror: tuple[Path, str], tmp_path: Path) -> None:
-    result = graspd("data", "--to", tmp_path / "data", "--url", mirror[1])
-    assert result.returncode == 1
-    assert "404" in result.stderr
-    result = graspd("data", "--to", tmp_path / "data", "--from", tmp_path)
-    assert result.returncode == 1
-    assert "has neither" in result.stderr
-    assert "--from" not in result.stderr
-
-
-@pytest.mark.parametrize("below", ["tables", "my data/csv"])
-def test_the_folder_below_that_has_the_tables_is_named(tmp_path: Path, below: str) -> None:
-    folder = tmp_path / below
-    folder.mkdir(parents=True)
-    (folder / TABLES[0].upstream_name).write_text("object,slipped\n")
-    result = graspd("data", "--to", tmp_path / "data", "--from", tmp_path)
-    assert result.returncode == 1
-    assert result.stderr.endswith(f"; try --from {shlex.quote(str(folder))}\n")
 
 
 @contextmanager

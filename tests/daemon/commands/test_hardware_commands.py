@@ -6,7 +6,6 @@ import json
 import signal
 import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,11 +13,11 @@ import numpy as np
 import pytest
 
 from graspd.daemon.publish.messages import Tactile, Verdict
-from graspd.drivers.base import TactileReading
-from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_rows import read_rows
 from tests.bench.live import Subscriber
-from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, start, wait_for
-from tests.kit.messages import decode_tactile, decode_verdict
+from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.kit.messages import decode_tactile
 from tests.kit.scenes import written
 from tests.ports import can_id, free_port, multicast_group
 
@@ -82,9 +81,9 @@ def heard(folder: Path, wanted: int) -> list[Tactile]:
 
 
 def published(folder: Path, wanted: int) -> list[Verdict]:
-    command = [sys.executable, "-c", SUBSCRIBER, f"ipc://{folder}/graspd", str(wanted)]
-    result = subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
-    return [decode_verdict(line) for line in result.stdout.splitlines()]
+    with Subscriber(f"ipc://{folder}/graspd") as subscriber:
+        found = [subscriber.verdict(TIMEOUT_S) for _ in range(wanted)]
+    return [verdict for verdict in found if verdict is not None]
 
 
 @pytest.mark.parametrize("kind", TWINS)
@@ -98,14 +97,7 @@ def test_a_recording_on_the_wire_reads_as_its_replay(tmp_path: Path, kind: str) 
     sound = [str(reading.counts) for reading in readings]
     assert json.loads(output)["injected"] == {}
     assert len(sound) == WANTED
-    with ReplayDriver([DEMO_TABLE], ("ff", "mf", "th"), speed=None) as replay:
-        rows: set[str] = set()
-        while not replay.exhausted:
-            rows |= {
-                str(row.counts.tolist())
-                for row in replay.read_ready()
-                if isinstance(row, TactileReading)
-            }
+    rows = {str(row.counts.tolist()) for row in read_rows(DEMO_TABLE, ("ff", "mf", "th"))}
     # A machine that stalls may lose sweeps, so each reading is looked up in all rows.
     assert set(sound) <= rows
 

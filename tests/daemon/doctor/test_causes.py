@@ -21,7 +21,7 @@ import pytest
 from graspd.daemon.commands import doctor
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
-from graspd.daemon.doctor.finding import Cause, Finding, Level
+from graspd.daemon.doctor.finding import Cause, Level
 from graspd.daemon.doctor.surroundings import can_finding
 from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.twins import spi as spi_twin
@@ -294,20 +294,6 @@ def test_rights_that_a_user_lacks_are_told(
     assert mine.keys() == {"socket-denied", "socket-group", "realtime"}
     assert mine["socket-group"] == "sudo usermod -aG daemon $USER, then log in again"
     assert "LimitRTPRIO=40" in str(told)
-
-
-def test_findings_fit_80_columns_and_elsewhere_one_line() -> None:
-    advice = "look at this and at that, " * 8
-    told = [
-        Finding(Level.ERROR, "something is wrong " * 6, Cause.SLOW, advice),
-        Finding(Level.OK, "something is fine"),
-    ]
-    people = list(doctor.in_words(told, 80))
-    assert max(map(len, people)) <= 80
-    assert people[0].startswith("!! something")
-    assert sum(line.startswith("   -> look") for line in people) == 1
-    assert people[-3:] == ["ok something is fine", "", "1 wrong, 0 to look at"]
-    assert len(list(doctor.in_words(told, None))) == len(told) + 2
 
 
 def test_the_table_of_electrodes_needs_all_and_fits(tmp_path: Path, healthy: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gzip
 import io
 import json
 from collections.abc import Callable
@@ -22,7 +21,6 @@ from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.kinds import open_recording
 from tests.daemon.record.recorded import BOOT
 from tests.daemon.record.test_mcap import OFFSET_NS, START_NS, WHOLE, header, read
 
@@ -48,53 +46,20 @@ def packed_again(
     return stream.getvalue()
 
 
-def by_topic(messages: list[RecordedMessage]) -> list[RecordedMessage]:
-    return sorted(messages, key=lambda message: message.kind)
-
-
 def in_fifths(messages: list[RecordedMessage]) -> list[RecordedMessage]:
     """Every fifth message, then every fifth after the first, and the like."""
     return [message for first in range(5) for message in messages[first::5]]
 
 
-def backwards(messages: list[RecordedMessage]) -> list[RecordedMessage]:
-    return messages[::-1]
-
-
-@pytest.mark.parametrize("order", [list, by_topic, backwards])
-@pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"chunk_size": 1}])
-def test_any_order_of_a_file_gives_the_order_of_time(
-    order: Callable[[list[RecordedMessage]], list[RecordedMessage]], options: dict[str, int]
-) -> None:
-    assert read(packed_again(WHOLE, order, **options)) == read(WHOLE)
-
-
-def test_a_packed_file_in_any_order_is_unpacked_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps_back: list[int] = []
-    seek = gzip.GzipFile.seek
-
-    def counted(file: gzip.GzipFile, offset: int, whence: int = 0) -> int:
-        if whence == 0 and offset < seek(file, 0, 1):
-            steps_back.append(offset)
-        return seek(file, offset, whence)
-
-    monkeypatch.setattr(gzip.GzipFile, "seek", counted)
-    path = tmp_path / "a.mcap"
-    path.write_bytes(gzip.compress(packed_again(WHOLE, backwards)))
-    with open_recording(path) as stream:
-        assert list(McapReader(path, stream)) == read(WHOLE)
-    assert steps_back == [0]
-
-
-@given(st.randoms(use_true_random=False), st.integers(1, 20_000))
+@given(st.randoms(use_true_random=False), st.integers(1, 20_000), st.booleans())
 @settings(max_examples=50, deadline=None)
-def test_no_order_and_no_cut_gives_readings_out_of_time(random: Random, chunk: int) -> None:
+def test_no_order_and_no_cut_gives_readings_out_of_time(
+    random: Random, chunk: int, chunked: bool
+) -> None:
     def shuffled(messages: list[RecordedMessage]) -> list[RecordedMessage]:
         return random.sample(messages, len(messages))
 
-    data = packed_again(WHOLE, shuffled, chunk_size=chunk)
+    data = packed_again(WHOLE, shuffled, chunk_size=chunk, use_chunking=chunked)
     assert read(data) == read(WHOLE)
     with contextlib.suppress(RecordingError):
         found = [message.at_ns for message in read(data[: random.randrange(len(data))])]

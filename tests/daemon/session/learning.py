@@ -172,14 +172,3 @@ def sensor_watch(
 def kept_trust(folder: SessionFolder) -> TrustState | None:
     kept = last_kept(folder.path)
     return None if kept is None or kept.trust is None else kept.trust
-
-
-def taught(folder: SessionFolder) -> tuple[SessionCalibration, Trust, SessionKeeper]:
-    """A session of 30 grasps, and what the outcomes of 20 have taught."""
-    session, part = calibration(), trust()
-    keeper = session_keeper(session, sensors(), folder, part=part)
-    observe(session, 30)
-    for grasp in range(20):
-        judge(part, grasp)
-        tell(part, grasp)
-    return session, part, keeper

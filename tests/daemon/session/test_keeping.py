@@ -39,7 +39,6 @@ from tests.daemon.session.learning import (
     read_once,
     sensors,
     session_keeper,
-    taught,
     tell,
     trust,
 )
@@ -146,7 +145,11 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
 
 
 def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> None:
-    session, part, keeper = taught(folder)
+    session, part = calibration(), trust()
+    keeper = session_keeper(session, sensors(), folder, part=part)
+    observe(session, 30)
+    judge(part, 1)
+    tell(part, 1)
     keeper.save()
     other = trust("of two fingers", inputs=52)
     judged = cast(Pipeline, FakeJudge(None, other))

@@ -132,12 +132,10 @@ LIMITS: dict[str, Any] = {"motion_limits": {"ff": 1.5, "th": 1.0}}
     ("told", "motions"),
     [
         (MOVES | LIMITS, {"ff": (1.2, 1.5), "th": (None, 1.0)}),
-        ({"motion": {"ff": 0.0}} | LIMITS, {"ff": (0.0, 1.5), "th": (None, 1.0)}),
         (MOVES, {"ff": (None, 0.0), "th": (None, 0.0)}),
         ({"motion": {"ff": 1.0}, "motion_limits": {"ff": 0.0}}, {"ff": (None, 0.0)}),
         ({}, {"ff": None, "th": None}),
     ],
-    ids=["all", "one", "no limits", "no limit", "nothing"],
 )
 def test_unknown_motion_of_a_finger_is_not_zero(
     told: dict[str, Any], motions: dict[str, tuple[float | None, float] | None]
