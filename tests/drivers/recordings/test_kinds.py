@@ -65,7 +65,6 @@ FILES: dict[str, tuple[bytes | Callable[[Path], None], Kind]] = {
     "ROS 1 bag": (b"#ROSBAG V2.0\n\x45\0\0\0", Kind.ROS1_BAG),
     "SQLite bag": (bag2(TOPICS), Kind.ROS2_BAG),
     "candump -L": (b"(1436509052.249713) can0 5A1#A2BF98\n", Kind.CANDUMP),
-    "candump -L in ns": (b"(1436509052.249713123) vcan0 0000005A#R\n", Kind.CANDUMP),
     "candump -ta": (b" (1436509052.249713)  can0  5A1   [7]  A2 BF 98\n", Kind.CANDUMP),
     "candump -tA": (b" (2023-11-14 22:13:20.000000)  can0  5A1   [1]  A2\n", Kind.CANDUMP),
     "candump alone": (b"  can0  5A1   [2]  A2 BF\n", Kind.CANDUMP),

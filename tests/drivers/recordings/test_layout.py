@@ -179,8 +179,6 @@ def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
     [
         ("Timestamp", TIMES),
         ("Time (s)", TIMES),
-        ("__time", TIMES),
-        ("t_sec", TIMES),
         ("Rel. Time", TIMES),
         ("Czas (s)", TIMES),
         ("millis()", ["0", "10", "20", "30"]),

@@ -9,7 +9,6 @@ import subprocess
 import zlib
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from graspd.drivers.biotac import ERROR_WORDS
@@ -22,21 +21,15 @@ from tests.drivers.spi.bridge_c import (
     PAC,
     PDC,
     PING,
-    START,
     STATUS,
-    STOP,
     SWEEP,
     TAC,
     TDC,
-    StartBridge,
     ask,
     build_program,
-    counts_of,
     damaged,
     frame,
     judged,
-    pattern,
-    seq_of,
 )
 
 pytestmark = pytest.mark.usefixtures("comes_first")
@@ -152,35 +145,3 @@ def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(
     assert last == f"errors {errors}", seed
     assert [line for line in lines if line in set(nonces)] == nonces, seed
     assert errors > 50_000
-
-
-def test_a_hello_says_what_the_bridge_is(start_bridge: StartBridge) -> None:
-    host = start_bridge(
-        "--sensors", 2, "--period-us", 12345, "--board", "left hand", "--serial", "1:XX"
-    )
-    hello = host.hello(0xCAFE)
-    assert struct.unpack_from("<BII", hello) == (1, DIGEST, 0xCAFE)
-    tick, tick_hz, firmware, board, *numbers = struct.unpack_from("<QIH16sIBB", hello, 9)
-    assert numbers == [12345, 2, 24]
-    assert (tick_hz, firmware) == (1_000_000, 0x0002)
-    assert tick < 60_000_000
-    assert board == b"left hand".ljust(16, b"\0")
-    assert hello[45:61] == b"BTSP000000000001"
-    assert hello[61:77] == bytes(16)
-    assert hello[77:] == ELECTRODE_COMMANDS
-
-
-def test_sweeps_carry_what_the_sensors_feel(start_bridge: StartBridge) -> None:
-    host = start_bridge("--period-us", 3000)
-    host.hello()
-    host.send(frame(START))
-    sweeps = host.next_of(SWEEP, 100)
-    assert [seq_of(sweep) for sweep in sweeps] == list(range(100))
-    for row, sweep in enumerate(sweeps):
-        np.testing.assert_array_equal(counts_of(sweep), pattern(row))
-    starts, ends = np.array([struct.unpack_from("<QQ", sweep, 4) for sweep in sweeps]).T
-    assert (ends - starts >= 1900).all()
-    host.send(frame(STOP), frame(START))
-    while seq_of(again := host.next_of(SWEEP)[0]) != 0:
-        pass
-    np.testing.assert_array_equal(counts_of(again), pattern(0))

@@ -73,9 +73,7 @@ def test_a_ping_is_sent_every_247_milliseconds() -> None:
         assert now_ns == T0 + 247 * MS * (number + 1)
 
 
-@pytest.mark.parametrize(
-    ("period_ms", "silence_ms"), [(1, 100), (10, 100), (20, 200), (1000, 10_000)]
-)
+@pytest.mark.parametrize(("period_ms", "silence_ms"), [(10, 100), (20, 200), (1000, 10_000)])
 def test_silence_is_ten_missing_sweeps_and_100_ms(period_ms: int, silence_ms: int) -> None:
     conversation = greeted(hello(0, period_ms=period_ms))
     assert said(conversation, T0) == [Start()]
@@ -230,7 +228,7 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
 
 @pytest.mark.parametrize(
     ("firmware", "newer"),
-    [(FIRMWARE - 1, "0.2"), (FIRMWARE, None), (FIRMWARE + 1, None), (0x0200, None)],
+    [(FIRMWARE - 1, "0.2"), (FIRMWARE, None), (FIRMWARE + 1, None)],
 )
 def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None) -> None:
     conversation = greeted(dataclasses.replace(hello(0), firmware=firmware))
