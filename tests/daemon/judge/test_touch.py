@@ -43,8 +43,8 @@ def held(depth: float, since_ns: int = 0) -> Touch:
 def test_a_finger_lets_go_below_its_share(
     depth: float, after_ns: int, fall: float, kept: bool
 ) -> None:
-    touch = held(depth)
-    touch.follow(after_ns, 0.0, -99.0, fall)
+    touch = held(depth, since_ns=S)
+    touch.follow(S + after_ns, 0.0, -99.0, fall)
     assert (touch.touching, touch.fall) == (kept, fall), "only the relative fall counts in a hold"
     assert touch.held_long == (not kept and after_ns > 60 * S)
 
