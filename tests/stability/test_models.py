@@ -1,4 +1,7 @@
-"""Each row of `graspd report stability` keeps its bounds, and wrong figures break theirs."""
+"""Each row of `graspd report stability` keeps its bounds, and wrong figures break theirs.
+
+It finds what process replay does not: weights of the image that are rounded to float32.
+"""
 
 from __future__ import annotations
 

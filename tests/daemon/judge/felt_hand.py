@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,17 +16,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspd.biotac import Finger
-from graspd.daemon.judge.decision import GateLimits, HandLimits
+from graspd.daemon.judge.decision import GateLimits, HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision
 from graspd.drivers.base import JointReading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeModel, pipeline
-from tests.daemon.judge.necessity import (
-    AGE_MAX_MS,
-    EARLY_MS,
-    STILL_MS,
-    Necessity,
-)
+from tests.daemon.judge.necessity import EARLY_MS, MOVED_COUNTS, STILL_MS, Necessity
 
 Counts = NDArray[np.uint16]
 PERIOD_NS = 10 * MS
@@ -106,11 +102,24 @@ class Feel:
 class Hand:
     """A pipeline whose fingers are tared, and what is necessary for a verdict."""
 
-    def __init__(self, gate: HandLimits) -> None:
-        self.model, self.clock = FakeModel(), Clock()
-        self.pipeline: Pipeline = pipeline(self.model, self.clock, hand=gate)
-        still_ms = EARLY_MS if gate.gate.early else STILL_MS
-        self.necessity = Necessity(POSES["rest"], FINGERS, gate.required or FINGERS, still_ms)
+    def __init__(
+        self,
+        gate: HandLimits,
+        build: Callable[[FakeModel, Clock], Pipeline] | None = None,
+        limits: Limits = Limits(),  # noqa: B008 (frozen)
+        moved_counts: float = MOVED_COUNTS,
+    ) -> None:
+        """`build` makes a pipeline with these limits."""
+        self.model, self.clock, self.limits = FakeModel(), Clock(), limits
+        self.pipeline = (
+            pipeline(self.model, self.clock, hand=gate)
+            if build is None
+            else build(self.model, self.clock)
+        )
+        still_ms, required = EARLY_MS if gate.gate.early else STILL_MS, gate.required or FINGERS
+        self.necessity = Necessity(
+            POSES["rest"], FINGERS, required, still_ms, moved_counts=moved_counts
+        )
         self.answer: float | None = None
         """What the network said when it was last asked, and of the reading of which time, ns."""
         self.answered_ns = 0
@@ -145,7 +154,7 @@ class Hand:
         judgement = self.pipeline.judge(reading)
         if self.model.runs != runs:
             self.answer, self.answered_ns = answer, reading.t_ns
-            if answer is not None and 0.5 <= answer <= 1.0:
+            if answer is not None and self.limits.slip_threshold <= answer <= 1.0:
                 self.slip = judgement.moment.grasp, reading.t_ns
         self.judged += judgement.moment.judged
         unknown = judgement.decision is Decision.UNKNOWN
@@ -159,8 +168,9 @@ class Hand:
             assert 0 <= reading.t_ns - self.answered_ns <= STANDS_MS * MS
             grasp, slip_ns = self.slip
             doubted = grasp == judgement.moment.grasp and reading.t_ns - slip_ns < STEADY_MS * MS
-            assert (judgement.decision is Decision.SLIP) is (p_slip >= 0.5 or doubted)
-            assert 0 <= self.clock() - reading.t_ns <= AGE_MAX_MS * MS
+            slips = p_slip >= self.limits.slip_threshold or doubted
+            assert (judgement.decision is Decision.SLIP) is slips
+            assert 0 <= self.clock() - reading.t_ns <= self.limits.max_age_ns
             assert not self.necessity.lacks(), self.necessity.lacks()
         return judgement
 

@@ -2,6 +2,7 @@
 
 It shares no code and no number with the first; Gaussian tails are scipy's. What both leave out of
 noise and how windows are laid is as deploy/JUDGING.md and the docstrings of `windows` say it.
+It finds what process replay does not: a step that is the sum of its sweeps in place of their mean.
 """
 
 from __future__ import annotations
