@@ -131,31 +131,18 @@ def test_the_journal_says_how_long_a_link_was_down(caplog: pytest.LogCaptureFixt
     link = Link("spi")
     with caplog.at_level(logging.INFO):
         link.start(2_000_000_000)
+        link.failed(LinkCause.UNKNOWN, "not there", 2_100_000_000)
+        assert link.losses == 0, "it was never up"
         link.up("a device", 5_250_000_000)
+        assert (link.state, link.reason, link.retry_ns) == (LinkState.UP, None, None)
         link.failed(LinkCause.UNKNOWN, "gone", 8_000_000_000)
         link.failed(LinkCause.UNKNOWN, "not there", 8_100_000_000)
+        assert (link.losses, link.reason) == (1, "not there")
         link.up("a device", 9_000_000_000)
     assert [r.getMessage() for r in caplog.records if r.levelname == "INFO"] == [
         "spi: up after 3.25 s: a device",
         "spi: up after 1.00 s: a device",
     ]
-
-
-def test_only_a_link_that_was_up_is_lost() -> None:
-    link = Link("spi")
-    link.start(0)
-    link.failed(LinkCause.UNKNOWN, "not there", 0)
-    link.greeting()
-    link.failed(LinkCause.UNKNOWN, "no answer", 0)
-    assert link.losses == 0
-    link.greeting()
-    link.up("a device", 0)
-    assert (link.state, link.reason, link.retry_ns) == (LinkState.UP, None, None)
-    link.failed(LinkCause.UNKNOWN, "gone", 0)
-    assert link.losses == 1
-    assert link.reason == "gone"
-    link.close()
-    assert (link.state, link.retry_ns) == (LinkState.CLOSED, None)
 
 
 def test_a_reason_is_warned_of_once_per_outage(caplog: pytest.LogCaptureFixture) -> None:
