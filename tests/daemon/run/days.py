@@ -34,7 +34,7 @@ from graspd.daemon.run.loop import LoopTiming
 from graspd.daemon.run.runner import Runner
 from graspd.daemon.run.systemd import Systemd
 from graspd.daemon.session.keeper import SessionKeeper
-from graspd.drivers.base import JointReading, Reading
+from graspd.drivers.base import JointReading, Reading, TactileReading
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS
@@ -52,7 +52,7 @@ ROUNDS_MAX = 1000
 """Rounds at one time: a flood of questions takes forty."""
 TROUBLE_NS, CALM_NS = 12 * S, 9 * S
 WITHHELD = {"low-confidence", "unproven", "risk-exceeded", "not-calibrated", "never-seen"}
-"""Reasons for which a sound grasp may be `unknown`: outcomes and grasps before it."""
+"""Reasons for which a sound, settled grasp may be `unknown`: outcomes and grasps before it."""
 
 
 @cache
@@ -70,7 +70,7 @@ class Watch(Companion):
         self._said_ns = self._status_ns = self.world.worked_ns
         self._silence_ns = AGE_NS
         self._seq = self._round_ns = -1
-        self._rounds = self._given = self._judged = 0
+        self._rounds = self._given = self._judged = self._waiting = 0
         self._began_ns = -S
         day.door.hear = self._hear
 
@@ -96,6 +96,7 @@ class Watch(Companion):
             self.necessity.observe_joints(reading)
         else:
             self._given += 1
+            self._waiting += 1
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         verdict, reading = published.verdict, published.reading
@@ -103,22 +104,30 @@ class Watch(Companion):
         self.day.judged += verdict.judged
         if reading is not None:
             self._judged += 1
+            self._waiting -= 1
             self.necessity.observe(reading)
+            if self._waiting:  # some were skipped
+                self._waiting, self._began_ns = 0, reading.t_ns
         unknown = verdict.verdict == "unknown"
         assert unknown is bool(verdict.reasons) is (verdict.p_slip is None) is not verdict.valid
-        if not unknown:
+        if set(verdict.reasons) <= WITHHELD:
             assert reading is not None, "a verdict on nothing"
-            lacks = self.necessity.lacks()
-            if not 0 <= self.world.now_ns - reading.t_ns <= AGE_NS:
-                lacks.append("a reading that is not too old")
-            if 0 <= reading.t_ns - self._began_ns < self._still_ms * MS:
-                lacks.append("stillness since its sender began again")
-            if published.lifts.is_told(published.grasp):
+            lacks = self._lacks(reading)
+            if not unknown and published.lifts.is_told(published.grasp):
                 lacks.append("a lift that is not over")
             if verdict.verdict == "stable":
                 lacks += self._lacks_trust(published)
-            assert not lacks, f"{verdict.verdict} without {lacks}"
+            assert not lacks, f"{verdict.verdict} {verdict.reasons} without {lacks}"
         self.world.stall(self.day.cost_ns)
+
+    def _lacks(self, reading: TactileReading) -> list[str]:
+        """What the hand lacks."""
+        lacks = self.necessity.lacks()
+        if not 0 <= self.world.now_ns - reading.t_ns <= AGE_NS:
+            lacks.append("a reading that is not too old")
+        if 0 <= reading.t_ns - self._began_ns < self._still_ms * MS:
+            lacks.append("stillness without a gap")
+        return lacks
 
     def _lacks_trust(self, published: PublishedVerdict) -> Iterator[str]:
         verdict, limits = published.verdict, self.day.scene.risk
@@ -297,8 +306,10 @@ class Day:
             world.after(t_ns, self._open)
             world.after(close_ns, self._grasp)
             world.after(close_ns + draw.choice((100, 400)) * MS, draw.choice(self.door.peers).ask)
+            if draw.random() < 0.5:
+                world.after(close_ns + draw.randrange(1200) * MS, self._break_sensors)
             t_ns = close_ns + draw.choice((300, 900, 1500, 2500)) * MS
-        self._some(5, lambda: self.sensors.faults.append(Fault(draw.choice(FAULTS), world)))
+        self._some(2, self._break_sensors)
         self._some(2, lambda: setattr(self.disk, draw.choice(("is_full", "is_slow")), True))
         self._some(1, world.kill_soon)
         self._some(1, self.sensors.stop)
@@ -309,6 +320,10 @@ class Day:
         self._some(1, lambda: setattr(self, "slept_ns", self.slept_ns + S * (draw.random() < 0.2)))
         for peer in self.door.peers:
             self._some(2, partial(peer.ask, lifts=draw.random() < 0.8))
+
+    def _break_sensors(self) -> None:
+        fault = Fault(self.world.random.choice(FAULTS), self.world)
+        self.sensors.faults.append(fault)
 
     def _open(self) -> None:
         self.sensors.take(self.sensors.rest)

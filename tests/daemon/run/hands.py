@@ -18,7 +18,7 @@ PERIOD_NS = 10 * MS
 DEEP_COUNTS = 80
 FAULTS = (
     *("lost", "outage", "twice", "late", "stuck", "stuck finger", "mixed", "dead", "flagged"),
-    *("wild", "again", "time back", "slide", "no joints", "joints frozen", "joints move"),
+    *("wild", "again", "time back", "began", "slide", "no joints", "joints frozen", "joints move"),
 )
 Counts = NDArray[np.int64]
 
@@ -169,7 +169,8 @@ class Sensors(FakeDriver):
                     counts = self.noise.integers(0, 4096, (3, 24), dtype=np.uint16)
                 case "time back":
                     t_ns -= fault.delay_ns
-                    began = fault.share == 1.0
+                case "began":
+                    began = True
         return TactileReading(t_ns, self._seq, counts, marks, interrupted=began)
 
     def _turn(self, active: dict[str, Fault]) -> None:
