@@ -26,7 +26,7 @@ from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
-from tests.daemon.publish.doors import WAIT_MS, Asked, KeyedDoor, Peers, published
+from tests.daemon.publish.doors import WAIT_MS, Asked, Peers, published
 from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
@@ -104,29 +104,6 @@ def test_another_user_with_the_same_routing_id_is_told_apart(door: tuple[Door, s
             assert first_of(door[0].receive) == [NAME, b"user 65534", b"lift"]
             rogue.kill()
         owner.kill()
-
-
-def test_the_name_of_a_key_is_the_credential_on_tcp(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened = KeyedDoor(tmp_path, monkeypatch)
-    lifts = LiftBook()
-    lifts.note(SEVENTH, bytes(8), stable=True)
-    try:
-        made = opened.connect(opened.known, zmq.DEALER)
-        made.send(b"lift")
-        requests, questions = Asked(), opened.sockets.questions
-        assert questions is not None
-
-        def has_come() -> bool:
-            opened.sockets.before_wait(requests)
-            return bool(requests.times)
-
-        wait_until(has_come)
-        ((peer, _),) = questions.waiting.items()
-    finally:
-        opened.close()
-    assert peer.credential == b"key controller"
 
 
 def wanted(folder: Path, tell: list[str], ask: str, curve: bool = False) -> scene.Scene:

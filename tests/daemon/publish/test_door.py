@@ -262,24 +262,6 @@ def test_connections_take_no_descriptor_of_the_daemon(tmp_path: Path) -> None:
         assert len(os.listdir("/proc/self/fd")) == before + 50  # the other ends
 
 
-def test_the_door_says_when_its_own_subscriber_hears_late(tmp_path: Path) -> None:
-    with Publisher(f"ipc://{tmp_path}/v") as publisher:
-        door, (process,) = publisher.door, processes()
-
-        def is_late() -> bool:
-            door.check()
-            return door.is_late
-
-        assert not is_late()
-        halt(process)
-        publisher.send(b"status.right", b"first")
-        assert not is_late()
-        wait_until(is_late)
-        os.kill(process, signal.SIGCONT)
-        publisher.send(b"status.right", b"second")
-        assert not door.is_late
-
-
 def test_its_process_ends_when_a_thread_of_it_has_ended(tmp_path: Path) -> None:
     with contextlib.closing(Listener(f"ipc://{tmp_path}/v")) as listener:
         plan = Plan(str(tmp_path), [listener.endpoint], [listener.fileno()], 10, [0], None)

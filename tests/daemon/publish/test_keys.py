@@ -42,6 +42,7 @@ def test_a_key_on_the_list_hears_messages_and_may_ask(door: KeyedDoor) -> None:
         return requests.times
 
     wait_until(has_come)
+    assert [peer.credential for peer in questions.waiting] == [b"key controller"]
     questions.answer(published())
     assert asker.poll(int(PATIENCE_S * 1e3))
     assert asker.recv() == b"{}"

@@ -108,6 +108,8 @@ def test_subscribers_that_hear_late_are_in_the_health(tmp_path: Path) -> None:
 
         wait_until(is_late)
         os.kill(process, signal.SIGCONT)
+        sockets.send(b"status.right", b"{}")
+        assert sockets.health == {}
 
 
 def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:

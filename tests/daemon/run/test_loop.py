@@ -55,17 +55,6 @@ def test_every_reading_gets_one_verdict_in_order() -> None:
     assert sent == bench.payloads
 
 
-def test_the_last_message_is_a_status_that_says_stopping() -> None:
-    clock = Clock()
-    bench = LoopBench(FakeDriver([reading(clock())], clock), clock)
-    bench.run()
-    status = bench.statuses[-1]
-    assert bench.output.sent[-1][0] == b"status.right"
-    assert status.state is State.STOPPING
-    assert status.verdicts == {Decision.STABLE: 1, Decision.SLIP: 0, Decision.UNKNOWN: 0}
-    assert status.drivers["fake"]["readings"] == 1
-
-
 class ScriptedDriver(FakeDriver):
     """Moves the clock at every look, and delivers at set times only."""
 
@@ -139,16 +128,6 @@ def test_latency_includes_the_wait_behind_other_readings() -> None:
     bench.run()
     assert [verdict.latency_us for verdict in bench.verdicts] == [3000.0, 6000.0, 9000.0]
     assert bench.statuses[-1].latency_us["max"] == 9000.0
-
-
-def test_status_comes_every_second_even_when_idle() -> None:
-    clock = Clock()
-    bench = LoopBench(ScriptedDriver([], clock, 3500), clock)
-    bench.run()
-    statuses = bench.statuses
-    assert [status.seq for status in statuses] == [0, 1, 2, 3]
-    assert [status.state for status in statuses[:3]] == [State.SILENT] * 3
-    assert statuses[0].readings_hz == 0.0
 
 
 @pytest.mark.parametrize("error", [LinkError(LinkCause.UNKNOWN, "gone"), DriverError("broken")])
