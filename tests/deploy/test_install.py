@@ -321,32 +321,6 @@ def test_a_python_that_is_too_old_is_refused(tmp_path: Path, wheels: Path) -> No
     assert content(root) == {}
 
 
-def test_python_in_a_home_is_staged_only_if_named(tmp_path: Path, wheels: Path) -> None:
-    python = tmp_path / "python3"
-    answer = "case $* in *base_prefix*) echo /root/python ;; "
-    python.write_text(f'#!/bin/sh\n{answer}*) exec {sys.executable} "$@" ;; esac\n')
-    python.chmod(0o755)
-    root = tmp_path / "root"
-    stage: list[str | Path] = [INSTALLER, "--root", root, "--wheelhouse", wheels]
-    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    by_default = subprocess.run(stage, env=path, capture_output=True, text=True, check=False)
-    assert (by_default.returncode, content(root)) == (1, {}), by_default.stdout
-    assert "such as --python /usr/bin/python3" in by_default.stderr
-    named = subprocess.run(
-        [*stage, "--python", python], capture_output=True, text=True, check=False
-    )
-    assert named.returncode == 0, named.stderr
-    assert f"warning: the service cannot see {python} (ProtectHome)" in named.stderr
-    assert version_below(root) == "graspd 0.1.0"
-
-
-def test_wheels_without_graspd_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    done = installer("--root", tmp_path / "root", "--wheelhouse", tmp_path / "empty")
-    assert done.returncode == 1
-    assert "has no wheel of graspd" in done.stderr
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -120,11 +120,6 @@ def test_options_and_files_come_in_any_order(files_first: str, mixed: str) -> No
     assert whole_parser().parse_args(mixed.split()) == expected
 
 
-def test_a_value_may_look_like_an_option_behind_two_dashes() -> None:
-    done = graspd("run", "--", "--scene.toml")
-    assert "graspd: --scene.toml: cannot read the scene" in done.stderr
-
-
 def test_the_version_tells_what_graspd_stands_on() -> None:
     first, second = graspd("--version").stdout.splitlines()
     assert re.fullmatch(rf"graspd {re.escape(version('graspd'))}( at \S+)?", first)

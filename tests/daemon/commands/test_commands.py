@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 import zmq
 
-from graspd.daemon import scene as scenes
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.trust.lift_book import NAME_BYTES
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
@@ -158,14 +157,6 @@ def loop_scene(folder: Path) -> Path:
     scene = folder / "loop.toml"
     scene.write_text(text.replace("../../drivers/recordings/demo", str(DEMO_TABLE.parent)))
     return scene
-
-
-def test_demo_and_loop_have_sockets_that_their_pages_name() -> None:
-    demo, loop = (scenes.load(DEPLOY / name) for name in ("scenes/demo.toml", "clients/loop.toml"))
-    assert {demo.endpoint, demo.ask_endpoint}.isdisjoint({loop.endpoint, loop.ask_endpoint})
-    for page, scene in ((DEPLOY.parent / "README.md", demo), (DEPLOY / "clients/README.md", loop)):
-        named = set(re.findall(r"ipc:///tmp/graspd-[\w.]+", page.read_text()))
-        assert {scene.endpoint} <= named <= {scene.endpoint, scene.ask_endpoint}
 
 
 @pytest.mark.slow

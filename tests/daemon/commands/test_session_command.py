@@ -54,18 +54,6 @@ def test_a_scene_that_keeps_no_session_touches_none(section: str, tmp_path: Path
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
-    path = session_scene(tmp_path)
-    fingers = ("ff", "mf", "th")
-    with SessionFolder(tmp_path / "right") as folder:
-        other = KeptSession(None, fingers, {"ff": "BTSP-2", "th": "BTSP-3"})
-        folder.save([KeptSession(None, fingers, {"ff": "BTSP-1"}), other])
-    shown = graspd("session", "show", path)
-    assert "0 grasps of ff BTSP-2, mf ?, th BTSP-3" in shown.stdout
-    (aside,) = json.loads(graspd("session", "show", path, "--json").stdout)["others"]
-    assert aside["serials"] == {"ff": "BTSP-2", "th": "BTSP-3"}
-
-
 def test_a_session_of_no_use_is_not_shown_as_calibrated(tmp_path: Path) -> None:
     """One that is of other fingers, and one whose electrodes all rest where no grasp is."""
     path = session_scene(tmp_path)

@@ -109,12 +109,6 @@ def test_a_recording_teaches_as_the_table_of_its_grasps_does(tmp_path: Path) -> 
     assert seed(recorded, recording) == seed(table, DEMO_TABLE)
 
 
-def test_a_table_without_labels_seeds_the_session_alone(tmp_path: Path) -> None:
-    learned = seed(session_scene(tmp_path), unlabelled_demo(tmp_path))
-    assert learned is not None
-    assert (learned.learner.outcomes, learned.risk.proven) == (0, 0)
-
-
 def test_a_model_without_session_learns_from_outcomes_or_refuses(tmp_path: Path) -> None:
     path = session_scene(tmp_path, model="mlp")
     refused = graspd("session", "seed", path, unlabelled_demo(tmp_path))

@@ -157,20 +157,6 @@ def test_readings_come_back_as_old_as_they_were(tmp_path: Path) -> None:
     assert driver.counters.malformed == driver.counters.cut_off == 0
 
 
-def test_at_a_speed_readings_come_when_they_are_due(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap")
-    now_ns = NOW_NS
-    with McapReplayDriver(
-        [tmp_path / "a.mcap"], ("ff",), speed=2.0, clock=lambda: now_ns
-    ) as driver:
-        assert len(driver.read_ready()) == 1  # joints
-        assert len(driver.read_ready()) == 1  # tactile
-        assert driver.due_ns() == NOW_NS + PERIOD_NS // 2
-        assert not driver.read_ready()
-        now_ns += PERIOD_NS // 2
-        assert len(driver.read_ready()) == 1
-
-
 def test_a_finger_that_was_not_recorded_is_refused(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap")
     with pytest.raises(RecordingError, match="no finger mf"):

@@ -224,18 +224,6 @@ def test_learning_shows_untold_lifts_first() -> None:
     ]
 
 
-def test_figures_are_told_with_their_units_or_as_unknown() -> None:
-    seen = after((b"status.right", status(0)), (b"verdict.right", verdict(0))).snapshot(0)
-    assert figures(seen.timing) == {
-        "age": "0.2 ms",
-        "readings": "100 /s",
-        "latency": "250 us, 99 % below 500 us",
-        "late": "3 readings",
-        "lost here": "0 messages",
-    }
-    assert figures(a_view().snapshot(0).timing) == {"lost here": "0 messages"}
-
-
 def outcome(grasp: int, ended: Literal["stable", "slip"], judged_by: str | None = None) -> bytes:
     told = OutcomeMessage(
         boot_id=BOOT, seq=0, t=0.0, t_mono_ns=0, grasp=grasp, outcome=ended, grasp_boot_id=judged_by

@@ -39,7 +39,6 @@ class Terminal:
     """A pseudo-terminal with a command in it."""
 
     def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
-        self.kind = "xterm-256color"
         self._arguments = arguments
         self._size = struct.pack("HHHH", lines, columns, 0, 0)
         self.output = b""
@@ -53,7 +52,7 @@ class Terminal:
             stdin=theirs,
             stdout=theirs,
             stderr=theirs,
-            env={**os.environ, "TERM": self.kind},
+            env={**os.environ, "TERM": "xterm-256color"},
         )
         os.close(theirs)
         return self
@@ -103,18 +102,7 @@ def endpoint(tmp_path: Path) -> str:
     return f"ipc://{tmp_path}/v"
 
 
-def test_ctrl_c_leaves_the_terminal_as_it_was(endpoint: str) -> None:
-    with Talker(endpoint), Terminal("--connect", endpoint) as terminal:
-        terminal.read_until(rb"readings 100")
-        terminal.output = b""
-        terminal.type(b"\x03")
-        assert terminal.end() == 0
-        assert LEAVE in terminal.output
-        assert b"Traceback" not in terminal.output
-        assert terminal.settings() == terminal.former
-
-
-def test_it_shows_verdicts_then_silence_and_verdicts_again(endpoint: str) -> None:
+def test_it_shows_verdicts_and_silence_and_ends_cleanly(endpoint: str) -> None:
     with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
         terminal.read_until(re.escape(ENTER))
         talker.decision = Decision.SLIP
@@ -124,24 +112,19 @@ def test_it_shows_verdicts_then_silence_and_verdicts_again(endpoint: str) -> Non
         terminal.read_until(rb"no message for [0-9]+ ms")
         talker.decision = Decision.STABLE
         terminal.read_until(rb"judged to hold")
+        terminal.type(b"\x1a")  # no old verdict stays behind
+        talker.decision = Decision.SLIP
+        terminal.read_until(rb"do not lift")
+        assert LEAVE not in terminal.output
         terminal.resize(200, 60)
         terminal.read_until(rb"latency")
         terminal.resize(20, 5)
         terminal.read_until(rb"details")
-        terminal.type(b"q")
+        terminal.output = b""
+        terminal.type(b"\x03")
         assert terminal.end() == 0
-
-
-def test_ctrl_z_does_not_leave_an_old_verdict(endpoint: str) -> None:
-    with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
-        talker.decision = Decision.STABLE
-        terminal.read_until(rb"judged to hold")
-        terminal.type(b"\x1a")
-        talker.decision = Decision.SLIP
-        terminal.read_until(rb"do not lift")
-        assert LEAVE not in terminal.output
-        terminal.type(b"q")
-        assert terminal.end() == 0
+        assert LEAVE in terminal.output
+        assert terminal.settings() == terminal.former
 
 
 def two_scenes(tmp_path: Path) -> list[str]:
