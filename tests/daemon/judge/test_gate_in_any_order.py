@@ -35,7 +35,6 @@ loose limit likewise."""
 OBJECTIONS = st.sampled_from(
     ((),) * 4 + ((Reason.JOINTS_LATE,), (Reason.JOINTS_LATE, Reason.NOT_TARED))
 )
-OFTEN_FALSE = st.sampled_from((False, False, True))
 Change = tuple[int, int, str, str, str]
 """Time, ms, grasp, former state, state and cause."""
 
@@ -159,7 +158,7 @@ class Model:
 class Readings(RuleBasedStateMachine):
     """What a gate is given, and the model beside it."""
 
-    @initialize(early=st.booleans(), on_request=OFTEN_FALSE, some=st.booleans())
+    @initialize(early=st.booleans(), on_request=st.booleans(), some=st.booleans())
     def begin(self, early: bool, on_request: bool, some: bool) -> None:
         self.required = ("ff", "th") if some else FINGERS
         self.against: tuple[Reason, ...] = ()
@@ -178,7 +177,10 @@ class Readings(RuleBasedStateMachine):
         self.touching = touching
         self.read()
 
-    @rule(motion=st.sampled_from(("still", *MOTIONS)), times=st.sampled_from((1, 10, 24, 49)))
+    @rule(
+        motion=st.sampled_from(("still", "slides", *MOTIONS)),
+        times=st.sampled_from((1, 10, 24, 49)),
+    )
     def move(self, motion: str, times: int) -> None:
         self.felt.kind = motion
         self.read(times)

@@ -209,3 +209,11 @@ def test_where_the_long_window_decides_the_short_one_is_looser() -> None:
     above = limits.fast[0] * 1.01
     limits.lay([above], [1.0], [0.0], still)
     assert (limits.early, limits.sure) == (False, True)
+
+
+def test_a_wavering_finger_is_noise_up_to_a_limit() -> None:
+    motion = Motion(1, 0.05)
+    fed(motion, wavering(4.0, 100.0, 20.0, 16), 100.0)
+    # Twice the 10 counts that are believed to be noise.
+    assert motion.slow[0] == pytest.approx(2.0, rel=0.15)
+    assert not motion.strict.sure
