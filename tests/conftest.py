@@ -34,7 +34,6 @@ ROOT = Path(__file__).parents[1]
 BEGUN_FIRST = (
     "emulated/test_driver.py",
     "emulated/test_timing.py",
-    "bench/test_mutants.py",
     "stability/test_models.py",
     "models/training/reports/test_error_vs_time.py",
     "daemon/doctor/test_link_faults.py",

@@ -37,7 +37,6 @@ STEPS: Final[tuple[Step, ...]] = (
     steps_faults.disk_full,
     steps_faults.clock_stepped,
     steps_verdicts.can_verdicts,
-    steps_verdicts.can_overload,
     steps_faults.recording_again,
     steps_faults.hangs,
     steps_faults.killed,

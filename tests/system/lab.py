@@ -166,15 +166,14 @@ class Lab:
             f"{PYTHON} {PAYLOAD}/guest/observe.py {endpoints}"
         )
 
-    def twin(self, rate_hz: float) -> None:
-        """Start the CAN board's twin on vcan0, or another one in its place.
+    def twin(self) -> None:
+        """Start the CAN board's twin on vcan0.
 
         It plays a recording, which costs it less than to make up grasps.
         """
         self.sh(
-            "systemctl stop twin-can 2>/dev/null; systemctl reset-failed twin-can 2>/dev/null\n"
             "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
-            f"--interface socketcan --channel vcan0 --rate {rate_hz} "
+            f"--interface socketcan --channel vcan0 --rate {RATE_HZ} "
             f"--recording {PAYLOAD}/recording.csv --loop"
         )
 

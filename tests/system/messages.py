@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import socket
 import threading
 import time
@@ -84,18 +83,6 @@ class Messages:
     def last(self, hand: str, kind: str) -> Message | None:
         """The newest of a hand and kind."""
         return next(reversed(self.between(hand, kind, 0.0, float("inf"))), None)
-
-    def readings(self, hand: str) -> int:
-        """Count the verdicts on readings of a hand, by `seq`: also those that did not come.
-
-        Count from the first one that came: a subscriber that came late has missed silences, which
-        have a `seq` too and are no readings. So only the difference of two counts means something.
-        """
-        verdicts = self.between(hand, "verdict", 0.0, math.inf)
-        newest = verdicts[-1].body
-        own = [each for each in verdicts if each.body["boot_id"] == newest["boot_id"]]
-        silences = {each.body["seq"] for each in own if not each.told}
-        return int(newest["seq"]) - int(own[0].body["seq"]) + 1 - len(silences)
 
     def _listen(self, port: socket.socket, stop: threading.Event) -> None:
         rest = b""

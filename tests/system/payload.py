@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 import sys
 import tempfile
 import tomllib
+import zipfile
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +25,12 @@ EXTRA: Final = "record"
 """The optional part that the scenes need."""
 RECORDED: Final = 6
 """Grasps of the recording that the CAN board plays."""
+UNUSED: Final = (
+    r"numpy/.*/tests/|numpy/(distutils|f2py)/.*/|onnxruntime/(transformers|quantization|tools)/|"
+    r"pydantic/v1/"
+)
+"""Files of wheels that graspd never imports, nor what it imports. To unpack and compile them takes
+the machine a third of the installation."""
 SLACK_MIB: Final = 24
 """What the file system itself takes, and more."""
 
@@ -59,13 +67,15 @@ def _dependencies(cache: Path) -> Path:
     """A folder with the wheels of what the project needs."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     wanted = sorted(project["dependencies"] + project["optional-dependencies"][EXTRA])
-    digest = hashlib.sha256("\n".join(wanted).encode()).hexdigest()[:16]
+    digest = hashlib.sha256("\n".join([*wanted, UNUSED]).encode()).hexdigest()[:16]
     folder = cache / f"wheels-{digest}"
     if not folder.is_dir():
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cache, prefix="wheels-new-") as scratch:
             made = Path(scratch) / "made"
             _wheel(made, *wanted)
+            for wheel in made.glob("*.whl"):
+                _slim(wheel)
             for former in cache.glob("wheels-????????????????"):
                 shutil.rmtree(former)
             made.rename(folder)
@@ -74,3 +84,13 @@ def _dependencies(cache: Path) -> Path:
 
 def _wheel(folder: Path, *what: str) -> None:
     run([sys.executable, "-m", "pip", "wheel", "--quiet", "--wheel-dir", str(folder), *what])
+
+
+def _slim(wheel: Path) -> None:
+    """Write a wheel again without `UNUSED`; pip does not mind files that are only listed."""
+    with zipfile.ZipFile(wheel) as content:
+        files = {each: content.read(each) for each in content.namelist()}
+    with zipfile.ZipFile(wheel, "w") as content:
+        for name, data in files.items():
+            if not re.match(UNUSED, name):
+                content.writestr(name, data)

@@ -9,7 +9,6 @@ from tests.system.lab import (
     MEMBER,
     PAYLOAD,
     PYTHON,
-    RATE_HZ,
     STRANGER,
     Lab,
     Outcome,
@@ -70,7 +69,7 @@ def start(lab: Lab) -> Outcome:
     lab.observe()
     for hand in HANDS:
         lab.await_message(hand, began_s, "a message", lambda _: True)
-    lab.twin(RATE_HZ)
+    lab.twin()
     what = " and ".join(f"{hand} after {s:.1f} s" for hand, s in zip(HANDS, ready_s, strict=True))
     return Outcome(f"READY {what}", max(ready_s))
 
