@@ -21,7 +21,8 @@ from graspd.drivers.spi.messages import (
 )
 from graspd.drivers.twins.datagrams import PalmTwin
 from tests.drivers.can.can_standin import decoder, sweep_of_frames
-from tests.drivers.can.can_words import pack_frame, truth
+from tests.drivers.can.can_words import pack_frame
+from tests.drivers.one_sweep import counts_of
 from tests.drivers.twins.signals import GeneratedContact
 
 MS = 1_000_000
@@ -122,4 +123,4 @@ def test_damaged_can_frames_hide_no_later_sweep(is_lost: bool, data: st.DataObje
         readings += made.push(frame, start_ns + at * 227_000)
     assert counters.readings == len(readings)
     assert not readings[-1].faults.any()
-    assert (readings[-1].counts == truth(3)).all()
+    assert (readings[-1].counts == counts_of(3)).all()

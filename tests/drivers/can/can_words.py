@@ -12,6 +12,7 @@ from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import E1, SEQUENCES
 from graspd.drivers.can.frames import ERROR, EXTENDED, REMOTE, CanCounters, CanFrame
 from graspd.drivers.can.samples import SampleAssembler
+from tests.drivers.one_sweep import counts_of
 
 # linux/can.h
 EFF_FLAG, RTR_FLAG, ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
@@ -30,12 +31,6 @@ def word(count: int) -> bytes:
     return bytes(int(part + str((part.count("1") + 1) % 2), 2) for part in (high, low))
 
 
-def truth(sweep: int) -> NDArray[np.uint16]:
-    """Counts, shape (fingers, 24), that no other sweep, finger or electrode has nearby."""
-    flat = 100 + 7 * sweep + np.arange(FINGERS * 24) * 37
-    return (flat % 4096).astype(np.uint16).reshape(FINGERS, 24)
-
-
 def words_of(counts: NDArray[np.uint16], channel: int) -> bytes:
     """Words of all fingers for one electrode, or of a channel that is none."""
     if channel not in ELECTRODE_CHANNELS:
@@ -51,7 +46,7 @@ def samples(sweep: int, sequence: str = "electrodes") -> list[Sample]:
     """The samples of one sweep, evenly spaced; sweeps follow each other without a gap."""
     channels = SEQUENCES[sequence]
     at_ns = sweep * len(channels) * SLOT_NS
-    counts = truth(sweep)
+    counts = counts_of(sweep)
     return [
         (channel, words_of(counts, channel), at_ns + slot * SLOT_NS)
         for slot, channel in enumerate(channels)

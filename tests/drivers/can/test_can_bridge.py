@@ -21,8 +21,7 @@ from tests.drivers.can.can_standin import (
     message,
     sweep_messages,
 )
-from tests.drivers.can.can_words import truth
-from tests.drivers.one_sweep import tactile
+from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -88,7 +87,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         for sent in ours[len(strange) :]:
             bus.send(sent)
         (reading,) = tactile(driver.read_ready())
-        assert (reading.counts == truth(0)).all()
+        assert (reading.counts == counts_of(0)).all()
         assert not reading.faults.any()
         counted = driver.counters.as_dict()
         names = [name for _, name in strange]

@@ -24,7 +24,8 @@ from graspd.drivers.can.stream import CanStream
 from graspd.drivers.twins.can import SAMPLE_ID
 from tests.conftest import ROOT
 from tests.drivers.can.can_standin import decoder
-from tests.drivers.can.can_words import samples, truth, word
+from tests.drivers.can.can_words import samples, word
+from tests.drivers.one_sweep import counts_of
 
 E1_SAMPLE = bytes.fromhex("A2 A251 A8C8 94B9")
 """Electrode 1 of three sensors: 2602, 2713, 2391."""
@@ -162,7 +163,7 @@ def test_a_board_that_pads_frames_needs_its_option() -> None:
     readings: list[TactileReading] = []
     for channel, words, t_ns in samples(0):
         readings += made.push(CanFrame(SAMPLE_ID, encode_sample(channel, words) + b"\x55"), t_ns)
-    assert (readings[0].counts == truth(0)).all()
+    assert (readings[0].counts == counts_of(0)).all()
     assert counters.faulty_readings == 0
 
 
@@ -180,7 +181,7 @@ def test_rows_are_fingers_and_words_are_sensors(fingers: Sequence[str]) -> None:
     rows = [ORDER.index(finger) for finger in fingers]
     for sweep, reading in enumerate(readings):
         assert not reading.faults.any()
-        assert (reading.counts == truth(sweep)[rows]).all()
+        assert (reading.counts == counts_of(sweep)[rows]).all()
 
 
 @pytest.mark.parametrize(

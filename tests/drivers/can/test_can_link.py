@@ -23,8 +23,7 @@ from tests.drivers.can.can_standin import (
     sweep_messages,
     sweep_of_frames,
 )
-from tests.drivers.can.can_words import truth
-from tests.drivers.one_sweep import tactile
+from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 
 FRAMES_PER_DRAIN = 512
@@ -82,7 +81,7 @@ def test_the_link_recovers_from_any_error_of_python_can(
     driver = CanBridgeDriver("robotell", "x", arbitration_id=SAMPLE_ID, clock=clock)
     with driver:
         (reading,) = tactile(driver.read_ready())
-        assert (reading.counts == truth(0)).all()
+        assert (reading.counts == counts_of(0)).all()
         assert not reading.interrupted
         assert driver.describe()["link"].text == "waiting"
         assert str(failure) in driver.describe()["why"].text
@@ -94,7 +93,7 @@ def test_the_link_recovers_from_any_error_of_python_can(
             clock.now_ns = driver.due_ns() or 0
             readings = tactile(driver.read_ready())
         (reading,) = readings
-        assert (reading.counts == truth(3)).all()
+        assert (reading.counts == counts_of(3)).all()
         assert reading.interrupted
         assert not reading.faults.any()
         known = driver.describe()

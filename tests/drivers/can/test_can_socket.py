@@ -27,8 +27,8 @@ from tests.drivers.can.can_standin import (
     stand_in,
     sweep_of_frames,
 )
-from tests.drivers.can.can_words import pack_frame, truth
-from tests.drivers.one_sweep import tactile
+from tests.drivers.can.can_words import pack_frame
+from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -61,7 +61,7 @@ def test_a_socketcan_bus_is_read_from_its_socket(socket_bus: SocketBus) -> None:
         for frame in sweep_of_frames(0):
             socket_bus.send(frame)
         (reading,) = tactile(driver.read_ready())
-        assert (reading.counts == truth(0)).all()
+        assert (reading.counts == counts_of(0)).all()
         assert driver.read_ready() == []
 
 
@@ -102,7 +102,7 @@ def test_bus_off_loses_the_link_and_its_sweep(
             for frame in sweep_of_frames(2)[9:] + sweep_of_frames(3):
                 second.send(frame)
             (reading,) = tactile(driver.read_ready())
-            assert (reading.counts == truth(3)).all()
+            assert (reading.counts == counts_of(3)).all()
             counters = driver.counters
             assert (counters.bus_off, counters.link_losses, counters.error_frames) == (1, 1, 1)
 
@@ -114,9 +114,9 @@ def test_an_overflow_of_the_controller_cuts_the_sweep_there(socket_bus: SocketBu
         for frame in [*frames, *sweep_of_frames(1)]:
             socket_bus.send(frame)
         cut, whole = tactile(driver.read_ready())
-        assert (cut.counts[:, :3] == truth(0)[:, :3]).all()
+        assert (cut.counts[:, :3] == counts_of(0)[:, :3]).all()
         assert (cut.faults[:, 3:] == ElectrodeFault.MISSING).all()
-        assert (whole.counts == truth(1)).all()
+        assert (whole.counts == counts_of(1)).all()
         assert (driver.counters.controller_overflows, driver.counters.cut_sweeps) == (1, 1)
         assert driver.counters.unsynchronised_frames == 19
 
@@ -165,8 +165,8 @@ def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
         assert driver.counters.cut_sweeps <= 1
         for reading in readings:
             sound = reading.faults == 0
-            assert any((reading.counts[sound] == truth(n)[sound]).all() for n in range(22))
-        assert (readings[-1].counts == truth(21)).all()
+            assert any((reading.counts[sound] == counts_of(n)[sound]).all() for n in range(22))
+        assert (readings[-1].counts == counts_of(21)).all()
 
 
 def test_the_loop_rests_fifteen_milliseconds_at_most(

@@ -20,22 +20,12 @@ from tests.drivers.can.can_words import (
     concatenated,
     feed,
     samples,
-    truth,
     word,
 )
+from tests.drivers.one_sweep import number_in
 
 MS = 1_000_000
 PERIOD_NS = 24 * SLOT_NS
-
-
-def sweep_of(reading: TactileReading) -> int:
-    """The sweep of all counts of a reading that are not flagged; each sweep has its own counts."""
-    sound = reading.faults == 0
-    base = (reading.counts.astype(int) - truth(0).astype(int)) % 4096
-    tags = set(base[sound].tolist())
-    assert len(tags) == 1, f"the reading has counts of the sweeps {tags}"
-    assert not reading.counts[~sound].any()
-    return int(tags.pop()) // 7
 
 
 def missing_electrodes(reading: TactileReading) -> list[int]:
@@ -56,7 +46,7 @@ def test_a_late_sample_is_put_in_its_place_or_flagged(at: int, distance: int) ->
     readings = feed(sweeps, stream)
     assert len(readings) == 9
     for sweep, reading in enumerate(readings):
-        assert sweep_of(reading) == sweep
+        assert number_in(reading) == sweep
     in_time = at + distance < 23
     assert missing_electrodes(readings[6]) == ([] if in_time else [at + 1])
     assert counters.reordered_frames == in_time
@@ -175,7 +165,7 @@ def test_the_first_sweep_may_end_on_time_after_a_loss() -> None:
     sweeps, counters = assembler()
     kept = samples(0)[:2] + samples(0)[21:]
     (reading,) = feed(sweeps, retimed(kept, [at * 100_000 for at in (0, 1, 21, 22, 23)]))
-    assert sweep_of(reading) == 0
+    assert number_in(reading) == 0
     assert (counters.late_frames, counters.lost_frames) == (0, 19)
 
 
@@ -188,7 +178,7 @@ def test_samples_of_vague_time_make_no_reading() -> None:
     for channel, words, _ in stalled:
         readings += sweeps.push(channel, words, since_ns, until_ns)
     readings += feed(sweeps, samples(10)[12:] + samples(11))
-    assert [sweep_of(reading) for reading in readings] == [*range(9), 10, 11]
+    assert [number_in(reading) for reading in readings] == [*range(9), 10, 11]
     assert [int(np.count_nonzero(r.faults[0])) for r in readings[8:]] == [12, 12, 0]
     assert counters.untimed_frames == len(stalled)
     assert [reading.seq for reading in readings] == [*range(9), 10, 11]
@@ -221,7 +211,7 @@ def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str) -> None
             times[at] = sent_ns + round(chance.expovariate(1 / 5) * MS)
     readings = feed(sweeps, retimed(stream, list(accumulate(times, max))))  # the order stays
     for reading in readings:
-        sweep_of(reading)
+        number_in(reading)
     assert sweeps.period_ns == len(SEQUENCES[sequence]) * SLOT_NS
     assert not any(reading.faults.any() for reading in readings[-20:])
 
@@ -235,6 +225,6 @@ def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> Non
     stream = concatenated([samples(n, sequence) for n in range(40)])
     readings = feed(sweeps, retimed(stream, [slot_ns * at for at in range(len(stream))]))
     for reading in readings:
-        sweep_of(reading)
+        number_in(reading)
     assert [r.faults.any() for r in readings[-30:]] == [False] * 30
     assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])

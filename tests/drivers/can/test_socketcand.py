@@ -16,8 +16,7 @@ from graspd.drivers.can.interfaces import Options
 from graspd.drivers.link import LinkState
 from graspd.drivers.twins.can import SAMPLE_ID
 from tests.drivers.can.can_standin import sweep_of_frames
-from tests.drivers.can.can_words import truth
-from tests.drivers.one_sweep import tactile
+from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 from tests.ports import free_port
 
@@ -124,7 +123,7 @@ def test_the_samples_and_errors_of_a_server_are_read(server: Server) -> None:
     with driver_of(server.options, clock) as driver:
         server.send("< error 004 23.4 >< frame 7FF 23.4  >" + sweep_text(0))
         (reading,) = readings_of(driver, clock)
-        assert (reading.counts == truth(0)).all()
+        assert (reading.counts == counts_of(0)).all()
         assert not reading.faults.any()
         assert (driver.counters.error_frames, driver.counters.foreign_frames) == (1, 1)
         assert driver.stream.link.state is LinkState.UP
@@ -136,7 +135,7 @@ def test_a_board_may_pause_between_sweeps(server: Server) -> None:
         for sweep in range(9):
             server.send(sweep_text(sweep, 5.0 + sweep / 100, 0.0002))
             (reading,) = readings_of(driver, clock)
-            assert (reading.counts == truth(sweep)).all()
+            assert (reading.counts == counts_of(sweep)).all()
             assert not reading.faults.any()
             clock.now_ns += 10_000_000
         assert driver.period_ns == pytest.approx(10_000_000, abs=50_000)
@@ -158,7 +157,7 @@ def test_a_server_that_ends_is_connected_to_again(server: Server) -> None:
         assert driver.counters.bus_faults == 1
         server.send(sweep_text(1))
         (reading,) = readings_of(driver, clock)
-        assert (reading.counts == truth(1)).all()
+        assert (reading.counts == counts_of(1)).all()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -17,7 +17,7 @@ from graspd.drivers.palm.stream import PalmDriver, PalmStream
 from graspd.drivers.twins.datagrams import PalmTwin
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.udp import Datagram, DatagramReceiver
-from tests.drivers.one_sweep import tactile
+from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 
 FINGERS = ("ff", "mf", "th")
@@ -45,10 +45,9 @@ class DatagramClock(Clock):
         patch.setattr(DatagramReceiver, "receive", aged)
 
 
-def rows(number: int, seed: int = 1) -> list[Counts]:
-    """Counts of so many rounds, all different, so that a value tells where it comes from."""
-    random = np.random.default_rng(seed)
-    return [random.integers(500, 3900, (3, 24)).astype(np.uint16) for _ in range(number)]
+def rows(number: int) -> list[Counts]:
+    """Counts of so many rounds."""
+    return [counts_of(each) for each in range(number)]
 
 
 @dataclass
@@ -84,15 +83,6 @@ def datagrams(rounds: int, palm: Palm = Palm.PALM_0220) -> list[bytes]:
 def play_packets(stream: Iterable[PalmPacket | None]) -> Played:
     """One packet per millisecond; None is one that does not come."""
     return play([] if packet is None else [packet.to_bytes()] for packet in stream)
-
-
-def row_of(reading: TactileReading, truth: Sequence[Counts]) -> int | None:
-    """The row that all unflagged counts of a reading come from, or None if there is no such row."""
-    fresh = reading.faults == 0
-    for index, row in enumerate(truth):
-        if (reading.counts[fresh] == row[fresh]).all():
-            return index
-    return None
 
 
 def flags(reading: TactileReading, fault: ElectrodeFault) -> list[list[int]]:
