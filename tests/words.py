@@ -1,7 +1,8 @@
 """Refuse phrases that readers stumble over, and commit subjects that are too long.
 
 Usage: `python -m tests.words [FILE ...]`, in CI without files. It reads the docstrings, comments
-and messages of the source, and the pages. The rules stand in .github/CONTRIBUTING.md.
+and messages of the source, the docstrings, comments and names of the tests, the comments and
+strings of C and C++, shell scripts and the pages. The rules stand in .github/CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -17,9 +18,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-SOURCE = ("daemon", "drivers", "models", "deploy")
-"""Folders of Python whose docstrings, comments and messages are checked."""
-PAGES = ("README.md", "deploy/**/*.md", "models/*.md")
+FOLDERS = ("daemon", "drivers", "models", "deploy", "tests")
+"""Folders of source."""
+SUFFIXES = {".py", ".c", ".h", ".cpp", ".hpp", ".sh"}
+"""Ends of the names of source files."""
+OTHERS = ("README.md", "deploy/**/*.md", "models/*.md", ".ci/run", ".ci/quick")
+"""Pages, and scripts without such an end."""
+EXEMPT = {ROOT / "tests/words.py", ROOT / "tests/test_words.py"}
+"""Files that have the refused phrases on purpose."""
 SUBJECT_MAX = 72
 """Longest subject of a commit, characters. `git log` cuts longer ones off on 80 columns."""
 SUBJECTS_SINCE = "2026-11-27T03:46:00+00:00"
@@ -37,13 +43,32 @@ INSTEAD = {
     "nobody": "the thing that lacks: no subscriber, no peer",
     "somebody": "the thing: a subscriber, a peer, a person",
     "whoever": "the thing: a subscriber that, a person who",
+    "goes on": "continues",
+    "go on": "continue",
+    "went on": "continued",
+    "can be had": "is available",
+    "are others": "differ",
+    "taken for": "read as, counted as, mistaken for",
+    "heed": "use, obey",
+    "heeds": "uses, obeys",
+    "wanted": "required, or the thing: the scene, the setting",
+    "heard": "received",
+    "felt": "detected, measured",
+    "is out": "has ended, is missing, has no answer yet",
+    "are out": "have ended, are missing, have no answer yet",
+    "is no": "is not a, is not an",
+    "are no": "are not",
 }
 """Refused phrases, and what to write instead."""
 SUBJECT_FIRST = "say the subject first: functions begin with a verb, values with a noun"
 
 _PHRASE = re.compile(
-    r"\b(" + "|".join(each.replace(" ", r"\s+") for each in INSTEAD) + r")\b", re.IGNORECASE
+    r"(?<!\bthere )\b(" + "|".join(each.replace(" ", r"\s+") for each in INSTEAD) + r")\b(?! longer\b|-)",
+    re.IGNORECASE,
 )
+_CODE = re.compile(r"`[^`]*`")
+_C_TEXT = re.compile(r'//[^\n]*|/\*.*?\*/|"(?:\\.|[^"\\\n])*"', re.DOTALL)
+_TEST_NAME = re.compile(r"^ *(?:async )?def (test_\w+)", re.MULTILINE)
 _WEAK_START = re.compile(
     r"(?:\A\s*|[.!?][\"')`]*\s+|\n\s*\n\s*)(Of|What|Who|Whoever|That|So|Where)\s"
 )
@@ -124,7 +149,7 @@ def texts_of_python(source: str) -> Iterator[Text]:
 def complaints(place: str, texts: Iterable[Text]) -> Iterator[Complaint]:
     """Yield what is refused in `texts`, which stand in the file `place`."""
     for line, text, is_docstring in texts:
-        for match in _PHRASE.finditer(text):
+        for match in _PHRASE.finditer(_CODE.sub(_blanked, text)):
             phrase = " ".join(match[1].lower().split())
             at = line + text.count("\n", 0, match.start(1))
             yield Complaint(place, at, phrase, INSTEAD[phrase])
@@ -133,12 +158,41 @@ def complaints(place: str, texts: Iterable[Text]) -> Iterator[Complaint]:
             yield Complaint(place, at, f"{match[1]} ...", SUBJECT_FIRST)
 
 
-def check_file(path: Path) -> list[Complaint]:
-    """Return the complaints about a Python file or a page."""
+def _blanked(code: re.Match[str]) -> str:
+    """Return spaces in place of code, which may have any name."""
+    return re.sub(r"[^\n]", " ", code[0])
+
+
+def texts_of_test(source: str) -> Iterator[Text]:
+    """Yield the docstrings, comments and names of a module of tests."""
+    for constant in docstrings(ast.parse(source)):
+        yield Text(constant.lineno, str(constant.value))
+    yield from comments(source)
+    for match in _TEST_NAME.finditer(source):
+        yield Text(source.count("\n", 0, match.start(1)) + 1, match[1].replace("_", " "))
+
+
+def texts_of_c(source: str) -> Iterator[Text]:
+    """Yield the comments and strings of a file in C or C++."""
+    for match in _C_TEXT.finditer(source):
+        yield Text(source.count("\n", 0, match.start()) + 1, match[0])
+
+
+def texts_of(path: Path) -> Iterable[Text]:
+    """Return the pieces of prose of a file: of source, of tests, or of a page as a whole."""
     source = path.read_text()
-    texts = texts_of_python(source) if path.suffix == ".py" else [Text(1, source)]
+    if path.suffix == ".py":
+        is_test = path.is_relative_to(ROOT / "tests")
+        return texts_of_test(source) if is_test else texts_of_python(source)
+    if path.suffix in {".c", ".h", ".cpp", ".hpp"}:
+        return texts_of_c(source)
+    return [Text(1, source)]
+
+
+def check_file(path: Path) -> list[Complaint]:
+    """Return the complaints about a file of source, a test, a script or a page."""
     place = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
-    return sorted(complaints(str(place), texts))
+    return sorted(complaints(str(place), texts_of(path)))
 
 
 def check_subjects(log: str) -> list[str]:
@@ -160,9 +214,11 @@ def recent_commits() -> str:
 
 
 def checked_files() -> list[Path]:
-    """Return the source files and pages that CI checks."""
-    source = (path for folder in SOURCE for path in (ROOT / folder).rglob("*.py"))
-    return sorted({*source, *(path for page in PAGES for path in ROOT.glob(page))})
+    """Return the source files, tests, scripts and pages that CI checks."""
+    every = (path for folder in FOLDERS for path in (ROOT / folder).rglob("*"))
+    source = (path for path in every if path.suffix in SUFFIXES and path.is_file())
+    others = (path for pattern in OTHERS for path in ROOT.glob(pattern))
+    return sorted({*source, *others} - EXEMPT)
 
 
 def main(names: list[str]) -> int:
