@@ -13,8 +13,8 @@ usage: deploy/install.sh [--prefix DIR] [--wheelhouse DIR] [--extras LIST] [--py
 
 Run it again to bring an installation up to date; where there is nothing to do it says so.
 
-  --prefix DIR      where the virtual environment goes (/opt/graspd, or where it is already); nobody
-                    but root may write there, nor in a folder above it
+  --prefix DIR      where the virtual environment goes (/opt/graspd, or where it is already); only
+                    root may write there and in the folders above it
   --wheelhouse DIR  install from the wheels in DIR and from nowhere else; graspd's own must be among
                     them. On a computer with network and the same Python: pip wheel -w DIR .
                     (with extras: pip wheel -w DIR '.[record]')
@@ -22,7 +22,7 @@ Run it again to bring an installation up to date; where there is nothing to do i
   --python PROGRAM  the Python to use, 3.11 or newer (python3); not one below /home or /root, which
                     the service cannot see (with --root a warning if it is named)
   --can             also have systemd-networkd bring up can0; an update keeps it
-  --rebuild         make the virtual environment anew even if graspd has not changed
+  --rebuild         make the virtual environment again, even if graspd has not changed
   --enable NAME     start graspd@NAME now and at boot, with the scene /etc/graspd/NAME.toml; where
                     systemd does not run, as in a chroot or the build of an image, at boot
   --root DIR        put all files below DIR as if it were /, for a package or an image:
@@ -115,7 +115,7 @@ find_root() {
     esac
 }
 
-# Where graspd is installed, where it is wanted, or /opt/graspd.
+# Prints --prefix, or the folder where graspd is installed, or /opt/graspd.
 find_prefix() {
     there=''
     if [ -L "$root$command_link" ]; then
@@ -136,7 +136,7 @@ find_prefix() {
     fi
 }
 
-# Nobody but root may put anything at the prefix or at what leads there, for root runs it.
+# Only root may write at the prefix and in the folders above it, for root runs it.
 check_prefix() {
     resolved=$(realpath -m -- "$root$prefix")
     case $resolved in
@@ -170,7 +170,7 @@ check_folder() {
     esac
 }
 
-# Those that are wanted, or that are there: an update must not take the recorder away.
+# Extras of --extras, or those installed: an update must not take the recorder away.
 find_extras() {
     case $extras in
         -) extras='' ;;
@@ -225,7 +225,7 @@ END
 }
 
 check_wheelhouse() {
-    [ -d "$wheelhouse" ] || fail "$wheelhouse is no folder"
+    [ -d "$wheelhouse" ] || fail "$wheelhouse is not a folder"
     wheelhouse=$(cd -- "$wheelhouse" && pwd)
     for wheel in "$wheelhouse"/graspd-*.whl; do
         [ -f "$wheel" ] ||
@@ -300,7 +300,7 @@ environment() {
     new=''
     case $former in
         '') did "$prefix/venv is new: $version" ;;
-        "$version") did "$prefix/venv is new: $version again, made anew" ;;
+        "$version") did "$prefix/venv is new: $version again, rebuilt" ;;
         *) did "$prefix/venv is new: from $former to $version" ;;
     esac
 }

@@ -110,7 +110,7 @@ def _of_table(table: Any, names: Sequence[str], fingers: Sequence[str]) -> NDArr
 
 
 def _columns(table: Any, needed: Sequence[str], names: Sequence[str]) -> dict[str, Any]:  # noqa: ANN401
-    """Return columns by what to call them, with None for what pandas calls NA, which is no number.
+    """Return columns by what to call them, with None for NA of pandas, which is not a number.
 
     Raises `ValueError` for one that is there twice, or is not one value for each row.
     """

@@ -181,7 +181,7 @@ class _Reader:
     def _fields(self, message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
         """Yield number and value of each field: an integer, or bytes.
 
-        Raises `ModelError` if the bytes are no message.
+        Raises `ModelError` if the bytes are not a message.
         """
         if isinstance(message, int):
             raise _broken("a number for a message")

@@ -54,8 +54,8 @@ BEGUN_FIRST = (
     "test_readme.py",
     "test_without_posix.py",
 )
-"""Files that take longest, by their place in this folder: a file is one process's own, and none of
-these may be left when the other processes are done."""
+"""Files that take longest, by their place in this folder: a file is one process's own, and no
+such file may be left when the other processes are done."""
 
 
 def data_dir() -> Path | None:

@@ -14,7 +14,7 @@ PORTS = (10_000 + (211 * os.getpid() + number) % 20_000 for number in itertools.
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A port of the loopback that nobody has, of TCP, or of UDP with `SOCK_DGRAM`."""
+    """A free port of the loopback, of TCP, or of UDP with `SOCK_DGRAM`."""
     while True:
         port = next(PORTS)
         with socket.socket(socket.AF_INET, kind) as probe, contextlib.suppress(OSError):

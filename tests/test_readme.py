@@ -38,7 +38,7 @@ def block(language: str, page: str = README) -> str:
 
 
 def run_subscriber(command: list[str], endpoint: str) -> list[str]:
-    """What a subscriber prints: of nobody at first, then of a replay of 200 verdicts."""
+    """What a subscriber prints: without a daemon at first, then of a replay of 200 verdicts."""
     replay = [sys.executable, "-m", "graspd", "replay", str(DEMO_TABLE), "--speed", "2"]
     replay += ["--publish", endpoint, "--wait", "20"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as subscriber:

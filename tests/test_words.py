@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.words import check_file, check_subjects, checked_files
+from tests.words import check_file, check_subjects, checked_files, texts_of_test
 
 SOURCE = '''\
 """Drop old sweeps.
@@ -37,8 +37,29 @@ def test_phrases_of_python_are_found_with_their_lines(tmp_path: Path) -> None:
         (10, "nobody"),
         (12, "That ..."),
         (12, "as far as"),
+        (12, "is no"),
         (13, "anew"),
     ]
+
+
+def test_comments_and_strings_of_c_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "client.hpp"
+    path.write_text('int anew;  // nobody\n/* `wanted`\n goes on */ say("is no\\"link");\n')
+    assert phrases(path) == [(1, "nobody"), (3, "goes on"), (3, "is no")]
+
+
+def test_there_is_no_and_is_no_longer_are_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "page.md"
+    path.write_text("There is no file. It is no longer open.\nIt is no file.\n")
+    assert phrases(path) == [(2, "is no")]
+
+
+def test_names_of_tests_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "test_it.py"
+    path.write_text('def test_it_goes_on():\n    """Wait for nobody."""\n    print("so long as")\n')
+    texts = [(each.line, each.text) for each in texts_of_test(path.read_text())]
+    assert (1, "test it goes on") in texts
+    assert "so long as" not in [text for _, text in texts]
 
 
 def test_a_subject_may_have_72_characters() -> None:
@@ -51,3 +72,5 @@ def test_source_and_pages_of_the_tree_are_checked() -> None:
     root = Path(__file__).parents[1]
     names = {str(path.relative_to(root)) for path in checked_files()}
     assert {"daemon/cli.py", "README.md", "deploy/bridge/BUILD.md", "models/RESULTS.md"} <= names
+    kinds = ("tests/ports.py", "deploy/install.sh", ".ci/run", "tests/clients/probe.cpp")
+    assert {*kinds, "deploy/clients/cpp/graspd_client.hpp", "deploy/bridge/src/bridge.c"} <= names

@@ -63,7 +63,8 @@ INSTEAD = {
 SUBJECT_FIRST = "say the subject first: functions begin with a verb, values with a noun"
 
 _PHRASE = re.compile(
-    r"(?<!\bthere )\b(" + "|".join(each.replace(" ", r"\s+") for each in INSTEAD) + r")\b(?! longer\b|-)",
+    r"(?<!\bthere )\b(" + "|".join(each.replace(" ", r"\s+") for each in INSTEAD) + r")\b"
+    r"(?!\s+(?:longer|of)\b|-)",
     re.IGNORECASE,
 )
 _CODE = re.compile(r"`[^`]*`")

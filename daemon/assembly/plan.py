@@ -14,7 +14,7 @@ from graspd.drivers.recordings.kinds import BAGS, Kind, kind_of_all, refuse_opti
 from graspd.drivers.recordings.layout import Layout, layout_of
 from graspd.extras import require
 
-NO_SWEEPS = "gate mode `every` judges each row of a grasp table; a sweep of a stream is no grasp"
+NO_SWEEPS = "gate mode `every` judges each row of a grasp table; a sweep of a stream is not a grasp"
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,7 @@ class RecordedRun(Source):
         """False in another gate mode, where recorded outcomes are of other grasps."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
-                log.warning("%s: does not go on where the file before it ends", path)
+                log.warning("%s: does not continue where the file before it ends", path)
         recorded = self.header.scene
         if not recorded:
             log.warning(LOST_HEADER, paths[0])

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check the scenes, their models and files; 0 if all are right. Warn of what they share.
-    Whether sockets can be had and devices work is for `graspd doctor`."""
+    `graspd doctor` checks sockets and devices."""
     checked = {path: _check(path, as_json=args.json) for path in args.scene}
     right = [(path, wanted) for path, wanted in checked.items() if wanted is not None]
     for (path, first), (other, second) in itertools.combinations(right, 2):
@@ -146,9 +146,9 @@ def _warnings(wanted: scene.Scene) -> Iterator[str]:
             case DeviceKind.UDP if device.only_from is None:
                 if ip_address(Endpoint.parse(device.name).address).is_unspecified:
                     yield (
-                        f"[{table}] listens to {device.name}, so anybody who can reach this "
-                        "computer is taken for the hand: name its sender with only_from, or listen "
-                        "on one address"
+                        f"[{table}] listens to {device.name}, so any sender that reaches this "
+                        "computer is treated as the hand: name its sender with only_from, or "
+                        "listen on one address"
                     )
             case DeviceKind.SERIAL if os.path.isabs(device.name):  # else a pyserial URL
                 yield from _unreachable("port", device.name, device.name)

@@ -61,7 +61,7 @@ def _get(args: argparse.Namespace, file: TableFile) -> str:
     args.to.mkdir(parents=True, exist_ok=True)
     if target.exists():
         if not target.is_file():
-            raise DataError(f"{target}: is there and is no regular file")
+            raise DataError(f"{target}: is there and is not a regular file")
         if _digest(_read(target)) == file.sha256:
             return f"{target}: is there"
     content = _from_folder(args.folder, file) if args.folder else _fetch(args.url, file)

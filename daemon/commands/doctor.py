@@ -47,7 +47,7 @@ COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
 NARROWEST = 40
 """Lines are not wrapped to fewer columns."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
-"""Faults of a device that explain why no finger is felt; so does `FRAMES_LOST` as an error."""
+"""Faults of a device that explain why no touch is detected; so does `FRAMES_LOST` as an error."""
 FINGER_COLUMNS = 25
 """Width of a finger in the table of electrodes."""
 USUAL_COLUMNS = 80

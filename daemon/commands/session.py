@@ -223,7 +223,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.Replay
             grasps, state = session.grasps, session.state()
             if not session.calibrated:
                 raise DriverError(
-                    f"{grasps} grasps of {readings} readings are too few, or they are no grasps"
+                    f"{grasps} grasps of {readings} readings are too few, or they are not grasps"
                 )
             _check(plan, model, state)
         elif not outcomes:

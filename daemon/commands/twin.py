@@ -198,7 +198,7 @@ def _electrode(text: str) -> tuple[int, int]:
         or not electrode.isdecimal()
         or not 1 <= int(electrode) <= ELECTRODES
     ):
-        raise ValueError(f"{text!r} is no electrode; th_24 would be one")
+        raise ValueError(f"{text!r} is not an electrode; th_24 would be one")
     return TABLE_FINGERS.index(finger), int(electrode) - 1
 
 

@@ -121,7 +121,7 @@ class ElectrodeStatistics:
             advice = "Reset the board. Check that no relay or recording repeats old data."
             what = f"{name}: all counts are frozen"
             return [Finding(Level.ERROR, what, Cause.REPEATED, advice)]
-        # A dead electrode is at a rail and has no noise: one of the two alone is no such sign.
+        # A dead electrode is at a rail and has no noise: one of the two alone is not enough.
         found = [_missing(name, missing, faults)] if missing.any() else []
         found += _named(name, rail & still, "stuck at a rail", DEAD)
         found += _named(name, still & ~rail, "frozen", FROZEN)

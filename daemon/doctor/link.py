@@ -50,7 +50,7 @@ NOT_OURS_ADVICE = {
     Cause.FOREIGN_SENDER: "They are of another hand. Compare hand.name, or give each hand a port.",
     Cause.REPEATED: "Their numbers or times do not rise: the same data comes again and again.",
     Cause.BITRATE: "Set the interface to the board's bit rate.",
-    Cause.NOT_A_BRIDGE: f"Check the baud rate. If it is no bridge yet: {FLASH}",
+    Cause.NOT_A_BRIDGE: f"Check the baud rate. If it is not a bridge yet: {FLASH}",
     Cause.PALM_MODE: "The palm is in a service mode or starting. Let the hand's driver start it.",
     Cause.SETTINGS: "Compare arbitration_id, sequence and data_length with the board's (candump "
     "shows what it sends). Check that sensors are connected to it.",
@@ -134,8 +134,8 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     ),
     LinkCause.NO_ANSWER: Trouble(
         Cause.SILENT,
-        f"Plug it in again. On a UART check TX to RX, and the baud rate. If it is no bridge yet: "
-        f"{FLASH}",
+        "Plug it in again. On a UART check TX to RX, and the baud rate. If it is not a bridge "
+        f"yet: {FLASH}",
     ),
     LinkCause.FOREIGN: Trouble(
         Cause.FOREIGN_SENDER, "Name the sender in only_from if it is the right one."

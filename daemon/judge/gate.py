@@ -2,7 +2,7 @@
 
 A grasp lasts from the first touch until nothing touches. It is judged when all fingers touch and
 have kept still until nothing can slide unseen; with `early`, first when nothing moves fast. It
-settles by the strict limit of motion and goes on by the loose one, so that the verdict on a hand
+settles by the strict limit of motion and continues by the loose one, so that the verdict on a hand
 that holds does not come and go. From then on it is refreshed many times a second and when the
 controller asks. Times are those of the readings, so a stall or a burst of old readings settles
 nothing. `phase.TRANSITIONS` has all ways from one state to the next.
@@ -82,7 +82,7 @@ class Stillness:
         self._since_ns, self.lasts_ns = since_ns, max(t_ns - since_ns, 0)
 
     def settle(self) -> None:
-        """Go on by the loose limit if slow slides are excluded."""
+        """Continue by the loose limit if slow slides are excluded."""
         self.sure = self.sure or self.lasts_ns >= LONG_NS
 
     def unsettle(self) -> None:

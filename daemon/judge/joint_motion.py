@@ -75,7 +75,7 @@ class JointMotion:
             angles = reading.position_rad[valid]
             past.append((t_ns, angles))
             del past[: -(ANGLES + 2)]  # and one at each end of the window
-            # Joints that were not heard of before tell nothing: they may come and go.
+            # Joints without an earlier angle say nothing: they may come and go.
             changed = before is not None and angles.tobytes() != before.tobytes()
             if changed or self._changed_ns is None or t_ns < self._changed_ns:
                 self._changed_ns = t_ns
@@ -94,7 +94,7 @@ class JointMotion:
         return Reason.JOINTS_FROZEN if self.is_frozen else None
 
     def misses_some(self, t_ns: int) -> bool:
-        """Return True if judging goes on at `t_ns` without joints that should be there."""
+        """Return True if judging continues at `t_ns` without joints that should be there."""
         return self.is_lost(t_ns) or bool(set(self.lost).difference(*self.past))
 
     @property

@@ -160,9 +160,9 @@ class Pipeline:
         self._late = judged
 
     def sensors_exchanged(self, known: Exchanged | None = None) -> None:
-        """Forget session, grasp and maybe the tare: the sensors are others.
+        """Forget session, grasp and maybe the tare: the sensors were exchanged.
 
-        Go on from what is `known` of them; None: nothing. Raises `ValueError` if that is of
+        Continue from what is `known` of them; None: nothing. Raises `ValueError` if that is of
         another model.
         """
         if known is None:

@@ -89,8 +89,8 @@ ADVICE: dict[Reason, str] = {
     Reason.NOT_CALIBRATED: "the session has too few grasps: grasp more; if it is kept, "
     "`graspd session seed` also helps",
     Reason.LOW_CONFIDENCE: "too close to call for min_confidence or for [risk]: grasp again",
-    Reason.UNPROVEN: "too few outcomes are known for [risk], or too many lifts are out: lift under "
-    "supervision, tell outcomes",
+    Reason.UNPROVEN: "too few outcomes are known for [risk], or too many lifts have no outcome: "
+    "lift under supervision, tell outcomes",
     Reason.RISK_EXCEEDED: "more `stable` lifts slipped than [risk] can make good: find out why, "
     "then `graspd session reset`",
     Reason.OUTCOME_TOLD: "the outcome of its lift is known: release the object, then grasp again",

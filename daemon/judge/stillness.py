@@ -277,7 +277,7 @@ class Motion:
     Fast motion shows in a short window, as the mean of the electrodes' absolute slopes. Slow slides
     stop and turn; they show in a long one, as the root mean square of the electrodes' deviations
     from their means. Each is divided by what noise alone makes of it. There are two limits of it: a
-    hand settles by the strict one, and goes on by the loose one.
+    hand settles by the strict one, and continues by the loose one.
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
@@ -299,7 +299,7 @@ class Motion:
         """How each finger moves over the short and over the long window, in units of its noise;
         infinite where that is not known."""
         self.looked = False
-        """True if that was worked out for the last step; else it was not wanted."""
+        """True if that was worked out for the last step, which is not always needed."""
         self.known = False
         """True if it is known of all fingers how they moved in the short window."""
 

@@ -98,7 +98,7 @@ def _run(
         _be_ordinary()
         try:
             results.put(job())
-        except Exception as error:  # noqa: BLE001 - also MemoryError: the loop goes on
+        except Exception as error:  # noqa: BLE001 - also MemoryError: the loop continues
             results.put(error)
         del job  # free what the job holds, which may be large
         os.eventfd_write(ended, 1)

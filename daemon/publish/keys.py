@@ -48,7 +48,7 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
     from zmq.auth import create_certificates  # the daemon itself makes none
 
     if not NAME.fullmatch(name) or name.startswith("."):
-        raise KeysError(f"{name!r} is no name for a key: letters, digits, '_', '-' and '.'")
+        raise KeysError(f"{name!r} is not a name for a key: letters, digits, '_', '-' and '.'")
     public, secret = folder / f"{name}{PUBLIC}", folder / f"{name}{SECRET}"
     for path in (public, secret):
         if path.exists():

@@ -138,7 +138,7 @@ def _refuse_other_kinds(path: Path) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise PublishError(f"{path} is there and is no socket")
+        raise PublishError(f"{path} is there and is not a socket")
 
 
 def _refuse_living(path: Path) -> None:
@@ -161,7 +161,7 @@ def _locked(path: Path) -> int:
             stack.callback(os.close, descriptor)
             status = os.fstat(descriptor)
             if not stat.S_ISREG(status.st_mode) or status.st_size:
-                raise PublishError(f"{path} is there and is no lock of graspd")
+                raise PublishError(f"{path} is there and is not a lock of graspd")
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

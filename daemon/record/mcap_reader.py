@@ -220,7 +220,7 @@ class McapReader:
         if isinstance(damage, EndOfFile):
             raise RecordingError(self.path, "is empty: nothing was recorded") from damage
         if damage is not None:
-            raise RecordingError(self.path, f"is no MCAP file: {damage}") from damage
+            raise RecordingError(self.path, f"is not an MCAP file: {damage}") from damage
         raise RecordingError(self.path, "is an MCAP file, but not one of graspd's")
 
     def _messages(self, offset_ns: int) -> Iterator[RecordedMessage]:

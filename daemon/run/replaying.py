@@ -91,7 +91,7 @@ def trained_on(
     fingers = models[0].contract.fingers
     for path, layout in layouts.items():
         if layout.is_stream:
-            continue  # sweeps are no grasps
+            continue  # sweeps are not grasps
         rows = [row.counts for row in read_rows(path, fingers, layout=layout)]
         counts = np.array(rows, np.uint16).reshape(-1, len(fingers), ELECTRODES)
         grasps = known_grasps.hashes(counts)

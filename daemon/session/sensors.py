@@ -23,7 +23,7 @@ Rest = NDArray[np.float64]
 """Resting counts, shape (fingers, 24); 0: not known. They differ between sensors."""
 
 UNTOLD: Final = (
-    "%d fingers rest in another pattern than before: taken for other sensors, not calibrated; "
+    "%d fingers rest in another pattern than before: treated as other sensors, not calibrated; "
     "open the hand"
 )
 MOVED_COUNTS: Final = 50.0

@@ -93,7 +93,7 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def is_awaited(self) -> bool:
-        """True if the lift was announced and its outcome is out."""
+        """True if the lift was announced and has no outcome yet."""
         return self.announced and self.slipped is None
 
 
@@ -133,7 +133,7 @@ class LiftBook:
         self.announced = 0
         """Number of lifts that were announced."""
         self.awaited = 0
-        """Number of announced lifts whose outcome is out."""
+        """Number of announced lifts without an outcome."""
 
     def __contains__(self, grasp: object) -> bool:
         """True if the grasp was judged and is in the book."""
@@ -215,7 +215,7 @@ class LiftBook:
         return True
 
     def offered(self, peer: Peer) -> GraspId | None:
-        """Return the last grasp that this connection may lift, if its outcome is out."""
+        """Return the last grasp that this connection may lift, if it has no outcome yet."""
         for lift in reversed(self._lifts.values()):
             if lift.owner == peer and lift.slipped is None:
                 return lift.id
@@ -279,7 +279,7 @@ class LiftBook:
         return LiftBookState(lifts, told, self.unreported, self.announced)
 
     def restore(self, state: LiftBookState, width: int) -> None:
-        """Go on from an earlier state, with features (width,). Raises `ValueError`."""
+        """Continue from an earlier state, with features (width,). Raises `ValueError`."""
         lifts = {lift.id: lift for lift in state.records}
         if len(lifts) != len(state.records):
             raise ValueError("holds a grasp twice")

@@ -151,7 +151,7 @@ class Trust:
         return state.model == self._model
 
     def restore(self, state: TrustState) -> None:
-        """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
+        """Continue from an earlier state. Raises `ValueError`, and changes nothing, for another."""
         if not self.fits(state):
             raise ValueError("is of another model")
         learner, risk = Learner(self.learner.inputs), Risk(self.risk.limits)

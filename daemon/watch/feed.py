@@ -68,7 +68,7 @@ class Feed:
         self.looked_ns = self._opened_ns
         """When the last message was looked for; it came before."""
         self.stood_still = 0, 0
-        """When this process last stopped looking for longer than `PAUSE_NS`, and went on, ns."""
+        """When this process last stopped looking for longer than `PAUSE_NS`, and continued, ns."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._events = EVENTS if keys is None else EVENTS_WITH_KEYS
         self._follow = 0

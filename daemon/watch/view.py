@@ -126,7 +126,7 @@ class View:
         """
         self.link = Link.CONNECTING
         self.stood_still = 0, 0
-        """When the viewer itself last stopped and went on, ns."""
+        """When the viewer itself last stopped and continued, ns."""
         self._endpoint = endpoint
         self._hand = hand
         self._look, self._doctor = look, doctor

@@ -43,7 +43,7 @@ class JointMessage:
     names: tuple[str, ...]
     """Joint names without hand prefix, in the order of the message."""
     position_rad: NDArray[np.float64]
-    """Shape (joints,); NaN for a value that is no angle."""
+    """Shape (joints,); NaN for a value that is not an angle."""
 
     def to_bytes(self) -> bytes:
         """Return the datagram. Raises `ValueError` for NaN."""
@@ -61,7 +61,7 @@ class JointStream:
         self._order = Order(self.counters)
 
     def interrupt(self) -> None:
-        """Do nothing: the order of messages is kept, so that no old one is taken for new."""
+        """Do nothing: the order of messages is kept, so that no old one is mistaken for new."""
 
     def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
         """Return the reading, none if no joint is known; None if the message is dropped."""

@@ -114,7 +114,7 @@ def _message(data: bytes, key: str) -> Message:
 
 
 def number(value: object) -> float:
-    """Return `value` if it is a finite number, else NaN. Booleans and text are no numbers."""
+    """Return `value` if it is a finite number, else NaN. Booleans and text are not numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     return float(value) if abs(value) <= NUMBER_MAX else math.nan

@@ -63,7 +63,7 @@ class TactileStream:
 
     def interrupt(self) -> None:
         """Let the next reading not continue those before. The order of messages is kept, so that
-        no old one is taken for new."""
+        no old one is mistaken for new."""
         self._interrupted = self.counters.readings > 0
 
     def receive(self, data: bytes, t_ns: int) -> list[TactileReading] | None:

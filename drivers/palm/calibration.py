@@ -5,7 +5,7 @@ A calibration file is TOML, as `deploy/calibration/example_hand.toml`. `[joints]
 `[coupled]` has THJ1_THJ2, points of [raw THJ1, raw THJ2, degrees, degrees]; it is optional, but
 without it THJ1 and THJ2 have no angle.
 
-Tables are linear between their points, and go on in a straight line beyond them, as in Shadow's
+Tables are linear between their points, and continue in a straight line beyond them, as in Shadow's
 driver. The sensors of THJ1 and THJ2 see each other's magnets, so both angles come from both raw
 values. J0 of a finger is the sum of J1 and J2, which one motor moves. A joint that is left out has
 no angle (NaN).

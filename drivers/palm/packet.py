@@ -151,7 +151,7 @@ class PalmCounters(DatagramCounters):
     """Fingers without a sensor: no counts, or only zeros. Each counts once in each round."""
     joint_readings: int = 0
     bad_angles: int = 0
-    """Angles of calibrated joints handed over as NaN, because the raw value is no count."""
+    """Angles of calibrated joints handed over as NaN, because the raw value is not a count."""
     impossible_angles: int = 0
     """Angles handed over that are more than 10 degrees out of the joint's range."""
     other_palms: int = 0

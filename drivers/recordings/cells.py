@@ -34,7 +34,7 @@ TITLE_LINES_MAX: Final = 30
 class Cells:
     """The header of a file, and its rows. Iterate once.
 
-    Lines that are blank or begin with `#` are no rows, and empty cells after those of the header
+    Lines that are blank or begin with `#` are not rows, and empty cells after those of the header
     are left out. Above the header may be titles and comments, of which it may be the last; fingers
     may stand above their electrodes, and units below. The constructor and iterating raise
     `RecordingError`.

@@ -59,7 +59,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     `recorded_ns` is the file's own time. No reading is skipped.
 
     `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
-    no counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
+    not counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
     """
 
     counters: ReplayCounters
@@ -141,7 +141,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
                 at_ns = start_ns + round(index * self._table_period_ns)
             else:
                 first_s = row.t_s if first_s is None else first_s
-                # A float of seconds since 1970 is no finer than a microsecond.
+                # A float of seconds since 1970 is not finer than a microsecond.
                 at_ns = start_ns + 1000 * round((row.t_s - first_s) * 1e6)
             if at_ns > before_ns:
                 period_ns = min(at_ns - before_ns, period_ns or at_ns)

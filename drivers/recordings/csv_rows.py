@@ -51,9 +51,9 @@ class Row:
 class Recording:
     """The rows of one file. Iterate once.
 
-    Iterating raises `RecordingError` for a wrong row. A value that is no count makes its electrode
-    faulty; with `strict` it raises. An outcome that cannot be read is not known; with `outcomes` it
-    raises.
+    Iterating raises `RecordingError` for a wrong row. A value that is not a count makes its
+    electrode faulty; with `strict` it raises. An outcome that cannot be read is not known; with
+    `outcomes` it raises.
 
     A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
     without a line end may be cut off within a value, so all its electrodes are faulty and its

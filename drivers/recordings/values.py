@@ -102,7 +102,7 @@ def is_outcome(cell: str) -> bool:
 
 
 def problem_with(cells: Sequence[str], *, decimal_comma: bool) -> str | None:
-    """Return why values of electrodes are no counts, as a whole; None: most of them are.
+    """Return why values of electrodes are not counts, as a whole; None: most of them are.
 
     A broken electrode has values that are missing or out of range; none has fractions, or
     negative values other than the -1 of a missing one.

@@ -35,7 +35,7 @@ GREETING_TRIES = 4
 One more is sent if the serial numbers of the last answer are not confirmed yet.
 """
 PING_PERIOD_NS = 247_000_000
-"""Time between PINGs, ns. It is no multiple of usual periods: a sweep may delay a PING."""
+"""Time between PINGs, ns. It is not a multiple of usual periods: a sweep may delay a PING."""
 NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """Most PINGs that may wait for an answer; the oldest is given up."""

@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 class SpiBridgeDriver(Opened):
     """Readings of the sensors behind one bridge; reconnects after every loss.
 
-    `t_ns` of a reading: when the bridge finished the sweep. `seq` goes on after a loss of the link.
+    `t_ns` of a reading: when the bridge finished the sweep. `seq` continues after a lost link.
     Electrodes that are not sampled, and those of an absent sensor, are `MISSING`. Ports without a
     descriptor (`rfc2217://`, `loop://`) are polled. A missing device raises nothing; `describe`
     reports it.

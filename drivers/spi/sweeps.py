@@ -49,7 +49,7 @@ An older one would hide the age of readings on a slow line, once the rate is wro
 
 @dataclass(slots=True)
 class BridgeCounters(FrameCounters):
-    """Counters of frames, sweeps and the link; they go on when the port is reopened."""
+    """Counters of frames, sweeps and the link; they continue when the port is reopened."""
 
     unknown_frames: int = 0
     """Whole frames of a type that no bridge of version 1 sends."""

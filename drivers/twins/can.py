@@ -20,7 +20,7 @@ from graspd.drivers.twins.grasps.grasps import Counts
 SAMPLE_ID: Final = 0x100
 """Default arbitration id of samples; that of the real board is not public."""
 OTHER_COUNTS: Final = {PAC: 2050, PDC: 2800, TAC: 2010, TDC: 2260}
-"""Counts of the channels that are no electrodes, as on an untouched hand."""
+"""Counts of the channels that are not electrodes, as on an untouched hand."""
 SEND_TIMEOUT_S: Final = 0.1
 """Longest wait for room in the transmit queue, s."""
 DOWN_S: Final = 0.2

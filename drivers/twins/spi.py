@@ -52,7 +52,7 @@ SWEEPS_AT_ONCE = 64
 """Most sweeps in a row; after them the host's bytes are read."""
 UNDRIVEN_WORD = 0xFFFF
 OTHER_COUNT = 2000
-"""Count of all channels that are no electrodes."""
+"""Count of all channels that are not electrodes."""
 
 _WORDS = np.array([encode_word(count) for count in range(4096)], dtype=np.uint16)
 
@@ -152,7 +152,7 @@ class SpiTwin(Opened):
         if not self.path.exists():
             return
         if not self.path.is_symlink():
-            raise FileExistsError(f"{self.path} is in the way: it is no link of a twin's")
+            raise FileExistsError(f"{self.path} is in the way: it is not a link of a twin's")
         raise FileExistsError(
             f"{self.path} is in the way: it leads to {self.path.readlink()}; if that is another"
             " twin, end it or give this one another path"

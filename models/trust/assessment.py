@@ -43,7 +43,7 @@ def assess(
     shape: such a grasp must be `unknown`.
     """
     if not 0.0 <= p_slip <= 1.0:  # also true for NaN
-        raise ValueError(f"{p_slip} is no probability")
+        raise ValueError(f"{p_slip} is not a probability")
     log_odds, features = learner.judge(margin, inputs)
     permission = risk.decide(log_odds, awaited)
     return Assessment(

@@ -27,7 +27,7 @@ others (`graspd report worth`, `worth` on the card of `small-session`).
 """
 MARGIN_MAX: Final = 30.0
 """Larger margins, log-odds, say no more: the logarithm of the smallest probability that a network's
-float32 output is taken for."""
+float32 output counts as."""
 INPUT_MAX: Final = 1e3
 """Larger inputs are refused: standardised features have a few units."""
 MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.5, 0.5, 0.2
@@ -158,7 +158,7 @@ class Learner:
         return LearnerState(self.outcomes, *(each.astype("<f8").tobytes() for each in arrays))
 
     def restore(self, state: LearnerState) -> None:
-        """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
+        """Continue from an earlier state. Raises `ValueError`, and changes nothing, for another."""
         count = min(state.outcomes, GRASPS_MAX) if self.inputs else 0
         size = self.inputs + 2 + count
         grasps = vector(state.grasps, count * self.inputs, INPUT_MAX).reshape(count, self.inputs)
@@ -170,11 +170,11 @@ class Learner:
             raise ValueError("holds means that are too large")
         highest = np.append(self._prior, np.full(count, residual.variance)) * ROUNDING
         if (spread != spread.T).any() or (covariance.diagonal() > highest).any():
-            raise ValueError("holds a matrix that is no covariance, or knows less than the prior")
+            raise ValueError("holds no covariance matrix, or knows less than the prior")
         try:
             np.linalg.cholesky(covariance)
         except np.linalg.LinAlgError as error:
-            raise ValueError("holds a matrix that is no covariance") from error
+            raise ValueError("holds no covariance matrix") from error
         self.outcomes = state.outcomes
         self._residual, self._mean, self._spread = residual, mean, spread
 

@@ -37,7 +37,7 @@ class Permission(StrEnum):
     WITHHELD = "withheld"
     """Too likely to slip for the risk that is set."""
     UNPROVEN = "unproven"
-    """Too few outcomes are known, or too many announced lifts are out: lift under supervision."""
+    """Too few outcomes are known, or too many announced lifts have none: lift under supervision."""
     RISK_EXCEEDED = "risk-exceeded"
     """More slipped than the rule can make good: nothing is `stable` until the user resets it."""
 
@@ -106,7 +106,7 @@ class Risk:
        after its announcement.
     7. An outcome of an announced lift lowers neither w nor this minimum: a slip takes 1 - a from b
        and m by one. Caps leave b >= BUDGET_START, and m <= M.
-    8. A lift that leaves the book untold is taken for a slip. Hence 6 holds at every moment.
+    8. A lift that leaves the book untold counts as a slip. Hence 6 holds at every moment.
     9. With the m lifts counted as slips, 2 is S <= a N + BUDGET_START - w: the third bound.
     10. Lifts that are told late without an announcement can leave b < 0; `bound` adds that.
 
@@ -169,7 +169,7 @@ class Risk:
     def decide(self, log_odds: float, awaited: int = 0) -> Permission:
         """Return whether a grasp with these log-odds of slip may be called `stable`.
 
-        `awaited`: announced lifts whose outcome is out.
+        `awaited`: announced lifts without an outcome.
         """
         threshold = self.threshold
         if threshold == math.inf:
@@ -222,7 +222,7 @@ class Risk:
         return RiskState(alpha, self.lifts, self.slips, self.proven, self.budget)
 
     def restore(self, state: RiskState) -> None:
-        """Go on from an earlier state; with another risk than now, only the warm-up counts.
+        """Continue from an earlier state; with another risk than now, only the warm-up counts.
 
         Raises `ValueError`, and changes nothing, if no outcomes lead to such a state.
         """

@@ -52,7 +52,7 @@ def read_card(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path}: cannot read the card: {error}") from error
     parts = ("contract", "file") if isinstance(content, dict) else ()
     if not parts or not all(isinstance(content.get(part), dict) for part in parts):
-        raise ModelError(f"{path}: is no card")
+        raise ModelError(f"{path}: is not a card")
     return dict(content)
 
 

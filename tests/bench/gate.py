@@ -70,7 +70,7 @@ class Felt:
     slides: NDArray[np.bool_]
     """True where a finger says `slide`, shape (sweeps, fingers)."""
     slides_at: int
-    """The sweep from which a slide that begins can be felt."""
+    """The sweep from which a slide that begins can be detected."""
 
     @property
     def stood(self) -> int:

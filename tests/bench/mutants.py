@@ -5,7 +5,7 @@
 takes the mutants of a file or a line.
 
 The mistakes: a comparison, an operator, a `not`, `and` or `or`, a number by one; a float or a large
-number by 20 %, for nobody chooses one nanosecond. Nothing is changed in place: a mutant is a
+number by 20 %, for one nanosecond means nothing. Nothing is changed in place: a mutant is a
 compiled file in a copy of the tree, which Python and whatever a test starts take for the source's.
 
 mutmut leaves numbers outside functions alone; cosmic-ray changes files in place, one command for
@@ -241,7 +241,7 @@ def _forked(task: Callable[[], int], limit_s: float | None, log: Path) -> int | 
             os.dup2(output, 1)
             os.dup2(output, 2)
             status = task()
-        except Exception:  # noqa: BLE001 (nothing may go on as if it were the parent)
+        except Exception:  # noqa: BLE001 (nothing may continue as if it were the parent)
             traceback.print_exc()
         finally:
             os._exit(status)

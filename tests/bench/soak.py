@@ -38,7 +38,7 @@ from tests.daemon.processes import GRASPD, before_others
 
 SAMPLE_S = 0.5
 IDLE_S = 0.05
-"""Longest that nobody looks what is due."""
+"""Longest time without a look at what is due."""
 BETWEEN_S = (1.0, 8.0)
 """Between two outages."""
 HURRY_S = 60.0
@@ -126,7 +126,7 @@ class Soak:
         return self._daemon.poll() is not None
 
     def _hear(self, done: Callable[[], bool], seconds: float) -> None:
-        """Listen, do what is due and look at the daemon, so long at most."""
+        """Listen, do what is due and look at the daemon, up to a time."""
         until_s = time.monotonic() + seconds
         while (now_s := time.monotonic()) < until_s and not done():
             verdict = self._subscriber.verdict(min(until_s - now_s, IDLE_S))

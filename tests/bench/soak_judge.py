@@ -14,8 +14,8 @@ from tests.bench.live import Usage
 SLOPE_MAX_KIB_PER_H = 1024.0
 """3 bytes per reading at 100 Hz, less than any object that could be kept of each."""
 GRAIN_KIB = 512
-"""Growth below this is no leak yet: an allocator takes pages as it likes. In the second minute of
-two at 100 Hz it is 87 bytes per reading; the smallest array has 112."""
+"""Growth below this is not a leak yet: an allocator takes pages as it likes. In the second minute
+of two at 100 Hz it is 87 bytes per reading; the smallest array has 112."""
 SPAN_MIN_S = 45.0
 """What the daemon holds is shown and not judged in a shorter span, s."""
 MOST_SHARE = 0.9

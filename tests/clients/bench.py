@@ -47,7 +47,7 @@ class Daemon:
         self.start()
 
     def start(self) -> None:
-        """Start it, and wait until it can be heard."""
+        """Start it, and wait for its first message."""
         bound = self._folder / "ask"
         bound.unlink(missing_ok=True)
         self._process = start("run", self._scene)
@@ -70,7 +70,7 @@ class Daemon:
 
 
 def _one_grasp(path: Path) -> Path:
-    """Write a recording of a grasp that is stable, so that nobody waits for it."""
+    """Write a recording of a grasp that is stable, so that no test waits for it."""
     head, *rows = DEMO_RECORDING.read_text().splitlines()
     kept = [row.partition(",")[2] for row in rows[REST] + rows[GRASP]]
     lines = [f"{number / RATE_HZ},{row}" for number, row in enumerate(kept)]
@@ -79,5 +79,5 @@ def _one_grasp(path: Path) -> Path:
 
 
 def free_endpoint() -> str:
-    """A place on the loopback address that nobody has just now."""
+    """A place on the loopback address that is free just now."""
     return f"tcp://127.0.0.1:{free_port()}"

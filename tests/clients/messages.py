@@ -42,7 +42,7 @@ def verdict(
     silence_ms: float = 100.0,
     **more: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
-    """A message as a daemon makes it that knows nothing of outcomes, but for what is `more`."""
+    """A message as a daemon makes it that knows nothing of outcomes, with `more` fields."""
     known = outcome != "unknown"
     return {
         "v": 1,

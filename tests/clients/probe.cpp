@@ -1,6 +1,6 @@
 // The C++ client's rules, line by line, for comparison with the Python client's.
 //
-// `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
+// `new MAX_AGE_NS SAME_COMPUTER` begins again; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
 // takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `end BOOT_ID GRASP` tells an outcome;
 // `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT [MAX_AGE_MS]` makes one, `lift` asks it and
 // answers with a line (`watch DEADLINE_S`: under supervision), `tell` tells it that the lift held
@@ -49,7 +49,7 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
 
 }  // namespace
 
-static_assert(std::is_move_constructible_v<graspd::Client>, "whoever makes one may keep it");
+static_assert(std::is_move_constructible_v<graspd::Client>, "a client can be moved");
 
 int main() {
     graspd::detail::Newest newest("verdict.right", 0, true);

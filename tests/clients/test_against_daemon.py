@@ -171,7 +171,7 @@ def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -
     assert (bool(answer), answer.verdict.reasons) == (False, ("silent",))
 
 
-def test_a_killed_daemon_is_unknown_until_heard_again(tmp_path: Path) -> None:
+def test_a_killed_daemon_is_unknown_until_its_next_message(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Client(daemon.endpoint, max_age_ms=1e6) as graspd:
         wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
         former = graspd.verdict().boot_id

@@ -1,4 +1,4 @@
-"""The client for asyncio: the same answers, while other tasks go on."""
+"""The client for asyncio: the same answers, while other tasks continue."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_lift_is_allowed_and_told_once(tmp_path: Path) -> None:
         asyncio.run(lifts())
 
 
-def test_without_a_daemon_it_is_no_in_time(tmp_path: Path) -> None:
+def test_without_a_daemon_the_answer_comes_in_time(tmp_path: Path) -> None:
     async def asks() -> None:
         async with made(tmp_path) as graspd:
             answer = await graspd.may_i_lift(DEADLINE_S)
@@ -79,7 +79,7 @@ def test_it_waits_without_looking_again_and_again(
     assert len(looks) < 20, "a few for each call, and for what the clocks round off"
 
 
-def test_other_tasks_go_on_while_it_waits(tmp_path: Path) -> None:
+def test_other_tasks_continue_while_it_waits(tmp_path: Path) -> None:
     async def waits() -> None:
         async with made(tmp_path, ask=False) as graspd:
             waiting = asyncio.create_task(graspd.wait_for_grasp(60.0))

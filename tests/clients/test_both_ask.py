@@ -221,7 +221,7 @@ def test_both_answer_and_newest_message_must_have_been_still(
 
 
 @pytest.mark.parametrize("still_ms", [-1.0, float("nan"), float("inf"), True, "240"])
-def test_a_stillness_that_is_no_time_is_refused(
+def test_a_stillness_that_is_not_a_time_is_refused(
     lift_gate: Path,
     tmp_path: Path,
     still_ms: Any,  # noqa: ANN401

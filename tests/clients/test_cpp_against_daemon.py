@@ -109,7 +109,7 @@ def test_cpp_trusts_nothing_from_before_a_sleep(
         out.linger = 0
         out.bind(endpoint)
         for seq in range(2):
-            while out.recv()[:1] != b"\x01":  # it has subscribed, the second time anew
+            while out.recv()[:1] != b"\x01":  # it has subscribed, then reconnected
                 pass
             message = verdict(seq, time.monotonic_ns(), "unknown", silence_ms=1e9)
             out.send_multipart(frames(message))
@@ -122,7 +122,7 @@ def test_cpp_trusts_nothing_from_before_a_sleep(
 @pytest.mark.parametrize(
     "words", [[], ["ipc:///x"], ["ipc:///x", "-1"], ["nowhere", "1"], ["--watch"]]
 )
-def test_a_wrong_command_line_is_no_yes(lift_gate: Path, words: list[str]) -> None:
+def test_a_wrong_command_line_never_means_yes(lift_gate: Path, words: list[str]) -> None:
     code, text = told(lift_gate, *words)
     assert code == WRONG
     assert "lift_gate" in text

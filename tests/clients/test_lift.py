@@ -146,7 +146,7 @@ def test_slip_is_a_no_at_once() -> None:
     ("outcomes", "reasons"),
     [([], ("no-message",)), (["unknown"] * 100, ("moving",)), (["unknown"], ("silent",))],
 )
-def test_at_the_deadline_it_is_no_and_why(outcomes: list[str], reasons: tuple[str, ...]) -> None:
+def test_at_the_deadline_the_answer_says_why(outcomes: list[str], reasons: tuple[str, ...]) -> None:
     with client(World(stream(*outcomes))) as graspd:
         answer = graspd.may_i_lift(0.3)
     assert (bool(answer), answer.verdict.reasons) == (False, reasons)
@@ -226,7 +226,7 @@ def test_only_true_asks_for_supervised_lifts(not_true: object) -> None:
 
 
 def grasps(number: int) -> World:
-    """So many grasps, each stable for 10 ms."""
+    """This number of grasps, each stable for 10 ms."""
     sent = coming(*(("stable", {"grasp": grasp}) for grasp in range(1, number + 1)))
     answers = [(0, message[1]) for _, message in sent for _ in range(2)]
     return World(sent, answers, [(MS, TAKEN)] * number)
@@ -306,14 +306,14 @@ def test_an_outcome_has_a_name(word: str | Outcome, bad: str | Outcome) -> None:
 
 
 @pytest.mark.parametrize("nothing", [True, False, None, 0, "", "Slip", "unknown", "true"])
-def test_what_is_no_outcome_is_not_told(nothing: object) -> None:
+def test_other_values_than_outcomes_are_not_told(nothing: object) -> None:
     world = World(stream("stable"))
     with client(world, ask=True) as graspd, pytest.raises(ValueError, match="Outcome"):
         graspd.tell(Verdict(Decision.STABLE, grasp=1, boot_id="a"), nothing)  # type: ignore[arg-type]
     assert world.telling.said == []
 
 
-def test_who_has_not_read_for_long_connects_anew() -> None:
+def test_a_client_that_has_not_read_for_long_reconnects() -> None:
     world = World(stream("stable"))
     with client(world) as graspd:
         graspd.verdict()

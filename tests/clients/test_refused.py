@@ -1,7 +1,7 @@
-"""What a rogue publisher or an older start sends lets nobody lift, in either language.
+"""What a rogue publisher or an older start sends allows no lift, in either language.
 
-A case is what comes after one another, each as a verdict that all is well with but for its
-`change`, for the field that it is `without`, or for the time of its reading, `later_ms`. Its
+A case is what comes after one another, each as a verdict in which all is well except its
+`change`, the field that it is `without`, or the time of its reading, `later_ms`. Its
 `frames` after the topic are that payload, changed as text (Latin-1: each character is a byte).
 Before it, the outcomes of the grasps were `told` of whose `boot_id` and number it has a list.
 """

@@ -108,7 +108,7 @@ def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> Non
     node.graspd.close()  # type: ignore[attr-defined]
 
 
-def test_the_node_says_why_it_is_no(node: Node, tmp_path: Path) -> None:
+def test_the_node_says_why_it_refuses(node: Node, tmp_path: Path) -> None:
     with false_daemon(tmp_path, told(), "unknown", reasons=["moving"]):
         wait_until(lambda: node.ask("~/may_i_lift") == (False, "unknown moving"))
         assert node.ask("~/held", data=True) == (False, "no lift was allowed")

@@ -144,7 +144,7 @@ def test_another_computers_first_message_may_be_old() -> None:
     assert newest.at(START_NS + 10 * MS)
 
 
-def test_another_computer_that_was_rebooted_is_heard_again() -> None:
+def test_messages_of_a_rebooted_computer_count_again() -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     for number, boot_id in enumerate("aabb"):
         now_ns = START_NS + number * 10 * MS
@@ -216,7 +216,7 @@ def test_what_is_forgotten_comes_back_only_with_a_newer_message() -> None:
     assert newest.at(START_NS).reasons == ("joining",)  # how the clocks differ is not known now
 
 
-def test_what_waited_while_nobody_read_has_no_time_of_arrival() -> None:
+def test_messages_that_waited_unread_have_no_time_of_arrival() -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     now_ns = START_NS + 3000 * MS
     for seq in range(50):  # came in the first half second, read after three

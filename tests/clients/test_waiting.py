@@ -240,7 +240,7 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
         def is_answered() -> bool:
             """On a machine that stands still the probe may begin to look too late for it."""
             fingers.update(HELD)
-            wait_until(lambda: probe.ask("slide", 0.01) == "0 1")  # it has heard of them
+            wait_until(lambda: probe.ask("slide", 0.01) == "0 1")  # it has received them
             probe.tell("slide", timeout_s)
             probe.flush()
             time.sleep(0.1)
@@ -301,7 +301,7 @@ def test_a_clock_that_is_not_understood_is_malformed(answer: bytes) -> None:
         assert graspd.counts.malformed == 1
 
 
-def test_who_hears_nothing_at_all_connects_anew_ever_more_seldom() -> None:
+def test_a_client_without_messages_reconnects_ever_more_seldom() -> None:
     world = World([])
     times_s = []
     with client(world) as graspd:

@@ -34,7 +34,7 @@ with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         topic, payload = socket.recv_multipart()
         print(payload.decode())
 """
-"""Plain pyzmq: prints the verdicts that come at an endpoint, so many at most."""
+"""Plain pyzmq: prints the verdicts that come at an endpoint, up to a number."""
 
 
 def graspd(*arguments: object, timeout_s: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:

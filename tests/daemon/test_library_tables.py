@@ -128,7 +128,7 @@ def test_sweeps_without_times_are_never_grasps() -> None:
         ([], "no recording was given"),
     ],
 )
-def test_what_is_no_recording_is_refused(given: Any, words: str) -> None:  # noqa: ANN401
+def test_other_things_than_recordings_are_refused(given: Any, words: str) -> None:  # noqa: ANN401
     with pytest.raises(ValueError, match=words):
         list(graspd.judge(given))
 

@@ -269,7 +269,7 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
-def test_a_prefix_in_a_folder_of_somebody_else_is_refused(tmp_path: Path, wheels: Path) -> None:
+def test_a_prefix_in_a_folder_of_another_user_is_refused(tmp_path: Path, wheels: Path) -> None:
     (tmp_path / "srv").mkdir()
     os.chown(tmp_path / "srv", 12345, -1)
     done = installer("--root", tmp_path, "--wheelhouse", wheels, "--prefix", "/srv/hand")
@@ -299,7 +299,7 @@ def test_can0_is_brought_up_only_for_those_who_ask(staged: Path, wheels: Path) -
     assert f"wrote {NETWORK}" in install(staged, wheels)
 
 
-def test_the_file_of_somebody_else_is_not_replaced(tmp_path: Path, wheels: Path) -> None:
+def test_the_file_of_another_program_is_not_replaced(tmp_path: Path, wheels: Path) -> None:
     foreign = tmp_path / "usr/local/bin/graspd"
     foreign.parent.mkdir(parents=True)
     foreign.write_text("theirs")

@@ -87,7 +87,7 @@ def test_the_unit_keeps_what_the_daemon_needs() -> None:
     assert unit["Restart"] == ["on-failure"]  # after a sleep of the computer, too
     assert unit["RestartPreventExitStatus"] == ["2"]
     assert unit["ExecStart"][0].endswith(" run /etc/graspd/%i.toml")
-    # The dash: systemd heeds RestartPreventExitStatus= of the main process only.
+    # The dash: systemd obeys RestartPreventExitStatus= of the main process only.
     (before,) = unit["ExecStartPre"]
     assert before.startswith("-/opt/graspd/")
     assert before.endswith(" check /etc/graspd/%i.toml")
@@ -100,7 +100,7 @@ def test_every_priority_that_a_scene_may_name_is_granted() -> None:
         Realtime(priority=int(limit) + 1)
 
 
-def test_folders_have_the_same_rights_whoever_makes_them_first() -> None:
+def test_folders_have_the_same_rights_from_every_maker() -> None:
     unit = settings(UNIT)
     wanted = {
         f"/run/{unit['RuntimeDirectory'][0]}": unit["RuntimeDirectoryMode"][0],

@@ -49,13 +49,13 @@ class Step:
 
     what: str
     """`send`; `lose`; `again`: the last ones come once more; `late`: they come after the next;
-    `stall`: the board pauses; `restart`: it begins anew, with all its counters."""
+    `stall`: the board pauses; `restart`: it begins again, with all its counters."""
     units: int
     """How many frames, packets or samples; of a stall, how long in them."""
 
 
 def plans(sweep: int, steady_sweeps: int = 1) -> st.SearchStrategy[list[Step]]:
-    """Plans for a board of which a sweep takes so many units; at first it sweeps undisturbed.
+    """Plans for a board of which a sweep takes `sweep` units; at first it sweeps undisturbed.
 
     Losses are often of whole sweeps, or nearly: there places agree again though sweeps do not.
     """
@@ -123,7 +123,7 @@ class Unit:
 def arrivals(plan: Sequence[Step], silent: int, late_max: int = 3) -> Iterator[Unit]:
     """Units in the order in which they come.
 
-    A board that begins anew is silent for so many units first; what is late or doubled comes at
+    A board that begins again is silent for `silent` units first; what is late or doubled comes at
     most `late_max` units after it was sent.
     """
     at = index = boot = 0

@@ -1,4 +1,4 @@
-"""A link of datagrams on a scripted socket: who is heard, when it is silent, what was dropped."""
+"""A link of datagrams on a scripted socket: who may send, when it is silent, what was dropped."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def test_at_most_256_datagrams_are_taken_at_once(bench: Bench) -> None:
 
 
 def test_a_socket_keeps_128_kilobytes() -> None:
-    """0.2 s of palm packets; the kernel gives what it gives to whoever asks for as much."""
+    """0.2 s of palm packets; the kernel gives what it gives to others that ask for as much."""
     receiver = DatagramReceiver(Endpoint("127.0.0.1", 0), 100)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 131_072)
@@ -344,7 +344,7 @@ def test_age_and_losses_are_what_the_kernel_notes(
 def test_a_wall_clock_that_steps_makes_nothing_younger(
     monkeypatch: pytest.MonkeyPatch, step_ms: int, age_ms: int
 ) -> None:
-    """A stall of 450 ms; the datagram came after 200 ms of it. A change of 2 ms is no step."""
+    """A stall of 450 ms; the datagram came after 200 ms of it. A change of 2 ms is not a step."""
     stamp = struct.pack("@ll", 5, 200_000_010)
     receiver, kernel = noted(monkeypatch)
     assert list(receiver.receive(5)) == []

@@ -36,7 +36,7 @@ def sweeping(powered: Board) -> Board:
 
 
 def sweep_on(board: Board, count: int) -> list[bytes]:
-    """So many more SWEEPs, to the pause between two of them."""
+    """Wait for this number of SWEEPs more, to the pause between two of them."""
     board.take(SWEEP)
     return board.until(SWEEP, count, PERIOD_MS * (count + 2))
 

@@ -74,7 +74,7 @@ class LoopBench(Companion):
     ) -> None:
         """Without `stop` the bench has one of its own, which `run` closes.
 
-        With `cost_ns` time stands still but for waits and for what each verdict costs.
+        With `cost_ns` time stands still except for waits and for what each verdict costs.
         """
         self.driver = driver
         self.clock = clock

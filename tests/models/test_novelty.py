@@ -85,7 +85,7 @@ def test_a_contract_that_contradicts_itself_is_refused(
     [(1.0, True, True, True), (1.9, True, False, True), (2.6, False, False, True),
      (5.1, False, False, False)],
 )  # fmt: skip
-def test_a_session_learns_twice_as_far_as_it_judges(
+def test_a_session_learns_at_twice_the_distance_it_judges(
     distance: float, near: bool, near_though_contradicted: bool, learned: bool
 ) -> None:
     check = Electrodes(seen(spread=1 / 100))

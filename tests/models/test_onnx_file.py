@@ -205,7 +205,7 @@ def test_a_location_of_more_bits_than_there_are_is_one() -> None:
         onnx_file.check(b"\x3a" + bytes([len(graph)]) + graph)
 
 
-def test_what_is_no_message_is_refused() -> None:
+def test_other_bytes_than_a_message_are_refused() -> None:
     cut_off = (b"\x3a\x05\x0a", b"\x3a", b"\x38\xff", b"\x3d\x01")
     for content in (*cut_off, b"\x3b", b"\x00\x00", b"\xff" * 20, b"\x08" + b"\xff" * 9 + b"\x02"):
         with pytest.raises(ModelError, match="not a usable ONNX model"):
@@ -245,7 +245,7 @@ def test_damage_raises_nothing_else_and_gets_nothing_by() -> None:
 
 def test_nothing_is_read_after_too_many_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_file, "FIELDS_MAX", 1000)
-    damage = b"\x0f"  # a field of a kind that there is not
+    damage = b"\x0f"  # a field of an unknown kind
     with pytest.raises(ModelError, match="more than 1000 fields"):
         onnx_file.check(b"\x08\x01" * 1000 + damage)
     with pytest.raises(ModelError, match="a field of kind 7"):

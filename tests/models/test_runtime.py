@@ -41,7 +41,7 @@ def test_the_answer_is_two_probabilities_that_follow_the_image() -> None:
     ],
     ids=["missing", "directory", "fifo", "empty", "text", "truncated"],
 )
-def test_what_is_no_model_is_refused_in_one_line(
+def test_other_files_than_models_are_refused_in_one_line(
     tmp_path: Path, make: Callable[[Path], object]
 ) -> None:
     path = tmp_path / "model.onnx"

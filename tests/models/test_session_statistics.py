@@ -126,7 +126,7 @@ def test_a_session_that_began_wrongly_finds_back() -> None:
     np.testing.assert_allclose(session.mean, 500.0, atol=60.0)
 
 
-def test_an_unbalanced_session_goes_on_where_it_was() -> None:
+def test_an_unbalanced_session_continues_where_it_was() -> None:
     session = halves(300)
     other = statistics()
     other.restore(msgspec.json.decode(msgspec.json.encode(session.state()), type=SessionState))

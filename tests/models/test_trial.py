@@ -1,4 +1,4 @@
-"""A model that nobody knows is tried in a process of its own, which may be slow or grow."""
+"""An unknown model is tried in a process of its own, which may be slow or grow."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def _run(folder: Path, rebuild: bool, table: Table) -> None:
 
 
 def _explain(machine: Machine) -> None:
-    """What the journal has, for whoever looks into a failure."""
+    """What the journal has, to look into a failure."""
     with contextlib.suppress(MachineError):
         said = machine.run("journalctl -q --no-pager -n 60 -p notice; systemctl --failed").out
         sys.stderr.write(said + "\n")

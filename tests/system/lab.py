@@ -120,7 +120,7 @@ class Lab:
         wanted: Callable[[Message], bool] | None = None,
         timeout_s: float = PATIENCE_S,
     ) -> Message:
-        """The first message of a hand after a time that is wanted. Raises `StepError` if none."""
+        """The first message of a hand after a time that fits. Raises `StepError` if none."""
 
         def fits(message: Message) -> bool:
             return message.hand == hand and (message.told if wanted is None else wanted(message))
@@ -148,7 +148,7 @@ class Lab:
         return message.body
 
     def verdicts(self, hand: str, from_s: float, to_s: float) -> list[Message]:
-        """Verdicts of a hand in a time, none of them lost. Raises `StepError` if one was."""
+        """All verdicts of a hand in a time. Raises `StepError` if one was."""
         found = self.machine.messages.between(hand, "verdict", from_s, to_s)
         for former, following in itertools.pairwise(found):
             if former.body["boot_id"] != following.body["boot_id"]:

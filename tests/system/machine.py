@@ -105,7 +105,7 @@ class JsonLines:
                 raise ProtocolError(f"{self._name}: hung up")
             self._rest += chunk
         line, self._rest = self._rest.split(b"\n", 1)
-        # After a synchronisation the agent's answer begins with a byte that is no JSON.
+        # After a synchronisation the agent's answer begins with a byte that is not JSON.
         try:
             decoded: dict[str, Any] = json.loads(line.lstrip(b"\xff"))
         except ValueError as error:

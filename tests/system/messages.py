@@ -62,7 +62,7 @@ class Messages:
                 yield
 
     def wait(self, wanted: Wanted, timeout_s: float, after_s: float = 0.0) -> Message | None:
-        """The first that is wanted and came later than `after_s`; None if none came in time."""
+        """The first that fits and came later than `after_s`; None if none came in time."""
         deadline_s = time.monotonic() + timeout_s
         at = 0
         with self._changed:

@@ -37,7 +37,7 @@ SESSION: Final = "/var/lib/graspd/serial.session/*.session"
 
 
 def killed(lab: Lab) -> Outcome:
-    """kill -9: systemd starts it anew, a subscriber need not do anything."""
+    """kill -9: systemd starts it again, a subscriber need not do anything."""
     at_s = lab.deed(f"kill -KILL {lab.show('can', 'MainPID')}")
     recovery_s = _started_anew(lab, "can", at_s, "signal")
     return Outcome("kill -9 -> first verdict of the new process", recovery_s)
@@ -50,7 +50,7 @@ def hangs(lab: Lab) -> Outcome:
 
 
 def hung(lab: Lab) -> Outcome:
-    """After SIGSTOP the watchdog notices and systemd starts it anew."""
+    """After SIGSTOP the watchdog notices and systemd starts it again."""
     recovery_s = _started_anew(lab, "serial", lab.done_s("SIGSTOP"), "watchdog")
     limit = lab.show("serial", "WatchdogUSec")
     what = f"SIGSTOP -> watchdog ({limit} here) -> first verdict of the new process"
@@ -115,7 +115,7 @@ def _same_process(lab: Lab, hand: str, pid: str) -> None:
 
 
 def disk_full(lab: Lab) -> Outcome:
-    """The disk is full: judging goes on, a warning each tells what cannot be kept, and no more."""
+    """The disk is full: judging continues, a warning each says what cannot be kept."""
     pid = lab.show("serial", "MainPID")
     try:
         full_s = lab.deed(FILL)

@@ -266,7 +266,7 @@ static void make_link(const char *path)
     struct stat about;
 
     if (lstat(path, &about) == 0 && !S_ISLNK(about.st_mode)) {
-        fail(EXIT_FAILED, "%s is in the way: it is no link", path);
+        fail(EXIT_FAILED, "%s is in the way: it is not a link", path);
     }
     if (snprintf(fresh, sizeof fresh, "%s.new", path) >= (int)sizeof fresh) {
         fail(EXIT_FAILED, "%s is too long", path);

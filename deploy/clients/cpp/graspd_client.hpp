@@ -47,22 +47,22 @@ constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not
 constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
 constexpr double REAL_MAX = 1e12;                              // as a time, thirty years in ms
 constexpr double WAIT_MAX_S = 1e9;                             // of a call: thirty years
-// A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
+// A verdict has 0.7 kB, at most 3; a peer that sends more is not a daemon and is disconnected.
 constexpr std::size_t MESSAGE_MAX_BYTES = 1 << 16;
 // Of lists and objects in a message, and so its depth; a verdict has ten.
 constexpr std::ptrdiff_t OPENINGS_MAX = 100;
 constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
-// Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
+// A client that has not read for longer reconnects: what waits is old, and newer ones are lost.
 constexpr Nanoseconds READ_WITHIN_NS = 5'000'000'000;
-// Whoever hears nothing for so long connects anew, at first and at most: who was turned away once
-// is not tried again by libzmq, and may be let in by now.
+// A client without a message for this long reconnects, at first and at most: libzmq does not try
+// a refused peer again, which may be let in by now.
 constexpr Nanoseconds QUIET_NS = 1'000'000'000, QUIET_MAX_NS = 10'000'000'000;
 // The computer has slept if its clocks have moved apart by more. A sleep takes seconds, the
 // scheduler a moment between two looks at the clocks.
 constexpr Nanoseconds SLEPT_NS = 50'000'000;
 // Longest wait in one piece: so well is it known when a message came from another computer.
 constexpr std::int64_t SLICE_MS = 10;
-// What a message may come from the future by before the clocks are taken for different ones.
+// What a message may come from the future by before the clocks count as different ones.
 constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
 // By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 constexpr double DRIFT = 1e-3;
@@ -71,14 +71,14 @@ constexpr Nanoseconds DRIFT_MAX_NS = 20'000'000;
 // Between two questions for the daemon's clock, and after one that was not answered.
 constexpr Nanoseconds CLOCK_EVERY_NS = 1'000'000'000, CLOCK_RETRY_NS = 10'000'000'000;
 constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembered as over
-// On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
+// On TCP: between two signs of life, and when a daemon that gives none is connected to again.
 constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
 constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
 constexpr std::size_t NAME_BYTES = 16;   // of a client's name
 constexpr std::size_t LIFTS_MAX = 256;  // that are remembered: as many as graspd takes outcomes of
 constexpr std::int64_t WARN_EVERY = 10;  // lifts whose outcome was never told
-// Longest wait at the end until graspd has heard that no lift follows, and most connections that
-// say so at a time.
+// Longest wait at the end until graspd has received that no lift follows, and most connections
+// that say so at a time.
 constexpr int TAKE_BACK_MS = 200;
 constexpr std::size_t LEAVING_MAX = 4;
 
@@ -103,18 +103,18 @@ inline const char* name(FingerState state) {
 // How a lift ended.
 enum class Outcome { held, slipped, not_lifted };
 
-// What lifts of `stable` verdicts came to: of `lifts` that were told, so many `slips`.
+// Outcomes of `stable` lifts: `lifts` were told, `slips` of them slipped.
 struct Risk {
     std::optional<double> target;  // share of slips that is allowed; none: no risk is set
     std::int64_t lifts = 0, slips = 0;
     std::int64_t outstanding = 0;  // outcomes that can still come
-    std::optional<double> bound;   // of `slips`, but for one more each that is outstanding
+    std::optional<double> bound;   // of `slips`; each outstanding lift adds one
     std::int64_t warm_up_left = 0;  // outcomes until most grasps need no supervision
     std::int64_t announced = 0;     // `lift` questions that were answered `stable`
-    std::int64_t awaited = 0;  // outcomes of these that are out; too many, and nothing is `stable`
+    std::int64_t awaited = 0;  // those without an outcome; too many, and nothing is `stable`
 };
 
-// What is known of the grasp. True in an `if` exactly when it is stable, and nobody need watch.
+// What is known of the grasp. True in an `if` exactly when it is stable; then no person need watch.
 struct Verdict {
     Decision decision = Decision::unknown;
     // Why it is unknown: the daemon's reasons, or one of those in deploy/clients/README.md.
@@ -167,7 +167,7 @@ struct LiftAnswer {
     explicit operator bool() const { return static_cast<bool>(verdict) || supervised; }
 };
 
-// What the fingers felt during a lift. True in an `if` exactly when it is to be stopped.
+// Words of the fingers during a lift. True in an `if` exactly when it is to be stopped.
 struct SlideAnswer {
     Verdict verdict;  // the newest; its `fingers` and `reasons` say what is known
     double waited_s = 0.0;
@@ -192,7 +192,7 @@ struct Counts {
     std::uint64_t lost = 0;      // gaps in `seq`, in messages
     std::int64_t repeats = 0;    // messages that were known already
     std::int64_t malformed = 0;  // messages that are not understood, answers too
-    std::int64_t restarts = 0;   // times that the daemon was started anew
+    std::int64_t restarts = 0;   // times that the daemon was started again
     std::int64_t former = 0;     // messages of a start that is over
 };
 
@@ -229,7 +229,7 @@ struct Options {
     // loopback addresses: say false through a tunnel.
     std::optional<bool> same_computer = {};
     std::optional<Keys> keys = {};
-    // A `stable` with a `p_slip` of so much or more is none: the scene's `slip_threshold`, if that
+    // A `stable` with this `p_slip` or more does not count: the scene's `slip_threshold`, if that
     // is higher.
     double max_p_slip = 0.5;
     // Is told of lifts that were allowed and whose outcome was not: of the first and each tenth.
@@ -409,8 +409,8 @@ inline Message message(const json& told) {
     return all;
 }
 
-// A JSON object, none of whose keys comes twice: which of two values holds, readers see differently.
-// Something that is no object for what is none.
+// A JSON object without a key twice: readers differ in which of two values holds.
+// Returns a value that is not an object for other text.
 inline json parsed(std::string_view payload) {
     const auto opens = [](char c) { return c == '[' || c == '{'; };
     // A byte order mark is passed over by the parser, and a NUL is its end.
@@ -504,7 +504,7 @@ public:
         : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer),
           max_p_slip_(max_p_slip) {}
 
-    // What each finger felt by the messages of the last look.
+    // Words of each finger in the messages of the last look.
     std::set<std::pair<std::string, FingerState>> passed;
     Counts counts;
     bool may_be_announced = false;  // the lift that the last answer was about
@@ -706,7 +706,7 @@ struct Call {
         return frames.size() == 1 ? frames[0].to_string() : std::string();
     }
 
-    // An answer that is late must not be taken for one to the next question.
+    // An answer that is late must not be mistaken for one to the next question.
     void hang_up() {
         socket.close();
         socket = zmq::socket_t();
@@ -721,7 +721,7 @@ public:
 
     bool receive(std::vector<zmq::message_t>& frames) { return received(socket_, frames); }
 
-    // Until a message or an answer waits, so long at most; a signal ends it sooner.
+    // Waits for a message or an answer, up to the time given; a signal ends it sooner.
     void wait(std::int64_t timeout_ms) {
         std::vector<zmq_pollitem_t> items;
         for (zmq::socket_t* each : {&socket_, &asking.socket, &telling.socket})
@@ -748,7 +748,7 @@ public:
         leaving_.pop_front();
     }
 
-    // Connect anew, and forget what waits.
+    // Connect again, and forget what waits.
     void renew() {
         socket_.close();
         socket_ = connected(zmq::socket_type::sub, options_.endpoint);
@@ -874,7 +874,7 @@ public:
                                                      : newest.reasons);
     }
 
-    // What was decided; if it is no lift on a message, also that nobody has answered.
+    // What was decided; if it is not a lift on a message, also that no answer came.
     Verdict at_the_end(Verdict said) {
         lifts_ = permits(said);
         auto& why = said.reasons;
@@ -940,7 +940,7 @@ public:
     // for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
     // person watches: then what graspd wants to learn from (in the warm-up, and now and then after
     // it) may be lifted too if it is not `early`, and the answer says that it is such a lift. With
-    // `still_ms` the hand must have been still for so long as well, and a daemon that does not say
+    // `still_ms` the hand must have been still for that time too, and a daemon that does not say
     // so gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`:
     // its scene allows that. Throws `std::invalid_argument` for a time that is none.
     LiftAnswer may_i_lift(double deadline_s, bool supervised = false,
@@ -963,7 +963,7 @@ public:
         return answer;
     }
 
-    // A time in the place of `supervised` would be taken for true.
+    // A time in the place of `supervised` would be mistaken for true.
     LiftAnswer may_i_lift(double deadline_s, double still_ms) = delete;
 
     // The verdict on the next grasp that is surely judged; none if there is none in time.
@@ -1036,8 +1036,8 @@ public:
     // Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
     // comes later is taken in by later calls; without one, tell it again. Throws
     // `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp, and for a
-    // name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins with one of the last
-    // two.
+    // name that is not 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins with one of the
+    // last two.
     OutcomeAnswer tell(const Verdict& lifted_on, Outcome how,
                        const std::string& object_name = {}, double wait_s = 2.0) {
         const std::string telling = detail::telling(lifted_on, how, object_name);
@@ -1128,7 +1128,7 @@ private:
             clock_asked_ns_.reset();
         }
         if (now_ns < clock_due_ns_) return;
-        // A late answer must not be taken for one to this question.
+        // A late answer must not be mistaken for one to this question.
         if (clock_asked_ns_) link_->timing.hang_up();
         clock_asked_ns_ = now_ns;
         clock_due_ns_ = now_ns + CLOCK_RETRY_NS;
@@ -1166,7 +1166,7 @@ private:
     }
 
     // What came or waits since before a sleep of the computer, or a long time without a look; when
-    // something was heard, or was connected to, last. While the computer sleeps the monotonic clock
+    // a message or a connection came last. While the computer sleeps the monotonic clock
     // stands still: all would look fresh.
     Nanoseconds forget_what_is_old() {
         const Nanoseconds slept_ns = detail::slept_ns();

@@ -3,7 +3,7 @@
 //
 //     lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT [OBJECT]]
 //                                                     one question; a person watches the lift; the
-//                                                     hand must have been still for so long. With
+//                                                     hand must have been still for MS. With
 //                                                     OBJECT: after a yes reads held, slipped or
 //                                                     not-lifted, and tells it
 //     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]

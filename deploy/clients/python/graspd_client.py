@@ -53,7 +53,7 @@ VERSION = 1  # of the messages; what has another is not understood
 INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
 REAL_MAX = 1e12  # of a message or an age: as a time, thirty years in ms
 WAIT_MAX_S = 1e9  # of a call: thirty years
-# A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
+# A verdict has 0.7 kB, at most 3; a peer that sends more is not a daemon and is disconnected.
 MESSAGE_MAX_BYTES = 1 << 16
 OPENINGS_MAX = 100  # of lists and objects in a message, and so its depth; a verdict has ten
 QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
@@ -68,7 +68,7 @@ SLEPT_NS = 50_000_000
 # Longest wait in one piece while the clock of another computer is not known: so well is it known
 # when a message came.
 SLICE_MS = 10
-# What a message may come from the future by before the clocks are taken for different ones.
+# What a message may come from the future by before the clocks count as different ones.
 CLOCK_SLACK_NS = 1_000_000
 # By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 DRIFT = 1e-3
@@ -83,7 +83,7 @@ NAME_BYTES = 16  # of a client's name, which routing ids begin with: random, the
 OBJECT_MAX = 64  # characters of an object's name
 LIFTS_MAX = 256  # that are remembered: as many as graspd takes outcomes of
 WARN_EVERY = 10  # lifts whose outcome was never told
-# Longest wait at closing until graspd has heard that no lift follows, and most connections that
+# Longest wait at closing until graspd has received that no lift follows, and most connections that
 # say so at a time.
 TAKE_BACK_MS, LEAVING_MAX = 200, 4
 
@@ -145,7 +145,7 @@ class Risk:
     bound: float | None  # of `slips`; each outstanding lift adds one
     warm_up_left: int  # outcomes until most grasps need no supervision
     announced: int = 0  # `lift` questions that were answered `stable`
-    awaited: int = 0  # outcomes of these that are out; too many, and nothing is `stable`
+    awaited: int = 0  # those without an outcome; too many, and nothing is `stable`
 
 
 @dataclass(frozen=True)
@@ -285,7 +285,7 @@ class _Hand:
         a peer to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
         unless given, it is with `ipc://` and on loopback addresses: say False through a tunnel.
         A `stable` with a `p_slip` of `max_p_slip` or more is none: say the scene's `slip_threshold`
-        if that is higher. Raises `zmq.ZMQError` for an endpoint, `TypeError` for one that is no
+        if that is higher. Raises `zmq.ZMQError` for an endpoint, `TypeError` for one that is not
         text, `ValueError` for an age or a probability that is none.
         """
         for name, text in (("endpoint", endpoint), ("hand", hand), ("ask_endpoint", ask_endpoint)):
@@ -507,7 +507,7 @@ class _Hand:
             self._clock_asked_ns = None
         if now_ns >= self._clock_due_ns:
             if self._clock_asked_ns is not None:
-                calling.hang_up()  # a late answer must not be taken for one to this question
+                calling.hang_up()  # a late answer must not be mistaken for one to this question
             self._clock_asked_ns, self._clock_due_ns = now_ns, now_ns + CLOCK_RETRY_NS
             calling.ask(b"clock")
 
@@ -629,8 +629,8 @@ class Client(_Hand):
         Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
         comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
         without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` or a time that
-        is none, and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins
-        with one of the last two.
+        is none, and for a name that is not 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or
+        begins with one of the last two.
         """
         return self._finish(self._tell(lifted_on, how, object_name, wait_s))
 
@@ -1100,7 +1100,7 @@ class _Call:
         return None if self.socket is None else frames[0] if len(frames) == 1 else b""
 
     def hang_up(self, *, lifts: bool = True) -> None:
-        """An answer that is late must not be taken for one to the next question.
+        """An answer that is late must not be mistaken for one to the next question.
 
         Unless the hand `lifts`, the daemon is told to await no outcome of what was asked.
         """
@@ -1145,7 +1145,7 @@ def _parsed(payload: bytes) -> dict[str, Any]:
     if len(payload) > MESSAGE_MAX_BYTES or openings > OPENINGS_MAX:
         raise ValueError
     told = json.loads(payload.decode(), object_pairs_hook=_once)
-    # Refuses what is no JSON and no number, and what is no Unicode.
+    # Refuses other text than JSON, numbers that JSON lacks, and other bytes than UTF-8.
     json.dumps(told, allow_nan=False, ensure_ascii=False).encode()
     if not isinstance(told, dict):
         raise ValueError
@@ -1249,7 +1249,7 @@ def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes
     words = ["outcome", boot_id, str(grasp), how.value]
     if object_name is not None:
         if _OBJECT.fullmatch(object_name) is None:
-            raise ValueError(f"{object_name!r} is no name of an object: {_OBJECT_IS}")
+            raise ValueError(f"{object_name!r}: no name of an object: {_OBJECT_IS}")
         words.append(object_name)
     return " ".join(words).encode()
 

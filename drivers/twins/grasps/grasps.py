@@ -19,5 +19,5 @@ def recorded_counts(path: Path) -> Iterator[Counts]:
     """Yield the counts of ff, mf, th of a grasp table or stream. Raises `RecordingError`."""
     for row in read_rows(path, ("ff", "mf", "th")):
         if row.faults.any():
-            raise RecordingError(path, "holds a value that is no count", line=row.annotation.line)
+            raise RecordingError(path, "holds another value than a count", line=row.annotation.line)
         yield row.counts

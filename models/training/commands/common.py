@@ -101,7 +101,7 @@ def exit_code(
     try:
         work()
     except KeyboardInterrupt:
-        say(command, "interrupted; the same command goes on from here")
+        say(command, "interrupted; the same command continues from here")
         return 130
     except OSError as error:
         say(command, f"{error.filename or folder}: {error.strerror or error}")

@@ -136,6 +136,6 @@ def _name(text: str) -> str:
         raise argparse.ArgumentTypeError(f"graspd ships a model {text!r}: choose another name")
     if not zoo.is_name(text):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is no name: up to {zoo.NAME_MAX} letters, digits, '.', '_' and '-'"
+            f"{text!r} is not a name: up to {zoo.NAME_MAX} letters, digits, '.', '_' and '-'"
         )
     return text

@@ -188,7 +188,7 @@ def _last(answer: str, read: NDArray[np.float32], graph: onnx.GraphProto) -> lis
     `read`: its answers on the table, which say whether they are probabilities.
     """
     if not np.isfinite(read).all():
-        raise ModelError("the network answers grasps of the table with values that are no numbers")
+        raise ModelError("the network answers grasps of the table with values that are not numbers")
     two = np.array([-1, read.shape[-1]], np.int64)
     graph.initializer.append(numpy_helper.from_array(two, "answer_shape"))
     nodes = [helper.make_node("Reshape", [answer, "answer_shape"], ["answer"])]

@@ -161,8 +161,8 @@ def read_with_lab_tables(
 ) -> Grasps:
     """Return the published tables of `folder`, if given, then each lab table.
 
-    Raises `DatasetError` for a file that is no grasp table. A lab table is also refused if it has
-    the name of another, repeats a grasp, has only one label, or under `FEWEST_GRASPS` grasps.
+    Raises `DatasetError` for a file that is not a grasp table. A lab table is also refused if it
+    has the name of another, repeats a grasp, has only one label, or under `FEWEST_GRASPS` grasps.
     Raises `ValueError` if there is neither a folder nor a lab table.
     """
     parts = [] if folder is None else [read_all(folder)]

@@ -113,7 +113,7 @@ def fit_classical(
 ) -> FittedClassical:
     """Fit a classifier to inputs (N, M) and labels (N,), on one thread.
 
-    Raises `ValueError` if the inputs are no vectors or a class is missing.
+    Raises `ValueError` if the inputs are not vectors or a class is missing.
     """
     if inputs.ndim != 2:
         raise ValueError(f"takes vectors, not inputs {inputs.shape[1:]}")

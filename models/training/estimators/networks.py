@@ -156,10 +156,10 @@ def on_another_day(features: torch.Tensor, shift: DayShift) -> torch.Tensor:
     """Shift standardised session features (N, fingers * 26) as they may be on another day.
 
     Each grasp is shifted by a draw of its own, from torch's global random state; `features` do
-    not change. Raises `ValueError` if these are no session features.
+    not change. Raises `ValueError` if these are not session features.
     """
     if features.ndim != 2 or features.shape[1] % FEATURES_PER_FINGER:
-        raise ValueError(f"inputs {tuple(features.shape[1:])} are no session features")
+        raise ValueError(f"inputs {tuple(features.shape[1:])} are not session features")
     grasps, width = features.shape
     fingers = width // FEATURES_PER_FINGER
     electrodes = fingers * ELECTRODES

@@ -152,11 +152,11 @@ def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
         yield "one table is one day: what the model is worth on another one is not measured"
     if objects < FEW_OBJECTS:
         known = "one object" if objects == 1 else f"{objects} objects"
-        yield f"of {known} little is learned about others: {FEW_OBJECTS} or more are wanted"
+        yield f"of {known} little is learned about others: {FEW_OBJECTS} or more are needed"
     for kind, number in (("slipped", slips), ("stayed", len(grasps) - slips)):
         if number < FEW_OF_A_KIND:
             yield (
-                f"only {number} grasps {kind}: {FEW_OF_A_KIND} or more are wanted; lift some that "
+                f"only {number} grasps {kind}: {FEW_OF_A_KIND} or more are needed; lift some that "
                 "are not `stable` too (deploy/RECORDING.md)"
             )
     if plan.only is not None:

@@ -19,7 +19,7 @@ EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98
 """Ends of the parts in which `p_slip` is compared with what slipped."""
 SLOPE_MAX: Final = 20.0
 CONFIDENT: Final = 1e-12
-"""A probability nearer to 0 or 1 is taken for this one."""
+"""A probability nearer to 0 or 1 counts as this one."""
 SPREAD: Final = (0.05, 0.5, 0.95)
 """Quantiles of the sessions' slopes."""
 

@@ -41,7 +41,7 @@ ADDED_MAX_MS = 2.0
 """Processor time that a flood may add to a round of the loop, ms. It adds 0.05 to 0.5, by
 the machine; a server in the loop itself took 3.6 to 6.2."""
 HEARD_MIN = 0.95
-"""Smallest share of the verdicts given that must be heard in a flood."""
+"""Smallest share of the verdicts given that must be received in a flood."""
 PATIENCE_MS = 500
 """A question is answered by then."""
 GREETING = bytes.fromhex("ff 00 00 00 00 00 00 00 01 7f 03 01 4e 55 4c 4c") + bytes(48)
@@ -67,7 +67,7 @@ class Plan:
     """What an attack is given."""
 
     seconds: float
-    """How long it shall go on, s; a round that has begun is ended. It does one at least."""
+    """How long it lasts, s; a round that has begun is ended. It does one at least."""
     random: random.Random
     """For all that it draws."""
     folder: Path
@@ -117,7 +117,7 @@ class Hand:
         return partial(connect, self.publish), partial(connect, self.ask)
 
     def outcome(self, tried: int, well: bool = True, said: str = "") -> Outcome:
-        """What became of it: whether it lives, is heard, and has little memory."""
+        """What became of it: whether it lives, its messages arrive, and it has little memory."""
         self.friend.drain()
         grown_mib = peak_mib(self.process.pid) - self.rest_mib
         lives = self.process.poll() is None
@@ -268,7 +268,7 @@ def flood(plan: Plan) -> Outcome:
 
 
 def cost(daemon: Hand) -> tuple[float, float]:
-    """Processor time of the loop's thread for each verdict, ms, and share of verdicts heard."""
+    """Processor time of the loop's thread for each verdict, ms, and share of verdicts received."""
     daemon.friend.drain()
     path = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/schedstat")
     end_s, began_ns = time.monotonic() + KEEPING_RULES_S, int(path.read_text().split()[0])

@@ -70,7 +70,7 @@ def hang_ups(plan: Plan) -> Outcome:
                 if not outcome.held:
                     return outcome
     said = f"{ends} ends of libzmq's process, {100 * share:.0f} % of the verdicts made, "
-    return Outcome(tried, said + "the daemon goes on and is heard again", share >= MADE_MIN)
+    return Outcome(tried, said + "the daemon continues and others receive again", share >= MADE_MIN)
 
 
 def _made_hz(daemon: Hand, seconds: float) -> float:

@@ -35,7 +35,7 @@ NEVER = {
     *("daemon.record", "daemon.assembly.recordings", "daemon.assembly.sources"),
     "daemon.publish.keys",
 )
-"""Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
+"""Modules, each with all below it, that these scenes do not need: what no scene does, and what is
 for a service, realtime, known keys or a model that is not of the zoo."""
 BUSES = {
     "replay": ours("drivers.recordings.csv_player", "drivers.recordings.csv_rows"),

@@ -138,7 +138,7 @@ def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:
     ) as process:
         os.close(terminal)
         text = b""
-        with contextlib.suppress(OSError):  # the end of a terminal that nobody holds any more
+        with contextlib.suppress(OSError):  # the end of a terminal without another end
             while part := os.read(own, 1 << 16):
                 text += part
     os.close(own)

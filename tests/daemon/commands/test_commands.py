@@ -37,7 +37,7 @@ DEPLOY = Path(__file__).parents[3] / "deploy"
         (["replay", str(DEMO_TABLE), "--max-slip-when-stable", "0.1"], "it needs --outcomes"),
         (["replay", str(DEMO_TABLE), str(DEMO_RECORDING)], "both grasp tables and streams"),
         (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
-        (["twin", "spi", "--dead", "th"], "'th' is no electrode"),
+        (["twin", "spi", "--dead", "th"], "'th' is not an electrode"),
         (["twin", "palm", "--one-byte-at-a-time"], "cannot show the fault one-byte-at-a-time"),
     ],
 )

@@ -94,7 +94,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("kind", ANSWERS)
-def test_an_answer_that_is_no_answer_is_one_line(tmp_path: Path, kind: str) -> None:
+def test_a_malformed_answer_is_reported_in_one_line(tmp_path: Path, kind: str) -> None:
     with served(lambda client: client.sendall(ANSWERS[kind])) as address:
         result = graspd("data", "--to", tmp_path / "data", "--url", address)
     assert result.returncode == 1
@@ -115,7 +115,7 @@ def test_an_address_that_is_none_is_one_line(tmp_path: Path, address: str) -> No
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
-def test_what_is_no_file_is_not_replaced(tmp_path: Path, kind: str) -> None:
+def test_other_things_than_files_are_not_replaced(tmp_path: Path, kind: str) -> None:
     target = tmp_path / f"{TABLES[0].name}.csv"
     if kind == "fifo":
         os.mkfifo(target)
@@ -123,5 +123,5 @@ def test_what_is_no_file_is_not_replaced(tmp_path: Path, kind: str) -> None:
         target.mkdir()
     result = graspd("data", "--to", tmp_path, "--from", tmp_path)
     assert result.returncode == 1
-    assert result.stderr == f"graspd: {target}: is there and is no regular file\n"
+    assert result.stderr == f"graspd: {target}: is there and is not a regular file\n"
     assert not target.is_file()

@@ -70,7 +70,7 @@ def end(process: subprocess.Popen[str]) -> str:
 
 
 def heard(folder: Path, wanted: int) -> list[Tactile]:
-    """Readings as the daemon publishes them, so many sound ones: one that stalls loses sweeps."""
+    """Readings that the daemon publishes, up to `wanted` sound ones: a stall loses sweeps."""
     found: list[Tactile] = []
     with Subscriber(f"ipc://{folder}/graspd", topics=("tactile.",)) as subscriber:
         while len(found) < wanted and (message := subscriber.take(TIMEOUT_S)) is not None:

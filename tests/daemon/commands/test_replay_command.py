@@ -182,7 +182,7 @@ def test_a_subscriber_in_another_process_gets_every_paced_verdict(
     assert list(tmp_path.iterdir()) == [received]
 
 
-def test_replay_fails_when_nobody_subscribes(tmp_path: Path) -> None:
+def test_replay_fails_without_a_subscriber(tmp_path: Path) -> None:
     result = graspd("replay", "--publish", f"ipc://{tmp_path}/graspd", "--wait", 0.1)
     assert result.returncode == 1
     assert result.stderr.startswith("graspd: no subscriber of ipc://")
@@ -230,7 +230,7 @@ def replace_cell(text: str) -> str:
 
 
 @pytest.mark.parametrize("text", ["4096", "2602.5"])
-def test_a_value_that_is_no_count_is_repaired_and_said(tmp_path: Path, text: str) -> None:
+def test_a_malformed_count_is_repaired_and_reported(tmp_path: Path, text: str) -> None:
     recording = tmp_path / "grasps.csv"
     recording.write_text(replace_cell(text))
     result = graspd("replay", recording, "--json")

@@ -1,6 +1,6 @@
 """Drivers and twins of every link in one thread and on one clock, as the doctor listens to them.
 
-The hand's own time may pass faster than that of the link: `skip` leaves out what it felt.
+The hand's own time may pass faster than that of the link: `skip` leaves out those readings.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Hand:
         return self._counts
 
     def skip(self, moments: int) -> None:
-        """Nobody listens for so long."""
+        """Let this time pass without a listener."""
         next(itertools.islice(self._counts, moments, moments), None)
 
 
@@ -142,7 +142,7 @@ STEPS_PER_S = {"spi": 100, "can": 100, "palm": 1000, "datagrams": 100, "joints":
 
 
 def listen(driver: Driver, step: Step, steps: int, statistics: ElectrodeStatistics) -> None:
-    """Let so many periods of the link pass, and take in what comes."""
+    """Let periods of the link pass, and take in what comes."""
     for _ in range(steps):
         step()
         for reading in driver.read_ready():

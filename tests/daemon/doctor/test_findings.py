@@ -173,7 +173,7 @@ def test_the_rate_is_judged_by_its_nominal(
 
 
 @pytest.mark.parametrize(("number", "findings"), [(0, 0), (13, 0), (108, 0), (109, 1)])
-def test_joining_in_the_middle_of_a_sweep_is_no_trouble(number: int, findings: int) -> None:
+def test_joining_in_the_middle_of_a_sweep_is_fine(number: int, findings: int) -> None:
     assert len(counter_findings("palm", {"unsynchronised_packets": number})) == findings
 
 

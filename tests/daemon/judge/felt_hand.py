@@ -32,9 +32,9 @@ JOINTS = ("FFJ3", "MFJ3", "THJ5")
 STILL_RAD = 0.5
 AHEAD_NS = 300 * MS
 STANDS_MS = 100
-"""A verdict that is told was judged within the last of so many."""
+"""A verdict that is told was judged within this time, ms."""
 STEADY_MS = 1000
-"""What was called slip is not `stable` before so many without."""
+"""What was called slip is not `stable` before this time without a slip, ms."""
 TURN_RAD = 0.01
 """Per reading: at 100 Hz ten times what a joint that is still may do."""
 
@@ -88,7 +88,7 @@ class Feel:
     age_ns: int = 0
     """Of the first reading."""
     lag_ns: int = 0
-    """By so much each reading is older than the one before."""
+    """Time by which each reading is older than the one before, ns."""
     repeats: bool = False
     """Whether all have the counts of the first."""
     flaws: tuple[Flaw, ...] = ()
@@ -244,7 +244,7 @@ def tared(gate: HandLimits) -> Hand:
 
 
 def often(usual: object, *others: object, times: int = 9) -> st.SearchStrategy[object]:
-    """The usual, so many times as often as all others together."""
+    """The usual, `times` as often as all others together."""
     return st.sampled_from([usual] * (times * len(others)) + [*others])
 
 

@@ -20,7 +20,7 @@ MS = 1_000_000
 AGE_MAX_MS = 100
 GAP_MS = 100
 STILL_MS, EARLY_MS = 240, 100
-"""Touch and stillness must have lasted so long; the second where a grasp may be judged early."""
+"""Least time of touch and stillness, ms; the second where a grasp may be judged early."""
 WINDOW_MS = 80
 """Of the joints."""
 MOVED_COUNTS = 15.0
@@ -49,7 +49,7 @@ NEAREST, FURTHEST = 3, 5
 """Three fresh values are among the last five, for at most every other one is held; and two of them
 among the last three."""
 STEP_MS, STEP_SWEEPS_MAX = 5, 10
-"""Of sweeps that come within a step the mean is looked at, and of no more than so many."""
+"""Length of a step, ms, and most sweeps in it: their mean is looked at."""
 REMEMBERED = FURTHEST + 2 * STEP_SWEEPS_MAX + 2
 KEPT_MS = STILL_MS + GAP_MS + 60
 """What is older matters to nothing here."""
@@ -107,9 +107,9 @@ class Necessity:
         self._together = 0
         """Readings that the judge used within the last two steps, before the last one."""
         self._used: list[_Used] = []
-        """The last ones, between which time goes on and no gap is."""
+        """The last ones, between which time continues and no gap is."""
         self._joints: dict[bytes, list[_Angles]] = {}
-        """By which are valid: the last ones, between which time goes on and no gap is."""
+        """By which are valid: the last ones, between which time continues and no gap is."""
         self._changed_ns: int | None = None
         """When some angle had another value than before; nothing is remembered of other joints."""
         self._without_joints_since_ns: int | None = None

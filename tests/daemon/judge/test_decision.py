@@ -109,5 +109,5 @@ def test_the_defaults_ask_for_no_confidence() -> None:
 
 @pytest.mark.parametrize(("age_ns", "stale"), [(100_000_000, False), (100_000_001, True)])
 def test_a_reading_is_stale_after_100_ms_by_default(age_ns: int, stale: bool) -> None:
-    """Ten periods at 100 Hz: no message for so long means unknown, too."""
+    """Ten periods at 100 Hz: silence of this time means unknown, too."""
     assert decide(0.1, (), HELD, age_ns, Limits())[1] == ((Reason.STALE,) if stale else ())

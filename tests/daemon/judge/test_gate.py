@@ -125,7 +125,7 @@ AGAIN = "settled:still judged:judged"
 DOWN = "released:contact-lost idle:time"
 SETTLES = (0.41, 0.45)
 """0.2 s of closing, and 240 ms in which the hand keeps still; the last sweep or two of closing are
-no more than noise."""
+noise."""
 REQUEST = replace(LIMITS, on_request=True)
 JOINTS = replace(LIMITS, joints=True)
 SUBSET = replace(LIMITS, required=("ff", "th"))

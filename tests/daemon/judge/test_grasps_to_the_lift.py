@@ -24,7 +24,7 @@ STILL_COUNTS_PER_S = 20.0
 """A hand is still when its electrodes move no faster, in the mean. A held touch of a real sensor
 relaxes as fast."""
 STILL_S = 0.24
-"""What is looked back at; the end of closing is no part of it."""
+"""What is looked back at; the end of closing is not a part of it."""
 WAITED_MAX_S = 0.5
 """After the hand is as still as a held touch; 99 in 100 have their verdict within 0.42 s."""
 STANDS_S = 0.03

@@ -78,7 +78,9 @@ def test_a_finger_that_need_not_touch_need_not_be_tared() -> None:
     hand = HandTracker(FINGERS, replace(LIMITS, required=FINGERS[:2]))
     for t_s, reading in readings(FIRM):
         counts = reading.counts.copy()
-        counts[2] += round(22.0 * (t_s + 5.0))  # it warms up too fast to be tared, and is no slide
+        counts[2] += round(
+            22.0 * (t_s + 5.0)
+        )  # it warms up too fast for the tare, and does not slide
         now, _ = hand.step(reading.made_ns, counts, SOUND)
         if t_s > 0.7:
             break
@@ -114,7 +116,7 @@ def test_after_time_went_back_a_second_sensors_may_be_others(
     assert hand.tared == tared
 
 
-def test_joints_are_lost_when_readings_go_on_without_them() -> None:
+def test_joints_are_lost_when_readings_continue_without_them() -> None:
     silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=True))
     assert "joints" not in HandTracker(FINGERS, silent.limits).health(), "nothing came yet"
     assert play(silent).hand.health()["joints"] is Reason.JOINTS_LATE

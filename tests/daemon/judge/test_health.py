@@ -20,7 +20,7 @@ def broken_of(checked: Checked) -> NDArray[np.bool_]:
     return np.zeros((FINGERS, 24), np.bool_) if checked.broken is None else checked.broken
 
 
-def test_first_low_counts_are_no_jump() -> None:
+def test_first_low_counts_are_not_a_jump() -> None:
     health = Health(FINGERS)
     counts = np.full((FINGERS, 24), 5)
     for place in range(3):  # two jumps more would be enough

@@ -95,7 +95,7 @@ def test_joints_that_never_come_are_waited_for_once() -> None:
     assert motion.is_lost(START_NS + 1001 * MS)
 
 
-def test_angles_of_one_and_the_same_time_are_no_speed() -> None:
+def test_angles_of_one_and_the_same_time_give_no_speed() -> None:
     motion, now_ns = turning(100.0, 0.0)
     for _ in range(1000):
         send(motion, now_ns, 0.3, 1.2, -0.1)
@@ -123,7 +123,7 @@ def test_each_sender_must_be_still() -> None:
 
 
 def silent_beside_another(silent_ms: int) -> Reason | None:
-    """What is said as a still sender has been silent so long, while another goes on."""
+    """Return the reason as a still sender has been silent for `silent_ms`, and another has not."""
     motion, now_ns = turning(100.0, 0.0)
     for ms in range(-500, silent_ms + 1, 10):
         send(motion, now_ns + ms * MS, 0.5, names=("THJ1",))
@@ -207,7 +207,7 @@ def test_a_window_compares_with_its_first_angle() -> None:
     assert found is None, "it moved 90 ms ago"
 
 
-def test_eight_senders_are_told_apart_and_a_ninth_begins_anew() -> None:
+def test_eight_senders_are_kept_apart_and_a_ninth_restarts() -> None:
     motion = JointMotion()
     for sender in range(8):
         send(motion, START_NS, 1.0, names=(f"J{sender}",))

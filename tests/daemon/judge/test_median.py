@@ -100,7 +100,7 @@ def test_nothing_of_before_a_reset_is_left() -> None:
     play(fresh, never_repeating(10))
     fresh.reset()
     assert not fresh.is_full(ALL)
-    sweeps = never_repeating(10)[9:]  # the very sweep before the reset is no repetition
+    sweeps = never_repeating(10)[9:]  # the very sweep before the reset is not a repetition
     for _ in range(3):
         fresh.push(sweeps[0], ALL)
         anew.push(sweeps[0], ALL)

@@ -142,7 +142,7 @@ def test_a_wholly_lost_finger_is_unknown() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, -1.0, float("nan")])
-def test_no_such_share_of_false_alarms_can_be_wanted(share: float) -> None:
+def test_no_such_share_of_false_alarms_is_accepted(share: float) -> None:
     with pytest.raises(ValueError, match="false_alarms"):
         Motion(3, share)
 

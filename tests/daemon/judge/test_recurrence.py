@@ -47,7 +47,7 @@ def test_a_ring_of_128_sweeps_is_frozen_from_its_repeat(sweeps: int, live: int) 
 
 @pytest.mark.parametrize("packets", [15, 896])
 def test_a_ring_of_odd_palm_packets_is_never_stable(packets: int) -> None:
-    """Where it begins anew a packet is lost, or two contradict each other: a round lacks those."""
+    """Where it restarts a packet is lost, or two contradict each other: a round lacks those."""
     clock, stream = Clock(), PalmStream(FINGERS)
     model = TactileModel(zoo.find("cnn1"))
     pipeline = Pipeline(model, FINGERS, Limits(), clock, hand=HandLimits())
@@ -80,7 +80,7 @@ def test_a_sweep_of_twenty_equal_electrodes_comes_again(equal: int, is_frozen: b
 
 @pytest.mark.parametrize("faulty", ["always the same", "another each time", "at first", "later"])
 def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
-    """Its count means nothing, whoever flags it."""
+    """Its count means nothing, however it is flagged."""
     health, random = Health(3), np.random.default_rng(1)
     old = random.integers(500, 3500, (9, 3, 24))
     said = []

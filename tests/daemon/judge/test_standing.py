@@ -104,7 +104,7 @@ def test_a_grasp_judged_again_under_risk_is_one_lift() -> None:
     assert (trust.risk.lifts, trust.risk.slips) == (1, 1)
 
 
-def test_under_a_risk_nobody_gets_a_lucky_draw_by_waiting() -> None:
+def test_under_a_risk_waiting_brings_no_lucky_draw() -> None:
     hand, trust = risky(RiskLimits(0.05))
     theta = 1.0 / (1.0 + math.exp(-trust.risk.threshold))
     said = [

@@ -210,7 +210,7 @@ def test_the_baseline_is_the_median_of_100_sweeps() -> None:
         (wavering(1), 1.5),  # 1.4826
         (wavering(4), 4 * 1.4826),
         (wavering(6), 6 * 1.4826),  # 8.9
-        (wavering(7), None),  # 10.4, more than 10 is no rest
+        (wavering(7), None),  # 10.4, more than 10 is not a rest
         (stepping(5), 2.5 * 1.4826),
         (stepping(-5), 2.5 * 1.4826),
         (stepping(6), None),

@@ -30,7 +30,7 @@ def test_each_line_in_the_journal_has_a_syslog_priority() -> None:
         assert line == f"<{number}>a\n<{number}>b"
 
 
-def test_a_pipe_is_no_journal_and_the_named_stream_is() -> None:
+def test_only_the_named_stream_counts_as_a_journal() -> None:
     there = os.fstat(2)
     assert is_journal({"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"})
     assert not is_journal({"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino + 1}"})

@@ -191,7 +191,7 @@ def test_closed_errors_do_not_change_the_exit_code() -> None:
     assert redirected("2>&-", "run", "absent.toml") == (2, "", "")
 
 
-def test_only_an_output_that_nobody_reads_may_break_quietly() -> None:
+def test_only_an_output_without_a_reader_may_break_quietly() -> None:
     code = """
 import graspd.daemon.commands.texts
 def run(args):

@@ -145,7 +145,7 @@ def test_tellers_are_users_or_keys_of_the_scene(tmp_path: Path) -> None:
         assert may == [credential == credentials[0] for credential in credentials]
 
 
-def test_a_teller_that_is_no_user_is_refused(tmp_path: Path) -> None:
+def test_a_teller_that_is_not_a_user_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PublishError, match="there is no user no-such-user"):
         Sockets(wanted(tmp_path, ["no-such-user"], f"ipc://{tmp_path}/ask"))
 

@@ -121,7 +121,7 @@ def test_a_subscriber_that_does_not_read_loses_only_messages(tmp_path: Path, pee
     assert numbers == sorted(set(numbers))
 
 
-def test_all_messages_before_the_last_status_are_heard(tmp_path: Path, peers: Peers) -> None:
+def test_all_messages_before_the_last_status_arrive(tmp_path: Path, peers: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
     with Publisher(endpoint) as publisher:
         subscriber = peers.subscribe(endpoint)

@@ -155,7 +155,7 @@ def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> No
 def test_own_keys_below_a_shared_folder_are_safe(
     tmp_path: Path,
 ) -> None:
-    """As below /tmp, where nobody may replace what is somebody else's."""
+    """As below /tmp, where no user may replace another's files."""
     keys = tmp_path / "keys"
     public, secret = make(keys, "laptop")
     tmp_path.chmod(0o1777)
@@ -196,7 +196,7 @@ def test_keys_are_told_apart_and_never_overwritten(tmp_path: Path) -> None:
     with pytest.raises(KeysError, match="there already"):
         make(tmp_path, "daemon")
     assert secret.read_bytes() == before
-    with pytest.raises(KeysError, match="no name"):
+    with pytest.raises(KeysError, match="not a name"):
         make(tmp_path, "../daemon")
 
 

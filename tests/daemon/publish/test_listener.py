@@ -38,11 +38,11 @@ OTHERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_what_is_no_socket_is_left_as_it_is(tmp_path: Path, kind: str) -> None:
+def test_other_things_than_sockets_are_left_as_they_are(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "v"
     OTHERS[kind](path)
     before = {each.name: each.lstat() for each in tmp_path.iterdir()}
-    with pytest.raises(PublishError, match="v is there and is no socket") as error:
+    with pytest.raises(PublishError, match="v is there and is not a socket") as error:
         Publisher(f"ipc://{path}")
     assert "\n" not in str(error.value)
     after = {each.name: each.lstat() for each in tmp_path.iterdir()}
@@ -54,7 +54,7 @@ def test_what_is_no_socket_is_left_as_it_is(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_SEQPACKET])
-def test_a_socket_that_somebody_listens_on_is_theirs(tmp_path: Path, kind: int) -> None:
+def test_a_socket_with_a_listener_is_kept(tmp_path: Path, kind: int) -> None:
     path = tmp_path / "v"
     with socket.socket(socket.AF_UNIX, kind) as theirs:
         theirs.bind(str(path))
@@ -130,7 +130,7 @@ def test_a_lock_file_of_others_is_kept(tmp_path: Path, kind: str) -> None:
     [
         ("absent/v", "there is no folder .*/absent; `graspd doctor SCENE` says who makes it"),
         ("file/v", "Not a directory"),
-        (".", "is there and is no socket"),
+        (".", "is there and is not a socket"),
         ("x" * 200, "AF_UNIX path too long"),
     ],
 )
@@ -143,7 +143,7 @@ def test_a_path_where_no_socket_can_be_is_one_line(tmp_path: Path, path: str, sa
 
 
 def test_a_folder_that_cannot_be_written_is_one_line() -> None:
-    # Nobody may make files there, not even root.
+    # No user may make files there, not even root.
     with pytest.raises(PublishError, match=r"cannot publish on ipc:///proc/graspd: \w"):
         Publisher("ipc:///proc/graspd")
 

@@ -73,7 +73,7 @@ class Asked:
         return True
 
     def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
-        """Tell an outcome, which is no question."""
+        """Tell an outcome, which is not a question."""
         requests = requests or Requests(takes_the_seventh)
         self.questions.take([[peer, USER, *frames]], 0, requests)
         assert requests.times == 0

@@ -50,7 +50,7 @@ def test_the_daemons_clock_is_told_at_once_and_judges_nothing(
         [b"lift mug"],
     ],
 )
-def test_what_is_no_question_is_counted_and_not_answered(
+def test_other_frames_than_questions_are_counted_and_not_answered(
     questions: Questions, sent: list[Frames], frames: list[bytes]
 ) -> None:
     requests = Asked()

@@ -53,7 +53,7 @@ def test_a_message_without_fields_added_later_is_still_read(name: str, added: st
     "name",
     ["", "a mug", "mug,cup", 'the "mug"', "mug's", "x" * 65, "m\u00fcg", "mug\n", "=1", "-", "a/b"],
 )
-def test_a_malformed_object_is_no_outcome(name: str) -> None:
+def test_a_malformed_object_is_not_an_outcome(name: str) -> None:
     content = json.loads((GOLDEN / "outcome.json").read_text()) | {"object": name}
     with pytest.raises(msgspec.DecodeError):
         decode_outcome(json.dumps(content).encode())
@@ -78,7 +78,7 @@ def test_the_committed_schema_is_the_one_of_the_code() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
 
 
-def test_a_probability_that_is_no_number_never_goes_out() -> None:
+def test_a_probability_that_is_not_a_number_never_goes_out() -> None:
     broken = msgspec.structs.replace(golden("verdict_unknown"), p_slip=math.nan)
     assert json.loads(encode(broken))["p_slip"] is None
 

@@ -37,7 +37,7 @@ def compared(verdict: dict[str, Any]) -> dict[str, Any]:
 
 
 def without_null(value: Any) -> Any:  # noqa: ANN401
-    """A message as it is recorded, where null is left out, but for a finger that is not known."""
+    """A message as it is recorded: null is left out, except for a finger that is not known."""
     if isinstance(value, dict):
         if isinstance(fingers := value.get("fingers"), dict):
             felt = {finger: state or "unknown" for finger, state in fingers.items()}

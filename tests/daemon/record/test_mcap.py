@@ -1,4 +1,4 @@
-"""Recordings are read as far as they are whole, and nothing that is in a file breaks the reader."""
+"""Recordings are read up to the first damage, and no content of a file breaks the reader."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def test_no_damage_makes_the_reader_raise_anything_else(changes: list[tuple[int,
         read(bytes(data))
 
 
-def test_messages_that_are_no_readings_are_counted(tmp_path: Path) -> None:
+def test_messages_that_are_not_readings_are_counted(tmp_path: Path) -> None:
     file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
     good = {
         **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": 5},
@@ -213,11 +213,11 @@ def test_messages_that_are_no_readings_are_counted(tmp_path: Path) -> None:
 
 
 MESSAGES = struct.pack("<BQHIQQ", 5, 24, 1, 0, 0, 0) + b"{}"
-"""The smallest that there is."""
+"""The smallest message."""
 
 
 def with_chunk(compression: str, content: bytes, said_bytes: int, times: int = 1) -> bytes:
-    """A recording's header and so many times this chunk, whose content is packed already."""
+    """A recording's header and this chunk some `times`, whose content is packed already."""
     builder = RecordBuilder()
     Channel(1, "strange.right", "json", {}, 0).write(builder)
     for _ in range(times):
@@ -237,7 +237,7 @@ def zstd(content: bytes, *, sized: bool = True) -> bytes:
 
 
 @pytest.mark.parametrize("compression", ["", "zstd", "lz4"])
-def test_what_other_tools_packed_anew_is_read(compression: str) -> None:
+def test_files_that_other_tools_repacked_are_read(compression: str) -> None:
     content = MESSAGES * 1000
     pack = {"": bytes, "zstd": zstd, "lz4": lz4.frame.compress}[compression]
     found = read(with_chunk(compression, pack(content), len(content)))
@@ -266,7 +266,7 @@ def test_a_chunk_of_more_than_a_recording_has_is_refused(
         read(with_chunk(compression, content, said_bytes))
 
 
-def test_many_small_chunks_are_no_way_around(tmp_path: Path) -> None:
+def test_many_small_chunks_do_not_pass_the_limit(tmp_path: Path) -> None:
     content = MESSAGES * 30_000
     path = tmp_path / "a.mcap"
     path.write_bytes(with_chunk("zstd", zstd(content), len(content), times=100))

@@ -204,7 +204,7 @@ def test_files_that_do_not_follow_each_other_are_named(
     recorded.restore(recorded.parts(wanted, assembly.load_model(wanted), None).pipeline)
     assert not caplog.records
     RecordedRun([first, third])
-    assert f"{third}: does not go on where the file before it ends" in caplog.text
+    assert f"{third}: does not continue where the file before it ends" in caplog.text
 
 
 def test_learning_of_another_graspd_is_left_out_with_a_warning(

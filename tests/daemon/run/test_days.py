@@ -1,4 +1,4 @@
-"""Days of the whole daemon under faults: its promises hold, and it goes on when they are over.
+"""Days of the whole daemon under faults: its promises hold, and it continues when they are over.
 
 A day of three shifts has a minute. `tests/daemon/run/days.py` says what is checked.
 """

@@ -178,7 +178,7 @@ class Watchdog(Companion):
         self.fed += 1
 
 
-def test_a_reading_is_sent_only_while_wanted() -> None:
+def test_a_reading_is_sent_only_while_there_is_a_subscriber() -> None:
     clock = Clock()
     angles = JointReading(clock(), 0, ("FFJ3", "MFJ3"), np.array([0.5, np.nan]))
     first, second, third = (reading(clock(), seed) for seed in (1, 2, 3))

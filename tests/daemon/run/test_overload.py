@@ -286,7 +286,7 @@ def test_a_slow_busy_processor_rests_too() -> None:
 
 
 def test_a_reading_that_does_not_follow_unsettles_the_grasp() -> None:
-    """The counts go on as before; only the sender says that it began again."""
+    """The counts continue as before; only the sender says that it began again."""
     clock, random = Clock(), np.random.default_rng(3)
     came: list[Reading] = []
     for seq, pose in enumerate(["rest"] * 150 + ["grasp"] * 100):

@@ -94,7 +94,7 @@ def test_only_a_sound_watchdog_of_this_process_counts(
 
 
 @pytest.mark.parametrize("address", ["", "relative", "vsock:2:1234"])
-def test_an_address_of_another_kind_is_no_manager(address: str) -> None:
+def test_an_address_of_another_kind_is_not_a_manager(address: str) -> None:
     assert Systemd.of({"NOTIFY_SOCKET": address}) is None
 
 

@@ -108,7 +108,7 @@ def test_a_kill_at_any_step_loses_no_session(tmp_path: Path) -> None:
     assert found == {(2,), (13, 2), (14, 13, 2), (14, 13)}
 
 
-def test_a_count_of_the_risk_is_no_empty_session() -> None:
+def test_a_count_of_the_risk_is_not_an_empty_session() -> None:
     """Without learning an outcome moves nothing else."""
     part = Trust("model", INPUTS, RiskLimits(0.1), learns=False)
     assert KeptSession(None, FINGERS, {}, part.state()).is_empty

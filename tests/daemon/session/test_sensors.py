@@ -1,4 +1,4 @@
-"""Sensors that are others than before are noticed by their serial numbers, or by their rest."""
+"""Exchanged sensors are noticed by their serial numbers, or by their rest."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_an_exchange_without_serial_numbers_ends_the_session(
     robot.stop()
     assert len(slips) == 20
     assert slips.count(Decision.STABLE) <= 2
-    assert "taken for other sensors" in caplog.text
+    assert "treated as other sensors" in caplog.text
     kept, former = kept_in(tmp_path / "right")
     assert former.statistics is not None
     assert former.statistics.grasps >= 100
@@ -210,7 +210,7 @@ def test_a_hand_that_held_at_the_start_continues_once_open(tmp_path: Path) -> No
     assert later.learner.state() == learned
 
 
-def test_a_relay_that_restarts_is_no_exchange(tmp_path: Path) -> None:
+def test_a_relay_that_restarts_is_not_an_exchange(tmp_path: Path) -> None:
     """Its sensors rest as before, whatever port it sends from."""
     now, (session, part) = [PATTERN], taught()
     driver = sensors(**dict.fromkeys(FINGERS, "udp://192.0.2.1:4001"))

@@ -52,8 +52,8 @@ def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
 
 
 @pytest.mark.parametrize("p", [math.nan, -0.1, 1.1, math.inf])
-def test_what_is_no_probability_is_refused(p: float) -> None:
-    with pytest.raises(ValueError, match="no probability"):
+def test_other_values_than_probabilities_are_refused(p: float) -> None:
+    with pytest.raises(ValueError, match="not a probability"):
         trust().judge(named(0), p, 0.0, inputs(0))
     with pytest.raises(ValueError, match="not finite"):
         trust().judge(named(0), 0.5, math.nan, inputs(0))
@@ -161,7 +161,7 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
         assert encode(part.state()) == before
 
 
-def test_too_many_records_are_no_state() -> None:
+def test_too_many_records_are_not_a_state() -> None:
     state = full().state()
     many = tuple(
         msgspec.structs.replace(state.lifts.records[0], id=named(grasp))

@@ -41,7 +41,7 @@ def first_of(publisher: Publisher, feed: Feed, seq: int, decision: Decision) -> 
     return found
 
 
-def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
+def test_messages_that_waited_unread_are_not_shown(endpoint: str) -> None:
     clock = Clock()
     with (
         closing(Peers()) as peers,
@@ -120,7 +120,7 @@ def test_a_known_key_is_let_in(tmp_path: Path, door: KeyedDoor) -> None:
         (None, "", "the daemon wants a key"),
     ],
 )
-def test_whoever_is_turned_away_is_told_why(
+def test_a_peer_that_is_turned_away_sees_why(
     tmp_path: Path, door: KeyedDoor, own: str | None, server: str, said: str
 ) -> None:
     keys = None if own is None else keys_of(tmp_path, own, server)

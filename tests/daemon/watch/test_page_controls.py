@@ -42,7 +42,7 @@ def test_the_timeline_is_read_by_pointing_and_can_be_paused(
     browser.value("document.querySelector('.pause').click()")
     assert re.fullmatch(r"Paused: five minutes until \d\d:\d\d:\d\d", text(browser, "minutes"))
     talker.decision = Decision.STABLE
-    see(browser, "stable")  # the verdict goes on
+    see(browser, "stable")  # the verdict continues
     box = browser.value(
         "(b => [b.right, b.top])(document.querySelector('.timeline').getBoundingClientRect())"
     )

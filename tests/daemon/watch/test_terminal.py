@@ -104,7 +104,7 @@ def test_figures_of_a_dead_daemon_are_dim_and_dated(width: int) -> None:
 
 
 @pytest.mark.parametrize("width", [1, 10, 40])
-def test_a_terminal_that_is_too_small_is_no_error(width: int) -> None:
+def test_a_terminal_that_is_too_small_is_not_an_error(width: int) -> None:
     assert text_of(a_full_hand(), width)
 
 

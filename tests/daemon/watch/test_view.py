@@ -73,7 +73,7 @@ def test_a_verdict_stands_until_its_silence_is_over(
     assert view.snapshot(124_385 * MS).why[0].advice == "no message for 124 s"
 
 
-def test_a_repeated_message_is_no_sign_of_life() -> None:
+def test_a_repeated_message_is_not_a_sign_of_life() -> None:
     view = after((b"verdict.right", verdict(5, Decision.STABLE)))
     view.take(b"verdict.right", verdict(5, Decision.STABLE), 90 * MS)
     assert view.snapshot(101 * MS).tone is Tone.SILENT

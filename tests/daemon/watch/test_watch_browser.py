@@ -209,7 +209,7 @@ def test_a_frozen_page_shows_unknown_and_nothing_that_waited(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     show(browser, page, talker, Decision.STABLE)
-    hide(browser, "false")  # as far as the page knows
+    hide(browser, "false")  # by what the page knows
     note_tones(browser)
     browser.ask("Page.setWebLifecycleState", state="frozen")
     talker.wait_for(50)  # stable verdicts wait

@@ -1,4 +1,4 @@
-"""The page's server: only for browsers of this computer, and none of them can hold it up."""
+"""The page's server: only for browsers of this computer, which cannot hold it up."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_pages_of_other_sites_are_refused(server: Server) -> None:
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "HEAD", "CONNECT", "X"])
-def test_whoever_does_more_than_ask_is_refused(server: Server, method: str) -> None:
+def test_other_methods_than_get_are_refused(server: Server, method: str) -> None:
     assert ask(server, method=method)[0] == 405
 
 
@@ -107,9 +107,7 @@ def test_nothing_else_is_there(server: Server, path: str) -> None:
     "sent",
     [b"\0" * 100, b"GET\r\n\r\n", b"GET / HTTP/9.9\r\n\r\n", b"a" * 70_000, b"\x16\x03\x01" * 9],
 )
-def test_what_is_no_request_ends_the_connection_and_nothing_else(
-    server: Server, sent: bytes
-) -> None:
+def test_a_malformed_request_ends_only_its_connection(server: Server, sent: bytes) -> None:
     with socket.create_connection(("127.0.0.1", server.server_port), 10) as link:
         link.sendall(sent)
         link.shutdown(socket.SHUT_WR)

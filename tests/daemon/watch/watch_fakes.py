@@ -1,4 +1,4 @@
-"""Messages to watch, views of them, and somebody who publishes them as long as he is asked to."""
+"""Messages to watch, views of them, and a publisher of them."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class Talker:
         self._publisher.close()
 
     def wait_for(self, number: int) -> None:
-        """Wait until so many more verdicts were sent."""
+        """Wait until this number of verdicts more was sent."""
         last = self.sent + number
         wait_until(lambda: self.sent >= last)
 

@@ -74,7 +74,7 @@ def test_the_kernels_structs_are_read(raw: str, frame: CanFrame) -> None:
 
 
 @pytest.mark.parametrize("raw", [bytes(15), bytes(17), bytes.fromhex("00010000 09") + bytes(11)])
-def test_what_is_no_struct_of_the_kernel_is_no_frame(raw: bytes) -> None:
+def test_other_bytes_than_a_kernel_struct_are_not_a_frame(raw: bytes) -> None:
     assert unpack_frame(raw) is None
 
 
@@ -149,7 +149,7 @@ def test_without_an_id_the_first_sound_sample_gives_it(unsound: CanFrame) -> Non
 
 
 @pytest.mark.parametrize("configured", [None, 0x100])
-def test_an_id_that_was_heard_is_forgotten_with_the_link(configured: int | None) -> None:
+def test_an_id_that_was_learned_is_forgotten_with_the_link(configured: int | None) -> None:
     made, counters = decoder(configured)
     made.push(CanFrame(0x100, E1_SAMPLE), 0)
     made.interrupt()

@@ -121,7 +121,7 @@ def test_an_overflow_of_the_controller_cuts_the_sweep_there(socket_bus: SocketBu
         assert driver.counters.unsynchronised_frames == 19
 
 
-def test_records_that_are_no_frames_are_counted(socket_bus: SocketBus) -> None:
+def test_records_that_are_not_frames_are_counted(socket_bus: SocketBus) -> None:
     with over_socket() as driver:
         for record in (b"\1", bytes(15), bytes(71), pack_frame(CanFrame(1, b"")) + b"\0"):
             socket_bus.far_end.send(record)
@@ -141,7 +141,7 @@ class DownSocket(socket.socket):
 def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A board whose samples bear one id; exactly whole sweeps may be lost, so time is no help."""
+    """A board whose samples bear one id; exactly whole sweeps may be lost: time does not help."""
     clock = Clock()
     bus = ScriptedBus()
     with (

@@ -18,7 +18,7 @@ PLACES: dict[str, Callable[[int, int], bool]] = {
     "jump": lambda place, last: place in (21, 22, 23) and last in (0, 1, 2),
 }
 """By word of the page, as it says below the table; places and the furthest one from 0."""
-OUT = ", reading is out"
+OUT = ", reading has ended"
 TIMES = {"any": set(Timing), "late": {Timing.LATE}, "early": {Timing.EARLY}}
 HELD = {
     "any": set(Held),

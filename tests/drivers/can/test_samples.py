@@ -120,7 +120,7 @@ def test_a_sample_vague_by_three_quarters_is_dropped(doubt_ns: int, untimed: int
 
 @pytest.mark.parametrize("lost", [23, 24, 47])
 def test_repeated_words_make_no_copies_of_lost_samples(lost: int) -> None:
-    """The words of all sweeps are the same, so only time tells that a sample is no copy."""
+    """The words of all sweeps are the same, so only time tells that a sample is not a copy."""
     sweeps, counters = assembler()
     stream = concatenated([samples(n) for n in range(20)])
     stream = [(channel, samples(0)[channel - 17][1], t_ns) for channel, _, t_ns in stream]

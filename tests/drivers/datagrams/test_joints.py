@@ -133,7 +133,7 @@ def test_a_message_is_a_reading_and_a_gap_a_loss(driver: JointStreamDriver) -> N
     assert driver.stream.counters.missed_readings == 2
 
 
-def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:
+def test_a_message_without_a_known_joint_is_not_a_reading(driver: JointStreamDriver) -> None:
     assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
     assert driver.link.state is LinkState.UP
 

@@ -96,7 +96,7 @@ def test_another_message_is_counted_named_and_dropped(
         ([0, 4095, *COUNTS[:22]], {}, None, 0),
     ],
 )  # fmt: skip
-def test_what_is_no_count_costs_no_other(
+def test_a_value_that_is_not_a_count_costs_no_other(
     finger: object,
     faults: dict[ElectrodeFault, int],
     counter: str | None,

@@ -46,7 +46,7 @@ class DatagramClock(Clock):
 
 
 def rows(number: int) -> list[Counts]:
-    """Counts of so many rounds."""
+    """Counts of `number` rounds."""
     return [counts_of(each) for each in range(number)]
 
 
@@ -72,7 +72,7 @@ def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) ->
 
 
 def packets(number: int) -> list[PalmPacket]:
-    """Packets of so many rounds of `rows`."""
+    """Packets of rounds of `rows`."""
     return list(PalmTwin(rows(number)).packets())
 
 

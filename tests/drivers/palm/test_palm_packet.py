@@ -1,4 +1,4 @@
-"""The palm status packet against an independent description of its layout; what is no packet."""
+"""The palm status packet against an independent description of its layout; what is not a packet."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ def test_a_hand_frozen_in_the_topic_is_not_judged(tmp_path: Path) -> None:
         assert {verdict.verdict for verdict in judge(path)} == {"unknown"}
 
 
-def test_absent_sensors_and_values_that_are_no_counts_are_broken(tmp_path: Path) -> None:
+def test_absent_sensors_and_values_that_are_not_counts_are_broken(tmp_path: Path) -> None:
     sweeps = noise(30)
     sweeps[25].electrodes["ff"][:3] = -22072, 32570, 5000
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)

@@ -94,7 +94,7 @@ def test_several_files_play_in_a_row_on_one_time_axis(tmp_path: Path) -> None:
         write(tmp_path, table(2), "d.csv"),
     ]
     readings = play(ReplayDriver(paths, clock=clock), clock)
-    # A stream goes on for its shortest step, 10 ms; one of a single row for that of tables.
+    # A stream continues for its shortest step, 10 ms; one of a single row for that of tables.
     assert times_ms(readings) == [0, 10, 20, 50, 60, 70, 80, 90]
     assert [reading.seq for reading in readings] == list(range(8))
     sources = [

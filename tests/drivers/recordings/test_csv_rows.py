@@ -195,7 +195,7 @@ def test_joints_are_those_of_the_shadow_hand(column: str, known: bool) -> None:
 
 
 @pytest.mark.parametrize("cell", ["nan", "", "1e999"])
-def test_an_angle_that_is_no_number_is_nan(cell: str) -> None:
+def test_an_angle_that_is_not_a_number_is_nan(cell: str) -> None:
     content = stream(["0"], {"FFJ1": ["0.5"], "FFJ2": [cell]})
     (row,) = rows_of(content)
     np.testing.assert_array_equal(row.position_rad, [0.5, math.nan])
@@ -237,7 +237,7 @@ COUNTS = {
 
 
 @pytest.mark.parametrize("cell", NOT_COUNTS, ids=lambda cell: repr(cell)[:24])
-def test_a_value_that_is_no_count_makes_its_electrode_faulty(cell: str) -> None:
+def test_a_malformed_count_makes_its_electrode_faulty(cell: str) -> None:
     quoted = f'"{cell}"'
     content = table(3, {1: {"mf_biotac_2": quoted}})
     before, row, after = rows_of(content)

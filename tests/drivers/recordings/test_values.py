@@ -36,7 +36,7 @@ def scaled(change: Callable[[int], str], separator: str = ",") -> bytes:
         (scaled(lambda _: "high"), "text in place of numbers?"),
     ],
 )
-def test_values_that_are_no_counts_are_refused_once(content: bytes, said: str) -> None:
+def test_values_that_are_not_counts_are_refused_once(content: bytes, said: str) -> None:
     message = refusal(content)
     assert "of 288 values are not counts, whole numbers in 0..4095, the first is '" in message
     assert said in message

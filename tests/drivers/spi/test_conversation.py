@@ -167,7 +167,7 @@ def test_sensors_that_are_absent_or_twice_there_are_a_fault(
         ((10, 9, 0), Fact("10, -, 0", DeviceFault.SENSOR_WORDS)),
     ],
 )
-def test_spi_errors_where_no_sensor_is_are_no_fault(numbers: tuple[int, ...], errors: Fact) -> None:
+def test_spi_errors_without_a_sensor_are_ignored(numbers: tuple[int, ...], errors: Fact) -> None:
     conversation = greeted(dataclasses.replace(hello(0), serials=("A", "", "C")))
     hear(conversation, BridgeStatus(1, 0, 0, 0, 0, numbers), T0)
     assert conversation.describe()["spi errors"] == errors
@@ -255,7 +255,7 @@ def test_a_frame_makes_no_sense_or_its_type_is_unknown(kind: int, bad: int) -> N
 
 
 @pytest.mark.parametrize(("first", "missed"), [(0, 0), (1, 1), (1000, 1000), (1001, 0)])
-def test_a_high_first_number_is_no_loss(first: int, missed: int) -> None:
+def test_a_high_first_number_is_not_a_loss(first: int, missed: int) -> None:
     conversation = greeted()
     assert len(hear(conversation, sweep(first, 10**9), T0)) == 1
     assert conversation.counters.missed_readings == missed

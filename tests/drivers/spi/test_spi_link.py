@@ -84,7 +84,7 @@ def test_a_bridge_of_another_version_is_refused_in_one_line(
     assert rig.bridge.says_nothing_more(), "not even START"
 
 
-def test_sweeps_that_waited_while_the_host_slept_are_no_silence(rig: Rig) -> None:
+def test_sweeps_that_waited_while_the_host_slept_are_not_silence(rig: Rig) -> None:
     rig.greet()
     for seq in range(50):
         rig.bridge.send(sweep(seq, 10_000 * seq + 100))

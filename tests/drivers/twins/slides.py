@@ -45,7 +45,7 @@ WANDER_TAU_S = 0.06
 SLIDE_DIRECTIONS = (0.81, 0.14, 0.05)
 """The same of a slide: along one, along a second, and along others."""
 STANDSTILL_S = (0.0, 0.2)
-"""For so long nothing slides at the beginning, and again at the end, s."""
+"""Time without a slide at the beginning, and again at the end, s."""
 SLIDE_WANDER = 1.5
 """The pressure of a slide wanders faster than that of a hold by this factor."""
 SPEED_COUNTS_PER_S = 76.0

@@ -11,7 +11,7 @@ enum { SENSORS = COUNTS_SENSORS_MAX, ARGUMENTS_MAX = 4 };
 static struct sim_sensor sensor[SENSORS];
 static struct counts counts;
 
-/* The arguments, as far as they are numbers; the first one, where a sensor is named, names one. */
+/* The arguments that are numbers; the first one, where a sensor is named, names one. */
 static void take_numbers(napi_env env, napi_callback_info info, double value[ARGUMENTS_MAX])
 {
     napi_value argument[ARGUMENTS_MAX];

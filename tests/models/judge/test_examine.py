@@ -81,7 +81,7 @@ def of_sessions() -> GraspJudge:
         (4.0, {"calibrated": False}, False, True),  # a young one learns from all
     ],
 )
-def test_a_session_learns_from_twice_as_far_as_it_judges(
+def test_a_session_learns_at_twice_the_distance_it_judges(
     of_sessions: GraspJudge,
     stretched: float,
     known: dict[str, bool],

@@ -60,7 +60,7 @@ def table(name: str, grasps: int, seed: int, drift: int = 0) -> Grasps:
 
 
 def sessions(grasps: int) -> Grasps:
-    """Three tables of so many grasps each."""
+    """Three tables of `grasps` grasps each."""
     return concatenate(_tables(grasps))
 
 

@@ -69,7 +69,7 @@ class Reference:
         self.go_on(told, *self.state(told))
 
     def go_on(self, told: list[int], mean: Exact, covariance: Exact) -> None:
-        """Go on from what `state` of another one returned for these grasps."""
+        """Continue from what `state` of another one returned for these grasps."""
         kept = [*self.weights, *(len(self.weights) + grasp for grasp in told)]
         links = self.prior[:, kept] @ inverse(self.prior[np.ix_(kept, kept)])
         left = self.prior - links @ self.prior[kept]

@@ -183,7 +183,7 @@ def test_a_reset_learner_is_a_new_one() -> None:
 
 
 @pytest.mark.parametrize("inputs", [26, 52, 78])
-def test_a_restored_learner_goes_on_bit_for_bit(inputs: int) -> None:
+def test_a_restored_learner_continues_bit_for_bit(inputs: int) -> None:
     whole, first, second = Learner(inputs), Learner(inputs), Learner(inputs)
     stream = list(lifts(80, inputs))
     learn(whole, iter(stream))

@@ -118,7 +118,7 @@ def test_sensors_that_return_add_nothing_to_the_budget(known: float | None, left
 def test_a_share_of_withheld_grasps_is_lifted_under_supervision() -> None:
     rule, none = risk(0.05, explore=0.05), risk(0.05)
     chosen = [rule.supervised(Permission.WITHHELD, "boot", grasp) for grasp in range(20_000)]
-    # Three standard deviations of so many draws.
+    # Three standard deviations of the draws.
     assert abs(sum(chosen) / 20_000 - 0.05) < 3 * math.sqrt(0.05 * 0.95 / 20_000)
     assert chosen == [rule.supervised(Permission.WITHHELD, "boot", n) for n in range(20_000)]
     assert chosen != [rule.supervised(Permission.WITHHELD, "next", n) for n in range(20_000)]

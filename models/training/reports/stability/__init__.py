@@ -25,7 +25,7 @@ LEGEND = (
     "network: error of `p_slip`, against the network in float64 with the same float32 input.",
     "p_slip: the same from the counts on, with nothing rounded; not bounded for trees.",
     "flips: verdicts that differ from the reference further from the threshold than the bound.",
-    "wrong: answers that are no probability and have no reason, or spreads off their floor.",
+    "wrong: answers that are not probabilities and have no reason, or spreads off their floor.",
 )
 WITHOUT_ONNX = (
     "onnx is not installed: networks are not compared with their reference (extra: train)."

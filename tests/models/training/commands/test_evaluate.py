@@ -198,5 +198,5 @@ def test_ctrl_c_ends_processes_and_leaves_their_results(data: Path, tmp_path: Pa
     assert process.returncode == 130
     lines = [line for line in errors.splitlines() if "published" not in line]
     # A thread of joblib that was about to hand out a job may complain before.
-    assert lines[-1] == "graspd evaluate: interrupted; the same command goes on from here"
+    assert lines[-1] == "graspd evaluate: interrupted; the same command continues from here"
     assert 2 <= kept(tmp_path) < 300

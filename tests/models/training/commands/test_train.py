@@ -240,8 +240,8 @@ def test_what_cannot_be_trained_is_one_line(data: Path, tmp_path: Path) -> None:
         (SYSTEM, ("--own", own, "--only", "cv", "--out", own), f"{own}: File exists"),
         (SYSTEM, ("--own", own, "--folds", "2"), "2 folds need 2 objects, there are 1 (see"),
         (SYSTEM, (*some, "--name", "svm"), "graspd ships a model"),
-        (SYSTEM, (*some, "--name", "a/b"), "is no name"),
-        (SYSTEM, (*some, "--name", "x.onnx"), "is no name"),
+        (SYSTEM, (*some, "--name", "a/b"), "is not a name"),
+        (SYSTEM, (*some, "--name", "x.onnx"), "is not a name"),
         (SYSTEM, (*some, "--folds=1"), "argument --folds: '1' is not a whole number from"),
         (SYSTEM, (*some, "--seed=-1"), "argument --seed: '-1' is not a whole number from"),
     ):

@@ -127,7 +127,7 @@ def test_a_protocol_whose_table_is_missing_is_refused(protocol: EvalProtocol) ->
 
 
 @pytest.mark.parametrize("protocol", ["cv", "objects", "objects-whole"])
-def test_tables_of_ones_own_alone_are_all_that_there_is(protocol: EvalProtocol) -> None:
+def test_own_tables_alone_are_all_data(protocol: EvalProtocol) -> None:
     grasps = concatenate([table("monday", 100, 0), table("friday", 60, 1)])
     judged = np.concatenate([split.test for split in splits(protocol, grasps, seed=0)])
     assert sorted(judged.tolist()) == list(range(160))

@@ -202,5 +202,5 @@ def test_an_offset_is_of_means_and_spreads_alone() -> None:
 
 def test_other_inputs_have_no_other_day() -> None:
     for shape in ((2, 72), (2, 3, 26)):
-        with pytest.raises(ValueError, match="no session features"):
+        with pytest.raises(ValueError, match="not session features"):
             on_another_day(torch.zeros(shape), DayShift())

@@ -162,7 +162,7 @@ def test_a_killed_process_ends_the_run() -> None:
         raise TerminatedWorkerError
 
 
-def test_an_interrupted_training_is_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_training_is_not_a_result(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 

@@ -206,7 +206,7 @@ def test_from_tables_to_picture(folder: Path) -> None:
     assert text.partition("\n\n")[2].partition("\n\n")[0] in drawn, "the picture's own figures"
 
 
-def test_the_figures_go_on_a_card(folder: Path) -> None:
+def test_the_figures_go_onto_a_card(folder: Path) -> None:
     card = json.loads((folder / "card.json").read_text())
     assert card["contract"] == zoo.card("small-session")["contract"]
     assert card["worth"] == json.loads((folder / "worth.json").read_text())
