@@ -6,9 +6,10 @@ import contextlib
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from tests.kit.waiting import wait_until
 
 GRASPD = (sys.executable, "-m", "graspd")
 WITH_CONSTANTS = """
@@ -99,7 +100,4 @@ def before_others() -> Iterator[None]:
 
 def wait_for(path: Path) -> None:
     """Wait until a file is there."""
-    deadline_s = time.monotonic() + TIMEOUT_S
-    while not path.exists():
-        assert time.monotonic() < deadline_s, f"{path} did not appear"
-        time.sleep(0.01)
+    wait_until(path.exists, 0.01, says=f"{path} did not appear")

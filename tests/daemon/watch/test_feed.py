@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -18,7 +17,7 @@ from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, KeyedDoor, Peers, Publisher, first_message
 from tests.daemon.watch.watch_fakes import MS, verdict
 from tests.kit.messages import decode_verdict
-from tests.kit.waiting import PATIENCE_S, wait_until
+from tests.kit.waiting import wait_until
 
 Keys = tuple[bytes, bytes, bytes]
 
@@ -95,15 +94,16 @@ def keys_of(folder: Path, own: str = "controller", daemon: str = "daemon.key") -
 
 
 def hears(door: KeyedDoor, feed: Feed, until: Callable[[bool], bool]) -> bool:
-    deadline_s = time.monotonic() + PATIENCE_S
-    heard = False
-    while not until(heard):
-        assert time.monotonic() < deadline_s, feed.link
+    heard: set[bytes] = set()
+
+    def is_over() -> bool:
         door.sockets.before_wait(Asked())
         door.sockets.send(b"verdict.right", verdict(0))
-        time.sleep(0.01)
-        heard = heard or any(topic == b"verdict.right" for topic, _ in feed.take())
-    return heard
+        heard.update(topic for topic, _ in feed.take())
+        return until(b"verdict.right" in heard)
+
+    wait_until(is_over, 0.01, says=feed.link)
+    return b"verdict.right" in heard
 
 
 def test_a_known_key_is_let_in(tmp_path: Path, door: KeyedDoor) -> None:

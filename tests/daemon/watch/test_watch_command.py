@@ -13,7 +13,6 @@ import socket
 import struct
 import subprocess
 import termios
-import time
 from pathlib import Path
 from typing import Self
 
@@ -23,7 +22,7 @@ from graspd.daemon.judge.reasons import Decision
 from tests.daemon.processes import GRASPD, start
 from tests.daemon.watch.watch_fakes import Talker
 from tests.kit.inside import graspd
-from tests.kit.waiting import PATIENCE_S
+from tests.kit.waiting import PATIENCE_S, wait_until
 from tests.ports import free_port
 
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
@@ -66,16 +65,14 @@ class Terminal:
         """Wait until the command has written something since the last time."""
         self.output = b""
         os.set_blocking(self._ours, False)
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not re.search(pattern, self.output, re.DOTALL):
-            assert time.monotonic() < deadline_s, self.output[-3000:]
-            time.sleep(0.02)
-            self.read()
+        wait_until(lambda: self.read() or re.search(pattern, self.output, re.DOTALL), 0.02)
 
-    def read(self) -> None:
+    def read(self) -> bool:
+        """Take what the command has written; return False."""
         with contextlib.suppress(BlockingIOError, OSError):
             while part := os.read(self._ours, 1 << 16):
                 self.output += part
+        return False
 
     def type(self, keys: bytes) -> None:
         os.write(self._ours, keys)
@@ -85,11 +82,7 @@ class Terminal:
 
     def end(self) -> int:
         """Wait for the command; its exit code."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while self.process.poll() is None:
-            assert time.monotonic() < deadline_s
-            self.read()
-            time.sleep(0.02)
+        wait_until(lambda: self.read() or self.process.poll() is not None, 0.02)
         self.read()
         return self.process.returncode
 
