@@ -44,11 +44,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
     [
         ("", "tactile", "is missing"),
         ("[tactile]\nrecordings = ['a']", "tactile.driver", "is missing"),
-        (
-            "[tactile]\ndriver = 'i2c'\nrecordings = ['a']",
-            "tactile.driver",
-            "there are: replay, spi, can, palm, datagrams",
-        ),
+        ("[tactile]\ndriver = 'i2c'", "tactile.driver", "there are: replay, spi, can, palm, "),
         ("[tactile]\ndriver = 'spii'", "tactile.driver", "no driver 'spii'; did you mean spi?"),
         (GOOD + "[hnad]\nname = 'left'", "hnad", "did you mean hand?"),
         (GOOD + "outcome = true", "tactile.outcome", "did you mean outcomes?"),
@@ -56,11 +52,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (GOOD + "[hand]\nfingers = ['ff', 'ff']", "hand.fingers", "twice"),
         (GOOD + "[hand]\nfingers = ['thumb']", "hand.fingers.0", "'th'"),
         (GOOD + "[model]\nname = 'cnn1'\npath = 'x.onnx'", "model", "not both"),
-        (
-            GOOD + "[publish]\nendpoint = 'tcp://0.0.0.0:5555'",
-            "scene",
-            "publish.endpoint tcp://0.0",
-        ),
+        (GOOD + "[publish]\nendpoint = 'tcp://0.0.0.0:5'", "scene", "publish.endpoint tcp://0.0"),
         (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1'", "publish.endpoint", "port"),
         (GOOD + "[publish]\nendpoint = 'udp://127.0.0.1:5'", "publish.endpoint", "ipc://"),
         (GOOD + f"[publish]\nendpoint = 'ipc://{'x' * 108}'", "publish.endpoint", "107 bytes"),
@@ -76,17 +68,9 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         (GOOD + "[ask]\nendpoint = 'ipc://@graspd'", "ask.endpoint", "no file mode"),
         (GOOD + '[publish]\nendpoint = "ipc:///tmp/\\u0000"', "publish.endpoint", "NUL"),
         (GOOD + '[model]\npath = "\\u0000.onnx"', "model.path", "NUL"),
-        (
-            PALM + "[gate]\nmode = 'every'",
-            "scene",
-            "gate.mode every is for grasp tables",
-        ),
+        (PALM + "[gate]\nmode = 'every'", "scene", "gate.mode every is for grasp tables"),
         (SPI + "sped = 1", "tactile.sped", "there are: driver, port, sensors, baud"),
-        (
-            "[hand]\nfingers = ['ff', 'mf', 'rf', 'th']\n" + CAN,
-            "scene",
-            "a frame on CAN carries three sensors",
-        ),
+        ("[hand]\nfingers = ['ff', 'mf', 'rf', 'th']\n" + CAN, "scene", "three sensors"),
         (
             CAN + "[joints]\ndriver = 'palm'\ncalibration = 'hand.toml'",
             "scene",
