@@ -77,7 +77,10 @@ def test_the_running_figures_are_those_of_numpy() -> None:
     assert found.faulty[1, 3] == 50
 
 
-def at(finger: int, electrode: int, value: float) -> Callable[[Counts, object, int], None]:
+ALL = slice(None)
+
+
+def at(finger: int, electrode: int | slice, value: float) -> Callable[[Counts, object, int], None]:
     def spoil(counts: Counts, _faults: object, _number: int) -> None:
         counts[finger, electrode] = value
 
@@ -104,7 +107,7 @@ def restless(counts: Counts, _faults: object, number: int) -> None:
         (at(1, 7, 0.0), Level.ERROR, "mf_8 stuck at a rail"),
         (at(2, 23, 4095.0), Level.ERROR, "th_24 stuck at a rail"),
         (at(0, 0, 2500.0), Level.ERROR, "ff_1 frozen"),
-        (fault(2, slice(None), ElectrodeFault.MISSING, 1), Level.ERROR, "th: no electrode"),
+        (fault(2, ALL, ElectrodeFault.MISSING, 1), Level.ERROR, "th: no electrode"),
         (fault(1, 4, ElectrodeFault.MISSING, 1), Level.ERROR, "mf_5 never or rarely sampled"),
         (
             fault(0, 2, ElectrodeFault.PARITY, 10),
@@ -131,21 +134,13 @@ def touched(counts: Counts, _faults: object, number: int) -> None:
     counts[1, 3:12] -= 300.0 * np.sin(number / 10.0)
 
 
-def all_at_a_rail(counts: Counts, _faults: object, _number: int) -> None:
-    counts[1] = 0.0
-
-
-def all_frozen(counts: Counts, _faults: object, _number: int) -> None:
-    counts[1] = 2500.0
-
-
 @pytest.mark.parametrize(
     ("spoil", "level", "cause", "says"),
     [
         (at_a_rail_with_noise, Level.WARNING, Cause.ELECTRODE_RAIL, "mf_8 near the end"),
         (touched, Level.OK, None, "mf is touched or moves: 9 of its electrodes do"),
-        (all_at_a_rail, Level.ERROR, Cause.SENSOR_ABSENT, "mf: no electrode can be read"),
-        (all_frozen, Level.ERROR, Cause.REPEATED, "mf: all counts are frozen"),
+        (at(1, ALL, 0.0), Level.ERROR, Cause.SENSOR_ABSENT, "mf: no electrode can be read"),
+        (at(1, ALL, 2500.0), Level.ERROR, Cause.REPEATED, "mf: all counts are frozen"),
     ],
 )
 def test_hardware_is_accused_by_two_signs_only(
