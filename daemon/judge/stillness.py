@@ -120,7 +120,7 @@ class StepRing:
         self._total = np.zeros(shape, dtype=np.float32)
         """Sum of the sweeps of the step at hand."""
         self._total_ns = 0
-        """Sum of their times since the step before."""
+        """Sum of the times of these sweeps since the step before, ns."""
         self._begun_ns = 0
         """Time of the first sweep."""
 

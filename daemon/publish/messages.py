@@ -73,7 +73,7 @@ class RiskReport(msgspec.Struct, frozen=True):
     announced: Count = 0
     """`lift` questions that were answered `stable`, one a grasp."""
     awaited: Count = 0
-    """Those of them without an outcome yet. From `[risk] outstanding_max` nothing is `stable`."""
+    """Announced lifts without an outcome yet. From `[risk] outstanding_max` nothing is `stable`."""
 
 
 class Verdict(_Message, frozen=True, kw_only=True):

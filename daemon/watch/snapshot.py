@@ -134,7 +134,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     health: list[Line]
     """Parts that are not as they should be, first those to act on."""
     not_well: str
-    """Those to act on in a few words, without what `why` says; empty: none, or not known."""
+    """Parts to act on in a few words, without what `why` says; empty: none, or not known."""
     state: str | None
     """`running`, `no readings` or `stopping`; None: not known."""
     model: str | None

@@ -70,7 +70,7 @@ class RecordedDriver(Opened, Generic[Item]):
             self._playing = None
 
     def due_ns(self) -> int | None:
-        """Return when the next item is due, ns; in the past: now. None: no item."""
+        """Return when the next item is due, ns; a time in the past means now. None: no item."""
         if self._playing is None or self.exhausted:
             return None
         if self.speed is None or self._next is None or self._began is None:

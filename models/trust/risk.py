@@ -202,7 +202,7 @@ class Risk:
             self.budget = min(self.budget + alpha - slipped, BUDGET_MAX)
 
     def take_untold(self) -> None:
-        """Take an announced lift whose outcome cannot come any more for a slip."""
+        """Count an announced lift whose outcome cannot come any more as a slip."""
         if self.limits.max_slip_when_stable is not None:
             self.take(stable=True, slipped=True, proves=False)
 

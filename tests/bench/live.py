@@ -157,7 +157,7 @@ class Usage:
 
 
 def usage(pid: int) -> Usage:
-    """Of a process that runs (proc(5): smaps_rollup)."""
+    """Return what a running process uses (proc(5): smaps_rollup)."""
     about = Path(f"/proc/{pid}")
     memory = (about / "smaps_rollup").read_text().partition("\nRss:")[2]
     return Usage(

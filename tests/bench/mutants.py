@@ -44,11 +44,11 @@ from tests.kit.mutants import Mutant, mutants
 
 NUMBER = 200
 KILLED_SHARE = 0.9
-"""Of the mutants that the tests must notice."""
+"""Share of the mutants that the tests must notice."""
 LEFT_OUT = ("drivers/twins/",)
 """Test equipment."""
 KINDS = ("comparison", "operator", "logic", "number")
-"""Of the mutants that are picked from."""
+"""Kinds of the mutants that are picked from."""
 TESTS_S = 60.0
 """Tests that a mutant gets, by the time that they take without it, s."""
 SLACK, SLACK_S = 5.0, 10.0
@@ -71,7 +71,7 @@ class Baseline:
     tests: dict[str, dict[str, list[str]]] = dataclasses.field(default_factory=dict)
     """By file and line (as text) the tests that execute it."""
     naming: dict[str, list[str]] = dataclasses.field(default_factory=dict)
-    """By file the tests in files that name its module."""
+    """Tests in files that name a module, by the module's file."""
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """A part of a test is done."""

@@ -24,7 +24,7 @@ WARM_UP_S, WARM_UP_SHARE = 60.0, 0.5
 They grew 1.8 MiB in the first 20 s, 0.4 MiB in the next 40 s, and 0.2 MiB in the minute after.
 A run of less than two minutes warms up for this share of it."""
 SLOPE_SAMPLES = 500
-"""Of an hour's 7200: all pairs of them are looked at."""
+"""Most samples of an hour's 7200: all pairs of them are looked at."""
 
 
 @dataclass(slots=True)
@@ -54,7 +54,7 @@ class Found:
     """What is known when a soak is over."""
 
     samples: Sequence[Usage]
-    """Of the daemon."""
+    """What the daemon used, sample by sample."""
     heard: Heard
     outages: int
     """Twins that were killed, and subscribers that were stopped."""

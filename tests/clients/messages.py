@@ -72,7 +72,7 @@ def supervised(seq: int = 0, read_ns: int = 0) -> dict[str, Any]:
 
 
 def frames(message: dict[str, Any]) -> list[bytes]:
-    """As they come from the socket."""
+    """Return the frames of a message as they come from the socket."""
     return [TOPIC, json.dumps(message).encode()]
 
 

@@ -34,7 +34,7 @@ def well(read_ns: int, seq: int = 0) -> dict[str, Any]:
 
 
 def came(case: dict[str, Any], read_ns: int) -> list[list[bytes]]:
-    """The messages of a case, one after the other, where it is `read_ns`."""
+    """Return the frames of a case's messages in order; `read_ns`: base of their times."""
     return [_frames(each, read_ns) for each in case["came"]]
 
 
@@ -60,7 +60,7 @@ def _changed(payload: str, how: dict[str, Any]) -> bytes:
 
 
 PADDED = [TOPIC, json.dumps(well(START_NS)).encode().ljust(1 << 16)]
-"""As long as a message may be."""
+"""The longest message that is allowed."""
 
 
 Grasps = Sequence[tuple[str, int]]

@@ -26,7 +26,7 @@ from tests.kit.waiting import wait_until
 FOLDER = CPP.parent / "ros"
 START_S = 1_700_000_000
 SENSORS = 5
-"""Of `BiotacAll.tactiles`: first, middle, ring and little finger, thumb (sr_robot_msgs)."""
+"""Length of `BiotacAll.tactiles`: first, middle, ring and little finger, thumb (sr_robot_msgs)."""
 
 
 @dataclass

@@ -113,7 +113,7 @@ def test_gaps_repeats_and_restarts_are_counted() -> None:
 
 
 OFFSET_NS = 77_000 * MS
-"""By which the other computer's clock is ahead."""
+"""Time by which the other computer's clock is ahead, ns."""
 
 
 @settings(max_examples=80)
@@ -161,7 +161,7 @@ def test_messages_of_a_rebooted_computer_count_again() -> None:
 def test_where_the_daemon_tells_its_clock_no_delay_is_hidden(
     delays_ms: list[tuple[int, int]], drift: float
 ) -> None:
-    """Of each message, and of each question before it; from the first message on."""
+    """The delay of each message, and of each question before it, from the first message on."""
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     for seq, (delay_ms, asking_ms) in enumerate([(1, 1), *delays_ms]):
         sent_ns = START_NS + seq * 1000 * MS

@@ -16,7 +16,7 @@ from tests.deploy.staging import DEPLOY, INSTALLER
 
 UNIT = DEPLOY / "systemd/graspd@.service"
 EXPOSURE_MAX_TENTHS = 25
-"""Of `systemd-analyze security`, from 0, nothing is exposed, to 100."""
+"""Largest score of `systemd-analyze security`, from 0 (closed) to 100."""
 
 
 def settings(path: Path) -> dict[str, list[str]]:

@@ -311,7 +311,7 @@ def noted(
 
 
 SOL, STAMP, LOST = socket.SOL_SOCKET, 35, 40
-"""Of asm-generic/socket.h: SO_TIMESTAMPNS and SO_RXQ_OVFL."""
+"""Numbers of SO_TIMESTAMPNS and SO_RXQ_OVFL in asm-generic/socket.h."""
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def test_twenty_seconds_are_judged_as_exact_ones(
 
 
 def grasp_verdicts(readings: Sequence[TactileReading]) -> list[tuple[int, str, float | None]]:
-    """Of each judged grasp: at which reading, the verdict, the probability of slip."""
+    """Return reading, verdict and probability of slip of each judged grasp."""
     found, at = [], 0
     for entry in judged(iter(readings), joints=False):
         if entry["judged"]:

@@ -42,7 +42,7 @@ COMMANDS = {
     "all": bytes([PAC, PDC, TAC, TDC]) + ELECTRODE_COMMANDS,
     "interleaved": b"".join(bytes([one, PAC]) for one in (*ELECTRODE_COMMANDS, PDC, TAC, TDC)),
 }
-"""By sequence (manual table 12)."""
+"""Commands by sequence (manual table 12)."""
 SETTLE_US, GAP_US = 50.0, 5.0
 """Least times between a command and an answer, and after an answer (manual figure 14)."""
 SPI_HZ_MIN, SPI_HZ_ASKED = 500_000, 4_400_000

@@ -50,7 +50,7 @@ class Mutant:
 
     source: str
     place: int
-    """Of the changed node among those of the module."""
+    """Place of the changed node among those of the module."""
     line: int
     begin: int
     """First line of the statement around it: what runs them runs the mistake."""

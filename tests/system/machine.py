@@ -26,7 +26,7 @@ START_TIMEOUT_S: Final = 60.0
 BOOT_TIMEOUT_S: Final = 900.0
 """18 s where the host is idle, 220 s where its tests leave it a tenth of a processor."""
 CONSOLE_BYTES: Final = 2000
-"""Of the console, in an error."""
+"""Most of the console in an error, bytes."""
 ANSWER_TIMEOUT_S: Final = 200.0
 """For a guest agent that is busy, under emulation."""
 COMMAND_TIMEOUT_S: Final = 600.0

@@ -18,8 +18,8 @@ STALE_S: Final = 5.0
 """Age at which a reading is stale: `max_age_ms` of both scenes."""
 DAY_S: Final = 86_400
 STEPS: Final = ("+", "-", "+", "-")
-"""Of the clock, by a day. A busy host that stands still may cost the link once, which is warned of;
-a step that is noticed is warned of each time."""
+"""Signs of the clock's steps of a day. A busy host that stands still may cost the link once, with a
+warning; a step that is noticed brings one each time."""
 FILLER: Final = "/filler"
 FILL: Final = f"""
 for size in 64M 1M 64K 4K; do

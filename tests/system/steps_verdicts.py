@@ -18,7 +18,7 @@ P_SLIP_ERROR_MAX: Final = 0.05
 """Emulation stalls, so a grasp may settle some sweeps later than in a replay: by noise alone its
 `p_slip` is up to 0.03 another then."""
 CAN_MODEL: Final = "small-electrodes"
-"""As in `can.toml`."""
+"""Model that `can.toml` names."""
 GRASPS: Final = 3
 
 

@@ -28,11 +28,11 @@ from tests.ports import free_port
 from tests.threads import at_work
 
 MEMORY_MAX_MIB = 32.0
-"""So far from rest the daemon's memory may go."""
+"""Largest growth of the daemon's memory, MiB."""
 CONNECTIONS = 2500
 """In one round to each socket, of each kind."""
 OPEN_MAX = 1500
-"""Of those at a time."""
+"""Most connections at a time."""
 FLOOD_S = 1.5
 FLOODERS = 8
 KEEPING_RULES_S = 3.0

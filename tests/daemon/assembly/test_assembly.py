@@ -42,7 +42,7 @@ TRUST = {
 
 
 @pytest.mark.parametrize("text", TRUST)
-def test_outcomes_teach_and_a_risk_is_kept_by_scene(text: str) -> None:
+def test_the_scene_decides_on_learning_and_risk(text: str) -> None:
     scene = scene_of(REPLAY, **tomllib.loads(text))
     trust = assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene), Clock()).trust
     if TRUST[text] is None:
@@ -70,7 +70,7 @@ def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
 
 
 def test_a_table_is_judged_as_its_readings_are_handed_over() -> None:
-    """By this computer's clock the reading is as old as the computer's start."""
+    """The reading is as old as the computer's start, by its own clock."""
     source = Tables([DEMO_TABLE], {})
     scene = source.scene({}, {}, None)
     parts = source.parts(scene, assembly.load_model(scene), None)

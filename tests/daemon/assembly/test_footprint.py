@@ -66,12 +66,12 @@ FORBIDDEN = {
     "two-fingers": buses_but("spi") | JOINTS | HALL | ASK,
     **{name: buses_but(name) | JOINTS | HALL | ASK for name in ("spi", "can", "palm", "datagrams")},
 }
-"""By example scene."""
+"""Modules that must not be loaded, by example scene."""
 DRIVER = {"demo": "replay", "two-fingers": "spi"}
-"""By example scene, where it has not the driver's name."""
+"""Driver by example scene, where the scene has another name."""
 MEMORY_MIB = 132
-"""Resident; measured 82 to 88 MiB with numpy 2.4, onnxruntime 1.31 and pydantic 2.13, and other
-versions may take half as much again."""
+"""Most resident memory; measured 82 to 88 MiB with numpy 2.4, onnxruntime 1.31 and pydantic 2.13.
+Other versions may take half as much again."""
 
 STANDARD = 3
 """Descriptors of standard input, output and error."""

@@ -44,7 +44,7 @@ PORT = free_port(socket.SOCK_DGRAM)
 
 
 def filled(text: str, folder: Path) -> str:
-    """Of `SCENES` or `TWINS`, with the places that are this test's own."""
+    """Return a text of `SCENES` or `TWINS` with this test's own places."""
     return text.format(folder=folder, port=PORT, group=GROUP, id=can_id(GROUP))
 
 

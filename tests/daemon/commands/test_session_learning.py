@@ -149,7 +149,7 @@ def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
 
 
 def test_a_person_settles_announced_lifts(tmp_path: Path) -> None:
-    """As their controller would have told them, and by the same rule."""
+    """They settle as their controller would have told them, by the same rule."""
     sections = "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n"
     path, kept = session_scene(tmp_path, "mlp", sections), tmp_path / "right"
     trust, boot = live_trust(path), "0123456789abcdef" * 2

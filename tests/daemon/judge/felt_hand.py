@@ -86,7 +86,7 @@ class Feel:
     step_ns: int = PERIOD_NS
     """What the daemon's clock moves on by before each."""
     age_ns: int = 0
-    """Of the first reading."""
+    """Age of the first reading, ns."""
     lag_ns: int = 0
     """Time by which each reading is older than the one before, ns."""
     repeats: bool = False
@@ -94,7 +94,7 @@ class Feel:
     flaws: tuple[Flaw, ...] = ()
     joints: str = "still"
     answer: float | None = 0.1
-    """Of the network; None: it fails."""
+    """Answer of the network; None: it fails."""
     asks: bool = False
     """Whether the controller asks once before the first reading."""
 
@@ -223,7 +223,7 @@ def limits(
     required: tuple[Finger, ...] = FINGERS,
     early: bool = False,
 ) -> HandLimits:
-    """Those that `Necessity` knows."""
+    """Return limits that `Necessity` knows."""
     return HandLimits(
         on_request=on_request, required=required, gate=GateLimits(early=early), joints=True
     )

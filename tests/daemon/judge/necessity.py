@@ -22,7 +22,7 @@ GAP_MS = 100
 STILL_MS, EARLY_MS = 240, 100
 """Least time of touch and stillness, ms; the second where a grasp may be judged early."""
 WINDOW_MS = 80
-"""Of the joints."""
+"""Length of the window of joint motion, ms."""
 MOVED_COUNTS = 15.0
 """A finger whose electrodes are in the mean this far from where they were a short while ago has
 moved: the speed of nine held touches in ten stays below 20 counts/s, noise here is 1.4 counts."""
@@ -61,7 +61,7 @@ class _Used:
 
     t_ns: int
     depth: float
-    """By how much each required finger touches at best, counts: the least of them."""
+    """Fall of the required finger that touches least, at best, counts."""
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     """Shape (fingers, 24): where each electrode's median is."""
@@ -109,7 +109,7 @@ class Necessity:
         self._used: list[_Used] = []
         """The last ones, between which time continues and no gap is."""
         self._joints: dict[bytes, list[_Angles]] = {}
-        """By which are valid: the last ones, between which time continues and no gap is."""
+        """Last angles, by which are valid: time rises between them without a gap."""
         self._changed_ns: int | None = None
         """When some angle had another value than before; nothing is remembered of other joints."""
         self._without_joints_since_ns: int | None = None
@@ -200,7 +200,7 @@ class Necessity:
         self._drop_joints(t_ns)
 
     def _depths(self) -> NDArray[np.float64]:
-        """By how much each finger touches at best, counts, shape (fingers,)."""
+        """Return the largest possible fall of each finger, counts, shape (fingers,)."""
         nearest = self._values[:NEAREST]
         most, least = self._rest - nearest.min(axis=0), self._rest - nearest.max(axis=0)
         third = np.sort(np.where(self._sick > 0, np.inf, most), axis=1)[:, -3]

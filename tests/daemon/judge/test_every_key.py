@@ -35,7 +35,7 @@ NAMES: Mapping[str, tuple[Any, ...]] = {
 }
 """Values of the keys that are names, fingers of a hand and paths."""
 MOVED_COUNTS = 40.0
-"""Certainly motion, also where few false alarms are asked for."""
+"""Step of counts that is motion even with few false alarms."""
 COMBINATIONS, CHUNKS = 5, 2
 TROUBLES = (
     Feel("rest", times=30),

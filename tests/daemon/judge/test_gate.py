@@ -37,7 +37,7 @@ class Scenario:
 
     name: str
     depth: Knots | dict[str, Knots]
-    """Of the touch, counts by time, s: of all fingers, or of each; lines in between."""
+    """Depth of the touch, counts by time, s, of all fingers or of each; lines in between."""
     changes: str
     """Expected: state:cause of each change."""
     seconds: float = 1.5

@@ -35,7 +35,7 @@ STANDS_S = 0.03
 def test_each_grasp_is_judged_once_it_is_still_before_its_lift(
     bts3_dir: Path, untouched: NDArray[np.uint16], held: bool
 ) -> None:
-    """As a palm's recording has them, or as an SPI bridge reads them."""
+    """Sweeps are those of a palm's recording, or of an SPI bridge."""
     table = [
         point
         for name in ("palm_down", "palm_side")

@@ -105,7 +105,7 @@ def test_sensors_away_for_a_second_may_be_others(
 def test_after_time_went_back_a_second_sensors_may_be_others(
     back_ns: int, tared: tuple[str, ...]
 ) -> None:
-    """As in two recordings, of which the later one is played first."""
+    """Time goes back if the later of two recordings is played first."""
     hand = HandTracker(FINGERS, LIMITS)
     for t_s, reading in readings(FIRM):
         hand.step(reading.made_ns, reading.counts, SOUND)

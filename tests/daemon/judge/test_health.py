@@ -64,7 +64,7 @@ def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -
         ({0: 151, 1: -151, 8: 151}, False),  # 1.91
     ],
 )
-def test_an_electrode_jumps_above_a_spike_more_than_twice(
+def test_more_than_two_jumps_above_a_spike_flag_an_electrode(
     jumps: dict[int, int], jumpy: bool
 ) -> None:
     _, found = watched(steps_of(max(jumps) + 1, jumps))

@@ -12,7 +12,7 @@ from graspd.daemon.judge.windows import STEPS, Noise
 
 FINGER = np.ones((1, 24), dtype=np.bool_)
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
-"""Of real held touches: by the differences of sweeps, over the root of 2; at one sweep."""
+"""Noise of real held touches, from differences of sweeps over the root of 2, and at one sweep."""
 
 
 def wavering(seconds: float, rate_hz: float, sigma: float, seed: int) -> NDArray[np.float64]:
@@ -22,7 +22,7 @@ def wavering(seconds: float, rate_hz: float, sigma: float, seed: int) -> NDArray
 
 
 def fed(motion: Motion, counts: NDArray[np.float64], rate_hz: float, begin_ns: int = 0) -> int:
-    """Feed sweeps, shape (sweeps, fingers, 24); when the next one is due, ns."""
+    """Feed sweeps, shape (sweeps, fingers, 24); return when the next one is due, ns."""
     usable = np.ones(counts.shape[1:], dtype=np.bool_)
     for index, sweep in enumerate(np.rint(counts).astype(np.uint16)):
         motion.add(begin_ns + round(index / rate_hz * 1e9), sweep, usable)
@@ -184,7 +184,7 @@ def test_who_looks_late_sees_what_who_always_looked_sees(rate_hz: float) -> None
 
 @pytest.mark.parametrize(("sweeps", "counts_per_s"), [(8, 83.0), (12, 53.0), (24, 25.0)])
 def test_the_slope_limit_fits_19_of_20_real_touches(sweeps: int, counts_per_s: float) -> None:
-    """Of 44 held touches at 100 Hz, in windows of 80, 120 and 240 ms."""
+    """There are 44 held touches at 100 Hz, in windows of 80, 120 and 240 ms."""
     times_s = 0.01 * (np.arange(sweeps) - (sweeps - 1) / 2)
     variance = np.array([SIGMA_COUNTS**2 / (1.0 - CORRELATION)])
     noise = Noise.of(variance, np.array([[CORRELATION], [0.03]]))

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 @dataclass
 class Found:
-    """Of each finger; windows that are not full yet are infinite."""
+    """Motion of each finger; windows that are not full yet are infinite."""
 
     fast: Floats
     fast_limit: Floats

@@ -23,7 +23,7 @@ def record(level: int, text: str, *values: object) -> logging.LogRecord:
 
 
 def test_each_line_in_the_journal_has_a_syslog_priority() -> None:
-    """As in syslog(3): LOG_ERR 3, LOG_WARNING 4, LOG_INFO 6, LOG_DEBUG 7."""
+    """Priorities are those of syslog(3): LOG_ERR 3, LOG_WARNING 4, LOG_INFO 6, LOG_DEBUG 7."""
     levels = {"CRITICAL": 3, "ERROR": 3, "WARNING": 4, "INFO": 6, "DEBUG": 7}
     for name, number in levels.items():
         line = JournalFormatter().format(record(logging.getLevelNamesMapping()[name], "a\nb"))

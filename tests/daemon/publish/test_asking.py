@@ -115,7 +115,7 @@ class Model:
         return (name, owner, supervised) if question.kept else None
 
     def may_lift(self, peer: Peer) -> bool:
-        """By the scene; else the user that lifted first. A name needs 16 bytes."""
+        """Return True for users of the scene, else the first that lifted. Names have 16 bytes."""
         lifter = self.book.lifter
         is_same = lifter is None or lifter.credential == peer.credential
         allowed = is_same if self.tells is None else self.tells(peer.credential)

@@ -155,7 +155,7 @@ def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> No
 def test_own_keys_below_a_shared_folder_are_safe(
     tmp_path: Path,
 ) -> None:
-    """As below /tmp, where no user may replace another's files."""
+    """Below /tmp no user may replace another's files."""
     keys = tmp_path / "keys"
     public, secret = make(keys, "laptop")
     tmp_path.chmod(0o1777)

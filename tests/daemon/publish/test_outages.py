@@ -58,7 +58,7 @@ class Twin(SpiTwin):
         self.serve(is_over)
 
     def do(self, deed: Callable[[], object]) -> None:
-        """Have something done; returns when it is done."""
+        """Have `deed` done in the other thread; return when it is done."""
         self._deeds.put(deed)
         self._deeds.join()
 

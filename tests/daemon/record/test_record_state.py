@@ -185,7 +185,7 @@ class Daemon:
 
 
 def sweeps() -> list[TactileReading]:
-    """Those of the demo recording, as if they came live, with the pace of it."""
+    """Return the sweeps of the demo recording, as if they came live, at its pace."""
     found = []
     with ReplayDriver([DEMO_RECORDING], speed=None, clock=lambda: 0) as driver:
         while not driver.exhausted:
@@ -266,7 +266,7 @@ def test_exchanged_sensors_and_their_return_are_played_again(
 def test_late_readings_are_late_again_in_the_replay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also those that only the network made late: their answer counts, as it did."""
+    """Readings that only the network's time made late are late again too."""
     daemon = Daemon(tmp_path, monkeypatch)
     ages_ms = {7: (101, 101), 8: (101, 120), 20: (50, 101), 31: (0, 200), 32: (100, 100)}
     expected = [daemon.judge(each, ages_ms.get(each.seq % 50, (0, 0))) for each in sweeps()[:1000]]

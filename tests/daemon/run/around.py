@@ -34,7 +34,7 @@ class World(Clock):
         super().__init__()
         self.random = random.Random(seed)
         self.away_ns = 0
-        """Time in all in which the computer did something else."""
+        """Total time in which the computer did something else, ns."""
         self._worked_ns = 0
         self.has_trouble = False
         self.kill_ns: int | None = None
@@ -160,7 +160,7 @@ class Controller:
     def __init__(self, world: World, door: Door, name: bytes, user: bytes) -> None:
         self.world, self.door, self.known = world, door, Peer(name, user)
         self.asked_ns: int | None = None
-        """By the time that the computer worked; None: no question is open."""
+        """Working time of the open question, ns; None: no question is open."""
         self.lifts = False
         self.told: tuple[GraspId, str] | None = None
         self.offers: set[GraspId] = set()

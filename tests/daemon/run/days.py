@@ -45,7 +45,7 @@ from tests.kit.messages import decode_status, decode_verdict
 
 AGE_NS = 100 * MS
 MOVED_COUNTS = 40.0
-"""Certainly motion: grasps are further apart."""
+"""Step of counts that is motion: grasps are further apart."""
 SAID_AFTER_NS = 1300 * MS
 """A fault that lasts this long is in the status."""
 ROUNDS_MAX = 1000

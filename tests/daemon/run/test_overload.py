@@ -181,7 +181,7 @@ def test_joints_are_all_followed_in_their_order() -> None:
 
 
 def test_the_newest_is_that_of_all_that_the_driver_has() -> None:
-    """Also of one that hands over a few at a time."""
+    """The driver may hand over a few readings at a time."""
     bench = flood(100 * MS, 3.0, at_once=3)
     ages_ms = [verdict.age_ms for verdict, _ in bench.judged[3:-1]]
     assert max(ages_ms) < 10.0
@@ -229,7 +229,7 @@ def test_a_sensor_frozen_among_skipped_readings_is_never_stable() -> None:
 
 
 def test_a_repeated_finger_is_held_despite_flagged_electrodes() -> None:
-    """As without the gap, where health takes no flagged electrode for a difference."""
+    """A flagged electrode does not count as different from the former sweep."""
     former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
     counts = newest.counts.copy()
     counts[0] = former.counts[0]

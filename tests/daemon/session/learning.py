@@ -35,7 +35,7 @@ SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
 BOOT = "0123456789abcdef" * 2
 INPUTS = 78
 NOBODY = cast(Requests, None)
-"""Of whom nothing is requested."""
+"""Stands in for requests that are never made."""
 SHORT = Durations(
     approach_s=(0.3, 0.3),
     settle_s=(0.5, 0.6),
@@ -112,7 +112,7 @@ def read_once(companion: Companion) -> None:
 
 
 def go_round(keeper: SessionKeeper) -> None:
-    """As the loop does, until nothing is being written any more."""
+    """Go round as the loop does, until all is written."""
     keeper.before_wait(NOBODY)
     while keeper.filenos:
         ready, _, _ = select.select(keeper.filenos, [], [], 60.0)

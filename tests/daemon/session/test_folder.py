@@ -38,9 +38,9 @@ from tests.daemon.session.learning import (
 STEPS = ("open", "chmod", "fsync", "replace", "unlink")
 """Functions of `os` by which a file is written; a kill comes before or after a call of one."""
 CALLS = 6
-"""Of these in a save: open, chmod and fsync of the part, the replacement, the folder's two."""
+"""Number of such calls in a save: three of the part, the replacement, the folder's two."""
 CALLS_OF_TWO = 2 * CALLS + 1
-"""Of these in the first save of two sessions: then the former file goes."""
+"""Number of such calls in the first save of two sessions: then the former file goes."""
 
 
 class Killed(BaseException):

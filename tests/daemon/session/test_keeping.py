@@ -169,7 +169,7 @@ def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> N
 def test_a_disk_that_fails_at_the_start_is_tried_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As on a full or read-only disk, and in a folder that is gone."""
+    """The disk is full or read-only, or the folder is gone."""
     gone = tmp_path / "gone"
     folder, part, found = SessionFolder(gone / "right"), trust(), list[Reply]()
     keeper = session_keeper(None, sensors(), folder, part=part)

@@ -167,7 +167,7 @@ class Browser:
         self.ask("Page.navigate", url=address)
 
     def value(self, expression: str) -> Any:  # noqa: ANN401
-        """Of a script in the page; None if it fails."""
+        """Return the value of a script in the page; None if it fails."""
         answer = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
         return answer["result"].get("value")
 

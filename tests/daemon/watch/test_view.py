@@ -140,7 +140,7 @@ def test_an_overload_is_the_cause_and_a_cable_is_not() -> None:
 
 @pytest.mark.parametrize(("late", "not_well"), [(5, ""), (6, "not well: late")])
 def test_many_late_verdicts_of_a_second_are_not_well(late: int, not_well: str) -> None:
-    """Of a hundred readings, after thousands that were late before."""
+    """A hundred readings follow thousands that were late."""
     view = after((b"verdict.right", verdict(0)))
     for second, count in enumerate((5000, 5000 + late)):
         at_ns = second * 1000 * MS

@@ -26,7 +26,7 @@ from tests.kit.waiting import PATIENCE_S, wait_until
 from tests.ports import free_port
 
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
-"""Of the alternate screen (xterm)."""
+"""Codes that enter and leave the alternate screen (xterm)."""
 
 
 @pytest.fixture

@@ -63,7 +63,7 @@ def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> by
 
 
 def tactile(seq: int, *counts: list[int], faulty: tuple[int, ...] = ()) -> bytes:
-    """Of the fingers `ff` and `th`; the electrodes of `ff` that are `faulty`, from 0."""
+    """Return a message of `ff` and `th`; `faulty`: electrodes of `ff`, from 0."""
     faults = [[0] * 24 for _ in counts]
     for electrode in faulty:
         faults[0][electrode] = 1

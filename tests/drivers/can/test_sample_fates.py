@@ -17,7 +17,7 @@ PLACES: dict[str, Callable[[int, int], bool]] = {
     "far back": lambda place, last: place < last - 3,
     "jump": lambda place, last: place in (21, 22, 23) and last in (0, 1, 2),
 }
-"""By word of the page, as it says below the table; places and the furthest one from 0."""
+"""Words of the page, as it says below the table; places and the furthest one from 0."""
 OUT = ", reading has ended"
 TIMES = {"any": set(Timing), "late": {Timing.LATE}, "early": {Timing.EARLY}}
 HELD = {

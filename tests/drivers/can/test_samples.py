@@ -95,7 +95,7 @@ def missed_when_late(number: int, late_ns: int) -> int:
 
 @pytest.mark.parametrize(("late_ns", "missed"), [(5 * MS - 1, 0), (5 * MS, 1)])
 def test_a_sweep_five_milliseconds_late_means_a_missed_one(late_ns: int, missed: int) -> None:
-    """Of a fast board, whose sweeps take 5.4 ms: it may be the host that is late."""
+    """Sweeps of a fast board take 5.4 ms: the host may be late instead."""
     assert missed_when_late(10, late_ns) == missed
 
 

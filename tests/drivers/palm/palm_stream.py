@@ -31,7 +31,7 @@ class DatagramClock(Clock):
     def __init__(self) -> None:
         super().__init__()
         self.age_ns = 0
-        """Of each datagram that is received."""
+        """Age of each datagram that is received, ns."""
 
     def rule(self, patch: pytest.MonkeyPatch) -> None:
         """Let datagrams be as old as this clock says: the kernel's stamps tell when a busy machine

@@ -94,7 +94,7 @@ def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
 def test_an_impossible_pressure_or_temperature_is_an_absent_sensor(
     position: int,
 ) -> None:
-    """As recorded from a hand without this sensor: -22072 is 43464 unsigned."""
+    """A hand without this sensor gave -22072, which is 43464 unsigned."""
     stream = packets(2)
     stream[position] = change(stream[position], "mf", {"other_0": 43464})
     stream[position] = change(stream[position], "ff", {"other_0": 4095})  # may be that high

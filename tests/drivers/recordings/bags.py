@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 BIOTAC = "int16 pac0\nint16 pac1\nint16 pdc\n\nint16 tac\nint16 tdc\n\nint16[] electrodes\n"
-"""As in sr_common, sr_robot_msgs/msg/Biotac.msg."""
+"""Definition of sr_robot_msgs/msg/Biotac.msg in sr_common."""
 BIOTAC_ALL = "Header header\nBiotac[5] tactiles\n"
 WITH_ARRAY = BIOTAC.replace("int16 pdc", "int16[] pac\nint16 pdc")
 """Another version of that message."""

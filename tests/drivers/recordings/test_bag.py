@@ -29,7 +29,7 @@ START_NS = 1_542_585_600_000_000_000
 PERIOD_NS = 10_000_000
 JOINTS = ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
 ROWS = 300
-"""Of the demo: one grasp."""
+"""Rows of the demo that hold one grasp."""
 
 
 def demo() -> pd.DataFrame:

@@ -233,7 +233,7 @@ def test_times_that_stand_or_fall_between_buses_are_not_steps(tmp_path: Path) ->
 
 
 def test_a_clock_that_was_set_back_is_a_pause(tmp_path: Path) -> None:
-    """As of two logs in one file; no sweep has frames of both."""
+    """Two logs in one file look like this; no sweep has frames of both."""
     path = tmp_path / "bus.log"
     path.write_text("".join([*lines_of(3)[:-5], *lines_of(3, since_ns=5 * 10**9)]))
     readings, _ = played([path])

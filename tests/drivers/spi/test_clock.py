@@ -183,7 +183,7 @@ def test_a_rate_wrong_by_500_ppm_is_a_fault(wrong_ppm: int) -> None:
 
 @given(st.floats(-80_000.0, 80_000.0), st.integers(0, 99))
 def test_a_wrong_rate_makes_no_reading_20_ms_newer(wrong_ppm: float, seed: int) -> None:
-    """As while a computer's time is set; what round trips hide is shorter than they are."""
+    """Rates are wrong while a computer's time is set; round trips hide less than their length."""
     too_old = [ns for ns, _ in too_old_ns(Way(drifts_ppm=(wrong_ppm,), seed=seed), 5)]
     assert min(too_old) >= -DOUBT_NS
 

@@ -91,7 +91,7 @@ def test_bytes_before_a_failure_are_handed_over(monkeypatch: pytest.MonkeyPatch)
         (termios.error(5, "gone"), "the device went away"),
     ],
 )
-def test_no_room_is_not_a_failure(
+def test_a_full_line_is_not_a_failure(
     monkeypatch: pytest.MonkeyPatch, failure: Exception, told: str | None
 ) -> None:
     port = Port()

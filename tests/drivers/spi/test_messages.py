@@ -26,7 +26,7 @@ from graspd.drivers.spi.messages import (
 from tests.drivers.spi.bridge_c import frame
 
 ENCODED_MAX_BYTES = 1024
-"""As the document says."""
+"""Largest encoded frame by deploy/bridge/PROTOCOL.md, bytes."""
 HELLO = Hello(
     nonce=0x11223344,
     tick=5_000_000,

@@ -174,7 +174,7 @@ def _slide(
 
 
 def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Of the motion of 24 electrodes; root mean square 1."""
+    """Draw a direction in which 24 electrodes move; root mean square 1."""
     direction = rng.normal(size=ELECTRODES)
     return np.asarray(direction / np.sqrt((direction**2).mean()), dtype=np.float64)
 

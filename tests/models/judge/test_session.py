@@ -11,7 +11,7 @@ from graspd.models.contract import SessionInput, Sharpness
 from graspd.models.judge.session import SessionCalibration
 
 MEAN, SPREAD = 2000.0, 100.0
-"""Of every electrode in the training, counts."""
+"""Mean and spread of every electrode in the training, counts."""
 SHAPE = (3, 24)
 
 

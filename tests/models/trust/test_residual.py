@@ -72,7 +72,7 @@ def test_learning_is_that_of_all_grasps_known_from_the_start(
 
 
 def test_rounding_of_many_outcomes_does_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By turns nearly equal grasps and others; outcomes depend on neither."""
+    """Nearly equal grasps and others alternate; outcomes depend on neither."""
     kept, number, random = 5, 1500, np.random.default_rng(3)
     monkeypatch.setattr(learner_module, "GRASPS_MAX", kept)
     spreads = np.where(np.arange(number) // 20 % 2, 1e-5, 0.5)[:, None]

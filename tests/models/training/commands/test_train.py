@@ -31,7 +31,7 @@ from tests.models.training.samples import (
 
 SYSTEM = "svm-session"
 GRASPS = 80
-"""Of each of the three tables."""
+"""Number of grasps of each of the three tables."""
 
 
 def train(*arguments: object, system: str = SYSTEM) -> CompletedProcess[str]:

@@ -176,7 +176,7 @@ def test_readings_of_one_grasp_stay_in_one_fold() -> None:
 
 @pytest.mark.parametrize("step", [4.0, 12.0])
 def test_readings_of_a_grasp_are_joined_near_by_near(step: float) -> None:
-    """As by scipy from all distances: RMS 8 counts over 72 electrodes."""
+    """Groups are those of scipy from all distances: RMS 8 counts over 72 electrodes."""
     random, rows = np.random.default_rng(4), 300
     walk = np.cumsum(random.normal(0.0, step / np.sqrt(2), (rows, 72)), axis=0) % 4096
     counts = random.permutation(walk).astype(np.uint16)

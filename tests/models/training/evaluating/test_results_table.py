@@ -87,7 +87,7 @@ def test_fifty_grasps_speak_for_a_calibrated_session() -> None:
     assert list(by_age(made.of_variant("running"))) == [0, 5, 10, 20]
 
 
-def test_each_stream_is_counted_for_itself_and_the_refused_apart() -> None:
+def test_streams_and_refused_grasps_are_counted_apart() -> None:
     parts = []
     for split in splits("days", GRASPS, 0, 2):
         test = split.test

@@ -186,7 +186,7 @@ def test_a_scale_is_fitted_on_other_objects_of_its_split() -> None:
 
 @pytest.fixture(scope="module")
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the report, made in this process: it starts slowly."""
+    """Return the folder of the report, made in this process: it starts slowly."""
     out = tmp_path_factory.mktemp("worth")
     card = out / "card.json"
     shutil.copy(zoo.find("small-session").with_suffix(".json"), card)
