@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -160,17 +159,6 @@ def test_the_second_controller_learns_who_owns_the_grasp(lift_gate: Path, tmp_pa
         wait_until(both_ask_for_one)
 
 
-def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Client(daemon.endpoint) as graspd:
-        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
-        daemon.send(signal.SIGSTOP)
-        wait_until(lambda: graspd.verdict().reasons == ("silent",))
-        answer = graspd.may_i_lift(0.2)
-        daemon.send(signal.SIGCONT)
-        wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
-    assert (bool(answer), answer.verdict.reasons) == (False, ("silent",))
-
-
 def test_a_killed_daemon_is_unknown_until_its_next_message(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Client(daemon.endpoint, max_age_ms=1e6) as graspd:
         wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
@@ -181,28 +169,6 @@ def test_a_killed_daemon_is_unknown_until_its_next_message(tmp_path: Path) -> No
         daemon.start()
         wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
         assert graspd.verdict().boot_id != former  # nothing of before has come back
-
-
-def test_a_told_grasp_is_offered_no_more(tmp_path: Path) -> None:
-    sections = "[risk]\nmax_slip_when_stable = 0.1\nwarm_up = 50\n"
-    with (
-        Daemon(tmp_path, sections, whole_grasps=True) as daemon,
-        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as lifts,
-        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as asks_too,
-    ):
-
-        def is_refused() -> bool:
-            answer = lifts.may_i_lift(1.0, supervised=True)
-            if not answer:
-                return False
-            grasp = answer.verdict
-            assert lifts.tell(grasp, Outcome.SLIPPED, wait_s=10.0)
-            for client in (lifts, asks_too):
-                again = client.may_i_lift(0.05, supervised=True)
-                assert not again or again.verdict.grasp != grasp.grasp
-            return again.verdict.grasp == grasp.grasp and "outcome-told" in again.verdict.reasons
-
-        wait_until(is_refused)
 
 
 def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:

@@ -277,12 +277,10 @@ def test_a_slow_busy_processor_rests_too() -> None:
         driver.ends = True
 
     driver.live = True
-    began_ns = time.monotonic_ns()
     timing = LoopTiming(60 * SECOND_NS, rest=rest, selector=BusySelector)
     LoopBench(driver, clock, timing=timing).run()
     assert len(rests_s) == 1
     assert 0.0 < rests_s[0] <= YIELD_MAX_NS / 1e9
-    assert time.monotonic_ns() - began_ns >= YIELD_AFTER_NS
 
 
 def test_a_reading_that_does_not_follow_unsettles_the_grasp() -> None:
