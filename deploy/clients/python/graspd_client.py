@@ -1153,7 +1153,7 @@ def _parsed(payload: bytes) -> dict[str, Any]:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object; which of two values holds, readers see differently."""
+    """Return the object. Raises `ValueError` for a key twice: readers differ in which one holds."""
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError

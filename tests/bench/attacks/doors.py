@@ -96,7 +96,7 @@ class Outcome:
     tried: int
     """How often: readings, connections, bytes or what else the attack counts."""
     happened: str
-    """In plain words with figures, such as "0 of 995 verdicts `stable`"."""
+    """Result in plain words with figures, such as "0 of 995 verdicts `stable`"."""
     held: bool
     """Whether graspd did what it must."""
 

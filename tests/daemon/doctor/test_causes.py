@@ -192,7 +192,7 @@ def test_a_controller_in_trouble_is_not_said_to_be_fine(state: str) -> None:
     assert "sudo ip link set can0 down; sudo ip link set can0 up type can" in (told.advice or "")
 
 
-def test_a_received_board_has_its_interfaces_bit_rate(
+def test_a_board_that_sends_has_no_finding_of_bit_rate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = computer.CanInterface(LOOPBACK, "error-active", 500_000)
