@@ -111,15 +111,6 @@ def test_spikes_of_one_or_two_electrodes_never_make_a_touch(
     assert not Hand().play(as_sampled(untouched, spiked)).any()
 
 
-def test_a_touch_growing_three_counts_a_second_stays() -> None:
-    hand = Hand()
-    hand.play(still(1.5))
-    depth = 3.0 * np.arange(3000)[:, None, None] / 100
-    touching = hand.play(noisy(at_rest() - depth * PRESSED))
-    assert touching[2500:].all()
-    assert not touching[:500].any()
-
-
 MOTIONS = {
     "rising": lambda t: 30.0 * t,
     "sinking": lambda t: -30.0 * t,
@@ -145,15 +136,6 @@ def test_a_hand_that_never_opened_touches_nothing_until_it_opens() -> None:
     assert not hand.play(touched(3.0, 500.0)).any()
     assert not hand.play(still(2.0))[5:].any()
     assert hand.play(touched(0.5, 40.0))[5:].all()
-
-
-def test_a_returning_electrode_counts_after_the_next_tare() -> None:
-    hand, usable = Hand(), ALL.copy()
-    usable[FF] = PRESSED < 1.0  # the eight that a touch presses most are lost at first
-    hand.play(still(1.5) * usable, usable)
-    assert not hand.play(touched(0.3, 40.0) * usable, usable)[:, FF].any(), "others sink alike"
-    hand.play(still(2.0))
-    assert hand.play(touched(0.3, 40.0))[5:].all()
 
 
 @pytest.mark.parametrize("usable_electrodes", [11, 12])

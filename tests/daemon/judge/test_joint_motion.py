@@ -40,16 +40,14 @@ def turning(rate_hz: float, rad_per_s: float, seconds: float = 1.0) -> tuple[Joi
     return motion, t_ns
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 30.0, 71.43, 100.0, 1000.0])
+@pytest.mark.parametrize("rate_hz", [10.0, 71.43, 1000.0])
 @pytest.mark.parametrize(
     ("rad_per_s", "reason"),
     [
-        (0.0, None),
         (0.095, None),
         (-0.095, None),
         (0.105, Reason.MOVING),
         (-0.105, Reason.MOVING),
-        (3.0, Reason.MOVING),
     ],
 )
 def test_speed_is_angle_over_time_at_every_rate(
@@ -57,16 +55,6 @@ def test_speed_is_angle_over_time_at_every_rate(
 ) -> None:
     motion, now_ns = turning(rate_hz, rad_per_s)
     assert motion.objection(now_ns) is reason
-
-
-def test_angles_that_are_all_missing_are_as_good_as_none() -> None:
-    motion, now_ns = turning(100.0, 0.0)
-    for ms in range(10, 400, 10):
-        send(motion, now_ns + ms * MS, np.nan, np.nan, np.nan)
-        expected = None if ms <= 150 else Reason.JOINTS_LATE
-        assert motion.objection(now_ns + ms * MS) is expected
-    unheard = JointMotion()
-    send(unheard, START_NS, np.nan, np.nan, np.nan)
 
 
 @pytest.mark.parametrize(
@@ -122,22 +110,17 @@ def test_each_sender_must_be_still() -> None:
     assert motion.objection(START_NS + 692 * MS) is None
 
 
-def silent_beside_another(silent_ms: int) -> Reason | None:
-    """Return the reason as a still sender has been silent for `silent_ms`, and another has not."""
+@pytest.mark.parametrize(
+    ("silent_ms", "reason"),
+    [(100, None), (200, Reason.JOINTS_LATE), (900, Reason.JOINTS_LATE), (1100, None)],
+)
+def test_a_silent_sender_beside_another_is_late_then_lost(
+    silent_ms: int, reason: Reason | None
+) -> None:
     motion, now_ns = turning(100.0, 0.0)
     for ms in range(-500, silent_ms + 1, 10):
         send(motion, now_ns + ms * MS, 0.5, names=("THJ1",))
-    return motion.objection(now_ns + silent_ms * MS)
-
-
-@pytest.mark.parametrize("silent_ms", [200, 900])
-def test_a_sender_that_falls_silent_beside_another_is_late(silent_ms: int) -> None:
-    assert silent_beside_another(silent_ms) is Reason.JOINTS_LATE
-
-
-@pytest.mark.parametrize("silent_ms", [100, 1100, 5000])
-def test_a_sender_that_is_given_up_leaves_the_others(silent_ms: int) -> None:
-    assert silent_beside_another(silent_ms) is None
+    assert motion.objection(now_ns + silent_ms * MS) is reason
 
 
 def test_angles_from_the_future_are_not_trusted() -> None:
@@ -252,27 +235,6 @@ def test_angles_unchanged_for_a_second_are_frozen(rate_hz: float) -> None:
     now_ns = START_NS + 1100 * MS
     assert motion.objection(now_ns) is Reason.JOINTS_FROZEN
     assert motion.is_frozen
-
-
-@pytest.mark.parametrize("changed", [0, 2])
-def test_one_joint_that_changes_by_a_bit_is_enough(changed: int) -> None:
-    motion = held({NAMES: 100.0}, 1.5)
-    angles = np.full(len(NAMES), 0.8)
-    angles[changed] = np.nextafter(0.8, 1.0)
-    now_ns = START_NS + 1510 * MS
-    assert motion.objection(now_ns) is Reason.JOINTS_FROZEN
-    motion.observe(JointReading(now_ns, 0, NAMES, angles), now_ns)
-    assert motion.objection(now_ns) is None
-
-
-def test_another_sender_whose_angles_change_speaks_for_the_hand() -> None:
-    """A sender of a single joint may well be quiet for a second."""
-    motion = held({("THJ1",): 100.0}, 1.5)
-    assert motion.objection(START_NS + 1500 * MS) is Reason.JOINTS_FROZEN
-    for ms in range(1500, 1700, 10):
-        send(motion, START_NS + ms * MS, 0.3, 1.2, -0.1)
-        motion.observe(JointReading(0, 0, ("THJ1",), np.array([0.8])), START_NS + ms * MS)
-    assert motion.objection(START_NS + 1690 * MS) is None
 
 
 @pytest.mark.parametrize("gap_ms", [200, 900, 1500, 5000])

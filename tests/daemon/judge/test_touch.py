@@ -133,15 +133,6 @@ def test_a_finger_that_rests_a_touch_higher_is_tared_again(middle: float, is_los
     assert Touch(THRESHOLD).has_lost_rest(S, middle) == is_lost
 
 
-def test_a_finger_whose_rest_is_not_known_has_no_fall() -> None:
-    touch = held(100.0)
-    touch.has_lost_rest(S, 0.0)
-    touch.end()
-    found = (touch.touching, touch.fall, touch.depth, touch.lowest)
-    assert found == (False, 0.0, 0.0, 0.0)
-    assert (touch.since_ns, touch.alone_since_ns) == (None, None)
-
-
 Sweeps = list[NDArray[np.uint16]]
 
 
