@@ -195,6 +195,11 @@ def arrow(values: NDArray[np.float64]) -> Any:  # noqa: ANN401
     return pa.table(columns(values))
 
 
+def polars(values: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    pl = pytest.importorskip("polars", reason="no extra brings polars, of 180 MB")
+    return pl.DataFrame(columns(values))
+
+
 GIVEN: dict[str, Callable[[NDArray[np.float64]], Any]] = {
     "lists": with_none,
     "a masked array": masked,
@@ -203,6 +208,7 @@ GIVEN: dict[str, Callable[[NDArray[np.float64]], Any]] = {
     "pandas": lambda values: pandas(values, "float64"),
     "pandas of its own integers": lambda values: pandas(values, "Int64"),
     "Arrow": arrow,
+    "polars": polars,
 }
 
 
@@ -247,6 +253,7 @@ REFUSED: dict[str, tuple[Callable[[NDArray[np.float64]], Any], str]] = {
         lambda values: pandas(values, "int").set_index(np.arange(len(values)) / 100),
         "the index of the table is a time",
     ),
+    "not collected": (lambda values: polars(values).lazy(), "LazyFrame has no values yet"),
 }
 
 

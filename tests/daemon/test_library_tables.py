@@ -28,7 +28,9 @@ def test_a_stream_is_judged_as_replay_judges_it() -> None:
     assert got == expected
 
 
-@pytest.mark.parametrize("given", ["columns by name", "Arrow", "pandas of its own integers"])
+@pytest.mark.parametrize(
+    "given", ["columns by name", "Arrow", "polars", "pandas of its own integers"]
+)
 def test_a_table_is_judged_as_its_file(
     counts: NDArray[np.float64], tmp_path: Path, given: str
 ) -> None:
