@@ -118,6 +118,18 @@ def test_a_count_of_the_risk_is_not_an_empty_session() -> None:
     assert not KeptSession(None, FINGERS, {}, part.state()).is_empty
 
 
+def test_starts_without_a_grasp_evict_no_session(tmp_path: Path) -> None:
+    taught = [KeptSession(state(each), FINGERS, {}) for each in (5, 4, 3, 2, 1)]
+    with SessionFolder(tmp_path) as folder:
+        folder.save(taught)
+        for serial in "AB":
+            others = [each for each in folder.load().values() if isinstance(each, KeptSession)]
+            folder.save([KeptSession(None, FINGERS, {"ff": serial}), *others])
+            assert kept_grasps(tmp_path) == [0, 5, 4, 3, 2, 1]
+        folder.save([KeptSession(state(6), FINGERS, {}), *taught])
+    assert kept_grasps(tmp_path) == [6, 5, 4, 3, 2]
+
+
 @given(st.integers(0, 1 << 20), st.integers(0, 255), st.sampled_from(("byte", "cut", "insert")))
 @settings(max_examples=300, deadline=None)
 def test_a_damaged_file_becomes_no_other_state(place: int, value: int, kind: str) -> None:
