@@ -29,6 +29,11 @@ def counts_of(number: int) -> NDArray[np.uint16]:
     return (FIRST + (number + _PLACES) % NUMBERS).astype(np.uint16).reshape(FINGERS, ELECTRODES)
 
 
+def sweeps_of(number: int) -> list[NDArray[np.uint16]]:
+    """Counts of the first sweeps."""
+    return [counts_of(each) for each in range(number)]
+
+
 def number_in(reading: TactileReading) -> int | None:
     """The number of a reading's sweep; None if all is flagged. Fails if there are two numbers."""
     sound = reading.faults == 0

@@ -22,17 +22,13 @@ from graspd.drivers.spi.messages import (
 from graspd.drivers.twins.datagrams import PalmTwin
 from tests.drivers.can.can_standin import decoder, sweep_of_frames
 from tests.drivers.can.can_words import pack_frame
-from tests.drivers.one_sweep import counts_of
-from tests.drivers.twins.signals import GeneratedContact
+from tests.drivers.one_sweep import counts_of, sweeps_of
 
 MS = 1_000_000
 PACKETS_KEPT = 14
 """Packets of a round: the most that the assembler may hold."""
 PACKETS = [
-    [
-        packet.to_bytes() + appended
-        for packet in PalmTwin(itertools.islice(GeneratedContact(), 4), palm=palm).packets()
-    ]
+    [packet.to_bytes() + appended for packet in PalmTwin(sweeps_of(4), palm=palm).packets()]
     for palm, appended in itertools.product(Palm, (b"", bytes(CAN_RECORD_BYTES)))
 ]
 """Four rounds of each kind of palm."""

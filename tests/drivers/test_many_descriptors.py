@@ -18,7 +18,8 @@ from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from graspd.drivers.twins.spi import SpiTwin
-from tests.drivers.can.can_standin import contact, sweep_of_frames
+from tests.drivers.can.can_standin import sweep_of_frames
+from tests.drivers.one_sweep import sweeps_of
 from tests.kit.crowd import SELECT_MAX, crowded
 from tests.kit.waiting import wait_until
 from tests.ports import can_id, multicast_group
@@ -38,7 +39,7 @@ class Bench(NamedTuple):
 @contextlib.contextmanager
 def spi(folder: Path) -> Iterator[Bench]:
     with (
-        SpiTwin(folder / "port", itertools.cycle(contact(50))) as twin,
+        SpiTwin(folder / "port", itertools.cycle(sweeps_of(50))) as twin,
         SpiBridgeDriver(str(folder / "port"), FINGERS) as driver,
     ):
         yield Bench(driver, lambda: twin.run_once(0.001), twin.unplug, twin.plug)
@@ -74,7 +75,7 @@ def multicast(_: Path) -> Iterator[Bench]:
     group = multicast_group()
     where, number = ("udp_multicast", group), can_id(group)
     options = {"arbitration_id": number, "sequence": "electrodes"}
-    twin = CanTwin(*where, itertools.cycle(contact(50)), **options)  # type: ignore[arg-type]
+    twin = CanTwin(*where, itertools.cycle(sweeps_of(50)), **options)  # type: ignore[arg-type]
     with twin, CanBridgeDriver(*where, **options) as driver:  # type: ignore[arg-type]
         yield Bench(driver, twin.send_sweep, driver.close, driver.open)
 

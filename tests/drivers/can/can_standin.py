@@ -22,7 +22,6 @@ from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_words import pack_frame, samples
 from tests.drivers.one_sweep import tactile
-from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -108,10 +107,6 @@ def bridge(where: str, **options: Any) -> CanBridgeDriver:  # noqa: ANN401
     options.setdefault("arbitration_id", SAMPLE_ID)
     options.setdefault("sequence", "electrodes")
     return CanBridgeDriver("virtual", where, **options)
-
-
-def contact(sweeps: int, seed: int = 0) -> list[Counts]:
-    return list(itertools.islice(GeneratedContact(seed=seed), sweeps))
 
 
 def message(data: bytes = b"", identifier: int = SAMPLE_ID, **options: bool) -> can.Message:

@@ -17,11 +17,10 @@ from tests.drivers.can.can_standin import (
     TwinLink,
     bridge,
     channel,
-    contact,
     message,
     sweep_messages,
 )
-from tests.drivers.one_sweep import counts_of, tactile
+from tests.drivers.one_sweep import counts_of, sweeps_of, tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -53,7 +52,7 @@ def test_an_interface_without_its_package_is_refused(
 
 def test_flipped_bits_are_counted_and_never_become_counts() -> None:
     link = TwinLink()
-    sent = contact(300)
+    sent = sweeps_of(300)
     with link.driver:
         link.send(sent[:2])
         twin = link.send(sent[2:298], LinkFaults(bit_flip_probability=0.05))

@@ -17,13 +17,12 @@ from tests.drivers.can.can_standin import (
     ScriptedBus,
     SocketBus,
     TwinLink,
-    contact,
     message,
     stand_in,
     sweep_messages,
     sweep_of_frames,
 )
-from tests.drivers.one_sweep import counts_of, tactile
+from tests.drivers.one_sweep import counts_of, sweeps_of, tactile
 from tests.kit.clock import Clock
 
 FRAMES_PER_DRAIN = 512
@@ -135,7 +134,7 @@ def test_a_silent_board_is_down_and_comes_back() -> None:
     with driver:
         assert driver.read_ready() == []
         assert str(driver.stream.link.state) == "greeting"
-        link.send(contact(8))
+        link.send(sweeps_of(8))
         assert driver.stream.link.state is LinkState.UP
         with can.Bus(interface="virtual", channel=link.where, ignore_config=True) as bus:
             for _ in range(10):
@@ -151,7 +150,7 @@ def test_a_silent_board_is_down_and_comes_back() -> None:
         assert "last error" not in driver.describe()
         assert (driver.counters.link_losses, driver.counters.bus_faults) == (1, 0)
         before = len(link.readings)
-        link.send(contact(3))
+        link.send(sweeps_of(3))
         assert driver.stream.link.state is LinkState.UP
         assert len(link.readings) == before + 3
         assert not any(reading.faults.any() for reading in link.readings)
@@ -161,7 +160,7 @@ def test_a_silent_board_is_down_and_comes_back() -> None:
 def test_slow_boards_have_ten_periods() -> None:
     link = TwinLink()
     with link.driver:
-        for sweep in contact(12):
+        for sweep in sweeps_of(12):
             link.clock.now_ns += 40 * MS
             link.send([sweep])
         link.clock.now_ns += 499 * MS

@@ -22,13 +22,12 @@ from tests.drivers.can.can_standin import (
     LOOPBACK,
     ScriptedBus,
     SocketBus,
-    contact,
     message,
     stand_in,
     sweep_of_frames,
 )
 from tests.drivers.can.can_words import pack_frame
-from tests.drivers.one_sweep import counts_of, tactile
+from tests.drivers.one_sweep import counts_of, sweeps_of, tactile
 from tests.kit.clock import Clock
 
 MS = 1_000_000
@@ -194,7 +193,7 @@ def test_real_socketcan_plays_count_for_count() -> None:
         socket.if_nametoindex("vcan0")
     except OSError:
         pytest.skip("there is no interface vcan0")
-    counts = contact(200)
+    counts = sweeps_of(200)
     driver = CanBridgeDriver("socketcan", "vcan0", arbitration_id=SAMPLE_ID)
     twin = CanTwin("socketcan", "vcan0", iter(counts))
     readings: list[TactileReading] = []
@@ -213,7 +212,7 @@ def test_old_frames_make_no_fresh_reading(monkeypatch: pytest.MonkeyPatch) -> No
     bus = ScriptedBus()
     stand_in(monkeypatch, lambda: bus)
     driver = CanBridgeDriver("robotell", "x", clock=clock, sequence="electrodes")
-    twin = CanTwin("virtual", "x", iter(contact(3)), sequence="electrodes")
+    twin = CanTwin("virtual", "x", iter(sweeps_of(3)), sequence="electrodes")
     with driver:
         driver.read_ready()
         for _ in range(3):

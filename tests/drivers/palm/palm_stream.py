@@ -15,9 +15,8 @@ from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.palm.packet import Palm, PalmCounters, PalmPacket
 from graspd.drivers.palm.stream import PalmDriver, PalmStream
 from graspd.drivers.twins.datagrams import PalmTwin
-from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.udp import Datagram, DatagramReceiver
-from tests.drivers.one_sweep import counts_of, tactile
+from tests.drivers.one_sweep import sweeps_of, tactile
 from tests.kit.clock import Clock
 
 FINGERS = ("ff", "mf", "th")
@@ -45,11 +44,6 @@ class DatagramClock(Clock):
         patch.setattr(DatagramReceiver, "receive", aged)
 
 
-def rows(number: int) -> list[Counts]:
-    """Counts of `number` rounds."""
-    return [counts_of(each) for each in range(number)]
-
-
 @dataclass
 class Played:
     """What came out of a stream."""
@@ -72,12 +66,12 @@ def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) ->
 
 
 def packets(number: int) -> list[PalmPacket]:
-    """Packets of rounds of `rows`."""
-    return list(PalmTwin(rows(number)).packets())
+    """Packets of rounds of `sweeps_of`."""
+    return list(PalmTwin(sweeps_of(number)).packets())
 
 
 def datagrams(rounds: int, palm: Palm = Palm.PALM_0220) -> list[bytes]:
-    return [packet.to_bytes() for packet in PalmTwin(rows(rounds), palm=palm).packets()]
+    return [packet.to_bytes() for packet in PalmTwin(sweeps_of(rounds), palm=palm).packets()]
 
 
 def play_packets(stream: Iterable[PalmPacket | None]) -> Played:

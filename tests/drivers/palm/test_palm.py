@@ -14,7 +14,7 @@ from graspd.drivers.palm.calibration import CalibrationError
 from graspd.drivers.palm.packet import Palm
 from graspd.drivers.palm.stream import PalmDriver
 from tests.conftest import ROOT
-from tests.drivers.one_sweep import tactile
+from tests.drivers.one_sweep import sweeps_of, tactile
 from tests.drivers.palm.palm_stream import (
     MS,
     ROUND,
@@ -22,7 +22,6 @@ from tests.drivers.palm.palm_stream import (
     Sender,
     datagrams,
     joints,
-    rows,
 )
 
 LOOPBACK = "udp://127.0.0.1:0"
@@ -40,7 +39,7 @@ def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver) -> None:
         for one, two in zip(datagrams(2), datagrams(2, Palm.PALM_0230), strict=True):
             sender.send(one, two)
         readings = tactile(driver.read_ready())
-    assert np.array_equal([reading.counts for reading in readings], rows(2))
+    assert np.array_equal([reading.counts for reading in readings], sweeps_of(2))
     assert driver.stream.counters.other_palms == 2 * ROUND
 
 

@@ -13,7 +13,7 @@ from graspd.drivers.base import ElectrodeFault, Reading
 from graspd.drivers.palm.packet import PalmPacket
 from graspd.drivers.palm.stream import PalmStream
 from graspd.drivers.twins.datagrams import PalmTwin
-from tests.drivers.one_sweep import number_in, tactile
+from tests.drivers.one_sweep import number_in, sweeps_of, tactile
 from tests.drivers.palm.palm_stream import (
     FINGERS,
     MS,
@@ -22,7 +22,6 @@ from tests.drivers.palm.palm_stream import (
     packets,
     play,
     play_packets,
-    rows,
 )
 
 MISSING, HELD, NOT_A_COUNT = (
@@ -43,9 +42,9 @@ def change(packet: PalmPacket, finger: str, values: dict[str, int], **fields: in
 
 @pytest.mark.parametrize("order", [("th", "ff"), ("mf",), ("ff", "mf", "rf", "lf", "th")])
 def test_fingers_come_in_the_order_asked_for(order: tuple[str, ...]) -> None:
-    made = list(PalmTwin(rows(2)).packets())
+    made = list(PalmTwin(sweeps_of(2)).packets())
     readings = play(([packet.to_bytes()] for packet in made), order).readings
-    for reading, row in zip(readings, rows(2), strict=True):
+    for reading, row in zip(readings, sweeps_of(2), strict=True):
         for place, finger in enumerate(order):
             if finger in FINGERS:
                 assert np.array_equal(reading.counts[place], row[FINGERS.index(finger)])
@@ -64,7 +63,7 @@ def test_a_value_that_is_not_fresh_is_held_or_missing() -> None:
     assert flags(first, MISSING) == [[1, 2]]  # nothing older is known
     assert not second.faults.any()
     assert flags(third, HELD) == [[1, 2]]
-    assert third.counts[1, 2] == rows(3)[2][1, 2]  # that of the round before
+    assert third.counts[1, 2] == sweeps_of(3)[2][1, 2]  # that of the round before
     assert flags(third, MISSING) == []
 
 

@@ -73,7 +73,10 @@ FILES: dict[str, tuple[bytes | Callable[[Path], None], Kind]] = {
     "ASC without its header": (b"   0.000200 1  5A1   Rx   d 7 A4 CB 70 DA 61 C7 A1\n", Kind.ASC),
     "BLF": (b"LOGG\x90\0\0\0", Kind.BLF),
     "TRC": (b";$FILEVERSION=2.1\n", Kind.TRC),
-    "serial": (b"noise\0" + encode_records(LineEvent.RECEIVED, 5, b"\1\2"), Kind.SERIAL),
+    **{
+        f"serial, {event.name}": (b"noise\0" + encode_records(event, 5, b"\1\2"), Kind.SERIAL)
+        for event in LineEvent
+    },
 }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import logging
 import socket
 import struct
@@ -16,10 +15,9 @@ from graspd.drivers.link import LinkState
 from graspd.drivers.spi.driver import SerialLine, SpiBridgeDriver
 from graspd.drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
 from graspd.drivers.twins.faults import LinkFaults
-from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.twins.spi import SpiTwin
+from tests.drivers.one_sweep import sweeps_of
 from tests.drivers.spi.bridge_bench import FINGERS, MS, Rig, ScriptedBridge, hello, run, sweep, take
-from tests.drivers.twins.signals import GeneratedContact
 from tests.kit.clock import Clock
 
 
@@ -161,13 +159,9 @@ def test_frames_that_find_no_room_are_counted(rig: Rig, monkeypatch: pytest.Monk
     assert rig.driver.counters.host_tx_dropped == len([Stop, Ping])
 
 
-def generated(sweeps: int, seed: int = 3) -> list[Counts]:
-    return list(itertools.islice(GeneratedContact(len(FINGERS), seed=seed), sweeps))
-
-
 def test_a_link_broken_within_a_frame_comes_back(tmp_path: Path) -> None:
     faults = LinkFaults(disconnect_every_frames=40)
-    rows = generated(100_000 // 24)
+    rows = sweeps_of(100_000 // 24)
     twin = SpiTwin(tmp_path / "b", rows, rate_hz=1000.0, faults=faults)
     with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
         readings = run(twin, driver, lambda _: driver.counters.link_losses >= 6)
@@ -183,9 +177,9 @@ def test_a_link_broken_within_a_frame_comes_back(tmp_path: Path) -> None:
 def test_only_a_dead_link_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "bridge"
     path.symlink_to("/dev/pts/of-a-twin-that-was-killed")
-    with SpiTwin(path, generated(1)) as first:
+    with SpiTwin(path, sweeps_of(1)) as first:
         terminal = path.readlink()
-        second = SpiTwin(path, generated(1))
+        second = SpiTwin(path, sweeps_of(1))
         with pytest.raises(FileExistsError, match=f"leads to {terminal}; .* another twin"):
             second.open()
         second.close()

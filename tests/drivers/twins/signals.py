@@ -1,4 +1,4 @@
-"""What twins may feel in tests: an endless contact, or the noise of a recording played again."""
+"""What twins may feel in tests: the noise of a recording played again, and grasps of scripts."""
 
 from __future__ import annotations
 
@@ -6,60 +6,21 @@ import ast
 import csv
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.biotac import COUNT_MAX, ELECTRODES
+from graspd.biotac import ELECTRODES
 from graspd.drivers.recordings.csv_rows import read_rows
 from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
-from graspd.drivers.twins.grasps.grasps import Counts
-from graspd.drivers.twins.grasps.whole_grasps import (
-    DRIFT_COUNTS_PER_S,
-    NOISE_COUNTS,
-    SPIKE_COUNTS,
-    SPIKE_PROBABILITY,
-    Counting,
-)
-
-UNTOUCHED_COUNTS = (2400.0, 3400.0)
-"""Range in which untouched electrodes rest, counts."""
-CONTACT_COUNTS = 700.0
-"""Deepest fall of an electrode under the generated contact, counts."""
-CONTACT_PERIOD_S = 4.0
-"""A touch comes and goes this often, s."""
+from graspd.drivers.twins.grasps.whole_grasps import Counting
 
 PALM_ROWS = 7
 """Rows of 10 ms in which a palm's rounds of 14 ms come round again, ..."""
 PALM_STALE_ROWS = 2
 """... and how many of them repeat an electrode: 28.57 %, verified in the untouched recording."""
-
-
-class GeneratedContact:
-    """An endless, synthetic contact: rest, a touch that comes and goes, and the measured noise."""
-
-    def __init__(self, fingers: int = 3, seed: int = 0) -> None:
-        """Readings are at 100 Hz; the same seed gives the same counts."""
-        self._random = np.random.default_rng(seed)
-        shape = (fingers, ELECTRODES)
-        self._rest = self._random.uniform(*UNTOUCHED_COUNTS, shape)
-        self._yielding = self._random.uniform(0.0, CONTACT_COUNTS, shape)
-        self._t_s = 0.0
-
-    def __iter__(self) -> Iterator[Counts]:
-        return self
-
-    def __next__(self) -> Counts:
-        touch = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._t_s / CONTACT_PERIOD_S)
-        counts = self._rest - touch * self._yielding + DRIFT_COUNTS_PER_S * self._t_s
-        counts = counts + self._random.normal(0.0, NOISE_COUNTS, counts.shape)
-        spiked = self._random.random(counts.shape) < SPIKE_PROBABILITY
-        counts = counts - spiked * self._random.uniform(*SPIKE_COUNTS, counts.shape)
-        self._t_s += 0.01
-        readable: Counts = np.clip(np.rint(counts), 1, COUNT_MAX - 1).astype(np.uint16)
-        return readable
 
 
 def played(
