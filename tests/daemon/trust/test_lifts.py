@@ -150,12 +150,15 @@ class Lifts(RuleBasedStateMachine):
         if self.number - back in self.model.lifts:
             self.say(self.number - back, margin)
 
-    @rule(stable=st.booleans())
-    def judge_what_cannot_be_assessed(self, stable: bool) -> None:
+    @rule(stable=st.booleans(), margin=st.none() | MARGINS)
+    def judge_what_cannot_be_assessed(self, stable: bool, margin: float | None) -> None:
+        """With a `margin` it can be at the next reading."""
         stable = stable and self.model.alpha is None
         self.number += 1
         self.part.note(named(self.number), Assessment(0), stable=stable)
         self.model.judged(self.number, NOT_ASSESSED, stable=stable)
+        if margin is not None:
+            self.say(self.number, margin)
 
     @rule(back=BACK, peer=st.sampled_from(PEERS))
     def claim(self, back: int, peer: Peer) -> None:
