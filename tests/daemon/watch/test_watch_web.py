@@ -86,6 +86,14 @@ def test_another_name_that_leads_here_is_refused(server: Server, host: str) -> N
     assert ask(server, "/events", Host=host)[0] == 421
 
 
+def test_two_names_or_none_are_refused(server: Server) -> None:
+    assert server.server_address[0] == "127.0.0.1"
+    for head in (b"", b"Host: localhost\r\nHost: evil.example\r\n"):
+        with socket.create_connection(("127.0.0.1", server.server_port), 10) as link:
+            link.sendall(b"GET / HTTP/1.1\r\n" + head + b"\r\n")
+            assert link.recv(100).startswith(b"HTTP/1.0 421 ")
+
+
 def test_pages_of_other_sites_are_refused(server: Server) -> None:
     assert ask(server, "/events", Sec_Fetch_Site="cross-site")[0] == 403
     assert ask(server, "/events", Sec_Fetch_Site="same-site")[0] == 403
