@@ -184,7 +184,8 @@ class Controller:
 
     def hear(self, answer: dict[str, Any]) -> None:
         if "ok" in answer:
-            self._hear_reply("ok" if answer["ok"] else answer["why"].partition(":")[0])
+            taken = "repeated" if "repeated" in answer else "ok"
+            self._hear_reply(taken if answer["ok"] else answer["why"].partition(":")[0])
         else:
             self._hear_verdict(answer)
 
@@ -194,8 +195,11 @@ class Controller:
         if word in ("not kept", "busy"):
             self.world.after(S, partial(self.tell, grasp, outcome))
             return
-        expected = "ok" if self.kept.get(grasp, outcome) == outcome else "contradicts"
-        assert word == expected, f"{word} to {outcome} of {grasp}, kept is {self.kept.get(grasp)}"
+        known = self.kept.get(grasp)
+        expected = (
+            ["repeated" if known == outcome else "contradicts"] if known else ["ok", "repeated"]
+        )
+        assert word in expected, f"{word} to {outcome} of {grasp}, kept is {known}"
         if grasp not in self.kept and self.world.random.random() < 0.4:
             again = self.world.random.choice(("slip", "stable"))
             self.world.after(S, partial(self.tell, grasp, again))

@@ -168,11 +168,11 @@ class Watch(Companion):
 
     def _check_health(self, status: Status) -> None:
         """What was lost is counted, and what has lasted for a while is said."""
+        if status.state == "stopping":
+            return
         lost = self._given - self._judged - status.skipped_readings
         assert not lost or self.day.slept_ns, f"{lost} readings are not judged"
         now_ns = self.world.now_ns
-        if status.state == "stopping":
-            return
         if now_ns - self.sensors.handed_ns > self._silence_ns + SLACK_NS + self.day.cost_ns:
             assert (status.state, status.health.get("link")) == ("silent", "stale")
         if len(self.sensors.faults) != 1 or now_ns - self.sensors.since_ns < SAID_AFTER_NS:
@@ -372,8 +372,9 @@ def run(seed: int, shifts: int = 3) -> Day:
         return day
 
 
-def main() -> None:
-    first, *last = map(int, sys.argv[1:])
+def main() -> int:
+    """Print what came of each day; 1 if one failed."""
+    failed, (first, *last) = 0, map(int, sys.argv[1:])
     for seed in range(first, last[0] if last else first + 1):
         try:
             day = run(seed)
@@ -382,10 +383,11 @@ def main() -> None:
         except Exception as error:
             if not last:
                 raise
-            found = f"FAILED: {type(error).__name__}: {error}"
+            failed, found = 1, f"FAILED: {type(error).__name__}: {error}"
         sys.stdout.write(f"{seed}: {found}\n")
         sys.stdout.flush()
+    return failed
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
