@@ -30,7 +30,7 @@ BOOK = 6
 ALPHAS = st.sampled_from((None, 0.001, 0.05, 0.1, 0.5))
 PEERS = [
     Peer(name, user)
-    for name in (b"controller-16byt1", b"controller-16byt2", b"another-16-bytes")
+    for name in (b"controller-16byt1", b"controller-16byt2", b"controller-16by.1")
     for user in (b"user 1000", b"user 1001")
 ]
 MARGINS = st.sampled_from((-9.0, -9.0, -4.0, -1.0, 3.0))
