@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 import subprocess
@@ -15,7 +14,6 @@ import pytest
 import zmq
 
 from graspd.daemon import scene
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.clients.bench import Daemon
 from tests.clients.building import CPP, skip_unless_it_can_be_compiled
 from tests.kit.messages import GOLDEN
@@ -23,10 +21,7 @@ from tests.kit.waiting import wait_until
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-AGE_LIMIT = "200e6"
 ENDPOINT = "ipc:///tmp/graspd-demo.ipc"
-
-
 CLIENTS = (ROOT / "deploy/clients/README.md").read_text()
 BESIDE = {"OUT": "ipc:///run/graspd/right.ipc", "ASK": "ipc:///run/graspd/right.ask.ipc"}
 """Endpoints in the programs of the clients' page: those of a scene that names none."""
@@ -37,24 +32,6 @@ def block(language: str, page: str = README) -> str:
     return str(re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)[0])
 
 
-def run_subscriber(command: list[str], endpoint: str) -> list[str]:
-    """What a subscriber prints: without a daemon at first, then of a replay of 200 verdicts."""
-    replay = [sys.executable, "-m", "graspd", "replay", str(DEMO_TABLE), "--speed", "2"]
-    replay += ["--publish", endpoint, "--wait", "20"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as subscriber:
-        try:
-            assert subscriber.stdout is not None
-            lines = [subscriber.stdout.readline().rstrip("\n")]
-            subprocess.run(replay, check=True, capture_output=True, timeout=200)
-            for line in subscriber.stdout:
-                lines.append(line.rstrip("\n"))
-                if lines[-1] == "unknown" and len(lines) - lines.count("unknown") == 200:
-                    break
-            return lines
-        finally:
-            subscriber.kill()
-
-
 def program(endpoint: str) -> str:
     """The README's, for an endpoint, and with less patience until the first message."""
     code = block("python")
@@ -63,14 +40,9 @@ def program(endpoint: str) -> str:
     return code.replace(ENDPOINT, endpoint).replace("2000", "200")
 
 
-def patient(code: str) -> str:
-    """With an age limit that a busy computer keeps."""
-    assert len(re.findall(AGE_LIMIT, code)) == 1
-    return re.sub(AGE_LIMIT, "60e9", code)
-
-
-def heard_of_old_and_new(command: list[str], endpoint: str, output: Path) -> str:
-    """What a subscriber prints of `stable` readings in turns: number 1 old, number 2 new."""
+def test_the_subscriber_prints_unknown_on_silence_and_old_readings(tmp_path: Path) -> None:
+    endpoint, output = f"ipc://{tmp_path}/graspd", tmp_path / "heard"
+    command = [sys.executable, "-Wignore", "-u", "-c", program(endpoint)]
     content = json.loads((GOLDEN / "verdict_stable.json").read_text())
     with (
         zmq.Context() as context,
@@ -79,7 +51,6 @@ def heard_of_old_and_new(command: list[str], endpoint: str, output: Path) -> str
         subprocess.Popen(command, stdout=file) as subscriber,
     ):
         publisher.linger = 0
-        publisher.bind(endpoint)
 
         def has_heard() -> bool:
             for number, age_ns in ((1, 300_000_000), (2, 0)):
@@ -88,25 +59,13 @@ def heard_of_old_and_new(command: list[str], endpoint: str, output: Path) -> str
             return output.read_text().count("0f0e0d0c0b0a09080706050403020100") > 3
 
         try:
+            wait_until(lambda: output.read_text().startswith("unknown"))
+            publisher.bind(endpoint)
             wait_until(has_heard, step_s=0.02)
+            wait_until(lambda: output.read_text().endswith("unknown\n" * 3))
         finally:
             subscriber.kill()
-    return output.read_text()
-
-
-def test_the_python_subscriber_prints_verdicts_and_unknown_on_silence(tmp_path: Path) -> None:
-    endpoint = f"ipc://{tmp_path}/graspd"
-    command = [sys.executable, "-Wignore", "-u", "-c", patient(program(endpoint))]
-    first, *lines, last = run_subscriber(command, endpoint)
-    said = [ast.literal_eval(line) for line in lines if line != "unknown"]
-    assert [each["seq"] for each in said] == list(range(200))
-    assert first == last == "unknown"
-
-
-def test_the_python_subscriber_takes_old_readings_for_unknown(tmp_path: Path) -> None:
-    endpoint = f"ipc://{tmp_path}/graspd"
-    command = [sys.executable, "-Wignore", "-u", "-c", program(endpoint)]
-    heard = heard_of_old_and_new(command, endpoint, tmp_path / "heard")
+    heard = output.read_text()
     assert "'seq': 2" in heard
     assert "'seq': 1," not in heard
 

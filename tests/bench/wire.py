@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Literal
@@ -39,6 +39,7 @@ from tests.bench.live import (
     spi_section,
 )
 from tests.kit.messages import decode_verdict
+from tests.kit.waiting import wait_until
 
 Way = Literal["echo", "daemon"]
 WAYS: tuple[Way, ...] = ("echo", "daemon")
@@ -107,7 +108,7 @@ def turn(way: Way, hands: int, seconds: float) -> list[int]:
         for folder in folders:
             folder.mkdir()
             twins.append(stack.enter_context(own("twin", folder)))
-            _wait(lambda folder=folder: (folder / "bridge").exists())  # type: ignore[misc]
+            wait_until((folder / "bridge").exists)
             if way == "echo":
                 stack.enter_context(own("echo", folder))
             else:
@@ -123,14 +124,6 @@ def turn(way: Way, hands: int, seconds: float) -> list[int]:
             for name, messages in heard.items()
         )
         return list(itertools.chain.from_iterable(times))
-
-
-def _wait(done: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + PATIENCE_S
-    while not done():
-        if time.monotonic() > until_s:
-            raise TimeoutError("a twin did not begin")
-        time.sleep(0.01)
 
 
 def listen(endpoints: Sequence[str], seconds: float) -> Mapping[str, Heard]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ import graspd
 from graspd.models.inputs import SPREAD_FLOOR_COUNTS
 from graspd.models.layout import D1, LAYOUTS
 from graspd.models.tactile_image import Fill, Normalisation, TactileImager, fill_matrix
+from graspd.models.training.data.datasets import read_table
 
 Image = list[list[float]]
 
@@ -67,22 +67,12 @@ def plain_image(counts: list[int], least_contact: bool, over_electrodes: bool) -
     return [[(pixel - mean) / deviation for pixel in line] for line in filled]
 
 
-def real_counts(bts3_dir: Path) -> list[list[int]]:
-    grasps = []
-    for name in ("palm_down.csv", "palm_side.csv"):
-        with (bts3_dir / name).open(newline="") as file:
-            grasps += [[int(cell) for cell in row[2:]] for row in list(csv.reader(file))[1:]]
-    return grasps
-
-
 @pytest.mark.parametrize("fill", Fill)
 @pytest.mark.parametrize("normalisation", Normalisation)
 def test_real_grasps_equal_the_plain_implementation(
     bts3_dir: Path, fill: Fill, normalisation: Normalisation
 ) -> None:
-    grasps = real_counts(bts3_dir)
-    assert len(grasps) == 2549
-    counts = np.array(grasps[::20], dtype=np.uint16).reshape(-1, 3, 24)
+    counts = read_table(bts3_dir / "palm_side.csv").counts[::10]
     images, _ = TactileImager(3, D1, fill, normalisation).build_batch(counts)
     assert images.shape == (128, 12, 11, 3)
     worst = 0.0

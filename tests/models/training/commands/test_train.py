@@ -138,20 +138,15 @@ def test_grasps_of_one_object_measure_known_objects_alone(tmp_path: Path) -> Non
     assert card["calibrated_by"] == "cv"
 
 
-def test_a_session_model_needs_several_objects_of_each_session(data: Path, tmp_path: Path) -> None:
-    write_table(tmp_path / "lab.csv", *separable_counts(GRASPS))
-    options = "--data", data, "--own", tmp_path / "lab.csv", "--folds", "2"
-    last = last_error(train(*options, "--out", tmp_path / "out"))
+def test_a_fold_lacks_no_kind_and_a_session_no_objects(data: Path, tmp_path: Path) -> None:
+    made, own, out = smallest(), tmp_path / "lab.csv", ("--out", tmp_path / "out")
+    write_table(own, *separable_counts(GRASPS))
+    last = last_error(train("--data", data, "--own", own, "--folds", "2", *out))
     assert "leaves out all objects of lab, by whose other grasps" in last
     assert "put the tables of a session together" in last
-
-
-def test_a_fold_with_one_kind_of_grasps_is_refused(tmp_path: Path) -> None:
-    made = smallest()
     objects = tuple("ball" if slip else "box" for slip in made.slipped)
-    write(tmp_path / "lab.csv", dataclasses.replace(made, objects=objects))
-    options = "--own", tmp_path / "lab.csv", "--out", tmp_path / "out", "--folds", "2"
-    last = last_error(train(*options))
+    write(own, dataclasses.replace(made, objects=objects))
+    last = last_error(train("--own", own, "--folds", "2", *out))
     assert re.match(r"graspd train: objects, fold 0, has 0 grasps that \w+ to train on", last)
 
 

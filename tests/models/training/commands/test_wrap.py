@@ -80,14 +80,7 @@ def test_log_odds_of_one_column_are_those_of_slip(folder: Path) -> None:
     assert "F1 100.0 % on the table itself" in wrapped(folder, Ramp(), (1, 72))
 
 
-@pytest.mark.parametrize(
-    ("network", "shape", "problem"),
-    [
-        (torch.nn.Linear(48, 2), (1, 48), "must take float counts"),
-        (torch.nn.Linear(72, 3), (1, 72), "must take float counts"),
-    ],
-)
-def test_a_network_of_another_shape_is_refused(
-    folder: Path, network: torch.nn.Module, shape: tuple[int, ...], problem: str
-) -> None:
-    assert problem in wrapped(folder, network, shape)
+def test_a_network_of_another_shape_is_refused(folder: Path) -> None:
+    for inputs, outputs in ((48, 2), (72, 3)):
+        network = torch.nn.Linear(inputs, outputs)
+        assert "must take float counts" in wrapped(folder, network, (1, inputs))

@@ -186,16 +186,16 @@ def test_a_scale_is_fitted_on_other_objects_of_its_split() -> None:
 
 @pytest.fixture(scope="module")
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of the report, made in this process: it starts slowly."""
+    """Return the folder of a report made outside of a test: matplotlib keeps fonts open."""
     out = tmp_path_factory.mktemp("worth")
-    card = out / "card.json"
-    shutil.copy(zoo.find("small-session").with_suffix(".json"), card)
-    words = ("report", "worth", "--data", bts3_dir, "--out", out, "--card", card, "--quick")
+    path = out / "card.json"
+    shutil.copy(zoo.find("small-session").with_suffix(".json"), path)
+    words = ("report", "worth", "--data", bts3_dir, "--out", out, "--card", path, "--quick")
     assert graspd(*words).returncode == 0
     return out
 
 
-def test_from_tables_to_picture(folder: Path) -> None:
+def test_the_report_makes_table_picture_and_card(folder: Path) -> None:
     text = (folder / "worth.md").read_text()
     assert text.startswith("**made with --quick")
     for name in (PUBLISHED, ALONE, LEARNING, RISK):
@@ -204,9 +204,6 @@ def test_from_tables_to_picture(folder: Path) -> None:
     assert drawn.count("<svg") == 1
     assert "-quick: the figures mean nothing -->" in drawn
     assert text.partition("\n\n")[2].partition("\n\n")[0] in drawn, "the picture's own figures"
-
-
-def test_the_figures_go_onto_a_card(folder: Path) -> None:
     card = json.loads((folder / "card.json").read_text())
     assert card["contract"] == zoo.card("small-session")["contract"]
     assert card["worth"] == json.loads((folder / "worth.json").read_text())
