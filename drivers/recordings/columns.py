@@ -106,7 +106,7 @@ class Columns:
     """Fingers that the file has, asked for or not."""
 
     @classmethod
-    def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int = 1) -> Columns:
+    def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int) -> Columns:
         """Return the columns to read for `fingers`; without any, for all that the file has.
 
         `names`: the header, of this line. Raises `RecordingError` for what is missing or there

@@ -167,6 +167,15 @@ def test_a_board_that_pads_frames_needs_its_option() -> None:
     assert counters.faulty_readings == 0
 
 
+def test_another_sequence_shows_after_twenty_readings() -> None:
+    made = CanStream("bus", ("ff", "mf", "th"), arbitration_id=SAMPLE_ID, sequence="all")
+    for sweep in range(20):
+        assert "sequence" not in made.describe()
+        for channel, words, t_ns in samples(sweep):
+            made.push(CanFrame(SAMPLE_ID, encode_sample(channel, words)), t_ns)
+    assert made.describe()["sequence"].text == "is not all, as the scene says"
+
+
 ORDER = ("th", "ff", "mf")
 """The board's sensors: its first word is the thumb's."""
 

@@ -79,7 +79,11 @@ BAD_FILES = {
     "odd UTF-16": (GOOD.decode().encode("utf-16")[:-1], "not UTF-16: this is a binary"),
     "one column missing": (
         table(2, columns=[name for name in TABLE_HEADER if name != "mf_biotac_7"]),
-        "line 1, column mf_biotac_7: this column is missing",
+        "line 1, column mf_biotac_7: this column is missing; the file has the fingers ff, mf, th",
+    ),
+    "two columns missing": (
+        table(2, columns=TABLE_HEADER[:-2]),
+        "line 1, column th_biotac_23: this column is missing, the first of 2 that are",
     ),
     "a finger missing": (
         table(2, columns=TABLE_HEADER[:-24]),

@@ -185,6 +185,7 @@ def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
         ("Time (\u00b5s)", ["0", "10000", "20000", "30000"]),
         ("field.header.stamp", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
         ("time_ms", ["5", "15", "25", "35"]),
+        ("ms", ["5", "15", "25", "35"]),
         ("timestamp", [f"{1.7e15 + n * 1e4:.0f}" for n in range(4)]),
         ("time", [f"2023-11-14T22:13:20.{n:02}Z" for n in range(4)]),
         ("time", [f"9:05:20.{n:02}" for n in range(4)]),

@@ -18,7 +18,7 @@ from graspd.drivers.recordings.serial_log import (
     parse_records,
 )
 from graspd.drivers.spi.conversation import LineEvent
-from graspd.drivers.spi.messages import FrameParser
+from graspd.drivers.spi.messages import FrameParser, encode_frame
 from tests.drivers.palm.palm_stream import MS
 from tests.kit.clock import Clock
 
@@ -47,6 +47,11 @@ def test_records_come_back_however_the_file_is_cut_into_chunks(
     assert len(list(frames.feed(data))) == len(made)
     counters = frames.counters
     assert counters.bad_cobs + counters.bad_crc + counters.too_long == 0
+
+
+@pytest.mark.parametrize(("kind", "size"), [(LineEvent.SENT, 7), (4, 8)])
+def test_a_frame_of_another_type_or_length_is_left_out(kind: int, size: int) -> None:
+    assert list(parse_records(FrameParser(), encode_frame(kind, bytes(size)))) == []
 
 
 @given(st.binary(min_size=961, max_size=2000))
