@@ -16,7 +16,7 @@ from graspd.daemon.publish.messages import Tactile, Verdict
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.kit.messages import decode_tactile
 from tests.kit.scenes import written
 from tests.ports import can_id, free_port, multicast_group
@@ -116,3 +116,26 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
             # More reasons follow if the hand moved, or a reading was lost, just before.
             assert gone[-1].reasons[0] == "stale"
         end(daemon)
+
+
+def test_the_doctor_finds_what_the_twin_broke(tmp_path: Path) -> None:
+    scene = scene_for("spi", tmp_path)
+    with twin("spi", tmp_path, "--dead", "th_24", "--unplugged", "mf") as hardware:
+        people = graspd("doctor", scene, "--listen", 2)
+        program = graspd("doctor", scene, "--listen", 2, "--json")
+        end(hardware)
+    assert people.returncode == program.returncode == 1
+    report = json.loads(program.stdout)
+    wrong = [finding["what"] for finding in report["findings"] if finding["level"] == "error"]
+    assert any(what.startswith("mf: no electrode can be read") for what in wrong)
+    assert "th_24 stuck at a rail" in wrong
+    assert len(wrong) == 2
+    assert report["readings"] > 50
+    for what in wrong:
+        assert what in people.stdout
+
+
+def test_the_doctor_without_a_scene_looks_at_the_computer() -> None:
+    result = graspd("doctor", "--listen", 0.3, "--json")
+    assert result.returncode in (0, 1)
+    assert json.loads(result.stdout)["findings"]
