@@ -24,6 +24,7 @@ from graspd.biotac import electrode_name
 from graspd.daemon import scene as scenes
 from graspd.daemon.assembly.parts import Parts
 from graspd.daemon.assembly.plan import Plan
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.process.sleep import Sleep
 from graspd.daemon.publish import sockets
@@ -51,6 +52,8 @@ SAID_AFTER_NS = 1300 * MS
 ROUNDS_MAX = 1000
 """Rounds at one time: a flood of questions takes forty."""
 TROUBLE_NS, CALM_NS = 12 * S, 9 * S
+OPEN_MS = 100
+"""A hand that must be tared is opened, and stays open for this long after it was reported."""
 WITHHELD = {"low-confidence", "unproven", "risk-exceeded", "not-calibrated", "never-seen"}
 """Reasons for which a sound, settled grasp may be `unknown`: outcomes and grasps before it."""
 
@@ -106,6 +109,8 @@ class Watch(Companion):
             self._judged += 1
             self._waiting -= 1
             self.necessity.observe(reading)
+            if Reason.NOT_TARED in verdict.reasons:
+                self.sensors.rest_for(OPEN_MS)
             if self._waiting:  # some were skipped
                 self._waiting, self._began_ns = 0, reading.t_ns
         unknown = verdict.verdict == "unknown"

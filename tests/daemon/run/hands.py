@@ -90,7 +90,8 @@ class Sensors(FakeDriver):
 
     def rest_for(self, ms: int) -> None:
         """Open the hand, to be tared."""
-        self.pose, self._open_until_ns = self.rest, self.world.now_ns + ms * MS
+        self.pose = self.rest
+        self._open_until_ns = max(self._open_until_ns, self.world.now_ns + ms * MS)
 
     def take(self, pose: Counts) -> None:
         if self.world.now_ns >= self._open_until_ns:
