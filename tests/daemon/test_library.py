@@ -64,7 +64,7 @@ def test_a_session_of_earlier_grasps_is_that_of_a_replay(counts: NDArray[np.floa
     assert got[0, 1] == said[40]["p_slip"]
 
 
-def test_an_electrode_at_a_rail_is_repaired_as_the_daemon_does(
+def test_an_electrode_at_a_rail_is_repaired_as_live(
     counts: NDArray[np.float64],
 ) -> None:
     railed = counts[:12].copy()
