@@ -121,7 +121,7 @@ def test_joints_are_lost_when_readings_continue_without_them() -> None:
     assert "joints" not in HandTracker(FINGERS, silent.limits).health(), "nothing came yet"
     assert play(silent).hand.health()["joints"] is Reason.JOINTS_LATE
     assert "joints" not in play(replace(silent, joint=lambda t_s: 0.7)).hand.health()
-    assert "joints" not in play(replace(silent, limits=LIMITS)).hand.health(), "nobody asks"
+    assert "joints" not in play(replace(silent, limits=LIMITS)).hand.health(), "not required"
 
 
 def test_the_window_nearer_its_limit_is_reported() -> None:

@@ -290,7 +290,7 @@ class Door:
         return taken
 
     def flood(self) -> None:
-        """Questions of many, and what is none."""
+        """Send questions of many connections, and messages that are not questions."""
         for number in range(300 * self.is_open):
             text = self.world.random.choice((b"judge", b"lift", b"clock", b"outcome x", b"?"))
             self.questions.append([b"flood-%010d" % number, b"user 9", text])

@@ -39,12 +39,12 @@ from graspd.drivers.base import JointReading, Reading, TactileReading
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS
-from tests.daemon.judge.necessity import EARLY_MS, STILL_MS, Necessity
+from tests.daemon.judge.necessity import AGE_MAX_MS, EARLY_MS, STILL_MS, Necessity
 from tests.daemon.run.around import SLACK_NS, Disk, Door, KilledError, S, Selector, World
 from tests.daemon.run.hands import FAULTS, Fault, Sensors
 from tests.kit.messages import decode_status, decode_verdict
 
-AGE_NS = 100 * MS
+AGE_NS = AGE_MAX_MS * MS
 MOVED_COUNTS = 40.0
 """Step of counts that is motion: grasps are further apart."""
 SAID_AFTER_NS = 1300 * MS
@@ -199,7 +199,7 @@ class Day:
         self.disk, self.door = Disk(self.world), Door(self.world)
         self.cost_ns = self.slept_ns = 0
         self.said: Counter[str] = Counter()
-        self.judged = self.lives = 0
+        self.judged = self._judged_before = self.lives = 0
         self.is_over = False
 
     def _draw_scene(self, folder: Path) -> scenes.Scene:
@@ -343,6 +343,7 @@ class Day:
         self.sensors.take(grasp)
 
     def _grasp_well(self) -> None:
+        self._judged_before = self.judged
         self.sensors.take(self.sensors.grasps[0])
 
     def _be_calm(self) -> None:
@@ -351,16 +352,14 @@ class Day:
         self.sensors.faults.clear()
         self.sensors.switch_off()
         self.disk.is_full = self.disk.is_slow = False
-        self.cost_ns, before = 0, [0]
-        close_ns = 6 * S
+        self.cost_ns, close_ns = 0, 6 * S
         self.world.after(close_ns, self._grasp_well)
-        self.world.after(close_ns, lambda: before.append(self.judged))
         self.world.after(close_ns + 600 * MS, self.door.evening.ask)
-        self.world.after(CALM_NS - S, lambda: self._check_going(self.judged - before[-1]))
+        self.world.after(CALM_NS - S, self._check_going)
 
-    def _check_going(self, judged: int) -> None:
+    def _check_going(self) -> None:
         assert self.door.is_open, "the daemon has ended"
-        assert judged, "a sound grasp was not judged"
+        assert self.judged > self._judged_before, "a sound grasp was not judged"
         said = self.door.evening.last
         assert set(said["reasons"]) <= WITHHELD, f"a sound grasp is {said['reasons']}"
 
