@@ -1,26 +1,281 @@
-"""Tare and contact, on a real recording of untouched sensors and on streams with its noise."""
+"""Tare and contact: each limit from both sides, and on a real recording of untouched sensors.
+
+The numbers are those of the rule as `graspd.daemon.judge.contact` states it: a touch takes 20
+counts, 0.6 of that or a quarter of how deep it was held keeps it, half of that after a minute.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.contact import Contact
+from graspd.daemon.judge.contact import Contact, Rest, Touch, Window
 from graspd.daemon.judge.hand import FreshMedian
 
-FF, MF, TH = 0, 1, 2
-PERIOD_NS = 10_000_000
+THRESHOLD = 20.0
+S = 1_000_000_000
+MS = 1_000_000
+PERIOD_NS = 10 * MS
+REST = np.full((1, 24), 3000, dtype=np.uint16)
+
+Counts = NDArray[np.uint16]
+Story = list[tuple[float, float, bool]]
+"""Time, s, fall, counts, and whether the finger touches then."""
+
+NS = 1e-9
+STORIES: dict[str, Story] = {
+    "a touch takes 20 counts": [(0, 19.99, False), (0, 20, True)],
+    "0.6 of a touch keeps a light one": [(0, 20, True), (1, 12, True), (1, 11.99, False)],
+    "a quarter keeps a deep one": [(0, 100, True), (0, 25, True), (0, 24.99, False)],
+    "a minute is not long": [(0, 100, True), (60, 25, True)],
+    "after a minute it is half": [(0, 60, True), (60 + NS, 30, True)],
+    "after a minute less is none": [(0, 60, True), (60 + NS, 29.99, False)],
+    "its depth fades 5 counts/s": [(0, 100, True), (1, 60, True), (1, 23.75, True)],
+    "and no faster": [(0, 100, True), (1, 60, True), (1, 23.74, False)],
+    "its depth fades to its fall": [(0, 100, True), (30, 60, True), (30, 15, True)],
+    "and no further": [(0, 100, True), (30, 60, True), (30, 14.99, False)],
+    "it touches again after 50 ms": [(0, 100, True), (1, 0, False), (1.05, 100, True)],
+    "and no sooner": [(0, 100, True), (1, 0, False), (1.05 - NS, 100, False)],
+    "time went back": [(0, 100, True), (1, 0, False), (1, 100, False), (1 - NS, 100, True)],
+    "from where it let go": [(0, 40, True), (1, 10, False), (9, 29.99, False), (9, 30, True)],
+    "from its smallest fall since": [
+        *((0, 40, True), (1, 10, False), (2, 4, False), (3, 8, False)),
+        *((9, 23.99, False), (9, 24, True)),
+    ],
+    "never by less than a touch": [
+        *((0, 40, True), (1, 10, False), (2, -3, False), (9, 19.99, False), (9, 20, True)),
+    ],
+}
+
+
+@pytest.mark.parametrize("story", STORIES.values(), ids=STORIES)
+def test_a_finger_touches_and_lets_go_by_its_fall(story: Story) -> None:
+    touch, last_s = Touch(THRESHOLD), 0.0
+    for t_s, fall, touches in story:
+        touch.follow(round(t_s * S), max(t_s - last_s, 0.0), fall, fall)
+        last_s = t_s
+        assert (touch.touching, touch.fall) == (touches, fall), (t_s, fall)
+        assert (touch.since_ns is not None) == (touch.depth > 0.0) == touches
+
+
+@pytest.mark.parametrize(
+    ("deep", "relative", "touches"),
+    [(20.0, 20.0, True), (19.99, 99.0, False), (99.0, 19.99, False)],
+)
+def test_a_touch_falls_below_baseline_and_finger(
+    deep: float, relative: float, touches: bool
+) -> None:
+    touch = Touch(THRESHOLD)
+    touch.follow(0, 0.0, deep, relative)
+    assert (touch.touching, touch.fall) == (touches, min(deep, relative))
+    touch.follow(1, 0.0, -99.0, relative)
+    assert touch.touching == touches, "only the relative fall counts in a hold"
+
+
+def held(*, for_ns: int, fall: float) -> Touch:
+    """A finger that has touched since 1 s, and its fall a while later."""
+    touch = Touch(THRESHOLD)
+    touch.follow(S, 0.0, 100.0, 100.0)
+    touch.follow(S + for_ns, 0.0, fall, fall)
+    return touch
+
+
+@pytest.mark.parametrize(
+    ("touch", "middle", "is_lost"),
+    [
+        (Touch(THRESHOLD), -20.0, False),
+        (Touch(THRESHOLD), -20.01, True),  # it rests higher, by more than a touch
+        (Touch(THRESHOLD), 99.0, False),
+        (held(for_ns=60 * S, fall=0.0), 0.0, False),
+        (held(for_ns=60 * S + 1, fall=0.0), 0.0, True),
+        (held(for_ns=60 * S + 1, fall=99.0), -99.0, False),
+    ],
+)
+def test_after_a_long_hold_or_far_above_its_rest_a_finger_is_tared_again(
+    touch: Touch, middle: float, is_lost: bool
+) -> None:
+    assert touch.has_lost_rest(100 * S, middle) == is_lost
+
+
+Sweeps = list[Counts]
+
+
+def sweeps_of(values: Iterable[float]) -> Sweeps:
+    """Sweeps in which all 24 electrodes read the same."""
+    return [np.full(24, round(value), dtype=np.uint16) for value in values]
+
+
+def wavering(step: float, number: int = 100) -> Sweeps:
+    """Up and down around 3000 by `step`, so that the standard deviation is 1.4826 times that."""
+    return sweeps_of(3000 + step * (-1) ** sweep for sweep in range(number))
+
+
+def stepping(step: float) -> Sweeps:
+    """At 3000, and half a second later `step` away from it."""
+    return sweeps_of([3000.0] * 50 + [3000.0 + step] * 50)
+
+
+def rest_of(sweeps: Sweeps, usable: int = 24) -> Rest | None:
+    window = Window.of(1)
+    for counts in sweeps:
+        window.add(counts[None], np.arange(24)[None] < usable)
+    (rest,) = window.rests([0])
+    return rest
+
+
+def pressed(rest: Counts, by: int, electrodes: int = 6) -> Counts:
+    """The first electrodes of each finger lower by that."""
+    counts = rest.copy()
+    counts[:, :electrodes] -= np.uint16(by)
+    return counts
+
+
+def rested(fingers: int = 1) -> tuple[Contact, Counts]:
+    """Fingers that are tared by the last of a hundred sweeps, 0.99 s, and their rest."""
+    contact, rest = Contact(fingers), np.repeat(REST, fingers, axis=0)
+    for place in range(100):
+        assert not any(contact.tared)
+        contact.observe(place * PERIOD_NS, rest, rest, None)
+    assert all(contact.tared)
+    return contact, rest
+
+
+def test_a_window_is_checked_after_100_sweeps_then_every_25() -> None:
+    contact, looks = Contact(1), []
+    for place in range(1, 320):
+        counts = pressed(REST, 100 if place == 160 else 0)
+        contact.observe(place * PERIOD_NS, counts, counts, None)
+        if contact.touches[0].tared_ns == place * PERIOD_NS:
+            looks.append(place)
+    assert looks == [100, 125, 150, 260, 285, 310], "a hundred sweeps after what looked as a touch"
+
+
+def test_a_finger_alone_for_half_a_minute_is_tared_again() -> None:
+    contact, rest = rested(2)
+    both = pressed(rest, 200)
+    one = np.concatenate((both[:1], rest[1:]))
+    for at_s, counts in ((1, one), (20, both), (21, one), (51, one)):
+        contact.observe(at_s * S, counts, counts, None)
+        assert contact.tared == [True, True]
+    contact.observe(51 * S + 1, one, one, None)
+    assert contact.tared == [False, True], "half a minute since it was left alone"
+
+
+def test_a_holds_depth_fades_by_time() -> None:
+    contact, rest = rested()
+    for t_ns, fall in ((1 * S, 200), (2 * S, 100)):
+        counts = pressed(rest, fall)
+        contact.observe(t_ns, counts, counts, None)
+    assert contact.touches[0].depth == 195.0
+
+
+def test_the_third_deepest_electrode_makes_the_touch() -> None:
+    contact, rest = rested()
+    for fallen in (2, 3):
+        counts = rest.copy()
+        counts[0, :fallen] -= np.arange(50, 50 + fallen, dtype=np.uint16)
+        contact.observe(S, counts, counts, None)
+        assert contact.touching == [fallen == 3]
+    assert contact.touches[0].fall == 50.0
+
+
+@pytest.mark.parametrize("number", [11, 12])
+def test_fewer_than_twelve_usable_electrodes_never_touch(number: int) -> None:
+    contact, rest = rested(2)
+    usable = np.ones(rest.shape, dtype=np.bool_)
+    usable[0, number:] = False
+    counts = pressed(rest, 200, 5)
+    contact.observe(S, counts, counts, usable)
+    assert contact.touching == [number == 12, True]
+
+
+def test_the_baseline_is_the_median_of_100_sweeps() -> None:
+    old, new = [np.full(24, 9, dtype=np.uint16)] * 50, wavering(0)
+    rest = rest_of([*old, *new])
+    assert rest is not None
+    assert rest[0].tolist() == [3000.0] * 24
+
+
+@pytest.mark.parametrize(
+    ("sweeps", "sigma"),
+    [
+        (wavering(0), 1.5),  # whole numbers hide what is smaller
+        (wavering(1), 1.5),  # 1.4826
+        (wavering(4), 4 * 1.4826),
+        (wavering(6), 6 * 1.4826),  # 8.9
+        (wavering(7), None),  # 10.4, more than 10 is not a rest
+        (stepping(5), 2.5 * 1.4826),
+        (stepping(-5), 2.5 * 1.4826),
+        (stepping(6), None),
+        (stepping(-6), None),
+        (sweeps_of(3000 + 0.12 * sweep for sweep in range(125)), None),  # 6 from half to half
+    ],
+)
+def test_a_finger_rests_that_neither_wavers_nor_rises(sweeps: Sweeps, sigma: float | None) -> None:
+    rest = rest_of(sweeps)
+    assert (rest is None) == (sigma is None)
+    if rest is not None and sigma is not None:
+        assert rest[1] == pytest.approx(sigma, rel=1e-9)
+
+
+@pytest.mark.parametrize(("usable", "known"), [(24, 24), (12, 12), (11, None)])
+def test_twelve_electrodes_make_a_tare(usable: int, known: int | None) -> None:
+    rest = rest_of(wavering(2), usable)
+    assert (None if rest is None else int(rest[2].sum())) == known
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "known"),
+    [
+        *((0, 0, False), (4095, 4095, False), (1, 1, True), (4094, 4094, True)),  # a rail
+        *((2980, 3020, True), (2979, 3021, False)),  # sigma 29.7 or 31.1, the limit is 30
+    ],
+)
+def test_an_electrode_at_a_rail_or_far_noisier_has_no_rest(
+    low: int, high: int, known: bool
+) -> None:
+    sweeps = wavering(2)
+    for place, sweep in enumerate(sweeps):
+        sweep[5] = (low, high)[place % 2]
+    rest = rest_of(sweeps)
+    assert rest is not None
+    assert rest[2].tolist() == [electrode != 5 or known for electrode in range(24)]
+
+
+@pytest.mark.parametrize(
+    ("step", "threshold"),
+    [(2, 20.0), (4, 5 * 4 * 1.4826)],  # 5 sigmas are 14.8, and 29.7
+)
+def test_a_touch_takes_five_sigmas_or_twenty_counts(step: int, threshold: float) -> None:
+    contact = Contact(1)
+    for place, counts in enumerate(wavering(step)):
+        contact.observe(place * PERIOD_NS, counts[None], counts[None], None)
+    assert contact.touches[0].threshold == pytest.approx(threshold)
+
+
+@pytest.mark.parametrize(
+    ("step", "followed"),
+    [(1.0, 1.0), (9.0, 1.25), (-0.3, -0.3), (-9.0, -0.375)],
+    ids=["rises slowly", "rises", "sinks slowly", "sinks"],
+)
+def test_a_baseline_rises_faster_than_it_sinks(step: float, followed: float) -> None:
+    contact, rest = rested()
+    contact.baseline[:] = 3000.0 - step
+    for place in range(100, 125):
+        contact.observe(place * PERIOD_NS, rest, rest, None)
+    assert contact.baseline[0, 0] == pytest.approx(3000.0 - step + followed)
+
+
 NOISE = 3.5
 """Counts, standard deviation of an untouched electrode (facts: 2.9 to 4.3)."""
 PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: eight all of it, the others a fifth."""
-ALL = np.ones((3, 24), dtype=np.bool_)
 SLOPES = np.random.default_rng(5).normal(0.0, 0.2, (3, 24))
 """Counts/s by which the electrodes of a finger drift apart: 0.13 to 0.22 (standard deviation, over
 the real recording of untouched sensors)."""
-
-Counts = NDArray[np.uint16]
 
 
 class Hand:
@@ -31,38 +286,25 @@ class Hand:
         self.fresh = FreshMedian((3, 24))
         self.t_ns = 10**12
 
-    def feel(self, counts: Counts, usable: NDArray[np.bool_] = ALL) -> None:
-        self.fresh.push(counts, usable)
-        self.contact.observe(self.t_ns, counts, self.fresh.counts, usable)
+    def feel(self, counts: Counts) -> None:
+        self.fresh.push(counts, None)
+        self.contact.observe(self.t_ns, counts, self.fresh.counts, None)
         self.t_ns += PERIOD_NS
 
-    def play(self, sweeps: Counts, usable: NDArray[np.bool_] = ALL) -> NDArray[np.bool_]:
+    def play(self, sweeps: Counts) -> NDArray[np.bool_]:
         """Which fingers touched in each sweep, shape (sweeps, fingers)."""
         touching = np.zeros((len(sweeps), 3), dtype=np.bool_)
         for place, counts in enumerate(sweeps):
-            self.feel(counts, usable)
+            self.feel(counts)
             touching[place] = self.contact.touching
         return touching
 
 
-def at_rest() -> NDArray[np.float64]:
-    return np.random.default_rng(1).uniform(2400.0, 3400.0, (3, 24))
-
-
-def noisy(mean: NDArray[np.float64], seed: int = 0) -> Counts:
-    """Counts around `mean`, shape (sweeps, 3, 24), as an untouched sensor wavers."""
-    noise = np.random.default_rng(seed).normal(0.0, NOISE, mean.shape)
-    return np.clip(np.rint(mean + noise), 1, 4094).astype(np.uint16)
-
-
-def still(seconds: float, seed: int = 0) -> Counts:
-    return noisy(np.broadcast_to(at_rest(), (round(seconds * 100), 3, 24)), seed)
-
-
-def touched(seconds: float, depth: float, seed: int = 0) -> Counts:
-    """All fingers are pressed at once by `depth` counts."""
-    mean = np.broadcast_to(at_rest() - depth * PRESSED, (round(seconds * 100), 3, 24))
-    return noisy(mean, seed)
+def felt(depth: float, begin_s: float, end_s: float, drift: float = 0.0) -> Counts:
+    """Sweeps of sensors that waver, drift since 0 s, counts/s, and are pressed by `depth`."""
+    random, t_s = np.random.default_rng(1), np.arange(begin_s, end_s, 0.01)[:, None, None]
+    mean = random.uniform(2400.0, 3400.0, (3, 24)) - depth * PRESSED + (drift + SLOPES) * t_s
+    return np.rint(mean + random.normal(0.0, NOISE, mean.shape)).astype(np.uint16)
 
 
 def as_sampled(recorded: Counts, changed: NDArray[np.int64]) -> Counts:
@@ -111,66 +353,11 @@ def test_spikes_of_one_or_two_electrodes_never_make_a_touch(
     assert not Hand().play(as_sampled(untouched, spiked)).any()
 
 
-MOTIONS = {
-    "rising": lambda t: 30.0 * t,
-    "sinking": lambda t: -30.0 * t,
-    "shaking": lambda t: 20.0 * np.sin(2 * np.pi * 3.1 * t),
-}
-
-
-@pytest.mark.parametrize("motion", list(MOTIONS))
-def test_a_finger_that_moves_is_not_tared_until_it_rests(motion: str) -> None:
+@pytest.mark.parametrize(("held_s", "drift"), [(30, 0.0), (300, 0.7)])
+def test_a_hand_that_opens_after_a_long_hold_touches_nothing(held_s: int, drift: float) -> None:
     hand = Hand()
-    t_s = np.arange(300) / 100
-    moved = MOTIONS[motion](t_s)[:, None, None]
-    for counts in noisy(at_rest() + moved):
-        hand.feel(counts)
-        assert not any(hand.contact.tared)
-        assert not any(hand.contact.touching)
-    hand.play(noisy(np.broadcast_to(at_rest() + moved[-1], (150, 3, 24)), 1))
+    hand.play(felt(0.0, -1.5, 0.0))
+    assert hand.play(felt(300.0, 0.0, held_s, drift))[10:].all()
+    assert not hand.play(felt(0.0, held_s, held_s + 4.0, drift))[10:].any()
     assert all(hand.contact.tared)
-
-
-def test_a_hand_that_never_opened_touches_nothing_until_it_opens() -> None:
-    hand = Hand()
-    assert not hand.play(touched(3.0, 500.0)).any()
-    assert not hand.play(still(2.0))[5:].any()
-    assert hand.play(touched(0.5, 40.0))[5:].all()
-
-
-@pytest.mark.parametrize("usable_electrodes", [11, 12])
-def test_fewer_than_twelve_usable_electrodes_never_touch(usable_electrodes: int) -> None:
-    hand, usable = Hand(), ALL.copy()
-    usable[FF, usable_electrodes:] = False
-    hand.play(still(1.5))
-    touching = hand.play(touched(0.5, 500.0), usable)
-    enough = usable_electrodes == 12
-    assert (touching[5:, FF] == enough).all()
-    assert touching[5:, [MF, TH]].all()
-    never_more = Hand()
-    never_more.play(still(1.5), usable)
-    assert never_more.contact.tared == [enough, True, True]
-    assert never_more.play(touched(0.5, 500.0), usable)[:, FF].any() == enough
-
-
-def held(seconds: int, drift: float, depth: float = 300.0) -> NDArray[np.float64]:
-    """Mean counts, shape (sweeps, 3, 24), of a hold while the sensors drift, in counts/s."""
-    t_s = np.arange(0, seconds, 0.01)[:, None, None]
-    return at_rest() - depth * PRESSED + (drift + SLOPES) * t_s
-
-
-def opened(seconds: float, after_s: int, drift: float) -> NDArray[np.float64]:
-    """Mean counts of an open hand after a hold of `after_s` seconds."""
-    t_s = after_s + np.arange(0, seconds, 0.01)[:, None, None]
-    return at_rest() + (drift + SLOPES) * t_s
-
-
-@pytest.mark.parametrize(("seconds", "drift"), [(30, 0.0), (300, 0.7)])
-def test_a_hand_that_opens_after_a_long_hold_touches_nothing(seconds: int, drift: float) -> None:
-    hand = Hand()
-    hand.play(still(1.5))
-    assert hand.play(noisy(held(seconds, drift)))[10:].all()
-    open_hand = hand.play(noisy(opened(4.0, seconds, drift), 1))
-    assert not open_hand[10:].any()
-    assert all(hand.contact.tared)
-    assert hand.play(noisy(held(2, 0.0) + (drift + SLOPES) * seconds, 2))[10:].all()
+    assert hand.play(felt(300.0, held_s, held_s + 2.0, drift))[10:].all()
