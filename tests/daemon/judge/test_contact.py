@@ -146,7 +146,7 @@ def rested(fingers: int = 1) -> tuple[Contact, Counts]:
 def test_a_window_is_checked_after_100_sweeps_then_every_25() -> None:
     contact, looks = Contact(1), []
     for place in range(1, 320):
-        counts = pressed(REST, 100 if place == 160 else 0)
+        counts = pressed(REST, 10 if place == 160 else 0)  # half of a touch
         contact.observe(place * PERIOD_NS, counts, counts, None)
         if contact.touches[0].tared_ns == place * PERIOD_NS:
             looks.append(place)
