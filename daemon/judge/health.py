@@ -118,7 +118,7 @@ class Health:
         if counts.shape != self._shape:
             return Checked((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
         self._faults = reading.faults
-        railed, differs = self._compare(counts)
+        railed = self._compare(counts)
         sound, faults = None, 0
         # Nearly all readings are sound, and that is seen with a few cheap operations.
         if reading.faults.tobytes() != self._no_faults:
@@ -127,7 +127,6 @@ class Health:
             faults = int(np.bitwise_or.reduce(reading.faults, axis=None))
             self._changed[~sound] = self._number
             railed &= sound
-            differs &= sound
         broken = railed | self._worn_out()
         if sound is not None:
             broken |= ~sound
@@ -159,8 +158,8 @@ class Health:
             findings[finger, electrode] = _fault_reasons(int(self._faults[finger, electrode]))[0]
         return findings
 
-    def _compare(self, counts: NDArray[np.uint16]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Take in counts; return which are at a rail, and which differ from those before."""
+    def _compare(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        """Compare counts with those before; return which are at a rail."""
         previous = self._previous
         self._number += 1
         above = self._above
@@ -181,7 +180,7 @@ class Health:
                 self._has_jumped |= 1 in jumps.tobytes()
                 self._jumps += jumps
         self._previous = counts
-        return railed, differs
+        return railed
 
     def _recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
         """Take in a sweep, shape (fingers, 24). Return True if some finger sent it before.

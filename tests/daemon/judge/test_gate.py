@@ -41,13 +41,11 @@ class Scenario:
     changes: str
     """Expected: state:cause of each change."""
     seconds: float = 1.5
-    rate_hz: float = 100.0
     settled_s: tuple[float, float] | None = None
     """Expected: when it settles first."""
     unusable: tuple[float, float] = (0.0, 0.0)
     """From when to when readings come that cannot be used, s."""
     missing: tuple[float, float] = (0.0, 0.0)
-    asks_s: float | None = None
     joint: Callable[[float], float | None] | None = None
     """Angle of a joint by time, rad; None where nothing is sent."""
     retime: Callable[[float], float] = lambda t_s: t_s
@@ -85,8 +83,8 @@ def readings(scenario: Scenario) -> list[tuple[float, TactileReading]]:
     random = np.random.default_rng(11)
     rest = random.uniform(2400.0, 3400.0, SHAPE)
     made = []
-    for place in range(-110, round(scenario.seconds * scenario.rate_hz)):
-        t_s = place / scenario.rate_hz
+    for place in range(-110, round(scenario.seconds * 100)):
+        t_s = place / 100
         counts = rest - depths(scenario, t_s)[:, None] * PRESSED
         counts += random.normal(0.0, NOISE, SHAPE)
         t_ns = START_NS + round(scenario.retime(t_s) * 1e9)
@@ -99,8 +97,6 @@ def play(scenario: Scenario) -> Played:
     played = Played(HandTracker(FINGERS, scenario.limits))
     hand = played.hand
     for t_s, reading in readings(scenario):
-        if t_s == scenario.asks_s:
-            hand.ask()
         angle = None if scenario.joint is None else scenario.joint(t_s)
         if angle is not None:
             hand.observe_joints(
@@ -118,7 +114,6 @@ def play(scenario: Scenario) -> Played:
 
 GRASPED = ((0.0, 0.0), (0.2, 300.0))
 """All fingers close within 0.2 s and hold."""
-LIGHT = ((0.0, 0.0), (0.2, 40.0), (1.0, 40.0), (1.1, 0.0))
 OPENED = (*GRASPED, (1.0, 300.0), (1.1, 0.0))
 UP = "closing:contact settled:still judged:judged"
 AGAIN = "settled:still judged:judged"
@@ -126,19 +121,12 @@ DOWN = "released:contact-lost idle:time"
 SETTLES = (0.41, 0.45)
 """0.2 s of closing, and 240 ms in which the hand keeps still; the last sweep or two of closing are
 noise."""
-REQUEST = replace(LIMITS, on_request=True)
 JOINTS = replace(LIMITS, joints=True)
 SUBSET = replace(LIMITS, required=("ff", "th"))
 
 
 SCENARIOS = [
-    Scenario("nothing touches", ((0, 0),), ""),
     Scenario("firm grasp", OPENED, f"{UP} closing:changed {DOWN}", settled_s=SETTLES),
-    Scenario(
-        "light touch",
-        {"ff": LIGHT, "mf": LIGHT, "th": ((0, 0), (0.2, 40), (0.9, 40), (0.95, 0))},
-        f"{UP} closing:contact-lost {DOWN}",
-    ),
     Scenario(
         "required fingers of which the third is none",
         {"ff": OPENED, "th": OPENED},
@@ -167,13 +155,6 @@ SCENARIOS = [
         settled_s=(1.03, 1.05),
     ),
     Scenario(
-        "10 Hz",
-        ((0, 0), (0.2, 300), (2, 300), (2.5, 0)),
-        f"{UP} closing:changed {DOWN}",
-        rate_hz=10.0,
-        seconds=4.0,
-    ),
-    Scenario(
         # The joint stops at 0.6 s; a window of 80 ms at 0.5 rad/s fades below 0.1 rad/s in 64 ms.
         "joints moving",
         GRASPED,
@@ -191,7 +172,6 @@ SCENARIOS = [
         limits=JOINTS,
         settled_s=(1.0, 1.02),
     ),
-    Scenario("asked before it settled", GRASPED, UP, asks_s=0.1, limits=REQUEST, settled_s=SETTLES),
 ]
 
 

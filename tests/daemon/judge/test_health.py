@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from graspd.daemon.judge.health import Checked, Health
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
-from graspd.models.electrodes import too_many
 from tests.daemon.fakes import sound
 
 FINGERS = 3
@@ -32,14 +31,15 @@ def test_first_low_counts_are_not_a_jump() -> None:
 def watched(steps: NDArray[np.int64]) -> tuple[Health, list[dict[tuple[int, int], Reason]]]:
     """What was found in electrodes that go from 2000 by `steps`, shape (sweeps, 24), finger 1.
 
-    The electrodes of the other fingers go up and down by one.
+    The electrodes of the other fingers go up and down by more than one that keeps still.
     """
     health, found = Health(FINGERS), []
     for place in range(len(steps) + 1):
-        counts = np.full((FINGERS, 24), 2000 + place % 2)
+        counts = np.full((FINGERS, 24), 2000 + 31 * (place % 2))
         counts[1] = 2000 + steps[:place].sum(axis=0)
-        health.check(sound(counts))
+        broken = broken_of(health.check(sound(counts)))
         found.append(health.electrodes())
+        assert {(f, e) for f, e in np.argwhere(broken).tolist()} == set(found[-1])
     return health, found
 
 
@@ -106,13 +106,15 @@ def test_an_electrode_unchanged_for_16_readings_is_dead() -> None:
         ((4, 4, 4), False),
         ((5, 4, 4), True),
         ((0, 0, 0), False),
+        ((24, 24, 24), True),
     ],
 )
 def test_more_than_twelve_or_eight_broken_electrodes_are_too_many(
     broken: tuple[int, ...], found: bool
 ) -> None:
-    mask = np.array([np.arange(24) < number for number in broken])
-    assert too_many(mask) == found
+    railed = np.array([np.arange(24) < number for number in broken])
+    checked = Health(FINGERS).check(sound(np.where(railed, 4095, 2000)))
+    assert checked.reasons == ((Reason.SATURATED, Reason.ELECTRODES_BROKEN) if found else ())
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.motion_limits import MotionLimits, SlowNoise, Tails, creep
+from graspd.daemon.judge.motion_limits import MotionLimits, Tails
 from graspd.daemon.judge.stillness import Motion
 from graspd.daemon.judge.windows import STEPS, Noise
 
@@ -133,14 +133,6 @@ def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
     assert motion.blocks.sums[0, 0] > 0.0
 
 
-def test_a_wholly_lost_finger_is_unknown() -> None:
-    motion, counts = Motion(1, 0.05), np.rint(wavering(2.0, 100.0, 3.5, 15)).astype(np.uint16)
-    for index, sweep in enumerate(counts):
-        motion.add(index * 10_000_000, sweep, FINGER if index < 150 else ~FINGER)
-    assert np.isinf(moves(motion)).all()
-    assert not motion.strict.sure
-
-
 @pytest.mark.parametrize("share", [0.0, 0.5, -1.0, float("nan")])
 def test_no_such_share_of_false_alarms_is_accepted(share: float) -> None:
     with pytest.raises(ValueError, match="false_alarms"):
@@ -192,28 +184,3 @@ def test_the_slope_limit_fits_19_of_20_real_touches(sweeps: int, counts_per_s: f
     limits = MotionLimits(1, Tails.of(1, 0.05, early=True))
     limits.lay([0.0], by_noise.tolist())
     assert limits.fast[0] * by_noise[0] == pytest.approx(counts_per_s, rel=0.1)
-
-
-def test_a_held_touch_creeps_as_measured() -> None:
-    # Mean absolute slopes of held touches over 240 ms: 14 counts/s in the median, 25 in 5 %, of
-    # which noise makes 12.6, and root mean squares are 1.25 times mean absolute values.
-    assert creep(0.0) == pytest.approx(1.25 * np.sqrt(14.0**2 - 12.6**2), rel=0.05)
-    assert creep(1.645) == pytest.approx(1.25 * np.sqrt(25.0**2 - 12.6**2), rel=0.2)
-
-
-def test_where_the_long_window_decides_the_short_one_is_looser() -> None:
-    # Of one finger's tails at 1 %: 2.326 for the short window alone, 3.090 beside the long one.
-    limits = MotionLimits(1, Tails.of(1, 0.01, early=True))
-    still = SlowNoise(1.0, [1.0], [0.1])
-    limits.lay([0.0], [1.0], [0.0], still)
-    above = limits.fast[0] * 1.01
-    limits.lay([above], [1.0], [0.0], still)
-    assert (limits.early, limits.sure) == (False, True)
-
-
-def test_a_wavering_finger_is_noise_up_to_a_limit() -> None:
-    motion = Motion(1, 0.05)
-    fed(motion, wavering(4.0, 100.0, 20.0, 16), 100.0)
-    # Twice the 10 counts that are believed to be noise.
-    assert motion.slow[0] == pytest.approx(2.0, rel=0.15)
-    assert not motion.strict.sure
