@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import numpy as np
 import pytest
 
 from graspd.biotac import Finger
@@ -15,7 +14,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.judge.reasons import FingerState, GateState, Reason
 from graspd.models import zoo
 from graspd.models.runtime import TactileModel
-from tests.daemon.fakes import FINGERS, MS, sound
+from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.test_gate import ALL, LIMITS, Scenario, readings
 
 FREE, TOUCH, SLIDE = FingerState
@@ -118,14 +117,6 @@ def test_a_finger_of_few_electrodes_hides_no_other() -> None:
     assert moment.fingers == {"ff": TOUCH, "mf": None, "th": TOUCH}
 
 
-def test_a_finger_whose_rest_is_not_known_is_not_free() -> None:
-    told = felt(FIRM, HandTracker(FINGERS, LIMITS))
-    assert told[0][2] == UNKNOWN
-    assert {tuple(feelings.values()) for t_s, _, feelings in told if -0.05 < t_s < 0.0} == {
-        (FREE,) * 3
-    }
-
-
 @pytest.mark.parametrize(("late_ms", "is_known"), [(100, True), (101, False)])
 def test_an_old_reading_tells_nothing(late_ms: int, is_known: bool) -> None:
     now_ns = late_ns = 0
@@ -138,8 +129,3 @@ def test_an_old_reading_tells_nothing(late_ms: int, is_known: bool) -> None:
     assert (judgement.moment.fingers == HELD) is is_known
     assert (judgement.moment.fingers == UNKNOWN) is not is_known
     assert judge.silence(reading.t_ns).moment.fingers == UNKNOWN
-
-
-def test_without_a_gate_no_finger_has_a_word() -> None:
-    judge = Pipeline(TactileModel(zoo.find("cnn1")), FINGERS, Limits(), lambda: 0)
-    assert judge.judge(sound(np.full(ALL.shape, 2000))).moment.fingers is None
