@@ -113,18 +113,3 @@ def test_a_grasp_that_was_not_allowed_stays_so(permission: Permission) -> None:
     allowed = trust.judge(grasp, 1e-6, -13.8, NONE)
     assert trust.review(grasp, allowed).permission is Permission.ALLOWED
     assert trust.review(grasp, replace(allowed, permission=permission)).permission is permission
-
-
-def test_without_learning_what_was_learned_before_is_not_used() -> None:
-    taught, x = Trust("model", 0), NONE
-    for number in range(40):
-        grasp = GraspId(BOOT, number)
-        taught.note(grasp, taught.judge(grasp, 0.4, -0.4, x), stable=False)
-        taught.outcome(grasp, slipped=False)
-    assert (taught.judge(GraspId(BOOT, 99), 0.4, -0.4, x).p_slip or 1.0) < 0.3
-    plain = Trust("model", 0, learns=False)
-    plain.restore(taught.state())
-    assessment = plain.judge(GraspId(BOOT, 99), 0.4, -0.4, x)
-    assert (assessment.p_slip, assessment.outcomes) == (0.4, 0)
-    assert plain.review(GraspId(BOOT, 99), None).outcomes == 0
-    assert plain.state() == taught.state()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graspd.daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
-from graspd.daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
+from graspd.daemon.trust.trust import DIGEST_BYTES, MAX_BYTES, Trust, TrustState, decode, encode
 from graspd.models.trust.learner import sigmoid
 from graspd.models.trust.residual import GRASPS_MAX
 from graspd.models.trust.risk import RiskLimits
@@ -36,11 +36,16 @@ def test_without_outcomes_the_models_probability_is_unchanged(
 
 
 def test_with_learning_off_outcomes_move_the_risk_alone() -> None:
-    part = trust(learns=False)
-    assert judge(part, 0)
-    assert part.outcome(named(0), slipped=True) is OutcomeStatus.TAKEN
-    assert p_slip(part) == sigmoid(-1.0)
-    assert (part.risk.lifts, part.risk.slips, part.risk.proven) == (1, 1, 1)
+    taught, part = full(), trust(learns=False)
+    part.restore(taught.state())
+    assert part.state() == taught.state()
+    for number in (10, 11):
+        assert p_slip(part) == sigmoid(-1.0) != p_slip(taught)
+        assert part.review(named(99), None).outcomes == 0
+        assert judge(part, number)
+        assert part.outcome(named(number), slipped=True) is OutcomeStatus.TAKEN
+    assert (part.risk.lifts, part.risk.slips) == (taught.risk.lifts + 2, taught.risk.slips + 2)
+    assert part.learner.state() == taught.learner.state()
 
 
 def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
@@ -51,12 +56,16 @@ def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
             part.note(named(0), assessment, stable=True)
 
 
-@pytest.mark.parametrize("p", [math.nan, -0.1, 1.1, math.inf])
-def test_other_values_than_probabilities_are_refused(p: float) -> None:
-    with pytest.raises(ValueError, match="not a probability"):
-        trust().judge(named(0), p, 0.0, inputs(0))
-    with pytest.raises(ValueError, match="not finite"):
-        trust().judge(named(0), 0.5, math.nan, inputs(0))
+@pytest.mark.parametrize(
+    ("p", "margin", "says"),
+    [
+        *((p, 0.0, "not a probability") for p in (math.nan, -0.1, 1.1, math.inf)),
+        (0.5, math.nan, "not finite"),
+    ],
+)
+def test_other_values_than_probabilities_are_refused(p: float, margin: float, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        trust().judge(named(0), p, margin, inputs(0))
 
 
 def test_a_state_is_not_changed_by_what_comes_later() -> None:
@@ -107,10 +116,21 @@ def test_no_damaged_byte_goes_unnoticed() -> None:
             decode(bad)
 
 
-def test_what_is_whole_and_no_state_is_refused() -> None:
-    for content in (b"\x80", b"\xc1", msgspec.msgpack.encode({"version": 2})):
-        with pytest.raises(ValueError, match="nothing that was learned"):
-            decode(hashlib.sha256(content).digest() + content)
+def too_many() -> bytes:
+    """A state of one record more than is remembered."""
+    state, replace = full().state(), msgspec.structs.replace
+    many = tuple(replace(state.lifts.records[0], id=named(n)) for n in range(LIFTS_MAX + 1))
+    return encode(replace(state, lifts=replace(state.lifts, records=many)))[DIGEST_BYTES:]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x80", b"\xc1", msgspec.msgpack.encode({"version": 2}), too_many()],
+    ids=["empty", "no message", "not compressed", "too many records"],
+)
+def test_what_is_whole_and_no_state_is_refused(content: bytes) -> None:
+    with pytest.raises(ValueError, match="nothing that was learned"):
+        decode(hashlib.sha256(content).digest() + content)
 
 
 def test_what_another_graspd_kept_is_refused_by_its_format() -> None:
@@ -159,14 +179,3 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
         with pytest.raises(ValueError, match=why):
             part.restore(other)
         assert encode(part.state()) == before
-
-
-def test_too_many_records_are_not_a_state() -> None:
-    state = full().state()
-    many = tuple(
-        msgspec.structs.replace(state.lifts.records[0], id=named(grasp))
-        for grasp in range(LIFTS_MAX + 1)
-    )
-    lifts = msgspec.structs.replace(state.lifts, records=many)
-    with pytest.raises(ValueError, match="nothing that was learned"):
-        decode(encode(msgspec.structs.replace(state, lifts=lifts)))
