@@ -166,6 +166,7 @@ class Health:
         np.subtract(counts, self._one, out=above[0])
         step = np.subtract(counts, previous, out=above[2])
         np.add(step, self._jump, out=above[1])
+        railed: NDArray[np.bool_]
         railed, far, differs = above > self._limits
         np.putmask(self._changed, differs, self._number)
         if self._has_jumped:

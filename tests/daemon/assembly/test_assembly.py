@@ -220,26 +220,6 @@ def test_a_driver_is_told_what_the_scene_says(
 
 
 @pytest.mark.parametrize(
-    ("sections", "says"),
-    [
-        (
-            {"tactile": {"driver": "can", "bitrate": 500_000}},
-            r"^\[tactile\] bit rates of socketcan",
-        ),
-        ({"tactile": {"driver": "can", "data_length": 3}}, r"^\[tactile\] frames of 3 bytes"),
-        ({"tactile": {"driver": "palm", "source": "udp://nowhere"}}, r"^\[tactile\] "),
-        ({"tactile": PALM, "joints": {"driver": "stream", "source": "udp://x"}}, r"^\[joints\] "),
-    ],
-)
-def test_what_a_driver_refuses_is_one_line_naming_the_section(
-    sections: dict[str, dict[str, Any]], says: str
-) -> None:
-    with pytest.raises(SceneError, match=says) as error:
-        assembly.build_drivers(Plan.of(scene_of(**sections)))
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("raised", "expected"),
     [
         (LinkError(LinkCause.UNKNOWN, "gone"), LinkError),

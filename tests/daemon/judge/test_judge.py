@@ -17,14 +17,25 @@ def test_every_reason_has_advice_and_every_fault_a_reason() -> None:
     assert set(REASON_OF_FAULT) == {fault for fault in ElectrodeFault if fault}
 
 
-@pytest.mark.parametrize(("p_slip", "decision"), [(0.1, Decision.STABLE), (0.9, Decision.SLIP)])
-def test_a_sound_reading_is_judged(p_slip: float, decision: Decision) -> None:
+@pytest.mark.parametrize(
+    ("answer", "decision", "reasons"),
+    [
+        (0.1, Decision.STABLE, ()),
+        (0.9, Decision.SLIP, ()),
+        (RuntimeError("no session"), Decision.UNKNOWN, (Reason.MODEL_FAILED,)),
+    ],
+    ids=["stable", "slip", "fails"],
+)
+def test_a_sound_reading_is_judged_as_the_network_answers(
+    answer: float | Exception, decision: Decision, reasons: tuple[Reason, ...]
+) -> None:
     clock = Clock()
-    judgement = pipeline(FakeModel(p_slip), clock).judge(reading(clock()))
-    assert judgement.decision is decision
-    assert judgement.p_slip == p_slip
-    assert judgement.reasons == ()
+    judge = pipeline(FakeModel(answer), clock)
+    judgement = judge.judge(reading(clock()))
+    assert (judgement.decision, judgement.reasons) == (decision, reasons)
+    assert judgement.p_slip == (None if reasons else answer)
     assert judgement.moment.grasp == 1
+    assert judge.health() == ({"model": Reason.MODEL_FAILED} if reasons else {})
 
 
 OF_AN_ELECTRODE = (

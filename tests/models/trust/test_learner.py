@@ -17,20 +17,6 @@ from tests.models.trust.streams import CLIP, Outcome, learn, lifts
 ONE_FINGER, THREE_FINGERS = 26, 78
 
 
-def test_before_an_outcome_the_prior_moderates_the_margin() -> None:
-    learner = Learner(2)
-    found = learner.judge(-3.0, np.array([1.0, -2.0]))[0]
-    variance = 1.5**2 * 0.5**2 + 0.5**2 + 0.2**2 * (1.0 + 4.0) + 9.009
-    moderated = -1.5 / math.sqrt(1.0 + math.pi * variance / 8.0)
-    assert found == pytest.approx(2.8 * moderated, rel=1e-14)
-
-
-def test_without_inputs_the_margin_is_only_moderated() -> None:
-    variance = 1.5**2 * 0.5**2 + 0.5**2
-    expected = -3.0 / math.sqrt(1.0 + math.pi * variance / 8.0)
-    assert Learner(0).judge(-3.0, np.zeros(0))[0] == pytest.approx(expected, rel=1e-14)
-
-
 def test_a_margin_beyond_thirty_says_no_more_than_thirty() -> None:
     learner, x = Learner(2), np.zeros(2)
     for margin in (30.5, 1e9):
@@ -172,14 +158,6 @@ def test_one_lie_turns_few_unlike_slips_stable(true_outcomes: int) -> None:
         unlike = (alike < 0.1) & slips[true_outcomes:]
         turned.append((after <= 0.0)[unlike & (before > 0.0)].mean())
     assert max(turned) < 0.1
-
-
-def test_a_reset_learner_is_a_new_one() -> None:
-    learner = Learner(ONE_FINGER)
-    learn(learner, lifts(30, ONE_FINGER))
-    assert learner.outcomes == 30
-    learner.reset()
-    assert learner.state() == Learner(ONE_FINGER).state()
 
 
 @pytest.mark.parametrize("inputs", [26, 52, 78])
