@@ -53,7 +53,7 @@ OTHERS = {"none": (), "a finger": ("THJ1",), "those but one": ("FFJ1", "FFJ3")}
 @pytest.mark.parametrize(
     ("age_ms", "reason"),
     [
-        (-100, None),  # jitter between two links
+        (-150, None),  # jitter between two links
         *((0, None), (150, None), (151, Reason.JOINTS_LATE), (1000, Reason.JOINTS_LATE)),
         *((1001, None), (3000, None)),
     ],
@@ -73,6 +73,7 @@ def test_joints_are_late_and_then_lost(
     assert motion.objection(now_ns) is reason
     assert motion.is_lost(now_ns) is (age_ms > 1000 and not others)
     assert motion.misses_some(now_ns) is (age_ms > 1000)
+    assert not motion.is_frozen
 
 
 def test_joints_of_the_future_or_none_are_waited_for_a_second() -> None:
@@ -88,6 +89,9 @@ def test_angles_of_one_and_the_same_time_give_no_speed() -> None:
     for angle in range(100):
         send(motion, START_NS, float(angle), 0.0, 0.0)
         assert motion.objection(START_NS) is Reason.MOVING
+    motion, now_ns = turning(100.0, 0.0)
+    send(motion, now_ns, 0.3, 1.2, -0.1)
+    assert motion.objection(now_ns) is None
 
 
 def test_each_sender_must_be_still() -> None:
