@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.words import check_file, check_subjects, checked_files, texts_of_test
 
 SOURCE = '''\
@@ -23,41 +25,36 @@ def wait(name: str) -> None:
 '''
 
 
-def phrases(path: Path) -> list[tuple[int, str]]:
-    return [(each.line, each.phrase) for each in check_file(path)]
+C_SOURCE = 'int anew;  // nobody\n/* `wanted`\n goes on */ say("is no\\"link");\n'
+PAGE = "There is no file. It is no longer open.\nIt is no file.\n"
 
 
-def test_phrases_of_python_are_found_with_their_lines(tmp_path: Path) -> None:
-    path = tmp_path / "module.py"
-    path.write_text(SOURCE)
-    assert phrases(path) == [
-        (3, "Of ..."),
-        (6, "but for"),
-        (9, "so long"),
-        (10, "nobody"),
-        (12, "That ..."),
-        (12, "as far as"),
-        (12, "is no"),
-        (13, "anew"),
-    ]
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        (
+            "module.py",
+            SOURCE,
+            [
+                *((3, "Of ..."), (6, "but for"), (9, "so long"), (10, "nobody")),
+                *((12, "That ..."), (12, "as far as"), (12, "is no"), (13, "anew")),
+            ],
+        ),
+        ("client.hpp", C_SOURCE, [(1, "nobody"), (3, "goes on"), (3, "is no")]),
+        ("page.md", PAGE, [(2, "is no")]),
+    ],
+)
+def test_refused_phrases_are_found_with_their_lines(
+    name: str, text: str, expected: list[tuple[int, str]], tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    assert [(each.line, each.phrase) for each in check_file(path)] == expected
 
 
-def test_comments_and_strings_of_c_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "client.hpp"
-    path.write_text('int anew;  // nobody\n/* `wanted`\n goes on */ say("is no\\"link");\n')
-    assert phrases(path) == [(1, "nobody"), (3, "goes on"), (3, "is no")]
-
-
-def test_there_is_no_and_is_no_longer_are_allowed(tmp_path: Path) -> None:
-    path = tmp_path / "page.md"
-    path.write_text("There is no file. It is no longer open.\nIt is no file.\n")
-    assert phrases(path) == [(2, "is no")]
-
-
-def test_names_of_tests_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "test_it.py"
-    path.write_text('def test_it_goes_on():\n    """Wait for nobody."""\n    print("so long as")\n')
-    texts = [(each.line, each.text) for each in texts_of_test(path.read_text())]
+def test_names_of_tests_are_read() -> None:
+    source = 'def test_it_goes_on():\n    """Wait for nobody."""\n    print("so long as")\n'
+    texts = [(each.line, each.text) for each in texts_of_test(source)]
     assert (1, "test it goes on") in texts
     assert "so long as" not in [text for _, text in texts]
 

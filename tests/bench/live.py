@@ -33,9 +33,9 @@ HELD = Durations(first_rest_s=(1.5, 1.5), settle_s=(600.0, 600.0))
 """A grasp that is closed once and then held."""
 
 
-def held_grasp(rate_hz: float = RATE_HZ) -> Iterator[Counts]:
+def held_grasp() -> Iterator[Counts]:
     """Counts of a grasp that is held for ten minutes."""
-    moments = synthetic_grasps(1, rate_hz=rate_hz, durations=HELD, seed=SEED)
+    moments = synthetic_grasps(1, rate_hz=RATE_HZ, durations=HELD, seed=SEED)
     return (moment.counts for moment in moments)
 
 
@@ -61,14 +61,13 @@ class Subscriber:
         *,
         topics: Sequence[str] = ("verdict.",),
         keys: Path | None = None,
-        client: str = "friend",
     ) -> None:
-        """`keys`: folder of a daemon's key and of the `client`'s; None: without keys."""
+        """`keys`: folder of a daemon's key and of a friend's; None: without keys."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.rcvhwm = 0  # what is lost must be lost elsewhere
         if keys is not None:
-            own = load_pair(keys / "clients" / f"{client}.key_secret")
+            own = load_pair(keys / "clients" / "friend.key_secret")
             self._socket.curve_publickey, self._socket.curve_secretkey = own
             self._socket.curve_serverkey = load_pair(keys / "daemon.key_secret")[0]
         for topic in topics:

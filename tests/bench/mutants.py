@@ -39,16 +39,14 @@ import coverage
 import pytest
 from hypothesis import Phase, settings
 
+from tests.bench.mistakes import Mutant, mutants
 from tests.conftest import ROOT, data_dir
-from tests.kit.mutants import Mutant, mutants
 
 NUMBER = 200
 KILLED_SHARE = 0.9
 """Share of the mutants that the tests must notice."""
 LEFT_OUT = ("drivers/twins/",)
 """Test equipment."""
-KINDS = ("comparison", "operator", "logic", "number")
-"""Kinds of the mutants that are picked from."""
 TESTS_S = 60.0
 """Tests that a mutant gets, by the time that they take without it, s."""
 SLACK, SLACK_S = 5.0, 10.0
@@ -262,10 +260,10 @@ def modules(root: Path, package: str, only: Sequence[str]) -> Iterator[Mutant]:
         file = path.relative_to(root).as_posix()
         if file.startswith(LEFT_OUT):
             continue
-        for mutant in mutants(path.read_text(), file=file):
+        for mutant in mutants(path.read_text(), file):
             places = (f"/{file}", f"/{file}:{mutant.line}")
             wanted = not only or any(at.endswith(f"/{end}") for at in places for end in only)
-            if mutant.kind in KINDS and wanted:
+            if wanted:
                 yield mutant
 
 

@@ -8,16 +8,17 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
-import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from subprocess import CompletedProcess
 from tempfile import TemporaryDirectory
 from typing import Final
+
+import pytest
 
 from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
 from tests.kit.inside import graspd
@@ -137,23 +138,11 @@ NUMBER: Final = re.compile(r"(?<=[\[:, ])-?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)(
 
 
 def execute(arguments: Sequence[str], folder: Path) -> CompletedProcess[str]:
-    """Run a command in this process and folder."""
-    with contextlib.chdir(folder), _environment(folder):
+    """Run a command in this process and folder, its home, with help texts of a fixed width."""
+    with contextlib.chdir(folder), pytest.MonkeyPatch.context() as patched:
+        patched.setenv("COLUMNS", "80")
+        patched.setenv("HOME", str(folder))
         return graspd(*arguments)
-
-
-@contextlib.contextmanager
-def _environment(folder: Path) -> Iterator[None]:
-    """Set the width of help texts and an empty home; undo that."""
-    former = {name: os.environ.get(name) for name in ("COLUMNS", "HOME")}
-    os.environ.update(COLUMNS="80", HOME=str(folder))
-    try:
-        yield
-    finally:
-        for name, value in former.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
 
 
 def path_of(name: str) -> Path:

@@ -38,7 +38,6 @@ OPERATORS: Final[dict[type[ast.operator], type[ast.operator]]] = {
     ast.BitOr: ast.BitAnd,
     ast.BitXor: ast.BitAnd,
 }
-VERDICTS: Final = {"SLIP": "STABLE", "STABLE": "SLIP", "UNKNOWN": "STABLE"}
 
 Change = Callable[[ast.AST], None]
 """Makes the mistake in a node."""
@@ -54,11 +53,10 @@ class Mutant:
     line: int
     begin: int
     """First line of the statement around it: what runs them runs the mistake."""
-    kind: str
     what: str
     change: Change
-    file: str = ""
-    """From the root, where it is one of a tree."""
+    file: str
+    """From the root."""
 
     def code(self) -> CodeType:
         """The module with the mistake, compiled."""
@@ -67,19 +65,19 @@ class Mutant:
             if place == self.place:
                 self.change(node)
                 break
-        return compile(ast.fix_missing_locations(tree), self.file or "mutant", "exec")
+        return compile(ast.fix_missing_locations(tree), self.file, "exec")
 
     def __str__(self) -> str:
         text = self.source.splitlines()[self.line - 1].strip()
         return f"{self.file}:{self.line}: {self.what} in `{text}`"
 
 
-def mutants(source: str, *, file: str = "") -> Iterator[Mutant]:
+def mutants(source: str, file: str) -> Iterator[Mutant]:
     """All mutants of a module."""
     for place, (node, statement) in enumerate(_nodes(ast.parse(source), None)):
         line = getattr(node, "lineno", 0)
-        for kind, what, change in _changes(node):
-            yield Mutant(source, place, line, statement.lineno, kind, what, change, file)
+        for what, change in _changes(node):
+            yield Mutant(source, place, line, statement.lineno, what, change, file)
 
 
 def _nodes(
@@ -106,44 +104,27 @@ def _is_message(node: ast.AST) -> bool:
     return isinstance(node, ast.JoinedStr)
 
 
-def _changes(node: ast.AST) -> Iterator[tuple[str, str, Change]]:
-    """Kind, description and function of everything that can go wrong in a node."""
+def _changes(node: ast.AST) -> Iterator[tuple[str, Change]]:
+    """Description and function of everything that can go wrong in a node."""
     match node:
         case ast.Compare():
             for place, operator in enumerate(node.ops):
-                for other in COMPARISONS[type(operator)]:
-                    what = f"{type(operator).__name__} becomes {other.__name__}"
-                    yield "comparison", what, _setter("ops", other(), place)
+                for wrong in COMPARISONS[type(operator)]:
+                    what = f"{type(operator).__name__} becomes {wrong.__name__}"
+                    yield what, _setter("ops", wrong(), place)
         case ast.BoolOp():
-            both = isinstance(node.op, ast.And)
-            yield "logic", "and and or change places", _setter("op", (ast.And, ast.Or)[both]())
-            for place in range(len(node.values)):
-                dropped = _setter("values", ast.Constant(both), place)
-                yield "operand", f"operand {place} is dropped", dropped
+            other = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+            yield "and and or change places", _setter("op", other)
         case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as sign, operand=operand):
-            kind = "logic" if isinstance(sign, ast.Not) else "operator"
             twice = ast.UnaryOp(sign, operand)
-            yield kind, f"{type(sign).__name__} is dropped", _setter("operand", twice)
+            yield f"{type(sign).__name__} is dropped", _setter("operand", twice)
         case ast.BinOp(op=sign) | ast.AugAssign(op=sign) if type(sign) in OPERATORS:
-            wrong = OPERATORS[type(sign)]
-            what = f"{type(sign).__name__} becomes {wrong.__name__}"
-            yield "operator", what, _setter("op", wrong())
+            instead = OPERATORS[type(sign)]
+            what = f"{type(sign).__name__} becomes {instead.__name__}"
+            yield what, _setter("op", instead())
         case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
             for changed in _numbers(number):
-                yield "number", f"{number} becomes {changed}", _setter("value", changed)
-        case ast.Attribute(attr=verdict) if verdict in VERDICTS:
-            what = f"{verdict} becomes {VERDICTS[verdict]}"
-            yield "verdict", what, _setter("attr", VERDICTS[verdict])
-    match node:
-        case ast.If() | ast.IfExp():
-            for truth in (True, False):
-                what = f"the condition is {truth}"
-                yield "condition", what, _setter("test", ast.Constant(truth))
-        case ast.Expr(value=value) if not isinstance(value, ast.Constant):
-            yield "statement", "a statement is dropped", _setter("value", ast.Constant(None))
-        case ast.AugAssign():  # of a list
-            nothing = ast.Tuple([], ast.Load())
-            yield "statement", "a statement is dropped", _setter("value", nothing)
+                yield f"{number} becomes {changed}", _setter("value", changed)
 
 
 def _setter(field: str, value: object, place: int | None = None) -> Change:
