@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspd.models import zoo
@@ -113,24 +111,6 @@ def test_the_search_takes_out_the_worst_first(seed: int) -> None:
         out[off.argmax()] = True
     marked = implausible(Electrodes(seen), values, broken.reshape(SHAPE), 6)
     assert np.flatnonzero(marked).tolist() == np.flatnonzero(out).tolist()
-
-
-@settings(max_examples=60)
-@given(
-    st.integers(0, 2**32 - 1),
-    st.integers(0, 15),
-    st.sampled_from([1, 5, 13]),
-)
-def test_the_search_ends_and_never_forgets_what_is_known(
-    seed: int, known: int, at_most: int
-) -> None:
-    _, _, seen = correlated()
-    random = np.random.default_rng(seed)
-    values = random.uniform(0.0, 4095.0, SHAPE)
-    broken = (random.permutation(72) < known).reshape(SHAPE)
-    marked = implausible(Electrodes(seen), values, broken, at_most)
-    assert (marked | ~broken).all()
-    assert marked.sum() <= max(at_most, known)
 
 
 @pytest.fixture(scope="module")

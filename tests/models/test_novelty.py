@@ -43,16 +43,6 @@ def test_the_distance_is_the_root_mean_square_deviation(off: int, refused: bool)
     assert check.never_seen(counts).tolist() == [refused]
 
 
-def test_the_triangle_is_read_row_by_row() -> None:
-    rows = [list(row) for row in diagonal(72, 1e-6)]
-    rows[5][2] = 1.0  # electrode 5 weighs on the third deviation
-    crossed = msgspec.structs.replace(seen(), whitening=tuple(map(tuple, rows)))
-    counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
-    counts[0, 0, 5] += 100
-    counts[1, 0, 2] += 100
-    assert Electrodes(crossed).never_seen(counts).tolist() == [True, False]
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -69,27 +69,6 @@ def trees(**changed: list[Any]) -> Any:  # noqa: ANN401
     )
 
 
-def leaves(tree: Any) -> int:  # noqa: ANN401
-    """Number of leaves below the first node, or more than there are nodes if paths meet."""
-    values = {each.name: list(each.ints) or list(each.strings) for each in tree.attribute}
-    keys = list(zip(values["nodes_treeids"], values["nodes_nodeids"], strict=True))
-    number = 0
-    for first in dict.fromkeys(values["nodes_treeids"]):
-        paths = [keys[values["nodes_treeids"].index(first)]]
-        for step in range(len(keys) + 1):
-            places = [keys.index(each) for each in paths]
-            inner = [place for place in places if values["nodes_modes"][place] != b"LEAF"]
-            number += len(places) - len(inner)
-            if (step == len(keys) and inner) or len(places) > len(keys):
-                return len(keys) + 1
-            paths = [
-                (first, values[f"nodes_{answer}nodeids"][place])
-                for place in inner
-                for answer in ("true", "false")
-            ]
-    return number
-
-
 def tensors(graph: Any) -> Iterator[Any]:  # noqa: ANN401
     yield from graph.initializer
     for node in graph.node:
@@ -114,7 +93,6 @@ def is_sound(model: Any) -> bool:  # noqa: ANN401
         all(node.op_type in onnx_file.OPERATORS.get(node.domain, ()) for node in graph.node)
         and not any(each.external_data or each.data_location for each in tensors(graph))
         and not (inner or graph.sparse_initializer or model.functions or model.training_info)
-        and all(leaves(node) <= 5 for node in graph.node if node.op_type in onnx_file.TREES)
     )
 
 

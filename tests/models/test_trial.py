@@ -125,15 +125,6 @@ def test_the_trial_runs_varied_counts(tmp_path: Path) -> None:
     assert int(done.stdout) > 20
 
 
-def test_what_it_finds_is_said_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "mine.onnx"
-    path.write_bytes(b"nothing")
-    with pytest.raises(ModelError) as error:
-        trial.load(path)
-    assert str(error.value).startswith(f"{path}: not a usable ONNX model")
-    assert len(str(error.value).splitlines()) == 1
-
-
 def giant(folder: Path, side: int) -> Path:
     """A zoo model that also multiplies matrices of `side` rows for minutes."""
     onnx = pytest.importorskip("onnx", reason="needs the extra `train`")

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from graspd.models.bts3 import TABLES
@@ -53,14 +52,6 @@ def test_a_published_table_is_read_whole(bts3_dir: Path) -> None:
         assert (file.name, file.sha256, file.rows) == (name, sha256, rows)
         assert hashlib.sha256(path.read_bytes()).hexdigest() == sha256
         assert unpublished(grasps.files) == []
-
-
-def test_counts_stand_by_finger_and_electrode(bts3_dir: Path) -> None:
-    grasps = read_table(bts3_dir / "palm_side.csv")
-    rows = pd.read_csv(bts3_dir / "palm_side.csv")
-    names = [f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)]
-    np.testing.assert_array_equal(grasps.counts.reshape(-1, 72), rows[names])
-    np.testing.assert_array_equal(grasps.slipped, rows["slipped"])
 
 
 def test_tables_of_a_folder_have_their_order(bts3_dir: Path) -> None:

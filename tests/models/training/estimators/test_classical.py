@@ -20,17 +20,6 @@ COUNTS, SLIPPED = separable_counts(120)
 VECTORS = VectorBuilder(3).build_batch(COUNTS)[0]
 
 
-def test_an_svm_decides_by_the_radial_kernel() -> None:
-    fitted = fit_classical(SvmConfig(3.0, 1.0 / 72.0), VECTORS, SLIPPED, seed=0)
-    vectors = fitted.model.support_vectors_
-    weights, bias = fitted.model.dual_coef_[0], fitted.model.intercept_[0]
-    for reading, margin in zip(VECTORS[:10], fitted.margins(VECTORS[:10]), strict=True):
-        distance = ((vectors - reading) ** 2).sum(axis=1)
-        expected = (weights * np.exp(-distance / 72.0)).sum() + bias
-        assert margin == pytest.approx(expected, abs=1e-9)
-    assert fitted.parameters == vectors.size + len(vectors) + 1
-
-
 def test_a_forest_of_one_mind_has_a_finite_margin() -> None:
     """All trees agree: 0.999 and 0.001, log-odds 6.9068."""
     fitted = fit_classical(ForestConfig(11, None), VECTORS, SLIPPED, seed=0)

@@ -22,7 +22,6 @@ from graspd.models.training.estimators.configs import (
 )
 from graspd.models.training.estimators.networks import (
     build,
-    logits,
     on_another_day,
     optimization,
     reproducible,
@@ -40,26 +39,15 @@ def plain_network(inputs: int = 72) -> nn.Sequential:
     return nn.Sequential(nn.Linear(inputs, 5), nn.ReLU(), nn.Linear(5, 2))
 
 
-@pytest.fixture(scope="module")
-def trained() -> nn.Sequential:
-    return train_network(TINY, IMAGES, SLIPPED, QUICK, seed=1)
-
-
 def _weights(network: nn.Sequential) -> list[float]:
     return [value for tensor in network.state_dict().values() for value in tensor.ravel().tolist()]
 
 
-def test_a_tiny_training_learns_what_can_be_separated(trained: nn.Sequential) -> None:
-    counts, labels = separable_counts(100, seed=8)
-    unseen = TactileImager(3).build_batch(counts)[0]
-    assert ((logits(trained, IMAGES).argmax(axis=1) == 1) == SLIPPED).all()
-    assert ((logits(trained, unseen).argmax(axis=1) == 1) == labels).all()
-
-
-def test_the_seed_alone_decides_the_weights(trained: nn.Sequential) -> None:
+def test_the_seed_alone_decides_the_weights() -> None:
+    trained = _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=1))
     torch.manual_seed(99)  # the state around a training does not matter
-    assert _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=1)) == _weights(trained)
-    assert _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=2)) != _weights(trained)
+    assert _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=1)) == trained
+    assert _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=2)) != trained
 
 
 def test_training_leaves_torch_as_it_was() -> None:
@@ -198,9 +186,3 @@ def test_an_offset_is_of_means_and_spreads_alone() -> None:
     features = shifted(torch.zeros(4000, 26), 0.0, 0.0, 0.7)
     assert torch.equal(features[:, :24], torch.zeros(4000, 24))
     assert features[:, 24:].std(dim=0).numpy() == pytest.approx(0.7, abs=0.04)
-
-
-def test_other_inputs_have_no_other_day() -> None:
-    for shape in ((2, 72), (2, 3, 26)):
-        with pytest.raises(ValueError, match="not session features"):
-            on_another_day(torch.zeros(shape), DayShift())

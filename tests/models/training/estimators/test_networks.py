@@ -21,9 +21,6 @@ from graspd.models.training.estimators.configs import (
 from graspd.models.training.estimators.networks import (
     Beside,
     build,
-    for_inference,
-    for_margin,
-    logits,
     reproducible,
 )
 
@@ -31,25 +28,7 @@ TINY = NetworkConfig(filters=4, hidden=16)
 DEEP = NetworkConfig(
     filters=4, hidden=8, pool=True, second=SecondConvolution(5, kernel=3), dropout=0.4
 )
-PLAIN = NetworkConfig(filters=4, hidden=8, batch_norm=False)
 IMAGE, FEATURES, VECTOR = (12, 11, 3), (78,), (72,)
-
-
-def _unsettled(config: NetworkConfig, shape: tuple[int, ...]) -> nn.Sequential:
-    """A network in evaluation mode, no parameter of which has its neutral value."""
-    with reproducible(seed=3):
-        network = build(config, shape)
-        for layer in network.modules():
-            if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
-                nn.init.uniform_(layer.weight, 0.5, 2.0)
-                nn.init.normal_(layer.bias)
-                assert layer.running_mean is not None
-                assert layer.running_var is not None
-                nn.init.normal_(layer.running_mean)
-                nn.init.uniform_(layer.running_var, 0.5, 2.0)
-            elif isinstance(layer, nn.Conv2d | nn.Linear) and layer.bias is not None:
-                nn.init.normal_(layer.bias)
-    return network.eval()
 
 
 @pytest.mark.parametrize(
@@ -102,7 +81,7 @@ def test_weights_start_as_in_keras() -> None:
 
 def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
     features = np.random.default_rng(5).integers(1, 4096, (3, 78)).astype(np.float32)
-    network = _unsettled(NetworkConfig(filters=4, hidden=8), FEATURES)
+    network = build(NetworkConfig(filters=4, hidden=8), FEATURES).eval()
     beside = network[0]
     assert isinstance(beside, Beside)
     front = beside.look[0](torch.from_numpy(features[:, :72])).numpy()
@@ -112,31 +91,3 @@ def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
     laid = beside(torch.from_numpy(features)).detach().numpy()
     assert laid.shape == (3, 4 * 90 + 6)
     assert np.array_equal(laid[:, -6:], features[:, 72:])
-
-
-@pytest.mark.parametrize(
-    ("config", "shape"),
-    [
-        (DEEP, IMAGE),
-        (PLAIN, IMAGE),
-        (NetworkConfig(4, 8, dropout=0.5), FEATURES),
-        (NetworkConfig(4, 8, batch_norm=False), VECTOR),
-    ],
-)
-def test_folding_batch_norm_and_temperature_changes_no_probability(
-    config: NetworkConfig, shape: tuple[int, ...]
-) -> None:
-    temperature = 2.5
-    inputs = np.random.default_rng(6).normal(size=(50, *shape)).astype(np.float32)
-    network = _unsettled(config, shape)
-    layers = len(network)
-    folded = for_inference(network, temperature)
-    assert not any(
-        word in type(layer).__name__ for layer in folded.modules() for word in ("Norm", "Drop")
-    )
-    scaled = np.exp(logits(network, inputs) / temperature)
-    expected = scaled / scaled.sum(axis=1, keepdims=True)
-    assert np.abs(logits(folded, inputs) - expected).max() < 1e-5
-    assert len(network) == layers, "the trained network itself must stay as it is"
-    stable, slip = logits(network, inputs).T
-    assert logits(for_margin(network), inputs)[:, 0] == pytest.approx(slip - stable, abs=1e-4)
