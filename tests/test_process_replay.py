@@ -7,7 +7,7 @@ import pytest
 from tests.process_replay import commands, messages, verdicts
 from tests.process_replay.__main__ import KINDS, SHOWN_MAX
 from tests.process_replay.commands import lines_apart
-from tests.process_replay.verdicts import entries_apart, is_near, reference
+from tests.process_replay.verdicts import entries_apart, reference
 
 ALL = [(kind, name) for kind in KINDS for name in KINDS[kind].NAMES]
 
@@ -48,12 +48,6 @@ def test_the_references_show_faults_overload_outcomes_and_exit_codes() -> None:
     assert answers == {"None", "contradicts", "unknown boot_id"}
     texts = "".join(commands.path_of(name).read_text() for name in commands.NAMES)
     assert all(f"\nexit code {code}\n" in texts for code in (0, 1, 2))
-
-
-def test_no_reference_is_near_the_threshold() -> None:
-    for name in verdicts.NAMES:
-        for entry in reference(name):
-            assert entry.get("near", False) == is_near(entry)
 
 
 def test_a_verdict_that_changes_is_found() -> None:

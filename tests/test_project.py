@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from graspd.drivers.spi.messages import FIRMWARE
+from tests.bench.attacks.__main__ import ATTACKS
 
 ROOT = Path(__file__).parents[1]
 VERSION = "0.1.0"
@@ -185,3 +186,7 @@ def test_files_that_contributors_are_sent_to_are_there() -> None:
         named = found(page, r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`")
         assert len(named) > 10
         assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_the_page_of_attacks_has_a_row_for_each() -> None:
+    assert found("deploy/ATTACKS.md", r"^\| `([a-z0-9-]+)` \|") == list(ATTACKS)

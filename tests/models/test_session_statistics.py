@@ -53,14 +53,6 @@ def test_what_is_not_finite_changes_nothing() -> None:
     np.testing.assert_array_equal(session.mean, mean)
 
 
-def test_a_reset_session_is_a_new_one() -> None:
-    session = statistics()
-    observe(session, grasps(10))
-    session.reset()
-    assert session.state() == statistics().state()
-    np.testing.assert_array_equal(session.mean, statistics().mean)
-
-
 def test_a_state_of_something_else_is_refused() -> None:
     session, ones = statistics(), (1.0,) * WIDTH
     observe(session, grasps(4))

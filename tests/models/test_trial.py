@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -103,26 +102,6 @@ def test_a_model_with_another_operator_is_refused(tmp_path: Path) -> None:
     for load in (trial.load, TactileModel):
         with pytest.raises(ModelError, match="no model may use: 'Loop'"):
             load(path)
-
-
-SPY = """
-import sys
-from graspd.models import runtime, trial
-run, seen = runtime.TactileModel.run, set()
-def noted(model):
-    seen.add(model.input.tobytes())
-    return run(model)
-runtime.TactileModel.run = noted
-trial.main()
-sys.stdout.write(str(len(seen)))
-"""
-
-
-def test_the_trial_runs_varied_counts(tmp_path: Path) -> None:
-    path = copy(tmp_path, "small-electrodes")
-    command = [sys.executable, "-c", SPY, str(path)]
-    done = subprocess.run(command, input=path.read_bytes(), stdout=subprocess.PIPE, check=True)
-    assert int(done.stdout) > 20
 
 
 def giant(folder: Path, side: int) -> Path:

@@ -35,21 +35,29 @@ def kept(out: Path) -> int:
     return len(list((out / "jobs").rglob("output.pkl")))
 
 
-def test_a_table_of_ones_own_is_measured_alone(tmp_path: Path) -> None:
+def test_a_table_of_ones_own_is_measured_alone_and_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     own, out = tmp_path / "monday.csv", tmp_path / "out"
-    made = table("monday", 80, 0)
     objects = tuple(OBJECTS[grasp % 4] for grasp in range(80))
-    write(own, dataclasses.replace(made, objects=objects))
-    options = "svm-session", "--own", own, "--out", out, "--seeds", "1"
-    done = graspd("evaluate", *options)
-    assert [line.split()[:2] for line in done.stdout.splitlines()] == [
-        ["svm-session", "cv"],
-        ["svm-session", "objects"],
-    ]
+    write(own, dataclasses.replace(table("monday", 80, 0), objects=objects))
+    words = "evaluate", "svm-session", "--own", own, "--out", out, "--seeds", "2", "--json"
+    done = graspd(*words)
     assert done.stderr == (
         "graspd evaluate: takes 4 folds: 10 folds need 10 objects, there are 4\n"
     )
-    assert kept(out) == 2 * 4
+    figures = json.loads(done.stdout)
+    assert [(one["protocol"], one["seed"], one["fold"]) for one in figures] == [
+        (protocol, seed, fold)
+        for protocol in ("cv", "objects")
+        for seed in range(2)
+        for fold in range(4)
+    ]
+    assert {one["system"] for one in figures} == {"svm-session"}
+    assert all(0.5 < one["f1"] <= 1.0 for one in figures if one["protocol"] == "cv")
+    assert kept(out) == 2 * 2 * 4
+    monkeypatch.setattr(frame, "judged", None)
+    assert json.loads(graspd(*words).stdout) == figures
 
 
 def test_fridays_grasps_are_judged_by_mondays_model(tmp_path: Path) -> None:
@@ -109,22 +117,6 @@ def test_a_quick_run_writes_summaries_and_table(data: Path, tmp_path: Path) -> N
     assert "svm-session session (n50): F1 " in done.stdout
     assert "palm_45.csv is not the published table" in done.stderr
     assert "graspd evaluate: 17 trainings, 1 at once: about 2 s of processor time" in done.stderr
-
-
-def test_what_is_finished_is_not_run_again(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = "svm", "--protocol", "cv", "--data", data, "--out", tmp_path, "--json", "--seeds", "2"
-    first = json.loads(graspd("evaluate", *options).stdout)
-    monkeypatch.setattr(frame, "judged", None)
-    assert json.loads(graspd("evaluate", *options).stdout) == first
-    assert [(one["seed"], one["fold"]) for one in first] == [
-        (seed, fold) for seed in range(2) for fold in range(10)
-    ]
-    assert {(one["system"], one["protocol"], one["variant"]) for one in first} == {
-        ("svm", "cv", "none")
-    }
-    assert all(0.5 < one["f1"] <= 1.0 for one in first)
 
 
 def test_wrong_input_is_one_line_and_exit_code_2(data: Path, tmp_path: Path) -> None:

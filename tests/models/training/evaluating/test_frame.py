@@ -21,6 +21,7 @@ from graspd.models.contract import VectorInput
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.estimators.configs import ForestConfig, MlpConfig, SvmConfig
 from graspd.models.training.evaluating import frame
+from graspd.models.training.evaluating.broken import KINDS, NUMBERS, broken_study
 from graspd.models.training.evaluating.frame import (
     Job,
     LostWorkerError,
@@ -171,3 +172,14 @@ def test_an_interrupted_training_is_not_a_result(monkeypatch: pytest.MonkeyPatch
     system = System("mlp", VectorInput(), MlpConfig((4,)))
     with pytest.raises(KeyboardInterrupt):
         judged(Job(system, "cv", 0, 0, 4), GRASPS)
+
+
+def test_dead_electrodes_cost_less_once_they_are_repaired() -> None:
+    study = broken_study(SYSTEMS["svm-session"], sessions(150), seed=1)
+    assert len(study["broken"]) == len(KINDS) * len(NUMBERS)
+    assert study["grasps"] == 135
+    # A tenth of the labels is wrong, so 90 % is the best that anybody could reach.
+    assert study["sound"] > 0.8
+    dead = next(b for b in study["broken"] if b["reads"] == "at 0" and b["number"] == 12)
+    assert dead["unnoticed"] < dead["known"]
+    assert dead["known"] > study["sound"] - 0.05

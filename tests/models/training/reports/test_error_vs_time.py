@@ -71,16 +71,6 @@ def test_the_report_has_error_and_time_of_every_model(
     assert {row["kind"] for row in found["rows"]} == {"model", "peer"}
 
 
-def test_each_model_of_the_whole_hand_has_a_row(folder: Path, found: dict[str, Any]) -> None:
-    drawn = (folder / "error-vs-time.svg").read_text()
-    whole = [row for row in found["rows"] if len(row["fingers"]) == 3]
-    for row in whole:
-        label = row["name"] + " (default)" * (row["name"] == "small-session")
-        assert drawn.count(f"<!-- {label} -->") == 1
-    assert not any(f"<!-- {row['name']} -->" in drawn for row in found["rows"] if row not in whole)
-    assert all(f"<!-- {asked}" in drawn for _, asked in error_vs_time.PANELS)
-
-
 def test_a_page_has_the_table_of_the_whole_hand(folder: Path, found: dict[str, Any]) -> None:
     page = (folder / "page.md").read_text()
     assert page.startswith("Above.\n\n**made with --quick")

@@ -18,7 +18,7 @@ pytest.importorskip("torch", reason="needs the extra `train`")
 pytest.importorskip("matplotlib", reason="needs the extra `report`")
 
 from graspd.models import zoo
-from graspd.models.training.arrays import Bools, Floats, Floats32, Ints
+from graspd.models.training.arrays import Ints
 from graspd.models.training.data.datasets import Grasps, read_all
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.reports import streams as module
@@ -49,22 +49,16 @@ def stream(seed: int = 0) -> Stream:
     slipped = random.random(GRASPS) < 0.5
     features = random.normal(0.0, 1.0, (GRASPS, 6)).astype(np.float32)
     features[:, 0] = np.where(slipped, 1.0, -1.0) * random.uniform(0.5, 2.0, GRASPS)
-    return stream_of(random.normal(0.0, 1.0, GRASPS), features, slipped, seed)
-
-
-def stream_of(
-    margins: Floats, features: Floats32, slipped: Bools, fold: int, refused: object = False
-) -> Stream:
     rows = {
-        "session": fold,
+        "session": seed,
         "split": 0,
-        "fold": fold,
+        "fold": seed,
         "day": "A",
         "table": "palm_45",
         "order": "random",
-        "grasp": np.arange(len(slipped)),
-        "margin": margins,
-        "refused": refused,
+        "grasp": np.arange(GRASPS),
+        "margin": random.normal(0.0, 1.0, GRASPS),
+        "refused": False,
         "published": -1.0,
         "slipped": slipped,
     }
