@@ -68,12 +68,6 @@ def test_a_state_of_something_else_is_refused() -> None:
     assert session.grasps == 4
 
 
-def test_a_prior_without_spread_or_weight_is_refused() -> None:
-    for spread, weight in ((0.0, 1.0), (np.nan, 1.0), (1.0, 0.0)):
-        with pytest.raises(ValueError, match="above zero"):
-            SessionStatistics(np.zeros(2), np.full(2, spread), weight)
-
-
 @settings(max_examples=50)
 @given(
     st.lists(st.lists(st.floats(-1e6, 1e6, width=32), min_size=WIDTH, max_size=WIDTH), max_size=40)

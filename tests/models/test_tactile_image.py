@@ -126,16 +126,6 @@ def test_not_a_number_has_no_image() -> None:
     assert np.isfinite(image).all()
 
 
-@pytest.mark.parametrize(
-    ("shape", "step"), [((12, 11, 2), 1), ((11, 12, 3), 1), ((396,), 1), ((12, 11, 6), 2)]
-)
-def test_a_buffer_of_another_shape_or_with_gaps_is_refused(
-    shape: tuple[int, ...], step: int
-) -> None:
-    with pytest.raises(ValueError, match="C-contiguous"):
-        TactileImager(3).build(np.ones((3, 24)), np.empty(shape, np.float32)[..., ::step])
-
-
 @pytest.mark.parametrize("fill", ["neighbour-mean", "least-contact"])
 def test_images_of_a_user_are_the_filled_ones(fill: str) -> None:
     drawn = np.random.default_rng(7).integers(1, 4096, (2, 3, 24)).tolist()
