@@ -220,24 +220,3 @@ def test_a_replay_outlasts_a_sleep_of_the_computer(
         assert process.wait(TIMEOUT_S) == 0
     grasps = {json.loads(line)["grasp"] for line in lines}
     assert grasps == set(range(1, DEMO_TABLE.read_text().count("\n")))
-
-
-def replace_cell(text: str) -> str:
-    header, first, *rest = DEMO_TABLE.read_text().splitlines()
-    cells = first.split(",")
-    cells[2] = text
-    return "\n".join([header, ",".join(cells), *rest]) + "\n"
-
-
-@pytest.mark.parametrize("text", ["4096", "2602.5"])
-def test_a_malformed_count_is_repaired_and_reported(tmp_path: Path, text: str) -> None:
-    recording = tmp_path / "grasps.csv"
-    recording.write_text(replace_cell(text))
-    result = graspd("replay", recording, "--json")
-    assert result.returncode == 0, result.stderr
-    first, second, *_ = (json.loads(line) for line in result.stdout.splitlines())
-    assert (first["valid"], first["repaired"]) == (True, ["ff_1"])
-    assert "ff_1" not in second["repaired"]
-    strict = graspd("replay", recording, "--strict", "--json")
-    assert strict.returncode == 2
-    assert f"{recording}, line 2, column ff_biotac_1: " in strict.stderr.splitlines()[-1]

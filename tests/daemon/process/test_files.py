@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from graspd.daemon.process.files import read_regular, write_atomically
-from graspd.extras import installer, needs
-from graspd.models.training.evaluating.files import markdown_table
+from graspd.extras import installer
 
 
 def test_a_replaced_file_has_the_given_mode(tmp_path: Path) -> None:
@@ -70,16 +69,6 @@ def test_other_things_than_regular_files_are_refused_at_once(tmp_path: Path) -> 
         read_regular(tmp_path / "nothing", 10)
 
 
-def test_a_missing_package_is_named_with_its_extra() -> None:
-    absent = ModuleNotFoundError("No module named 'rich.text'", name="rich.text")
-    assert needs("watch", "watch", absent) == (
-        f"watch needs the package 'rich': run {sys.executable} -m pip install '.[watch]' in the "
-        "folder of graspd's source"
-    )
-    with pytest.raises(ModuleNotFoundError, match=r"graspd\.no"):
-        needs("watch", "watch", ModuleNotFoundError("graspd.no", name="graspd.no"))
-
-
 @pytest.mark.parametrize(
     ("file", "content", "command"),
     [
@@ -98,12 +87,3 @@ def test_packages_are_added_by_what_made_the_environment(
     assert installer() == f"'{sys.executable}' -m pip install"
     (environment / file).write_text(content)
     assert installer() == command.format(environment)
-
-
-def test_a_table_is_markdown_with_numbers_to_the_right() -> None:
-    assert list(markdown_table(("name", "us"), [("a|b", "1"), ("c", "20")], right={"us"})) == [
-        "| name | us |",
-        "| --- | ---: |",
-        "| a\\|b | 1 |",
-        "| c | 20 |",
-    ]

@@ -40,45 +40,6 @@ def test_a_job_wakes_the_loop_and_gives_one_result(
     assert worker.filenos == []
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(5), KeyError()])
-def test_a_job_that_raises_stops_no_later_one(worker: Worker[object], error: Exception) -> None:
-    def fail() -> object:
-        raise error
-
-    assert worker.submit(fail)
-    assert worker.take(PATIENCE_S) is error
-    assert worker.submit(lambda: 1)
-    assert worker.take(PATIENCE_S) == 1
-
-
-def test_a_job_waits_for_the_result_before_it(worker: Worker[object]) -> None:
-    go = threading.Event()
-    assert worker.submit(go.wait)
-    assert worker.take() is None
-    assert not worker.submit(lambda: 2)
-    go.set()
-    readable, _, _ = select.select(worker.filenos, [], [], PATIENCE_S)
-    assert readable
-    assert not worker.submit(lambda: 2)
-    assert worker.take() is True
-    assert worker.submit(lambda: 3)
-    assert worker.take(PATIENCE_S) == 3
-
-
-def test_close_leaves_a_job_that_hangs() -> None:
-    worker: Worker[object] = Worker("slow")
-    descriptors = set(os.listdir("/proc/self/fd"))
-    go = threading.Event()
-    assert worker.submit(go.wait)
-    assert not worker.close(0.05)
-    assert worker.filenos == []
-    assert worker.take() is None
-    go.set()
-    for thread in named_slow():
-        thread.join(PATIENCE_S)
-    assert set(os.listdir("/proc/self/fd")) == descriptors
-
-
 def test_a_worker_that_was_closed_can_start_again() -> None:
     worker: Worker[object] = Worker("slow")
     go = threading.Event()

@@ -18,7 +18,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.publish.messages import OutcomeMessage, encode
 from graspd.daemon.record.export import collect
-from graspd.daemon.record.frames import read_grasps, read_recording
+from graspd.daemon.record.frames import read_grasps
 from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.record.topics import Judged, flat
 from graspd.drivers.base import ElectrodeFault, RecordingError, TactileReading
@@ -78,14 +78,6 @@ def sweeps(number: int, seed: int = 0) -> list[NDArray[np.uint16]]:
     """Counts as those of grasps, each electrode different in each sweep: all fresh."""
     base = np.random.default_rng(seed).integers(1500, 2500, (3, 24))
     return [(base + 37 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
-
-
-def record(path: Path, counts: NDArray[np.uint16]) -> None:
-    """A recording of one grasp with these counts; it slips."""
-    writer = Writer(path)
-    writer.judged(1, counts)
-    writer.outcome(1, "slip")
-    writer.close()
 
 
 def test_a_row_is_judged_unless_electrodes_are_broken(
@@ -239,16 +231,6 @@ def test_without_any_outcome_nothing_is_written(tmp_path: Path) -> None:
 # Tables of pandas.
 
 
-def test_a_grasp_table_is_what_pandas_itself_reads(tmp_path: Path) -> None:
-    expected = pd.read_csv(DEMO_TABLE)
-    got = read_grasps(DEMO_TABLE)
-    assert set(got.columns) == set(expected.columns)
-    assert got["slipped"].dtype == bool
-    pd.testing.assert_frame_equal(got, expected[got.columns], check_dtype=False)
-    got.to_parquet(tmp_path / "grasps.parquet")
-    pd.testing.assert_frame_equal(read_grasps(tmp_path / "grasps.parquet"), got)
-
-
 def test_a_stream_or_a_table_without_outcomes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="is a stream"):
         read_grasps(DEMO_RECORDING)
@@ -256,9 +238,3 @@ def test_a_stream_or_a_table_without_outcomes_is_refused(tmp_path: Path) -> None
     pd.read_csv(DEMO_TABLE).drop(columns="slipped").to_csv(table, index=False)
     with pytest.raises(RecordingError, match="no column `slipped`"):
         read_grasps(table)
-
-
-def test_a_file_without_electrodes_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(RecordingError, match="no column of electrodes is known"):
-        read_recording(tmp_path / "other.csv")

@@ -129,24 +129,17 @@ def test_readings_of_another_run_are_refused(
         assert driver.counters.readings == 10
 
 
-def lines(*kinds: str) -> list[tuple[str, bytes]]:
-    """Topics and contents; `stale` and `stable` are verdicts."""
-    verdicts = {
-        "stale": b'{"reasons": ["stale"]}',
-        "stable": b'{"reasons": []}',
-    }
-    reading = json.dumps(
-        {
-            **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": START_NS},
-            **{"fingers": ["ff"], "counts": [1] * 24, "faults": [0] * 24},
-        }
-    ).encode()
-    return [
-        ("verdict", verdicts[kind])
-        if kind in verdicts
-        else (kind, reading if kind == "tactile" else b"{}")
-        for kind in kinds
-    ]
+READING = {
+    **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": START_NS},
+    **{"fingers": ["ff"], "counts": [1] * 24, "faults": [0] * 24},
+}
+LINES: dict[str, tuple[str, object]] = {
+    "tactile": ("tactile", READING),
+    "stale": ("verdict", {"reasons": ["stale"]}),
+    "stable": ("verdict", {"reasons": []}),
+    "dropped": ("dropped", {}),
+}
+"""Topics and contents."""
 
 
 @pytest.mark.parametrize(
@@ -166,23 +159,17 @@ def test_a_reading_before_a_loss_is_late_without_a_verdict(
 ) -> None:
     path = tmp_path / "a.mcap"
     file = McapWriter(path, header("ff", joints=False))
-    for topic, content in lines(*recorded):
-        file.write(f"{topic}.right".encode(), content, START_NS)
+    for topic, content in (LINES[name] for name in recorded):
+        file.write(f"{topic}.right".encode(), json.dumps(content).encode(), START_NS)
     file.close()
     if is_cut:
         path.write_bytes(path.read_bytes()[:-1])
-    found: list[bool] = []
-    late = False
-
-    def note(event: RecordedEvent) -> None:
-        nonlocal late
-        late = late or isinstance(event, Late)
-
+    found, events = list[bool](), list[RecordedEvent]()
     with McapReplayDriver([path], ("ff",)) as driver:
-        driver.on_event = note
+        driver.on_event = events.append
         while not driver.exhausted:
-            for _ in driver.read_ready():
-                found.append(late)
-                late = False
+            if driver.read_ready():
+                found.append(any(isinstance(event, Late) for event in events))
+                events.clear()
         assert driver.counters.cut_off == is_cut
     assert found == called_late

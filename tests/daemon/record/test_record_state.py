@@ -245,33 +245,24 @@ def test_a_later_file_judges_as_then_after_a_rest(
     assert compared >= 2
 
 
-def test_exchanged_sensors_and_their_return_are_played_again(
+def test_exchanged_sensors_and_late_readings_are_played_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Readings that only the network's time made late are late again too."""
     daemon = Daemon(tmp_path, monkeypatch)
     expected, states = [], []
+    ages_ms = {7: (101, 101), 8: (101, 120), 20: (50, 101), 31: (0, 200), 32: (100, 100)}
     for reading in sweeps()[:1700]:
         if reading.seq in (1250, 1500):
             assert daemon.pipeline.session is not None
             states.append(daemon.pipeline.session.state())
             known = Exchanged(states[0] if reading.seq == 1500 else None)
             daemon.pipeline.sensors_exchanged(known)
-        expected.append(daemon.judge(reading))
+        expected.append(daemon.judge(reading, ages_ms.get(reading.seq % 50, (0, 0))))
     daemon.recorder.close()
     assert states[0].grasps > 3 > states[1].grasps
     assert expected[1249].reasons != expected[1250].reasons
-    assert again(*files(tmp_path)) == expected
-
-
-def test_late_readings_are_late_again_in_the_replay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Readings that only the network's time made late are late again too."""
-    daemon = Daemon(tmp_path, monkeypatch)
-    ages_ms = {7: (101, 101), 8: (101, 120), 20: (50, 101), 31: (0, 200), 32: (100, 100)}
-    expected = [daemon.judge(each, ages_ms.get(each.seq % 50, (0, 0))) for each in sweeps()[:1000]]
-    daemon.recorder.close()
     late = [each for each in expected if Reason.STALE in each.reasons]
-    assert len(late) == 1000 // 50 * 4
+    assert len(late) == 1700 // 50 * 4
     assert {each.moment.judges for each in late} == {False, True}
     assert again(*files(tmp_path)) == expected

@@ -8,21 +8,20 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.exchange import NOTHING_KNOWN, Exchanged
+from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.record.player import McapReplayDriver
-from graspd.daemon.record.topics import Topic, flat, schema_of, schemas, table
+from graspd.daemon.record.topics import Topic, schemas
 from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
 from graspd.models.layout import D1
 from graspd.models.session_statistics import SessionState
 from graspd.models.trust.learner import LearnerState
-from tests.daemon.record.recorded import files, messages, recorder
+from tests.daemon.record.recorded import files, recorder
 from tests.daemon.watch.watch_fakes import tactile, verdict
 
 PLAIN = ("boolean", "string", "number", "integer")
@@ -59,36 +58,6 @@ def test_a_viewer_can_read_the_schema_of_every_topic(topic: Topic) -> None:
     schema = json.loads(text)
     assert schema["type"] == "object"
     assert list(faults(schema, topic)) == []
-
-
-def test_a_type_with_two_meanings_has_no_schema() -> None:
-    class Either(msgspec.Struct):
-        value: int | str
-
-    with pytest.raises(TypeError, match="no viewer can read"):
-        schema_of(Either)
-
-
-def test_null_is_left_out_and_a_table_is_one_list() -> None:
-    content = {"a": None, "b": {"c": None, "d": 0}, "e": [[1, 2], [3, 4]], "f": [], "g": False}
-    assert flat(content) == {"b": {"d": 0}, "e": [1, 2, 3, 4], "f": [], "g": False}
-
-
-def test_an_unknown_finger_is_a_state_of_its_own() -> None:
-    felt = {"ff": "slide", "mf": None}
-    told = {"fingers": {"ff": "slide", "mf": "unknown"}, "motion": {}}
-    assert flat({"fingers": felt, "motion": {"ff": None}}) == told
-    fields = json.loads(schemas()[Topic.VERDICT][1])["properties"]["fingers"]["properties"]
-    assert set(fields) == {"ff", "mf", "rf", "lf", "th"}
-    assert fields["ff"] == {"type": "string", "enum": ["free", "touch", "slide", "unknown"]}
-    names = {"fingers": ["ff", "mf"]}  # of a reading
-    assert flat(names) == names
-
-
-@pytest.mark.parametrize("rows", [1, 3])
-def test_a_list_of_counts_becomes_the_table_again(rows: int) -> None:
-    counts = np.arange(24 * rows).reshape(rows, 24).tolist()
-    assert table(flat(counts)) == counts
 
 
 def reading(counts: NDArray[np.int64], faulty: tuple[int, ...] = ()) -> object:
@@ -189,56 +158,38 @@ def test_a_verdict_is_said_when_it_changes_and_not_again() -> None:
     assert said(viewer, "verdict", {**slip, "p_slip": 0.9}) == []
 
 
-def recorded(folder: Path) -> list[tuple[str, dict[str, Any]]]:
-    (path,) = files(folder)
-    return [(kind, content) for kind, content in messages(path) if kind != "image"]
+KNOWN = Exchanged(
+    SessionState(weight=2.5, grasps=3, mean=(0.1, 1e-9), squares=(4.0, 0.0)),
+    LearnerState(outcomes=4, mean=bytes(range(16)), covariance=b"\xff" * 32),
+    proven=4,
+)
+ASKED, SKIPPED = Topic.ASKED, Topic.SKIPPED
 
 
-def test_questions_in_a_row_are_one_event(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("events", "recorded"),
+    [
+        ([ASKED, ASKED], [ASKED]),  # questions in a row are one
+        ([ASKED, SKIPPED, ASKED], [ASKED, SKIPPED, ASKED]),
+        ([ASKED, KNOWN, ASKED], [ASKED, KNOWN, ASKED]),
+    ],
+    ids=["in a row", "around a loss", "around an exchange"],
+)
+def test_events_come_back_in_order_as_they_were(
+    tmp_path: Path, events: list[Topic | Exchanged], recorded: list[Topic | Exchanged]
+) -> None:
     writing = recorder(tmp_path)
-    for number in range(3):
-        if number:
-            writing.on_event(LoopEvent.ASKED)
-            writing.on_event(LoopEvent.ASKED)
-        writing.send(b"tactile.right", tactile(number, *REST.tolist()))
-    writing.close()
-    found = recorded(tmp_path)
-    assert [kind for kind, _ in found] == ["tactile", "asked", "tactile", "asked", "tactile"]
-
-
-@pytest.mark.parametrize("event", ["skipped", "announced", "exchanged"])
-def test_questions_around_an_event_stay_around_it(tmp_path: Path, event: str) -> None:
-    writing = recorder(tmp_path)
-    writing.on_event(LoopEvent.ASKED)
-    if event == "exchanged":
-        writing.exchanged(NOTHING_KNOWN)
-    else:
-        writing.on_event(LoopEvent(event))
-    writing.on_event(LoopEvent.ASKED)
+    for event in events:
+        if isinstance(event, Exchanged):
+            writing.exchanged(event)
+        else:
+            writing.on_event(LoopEvent(event))
     writing.send(b"tactile.right", tactile(0, *REST.tolist()))
     writing.close()
-    found = recorded(tmp_path)
-    assert [kind for kind, _ in found] == ["asked", event, "asked", "tactile"]
-
-
-def play(path: Path) -> list[object]:
-    """Readings and questions, in their order."""
     found: list[object] = []
-    driver = McapReplayDriver([path], ("th", "ff"))
-    driver.on_event = found.append
-    with driver:
+    with McapReplayDriver(files(tmp_path), ("th", "ff")) as driver:
+        driver.on_event = found.append
         while not driver.exhausted:
-            found.extend(driver.read_ready())
-    assert driver.counters.malformed == 0
-    return found
-
-
-def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
-    session = SessionState(weight=2.5, grasps=3, mean=(0.1, 1e-9), squares=(4.0, 0.0))
-    learned = LearnerState(outcomes=4, mean=bytes(range(16)), covariance=b"\xff" * 32)
-    known = Exchanged(session, learned, proven=4)
-    writing = recorder(tmp_path)
-    writing.exchanged(known)
-    writing.close()
-    (path,) = files(tmp_path)
-    assert play(path) == [known]
+            driver.read_ready()
+        assert driver.counters.malformed == 0
+    assert found == recorded

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import itertools
 import os
 from collections.abc import Callable, Iterator
@@ -20,14 +18,12 @@ from msgspec.structs import replace
 
 from graspd.daemon.session.file import KeptSession, SessionFileError, load
 from graspd.daemon.session.folder import SessionFolder
-from graspd.daemon.trust.lift_book import LIFTS_MAX
 from graspd.daemon.trust.trust import Trust
 from graspd.models.session_statistics import SessionState
 from graspd.models.trust.risk import RiskLimits
 from tests.daemon.session.learning import (
     FINGERS,
     INPUTS,
-    calibration,
     judge,
     kept_in,
     sealed,
@@ -118,18 +114,6 @@ def test_a_count_of_the_risk_is_not_an_empty_session() -> None:
     assert not KeptSession(None, FINGERS, {}, part.state()).is_empty
 
 
-def test_starts_without_a_grasp_evict_no_session(tmp_path: Path) -> None:
-    taught = [KeptSession(state(each), FINGERS, {}) for each in (5, 4, 3, 2, 1)]
-    with SessionFolder(tmp_path) as folder:
-        folder.save(taught)
-        for serial in "AB":
-            others = [each for each in folder.load().values() if isinstance(each, KeptSession)]
-            folder.save([KeptSession(None, FINGERS, {"ff": serial}), *others])
-            assert kept_grasps(tmp_path) == [0, 5, 4, 3, 2, 1]
-        folder.save([KeptSession(state(6), FINGERS, {}), *taught])
-    assert kept_grasps(tmp_path) == [6, 5, 4, 3, 2]
-
-
 @given(st.integers(0, 1 << 20), st.integers(0, 255), st.sampled_from(("byte", "cut", "insert")))
 @settings(max_examples=300, deadline=None)
 def test_a_damaged_file_becomes_no_other_state(place: int, value: int, kind: str) -> None:
@@ -190,17 +174,6 @@ def test_a_file_in_place_of_the_folder_stays(tmp_path: Path) -> None:
     assert path.read_bytes() == b"?"
 
 
-def test_a_disk_without_locks_is_not_in_use(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def flock(*_: object) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises(SessionFileError, match="cannot keep the session: No locks available"):
-        SessionFolder(tmp_path).lock()
-
-
 def test_files_with_other_names_are_let_alone(tmp_path: Path) -> None:
     names = {f"{stem}.session" for stem in ("0", "007", "٣", "9" * 10)}
     for name in names:
@@ -209,15 +182,3 @@ def test_files_with_other_names_are_let_alone(tmp_path: Path) -> None:
         assert folder.load() == {}
         save(folder, 1)
     assert {path.name for path in tmp_path.iterdir()} == {*names, "lock", "1.session"}
-
-
-def test_a_full_book_of_open_lifts_fits_the_file(tmp_path: Path) -> None:
-    part = trust(inputs=5 * 26)
-    for grasp in range(LIFTS_MAX + 1):
-        judge(part, grasp)
-    with SessionFolder(tmp_path / "right") as folder:
-        folder.save([KeptSession(calibration().state(), FINGERS, {}, part.state())])
-    (kept,) = kept_in(folder.path)
-    assert kept.trust is not None
-    assert kept.trust == part.state()
-    assert (folder.path / "1.session").stat().st_size < 1 << 20

@@ -106,12 +106,6 @@ def hears(door: KeyedDoor, feed: Feed, until: Callable[[bool], bool]) -> bool:
     return b"verdict.right" in heard
 
 
-def test_a_known_key_is_let_in(tmp_path: Path, door: KeyedDoor) -> None:
-    with Feed(door.endpoint, keys_of(tmp_path)) as feed:
-        hears(door, feed, lambda heard: heard)
-        assert feed.link == "connected"
-
-
 @pytest.mark.parametrize(
     ("own", "server", "said"),
     [

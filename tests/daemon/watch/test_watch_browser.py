@@ -110,14 +110,14 @@ def test_unknown_motion_is_not_a_bar_of_zero(page: Page, talker: Talker, browser
             ["unknown", "0%", "motion not known"],
         ),
     )
-    talker.more |= {"still_ms": 0.0, "motion": {"ff": 2.0, "th": 9.0}}
+    talker.more |= {"still_ms": 0.0, "motion": {"ff": 9.0, "th": 0.4}}
     see(
         browser,
         "stable",
         reads("still", "0 ms"),
         bars(
-            ["moving", "80%", "motion 2.0 / 1.3 \u03c3"],
-            ["moving", "100%", "motion 9.0 / 1.0 \u03c3"],
+            ["moving", "100%", "motion 9.0 / 1.3 \u03c3"],
+            ["still", "20%", "motion 0.4 / 1.0 \u03c3"],
         ),
     )
     talker.decision = None
@@ -257,3 +257,44 @@ def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> N
         note_tones(browser)
         late_s = 5.0
         browser.wait_for("tones.includes('silent')")
+
+
+def test_a_chosen_grasp_shows_its_image_until_left(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    show(browser, page, talker, Decision.STABLE)
+    browser.wait_for("document.querySelectorAll('figure canvas').length == 2")
+    talker.decision = Decision.UNKNOWN
+    see(browser, "waiting")
+    deepest = "document.querySelector('figcaption :last-child').innerText"
+    browser.wait_for(f"{deepest} == '0 counts'")  # of the open hand
+    browser.value("document.querySelector('.grasps button').click()")
+    past = "Grasp 7 as it was judged: stable, slip probability 25 %"
+    assert text(browser, "images") == past
+    assert browser.value(deepest) != "0 counts"
+    talker.decision = None
+    see(browser, "silent")
+    assert text(browser, "images") == past
+    browser.value("document.querySelector('.live').click()")
+    assert text(browser, "images") == "Tactile images and motion"
+    assert browser.value("document.querySelectorAll('figure').length") == 0
+
+
+def test_the_timeline_is_read_by_pointing_and_can_be_paused(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    show(browser, page, talker, Decision.SLIP)
+    browser.wait_for("/slip [2-9] s/.test(document.querySelector('.timeline').ariaLabel)")
+    browser.value("document.querySelector('.pause').click()")
+    assert re.fullmatch(r"Paused: five minutes until \d\d:\d\d:\d\d", text(browser, "minutes"))
+    talker.decision = Decision.STABLE
+    see(browser, "stable")  # the verdict continues
+    box = browser.value(
+        "(b => [b.right, b.top])(document.querySelector('.timeline').getBoundingClientRect())"
+    )
+    browser.ask("Input.dispatchMouseEvent", type="mouseMoved", x=box[0] - 6, y=box[1] + 20)
+    at = r"/^\d\d:\d\d:\d\d: slip.*; highest slip probability 75 %$/"
+    browser.wait_for(f"{at}.test(document.querySelector('.at').innerText)")
+    assert "stable" not in browser.value("document.querySelector('.timeline').ariaLabel")
+    browser.value("document.querySelector('.pause').click()")
+    browser.wait_for("document.querySelector('.timeline').ariaLabel.includes('stable')")
