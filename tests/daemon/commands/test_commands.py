@@ -10,7 +10,6 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -44,15 +43,7 @@ def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) ->
     assert "Traceback" not in result.stderr
 
 
-CAN, PALM = '[tactile]\ndriver = "can"\n', '[tactile]\ndriver = "palm"\n'
-
-
-def checked(folder: Path, text: str) -> dict[str, Any]:
-    """What `graspd check` tells programs of a scene that is right."""
-    result = graspd("check", written(folder, text), "--json")
-    assert result.returncode == 0, result.stderr
-    document: dict[str, Any] = json.loads(result.stdout)
-    return document
+PALM = '[tactile]\ndriver = "palm"\n'
 
 
 def test_run_names_the_process_that_has_the_port(
@@ -75,75 +66,6 @@ def test_run_names_the_process_that_has_the_port(
             result = graspd("run", scene)
             assert result.returncode == 1, result.stderr
             assert f"Address already in use: PID {pid}, " in result.stderr
-
-
-TWO = '[hand]\nname = "{}"\n[tactile]\ndriver = {}\n[publish]\nendpoint = "{}"\n'
-
-
-@pytest.mark.parametrize(
-    ("hand", "tactile", "endpoint", "shared"),
-    [
-        ("left", '"spi"\nport = "/dev/b"', "tcp://127.0.0.1:6001", []),
-        (
-            "right",
-            '"spi"\nport = "/dev/b"',
-            "tcp://127.0.0.1:6001",
-            ["hand.name", "session.folder"],
-        ),
-        ("left", '"spi"\nport = "/dev/../dev/a"', "tcp://127.0.0.1:6001", ["tactile.port"]),
-        ("left", '"can"', "tcp://[::ffff:127.0.0.1]:6000", ["endpoint"]),
-    ],
-)
-def test_check_says_what_two_scenes_cannot_share(
-    tmp_path: Path, hand: str, tactile: str, endpoint: str, shared: list[str]
-) -> None:
-    right = written(tmp_path, TWO.format("right", '"spi"\nport = "/dev/a"', "tcp://127.0.0.1:6000"))
-    other = tmp_path / "other.toml"
-    other.write_text(TWO.format(hand, tactile, endpoint))
-    result = graspd("check", right, other)
-    _, _, told = result.stderr.partition("cannot run together: the same ")
-    assert re.findall(r"(?:^|, )([a-z.]+)", told) == shared
-    assert result.returncode == 0
-
-
-@pytest.mark.parametrize(
-    ("source", "only_from", "warned"),
-    [
-        ("udp://0.0.0.0:9870", "", True),
-        ("udp://[::]:9870", "", True),
-        ("udp://0.0.0.0:9870", "10.0.0.2", False),
-        ("udp://[::]:9870", "fd00::2", False),
-        ("udp://127.0.0.1:9870", "", False),
-        ("udp://10.0.0.1:9870", "", False),
-    ],
-)
-def test_check_warns_of_udp_that_anybody_can_send_to(
-    tmp_path: Path, source: str, only_from: str, warned: bool
-) -> None:
-    heard = f'source = "{source}"\n' + (f'only_from = "{only_from}"\n' if only_from else "")
-    stream = f'[joints]\ndriver = "stream"\n{heard.replace(":98", ":99")}'
-    told = checked(tmp_path, f"{PALM}{heard}{stream}")["warnings"]
-    assert [warning[: warning.index(" ")] for warning in told] == ["[tactile]", "[joints]"] * warned
-    assert all("name its sender with only_from" in warning for warning in told)
-
-
-@pytest.mark.parametrize(
-    ("tactile", "absent"),
-    [
-        ('driver = "spi"\nport = "{folder}/bridge"\n', "the port {folder}/bridge"),
-        ('driver = "spi"\nport = "{folder}/there"\n', None),
-        ('driver = "spi"\nport = "socket://localhost:1"\n', None),
-        ('driver = "can"\nchannel = "can77"\n', "the CAN interface can77"),
-        ('driver = "can"\ninterface = "virtual"\nchannel = "can77"\n', None),
-    ],
-)
-def test_check_says_that_a_port_is_not_there_yet(
-    tmp_path: Path, tactile: str, absent: str | None
-) -> None:
-    (tmp_path / "there").touch()
-    told = checked(tmp_path, "[tactile]\n" + tactile.format(folder=tmp_path))["warnings"]
-    said = "" if absent is None else f"{absent.format(folder=tmp_path)} is not there yet; "
-    assert [warning.startswith(said) for warning in told] == [True] * (absent is not None)
 
 
 def loop_scene(folder: Path) -> Path:

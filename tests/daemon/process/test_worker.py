@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import select
 import sys
 import threading
-import weakref
 from collections.abc import Iterator
 
 import pytest
@@ -51,21 +49,6 @@ def test_a_worker_that_was_closed_can_start_again() -> None:
     assert worker.close(PATIENCE_S)
     for thread in named_slow():
         thread.join(PATIENCE_S)
-
-
-class _Large:
-    def run(self) -> int:
-        return 1
-
-
-def test_an_idle_worker_holds_nothing_of_its_last_job(worker: Worker[object]) -> None:
-    large = _Large()
-    known = weakref.ref(large)
-    assert worker.submit(large.run)
-    del large
-    assert worker.take(PATIENCE_S) == 1
-    gc.collect()
-    assert known() is None
 
 
 def test_where_the_system_refuses_a_thread_a_job_is_refused(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ from graspd.daemon.record.recorder import QUEUE_MAX, Recorder, ReplayRecorder
 from graspd.daemon.scene.scene import Record
 from graspd.drivers.recordings.kinds import open_recording
 from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, files, messages, recorder
+from tests.kit.disk import Disk
 from tests.kit.waiting import wait_until
 
 TOPIC = b"verdict.right"
@@ -124,33 +124,24 @@ def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
         assert make_room(options, "right") == removed
 
 
-class StalledDisk:
-    """Does not answer until told to."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.answers = threading.Event()
-        self.asked = threading.Event()
-        real = os.fdatasync
-
-        def stall(descriptor: int) -> None:
-            self.asked.set()
-            self.answers.wait(100)
-            real(descriptor)
-
-        monkeypatch.setattr("os.fdatasync", stall)
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    """It hangs."""
+    made = Disk(monkeypatch, "fdatasync")
+    made.goes_on.clear()
+    return made
 
 
 def test_entries_are_dropped_and_counted_while_a_disk_stalls(
-    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make: Make, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk = StalledDisk(monkeypatch)
     monkeypatch.setattr(recorder_module, "CLOSE_S", 100.0)
     writing = make()
     assert disk.asked.wait(100)
     for number in range(QUEUE_MAX + 500):
         writing.send(TOPIC, payload(number))
     assert writing.counters["record"]["dropped"] == 500
-    disk.answers.set()
+    disk.goes_on.set()
     wait_until(lambda: writing.counters["record"]["recorded"] == QUEUE_MAX)
     writing.send(TOPIC, payload(QUEUE_MAX + 500))
     writing.close()
@@ -162,21 +153,22 @@ def test_entries_are_dropped_and_counted_while_a_disk_stalls(
 
 
 def test_the_end_waits_for_no_disk_that_never_answers(
-    make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    make: Make,
+    disk: Disk,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    disk = StalledDisk(monkeypatch)
     monkeypatch.setattr(recorder_module, "CLOSE_S", 0.05)
     writing = make()
     assert disk.asked.wait(100)
     writing.close()
     assert "does not answer" in caplog.text
-    disk.answers.set()
+    disk.goes_on.set()
 
 
 def test_a_run_without_a_hand_waits_for_its_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk = StalledDisk(monkeypatch)
     monkeypatch.setattr(recorder_module, "CLOSE_S", 0.0)
     monkeypatch.setattr(recorder_module, "QUEUE_MAX", 20)
     options, silence = Record(directory=tmp_path / "record"), Mock(reading=None)
@@ -185,7 +177,7 @@ def test_a_run_without_a_hand_waits_for_its_disk(
         options, "right", BOOT, take_header=lambda: lambda: HEADER, patience_s=100.0
     )
     assert disk.asked.wait(100)
-    threading.Timer(0.2, disk.answers.set).start()
+    threading.Timer(0.2, disk.goes_on.set).start()
     for number in range(100):
         writing.send(TOPIC, payload(number))
         writing.on_verdict(silence)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import stat
-import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -19,7 +16,6 @@ from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.session.keeper import (
     BUSY,
     HANGS,
-    SAVE_PERIOD_NS,
     WAIT_S,
     WAITING_MAX,
     SessionKeeper,
@@ -42,34 +38,14 @@ from tests.daemon.session.learning import (
     tell,
     trust,
 )
+from tests.kit.disk import Disk
 
 KeeperOf = Callable[..., SessionKeeper]
 
 
-class Disk:
-    """Holds or refuses every file that is written, until told otherwise."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.goes_on = threading.Event()
-        self.goes_on.set()
-        self.is_full = False
-        self.written = 0
-        real = os.fsync
-
-        def fsync(descriptor: int) -> None:
-            if stat.S_ISREG(os.fstat(descriptor).st_mode):  # and not the folder, after the file
-                self.goes_on.wait()
-                if self.is_full:
-                    raise OSError(28, "No space left on device")
-                self.written += 1
-            real(descriptor)
-
-        monkeypatch.setattr(os, "fsync", fsync)
-
-
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    return Disk(monkeypatch)
+    return Disk(monkeypatch, "fsync")
 
 
 @pytest.fixture
@@ -229,25 +205,6 @@ def test_an_unexpected_error_of_the_writer_is_answered(
     keeper.keep(found.append)
     keeper.save()
     assert found[1:] == [KEPT]
-
-
-def test_an_open_grasp_is_kept_within_ten_seconds(
-    folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
-) -> None:
-    part, clock = trust(), Clock()
-    keeper = keeper_of(part, clock)
-    judge(part, 1)
-    read_once(keeper)
-    assert not keeper.filenos
-    for _ in range(3):
-        clock.now_ns += SAVE_PERIOD_NS
-        read_once(keeper)
-        go_round(keeper)
-    found: list[Reply] = []
-    keeper.keep(found.append)
-    assert found == [KEPT]
-    assert disk.written == 1  # nothing is written where nothing is new
-    assert kept_trust(folder) == part.state()
 
 
 def test_state_that_a_run_does_not_use_stays(folder: SessionFolder) -> None:

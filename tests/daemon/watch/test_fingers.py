@@ -124,37 +124,28 @@ def test_images_go_when_readings_no_longer_come() -> None:
     assert view.snapshot(1001 * MS).fingers == []
 
 
-MOVES: dict[str, Any] = {"still_ms": 130.0, "motion": {"ff": 1.2, "th": None}}
-LIMITS: dict[str, Any] = {"motion_limits": {"ff": 1.5, "th": 1.0}}
+def told_of(**told: Any) -> list[FingerImage]:  # noqa: ANN401
+    """The images beside a verdict that says this."""
+    reading = b"tactile.right", tactile(0, RESTING, RESTING)
+    return after(reading, (b"verdict.right", verdict(0, **told))).snapshot(0).fingers
 
 
 @pytest.mark.parametrize(
-    ("told", "motions"),
+    ("limits", "ff", "th"),
     [
-        (MOVES | LIMITS, {"ff": (1.2, 1.5), "th": (None, 1.0)}),
-        (MOVES, {"ff": (None, 0.0), "th": (None, 0.0)}),
-        ({"motion": {"ff": 1.0}, "motion_limits": {"ff": 0.0}}, {"ff": (None, 0.0)}),
-        ({}, {"ff": None, "th": None}),
+        ({"ff": 1.5, "th": 1.0}, (1.2, 1.5), (None, 1.0)),
+        ({}, (None, 0.0), (None, 0.0)),
+        ({"ff": 0.0}, (None, 0.0), (None, 0.0)),
     ],
 )
 def test_unknown_motion_of_a_finger_is_not_zero(
-    told: dict[str, Any], motions: dict[str, tuple[float | None, float] | None]
+    limits: dict[str, float], ff: tuple[float | None, float], th: tuple[float | None, float]
 ) -> None:
-    view = after(
-        (b"tactile.right", tactile(0, RESTING, RESTING)), (b"verdict.right", verdict(0, **told))
-    )
-    shown = {
-        finger.name: None if finger.motion is None else (finger.motion.now, finger.motion.limit)
-        for finger in view.snapshot(0).fingers
-    }
-    assert motions.items() <= shown.items()
+    shown = told_of(still_ms=130.0, motion={"ff": 1.2, "th": None}, motion_limits=limits)
+    assert [each.motion and (each.motion.now, each.motion.limit) for each in shown] == [ff, th]
+    assert [each.motion for each in told_of()] == [None, None]
 
 
 @pytest.mark.parametrize("told", [{"ff": "slide", "th": None}, {"ff": "slide"}, None])
 def test_a_finger_has_its_word_or_none(told: dict[str, Any] | None) -> None:
-    view = after(
-        (b"tactile.right", tactile(0, RESTING, RESTING)),
-        (b"verdict.right", verdict(0, fingers=told)),
-    )
-    shown = {finger.name: finger.state for finger in view.snapshot(0).fingers}
-    assert shown == {"ff": None if told is None else "slide", "th": None}
+    assert [each.state for each in told_of(fingers=told)] == [told and "slide", None]

@@ -103,11 +103,6 @@ def test_figures_of_a_dead_daemon_are_dim_and_dated(width: int) -> None:
         assert bool(styles and styles[1] == "\x1b[2;3m") is dims  # dim and italic (ECMA-48)
 
 
-@pytest.mark.parametrize("width", [1, 10, 40])
-def test_a_terminal_that_is_too_small_is_not_an_error(width: int) -> None:
-    assert text_of(a_full_hand(), width)
-
-
 def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     evil = "\x1b[2J\x1b]0;owned\x07"
     view = after(

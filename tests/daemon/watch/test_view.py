@@ -258,19 +258,22 @@ def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
     assert [last.ago_s for last in seen.grasps[:3]] == [0.0, 1.0, 2.0]
 
 
-def test_a_grasp_is_listed_with_its_last_verdict() -> None:
+@pytest.mark.parametrize(
+    ("decision", "gate", "held"),
+    [
+        (Decision.SLIP, GateState.JUDGED, True),
+        (Decision.UNKNOWN, GateState.JUDGED, True),
+        (Decision.UNKNOWN, GateState.RELEASED, False),
+    ],
+)
+def test_a_grasp_is_listed_with_its_last_judgement(
+    decision: Decision, gate: GateState, held: bool
+) -> None:
     view = after((b"verdict.right", verdict(0, Decision.STABLE, grasp=41)))
-    turned = verdict(1, Decision.SLIP, grasp=41, judged=False, gate=GateState.JUDGED)
-    view.take(b"verdict.right", turned, 0)
-    assert [(last.grasp, last.verdict) for last in view.snapshot(0).grasps] == [(41, "slip")]
-
-
-@pytest.mark.parametrize(("gate", "held"), [(GateState.JUDGED, True), (GateState.RELEASED, False)])
-def test_a_judged_grasp_is_past_once_it_is_released(gate: GateState, held: bool) -> None:
-    view = after((b"verdict.right", verdict(0, Decision.STABLE, grasp=41)))
-    view.take(b"verdict.right", verdict(1, grasp=41, gate=gate), 0)
+    view.take(b"verdict.right", verdict(1, decision, grasp=41, judged=False, gate=gate), 0)
     (last,) = view.snapshot(0).grasps
-    assert (last.verdict, last.held) == ("stable", held)
+    assert last.verdict == ("slip" if decision is Decision.SLIP else "stable")
+    assert last.held is held
 
 
 @pytest.mark.parametrize(
@@ -306,3 +309,4 @@ def test_odd_values_stop_neither_the_view_nor_the_terminal(data: st.DataObject) 
     seen = view.snapshot(0)
     json.loads(msgspec.json.encode(seen))
     assert max(map(len, text_of(seen))) <= 80
+    assert text_of(seen, data.draw(st.sampled_from((1, 10, 40))))

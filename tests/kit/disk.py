@@ -1,0 +1,31 @@
+"""A disk that hangs while a test says so."""
+
+from __future__ import annotations
+
+import os
+import stat
+import threading
+from typing import Literal
+
+import pytest
+
+
+class Disk:
+    """Holds every file that is written to the disk by a call, until `goes_on` is set."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, call: Literal["fsync", "fdatasync"]
+    ) -> None:
+        self.goes_on, self.asked = threading.Event(), threading.Event()
+        self.goes_on.set()
+        self.written = 0
+        real = getattr(os, call)
+
+        def sync(descriptor: int) -> None:
+            if stat.S_ISREG(os.fstat(descriptor).st_mode):  # and not the folder, after the file
+                self.asked.set()
+                self.goes_on.wait(100)
+                self.written += 1
+            real(descriptor)
+
+        monkeypatch.setattr(os, call, sync)
