@@ -20,7 +20,6 @@ from graspd.daemon.publish.companion import (
     Reply,
     Requests,
     Told,
-    hooks,
 )
 from graspd.daemon.publish.messages import Lifts, State
 from graspd.daemon.run.loop import UNKNOWN_START, Ended
@@ -334,10 +333,3 @@ def test_an_exchanged_sensor_is_noticed_before_its_first_reading() -> None:
     bench.output.wants_tactile = True
     bench.run()
     assert published_at_exchange == [4]  # two readings and their verdicts
-
-
-def test_companions_are_called_in_order_for_their_own_hooks() -> None:
-    first, second = Watchdog(), Watchdog()
-    bound = hooks([first, Companion(), second], Companion.after_round)
-    assert bound == (first.after_round, second.after_round)
-    assert hooks([first, second], Companion.on_status) == ()

@@ -21,14 +21,12 @@ from graspd.daemon.run.loop import Ended, Loop
 from graspd.daemon.run.runner import run_scene
 from graspd.daemon.scene import SceneError
 from graspd.drivers.base import DriverError
-from graspd.drivers.recordings.csv_player import DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import put_first, start
 from tests.kit.messages import decode_status, decode_verdict
 from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S
-
-DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
 
 SCENE = """
 [tactile]
@@ -46,7 +44,7 @@ class Running:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.scene = folder / "scene.toml"
-        self.scene.write_text(SCENE.format(recording=DEMO, folder=folder))
+        self.scene.write_text(SCENE.format(recording=DEMO_RECORDING, folder=folder))
 
     @contextmanager
     def started(self) -> Iterator[Running]:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import types
+import json
 from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any
 
-import annotated_types
 import pytest
 from hypothesis import HealthCheck, Phase, event, given, note, settings
 from hypothesis import strategies as st
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly
@@ -70,92 +67,50 @@ GOOD = 4
 """Number of good values for each bad one."""
 
 
-def numbers(kind: type, bounds: list[object]) -> st.SearchStrategy[Any]:
-    found = {name: getattr(bound, name) for bound in bounds for name in vars_of(bound)}
-    low, high = found.get("ge", found.get("gt", 0)), found.get("le", found.get("lt", 10_000))
-    if kind is int:
-        return st.integers(low, high)
-    ends = [float(found[name]) for name in ("ge", "le") if name in found]
-    inside = st.floats(low, high, exclude_min="gt" in found, exclude_max="lt" in found)
-    return inside | st.sampled_from(ends) if ends else inside
+SCHEMA = Scene.model_json_schema()
 
 
-def vars_of(bound: object) -> list[str]:
-    return [name for name in ("ge", "gt", "le", "lt") if hasattr(bound, name)]
-
-
-def values(annotation: Any, bounds: list[object]) -> st.SearchStrategy[Any]:  # noqa: ANN401
-    """Values of a type as TOML has them; some are refused."""
-    origin, inner = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        return values(inner[0], [*bounds, *inner[1:]])
-    if origin in (Union, types.UnionType):
-        kinds = [values(each, bounds) for each in inner if each is not type(None)]
-        return st.one_of(kinds)
-    if origin is Literal:
-        return st.sampled_from(inner)
-    if origin is tuple:
-        return st.lists(values(inner[0], []), min_size=1, max_size=3)
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return sections(annotation)
-    if annotation is bool:
+def values(schema: dict[str, Any]) -> st.SearchStrategy[Any]:
+    """Values that a schema allows, as TOML has them; some are refused all the same."""
+    if "$ref" in schema:
+        return sections(SCHEMA["$defs"][schema["$ref"].rpartition("/")[2]])
+    if choices := schema.get("anyOf", schema.get("oneOf")):
+        return st.one_of([values(each) for each in choices if each.get("type") != "null"])
+    if "const" in schema:
+        return st.just(schema["const"])
+    if "enum" in schema:
+        return st.sampled_from(schema["enum"])
+    if schema["type"] == "boolean":
         return st.booleans()
-    if annotation in (int, float):
-        spread = [bound for each in bounds for bound in unpacked(each)]
-        return numbers(annotation, spread)
-    raise NotImplementedError(f"values of {annotation}")
-
-
-def unpacked(bound: object) -> list[object]:
-    """The bounds in a field of pydantic, or a bound itself."""
-    if isinstance(bound, FieldInfo):
-        return list(bound.metadata)
-    return [bound] if isinstance(bound, annotated_types.BaseMetadata) else []
+    if schema["type"] == "integer":
+        return st.integers(schema["minimum"], schema["maximum"])
+    return st.floats(
+        schema.get("minimum", schema.get("exclusiveMinimum")),
+        schema.get("maximum", schema.get("exclusiveMaximum")),
+        exclude_min="exclusiveMinimum" in schema,
+        exclude_max="exclusiveMaximum" in schema,
+    )
 
 
 @st.composite
-def sections(draw: st.DrawFn, kind: type[BaseModel]) -> dict[str, Any]:
+def sections(draw: st.DrawFn, schema: dict[str, Any]) -> dict[str, Any]:
     drawn: dict[str, Any] = {}
-    for key, field in kind.model_fields.items():
-        if not field.is_required() and draw(st.floats(0.0, 1.0)) > SHARE:
+    for key, value in schema["properties"].items():
+        if key not in schema.get("required", ()) and draw(st.floats(0.0, 1.0)) > SHARE:
             continue
         if key in PLACES:
             good, bad = PLACES[key]
             drawn[key] = draw(st.sampled_from([*good * GOOD * max(len(bad), 1), *bad]))
         else:
-            drawn[key] = draw(values(field.annotation, list(field.metadata)))
+            drawn[key] = draw(values(value))
     return drawn
 
 
-def filled(drawn: Any, folder: Path, port: int) -> Any:  # noqa: ANN401
-    """The same with the folder and the port of this test."""
-    if isinstance(drawn, dict):
-        return {key: filled(value, folder, port) for key, value in drawn.items()}
-    if isinstance(drawn, list | tuple):
-        return [filled(value, folder, port) for value in drawn]
-    if isinstance(drawn, str):
-        return drawn.replace("F/", f"{folder}/").replace(":P", f":{port}")
-    return drawn
-
-
-def as_toml(drawn: dict[str, Any]) -> str:
-    lines = []
-    for name, section in drawn.items():
-        lines.append(f"[{name}]")
-        tables = {key: value for key, value in section.items() if isinstance(value, dict)}
-        lines += [f"{key} = {text(value)}" for key, value in section.items() if key not in tables]
-        for key, value in tables.items():
-            lines.append(f"[{name}.{key}]")
-            lines += [f"{inner} = {text(each)}" for inner, each in value.items()]
-    return "\n".join(lines) + "\n"
-
-
-def text(value: Any) -> str:  # noqa: ANN401
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return f"[{', '.join(map(text, value))}]"
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+def as_toml(value: object) -> str:
+    """One value; a section is an inline table."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {as_toml(each)}" for key, each in value.items()) + "}"
+    return json.dumps(value)
 
 
 def start(path: Path) -> None:
@@ -195,13 +150,13 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]
     phases=[Phase.generate],
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
-@given(drawn=sections(Scene))
+@given(drawn=sections(SCHEMA))
 def test_what_check_calls_fine_starts(place: tuple[Path, int], drawn: dict[str, Any]) -> None:
     folder, port = place
-    drawn = filled({"publish": {"endpoint": "ipc://F/a"}, **drawn}, folder, port)
-    drawn["publish"].setdefault("endpoint", f"ipc://{folder}/a")
+    drawn["publish"] = {"endpoint": "ipc://F/a", **drawn.get("publish", {})}
+    text = "\n".join(f"{name} = {as_toml(section)}" for name, section in drawn.items())
     path = folder / "scene.toml"
-    path.write_text(as_toml(drawn))
+    path.write_text(text.replace("F/", f"{folder}/").replace(":P", f":{port}"))
     note(path.read_text())
     fine = check.run(Namespace(scene=[path], json=True)) == 0
     event(f"fine: {fine}")

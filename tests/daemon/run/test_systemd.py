@@ -63,10 +63,8 @@ def test_the_watchdog_is_fed_four_times_within_its_timeout(ears: socket.socket) 
     manager.close()
 
 
-def test_without_a_watchdog_nothing_is_fed_and_nothing_is_due(ears: socket.socket) -> None:
-    manager = Systemd.of({"NOTIFY_SOCKET": ears.getsockname()})
-    assert manager is not None
-    assert manager.before_wait(NOBODY) is None
+def test_without_a_watchdog_nothing_is_fed(ears: socket.socket) -> None:
+    manager = Systemd(ears.getsockname())
     manager.after_round()
     manager.stopping()
     assert heard(ears) == ["STOPPING=1", "STATUS=stopping"]
@@ -76,6 +74,7 @@ def test_without_a_watchdog_nothing_is_fed_and_nothing_is_due(ears: socket.socke
 @pytest.mark.parametrize(
     ("environment", "watched"),
     [
+        ({}, False),
         ({"WATCHDOG_USEC": "1000"}, True),
         ({"WATCHDOG_USEC": "1000", "WATCHDOG_PID": str(os.getpid())}, True),
         ({"WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}, False),
@@ -157,14 +156,8 @@ def test_what_to_do_comes_first_and_what_follows_never(
     assert line.endswith(f", gate idle, {shown}")
 
 
-def test_late_readings_of_before_are_not_shown(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ears:
-        ears.bind(str(tmp_path / "notify"))
-        ears.settimeout(100.0)
-        manager = Systemd(str(tmp_path / "notify"))
-        for count in (3, 3, 5):
-            manager.on_status(msgspec.structs.replace(GOLDEN_STATUS, late_readings=count))
-        told = [ears.recv(4096).decode() for _ in range(3)]
-        manager.close()
-    late = [re.findall(r"(\d+) late", line) for line in told]
+def test_late_readings_of_before_are_not_shown(ears: socket.socket, systemd: Systemd) -> None:
+    for count in (3, 3, 5):
+        systemd.on_status(msgspec.structs.replace(GOLDEN_STATUS, late_readings=count))
+    late = [re.findall(r"(\d+) late", *heard(ears)) for _ in range(3)]
     assert late == [["3"], [], ["2"]]
