@@ -33,7 +33,7 @@ class Daemon:
 
         `more` is what else there is in the scene, from `[tactile]` on.
         """
-        self.endpoint = endpoint or f"ipc://{folder}/graspd"
+        self.endpoint = endpoint or f"ipc://{folder}/out"
         self.ask_endpoint = f"ipc://{folder}/ask"
         self._folder = folder
         self._scene = folder / "scene.toml"

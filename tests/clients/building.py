@@ -24,11 +24,15 @@ HEADERS = {"zmq_addon.hpp": "cppzmq-dev", "nlohmann/json.hpp": "nlohmann-json3-d
 """What the client includes, and the Debian package that has it."""
 
 
+def lacking() -> list[str]:
+    """What is missing to compile it."""
+    missing = [package for header, package in HEADERS.items() if not _is_there(header)]
+    return missing + [tool for tool in ("g++", "make") if shutil.which(tool) is None]
+
+
 def skip_unless_it_can_be_compiled() -> None:
     """Skip, and say what is missing."""
-    missing = [package for header, package in HEADERS.items() if not _is_there(header)]
-    missing += [tool for tool in ("g++", "make") if shutil.which(tool) is None]
-    if missing:
+    if missing := lacking():
         pytest.skip(f"no C++ client without it: apt install {' '.join(missing)}")
 
 
@@ -91,14 +95,6 @@ def asked(program: Path, *words: object, typed: str = "") -> subprocess.Complete
     return subprocess.run(
         command, capture_output=True, text=True, timeout=200, check=False, input=typed
     )
-
-
-def cpp_lifts(lift_gate: Path, *words: object) -> bool:
-    """Ask the C++ example whether to lift; its exit code and its words must agree."""
-    result = asked(lift_gate, *words)
-    assert result.returncode in (0, 1), result.stderr
-    assert ("\nlift after" in result.stdout) is (result.returncode == 0)
-    return result.returncode == 0
 
 
 def compiled_probe(name: str = "probe") -> Path:

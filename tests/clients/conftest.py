@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from tests.clients.building import Probe, compiled, compiled_probe
+from deploy.clients.python.graspd_client import Client
+from tests.clients.building import Probe, compiled, compiled_probe, lacking
+from tests.clients.either import Connect, Either, InCpp, InPython
 
 
 @pytest.fixture(scope="session")
@@ -32,3 +35,24 @@ def probe(binary: Path) -> Iterator[Probe]:
         yield Probe(process)
         process.communicate(timeout=200)
         assert process.returncode == 0, "the sanitizers found something"
+
+
+@pytest.fixture
+def cpp(request: pytest.FixtureRequest) -> Probe | None:
+    """The running probe; None where it cannot be compiled."""
+    found: Probe | None = None if lacking() else request.getfixturevalue("probe")
+    return found
+
+
+@pytest.fixture(params=["python", "cpp"])
+def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
+    """Makes clients in either language; those in Python are closed after the test."""
+    with ExitStack() as stack:
+
+        def made(folder: Path, ask: str | None = "ask") -> Either:
+            out, asked = f"ipc://{folder}/out", ask and f"ipc://{folder}/{ask}"
+            if request.param == "cpp":
+                return InCpp(request.getfixturevalue("probe"), out, asked)
+            return InPython(stack.enter_context(Client(out, ask_endpoint=asked)))
+
+        yield made

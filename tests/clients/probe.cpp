@@ -2,10 +2,11 @@
 //
 // `new MAX_AGE_NS SAME_COMPUTER` begins again; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
 // takes a message; `clock ASKED_NS TOLD_NS` compares clocks; `end BOOT_ID GRASP` tells an outcome;
-// `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT [MAX_AGE_MS]` makes one, `lift` asks it and
-// answers with a line (`watch DEADLINE_S`: under supervision), `tell` tells it that the lift held
-// (`slipped`: that it did not), `wait DEADLINE_S SUPERVISED` waits for a grasp,
-// `slide TIMEOUT_S` watches over a lift.
+// `at NOW_NS` answers with a line.
+//
+// `client ENDPOINT ASK_ENDPOINT MAX_AGE_MS` (`-`: not asked) makes one. Each of its calls answers
+// with a line: `lift DEADLINE_S SUPERVISED STILL_MS` (`-`: none), `wait DEADLINE_S SUPERVISED`,
+// `slide TIMEOUT_S`, `tell WAIT_S BOOT_ID GRASP OUTCOME NAME` (hex). What throws is `refused`.
 #include "graspd_client.hpp"
 
 #include <iostream>
@@ -47,14 +48,61 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
               << counts.restarts << ' ' << counts.former << std::endl;
 }
 
-}  // namespace
+void call(std::optional<graspd::Client>& client, const std::string& order,
+          std::istringstream& words) {
+    const auto number = [&] {
+        std::string word;
+        words >> word;
+        return word == "-" ? std::optional<double>{} : std::stod(word);
+    };
+    if (order == "client") {
+        graspd::Options options;
+        words >> options.endpoint >> options.ask_endpoint;
+        if (options.ask_endpoint == "-") options.ask_endpoint.clear();
+        options.max_age_ms = number().value();
+        options.warn = [](const std::string& text) { std::cout << "warn " << text << std::endl; };
+        client.emplace(options);
+        return;
+    }
+    if (order == "lift") {
+        const double deadline_s = number().value();
+        const bool supervised = number().value() != 0.0;
+        const auto answer = client.value().may_i_lift(deadline_s, supervised, number());
+        const auto& said = answer.verdict;
+        std::cout << static_cast<bool>(answer) << ' ' << answer.supervised << ' '
+                  << graspd::name(said.decision) << ' ' << client->unreported() << ' '
+                  << said.grasp.value_or(-1) << ' ' << (said.boot_id.empty() ? "-" : said.boot_id);
+        for (const std::string& reason : said.reasons) std::cout << ' ' << reason;
+    } else if (order == "wait") {
+        const double deadline_s = number().value();
+        const auto found = client.value().wait_for_grasp(deadline_s, number().value() != 0.0);
+        std::cout << (found ? found->grasp.value_or(0) : -1);
+    } else if (order == "slide") {
+        const auto slide = client.value().wait_for_slide(number().value());
+        std::cout << static_cast<bool>(slide) << ' ' << slide.held;
+        for (const std::string& finger : slide.sliding) std::cout << ' ' << finger;
+    } else {
+        graspd::Verdict lifted_on;
+        std::string how, name;
+        std::int64_t grasp = 0;
+        const double wait_s = number().value();
+        words >> lifted_on.boot_id >> grasp >> how >> name;
+        lifted_on.grasp = grasp;
+        const auto outcome = how == "stable" ? graspd::Outcome::held
+                             : how == "slip" ? graspd::Outcome::slipped
+                                             : graspd::Outcome::not_lifted;
+        std::cout << client.value().tell(lifted_on, outcome, unhexed(name), wait_s).why;
+    }
+    std::cout << std::endl;
+}
 
 static_assert(std::is_move_constructible_v<graspd::Client>, "a client can be moved");
+
+}  // namespace
 
 int main() {
     graspd::detail::Newest newest("verdict.right", 0, true);
     std::optional<graspd::Client> client;
-    graspd::LiftAnswer answer;
     for (std::string line; std::getline(std::cin, line);) {
         std::istringstream words(line);
         std::string order;
@@ -78,42 +126,16 @@ int main() {
             graspd::detail::Key grasp;
             words >> grasp.first >> grasp.second;
             newest.end(grasp);
-        } else if (order == "client") {
-            graspd::Options options;
-            words >> options.endpoint >> options.ask_endpoint;
-            double max_age_ms = 0.0;
-            if (words >> max_age_ms) options.max_age_ms = max_age_ms;
-            options.warn = [](const std::string& text) {
-                std::cout << "warn " << text << std::endl;
-            };
-            client.emplace(options);
-        } else if (order == "wait") {
-            double deadline_s = 0.0;
-            bool supervised = false;
-            words >> deadline_s >> supervised;
-            const auto found = client.value().wait_for_grasp(deadline_s, supervised);
-            std::cout << (found ? found->grasp.value_or(0) : -1) << std::endl;
-        } else if (order == "lift" || order == "watch") {
-            double deadline_s = 30.0;
-            words >> deadline_s;
-            answer = client.value().may_i_lift(order == "lift" ? 30.0 : deadline_s, order == "watch");
-            std::cout << static_cast<bool>(answer) << ' ' << answer.verdict.grasp.value_or(0) << ' '
-                      << client->unreported() << std::endl;
-        } else if (order == "slide") {
-            double timeout_s = 0.0;
-            words >> timeout_s;
-            const graspd::SlideAnswer slide = client.value().wait_for_slide(timeout_s);
-            std::cout << static_cast<bool>(slide) << ' ' << slide.held;
-            for (const std::string& finger : slide.sliding) std::cout << ' ' << finger;
-            std::cout << std::endl;
-        } else if (order == "tell" || order == "slipped") {
-            const auto how = order == "tell" ? graspd::Outcome::held : graspd::Outcome::slipped;
-            const bool taken{client.value().tell(answer.verdict, how, {}, 30.0)};
-            std::cout << (taken ? "told" : "not taken") << std::endl;
-        } else {
+        } else if (order == "at") {
             graspd::Nanoseconds now_ns = 0;
             words >> now_ns;
             say(newest.at(now_ns), newest.counts);
+        } else {
+            try {
+                call(client, order, words);
+            } catch (const std::invalid_argument& error) {
+                std::cout << "refused " << error.what() << std::endl;
+            }
         }
     }
 }

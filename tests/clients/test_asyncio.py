@@ -10,10 +10,10 @@ from selectors import DefaultSelector
 import pytest
 
 from deploy.clients.python.graspd_client import AsyncClient, Client, Decision
-from tests.clients.test_both_ask import DEADLINE_S, false_daemon, of, told
+from tests.clients.false_daemon import false_daemon, of
 from tests.kit.waiting import wait_until
 
-SHORT_S, HOURS_S = 0.05, 1e6
+SHORT_S, DEADLINE_S, HOURS_S = 0.05, 0.3, 1e6
 
 
 def made(folder: Path, *, ask: bool = True) -> AsyncClient:
@@ -42,7 +42,7 @@ def test_a_lift_is_allowed_and_told_once(tmp_path: Path) -> None:
             assert graspd.unreported == 0
         assert (await graspd.verdict()).reasons == ("closed",)
 
-    with false_daemon(tmp_path, told()):
+    with false_daemon(tmp_path):
         asyncio.run(lifts())
 
 
@@ -87,7 +87,7 @@ def test_other_tasks_continue_while_it_waits(tmp_path: Path) -> None:
                 await asyncio.sleep(DEADLINE_S / 100)
                 assert not waiting.done()
 
-    with false_daemon(tmp_path, told(), "unknown"):
+    with false_daemon(tmp_path, outcome="unknown"):
         asyncio.run(waits())
 
 

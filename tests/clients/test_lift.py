@@ -1,156 +1,40 @@
-"""May the hand lift? With a clock and sockets that the tests move."""
+"""When the Python client says that the hand may lift, by a clock that the tests move."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
-from tests.clients.messages import ADDED, MS, TEACHES, frames, supervised, verdict
-
-START_NS = 1000 * MS
-ASK = "ipc:///nowhere.ask"
-WATCHED = ADDED | {"supervised": True}
-TAKEN = b'{"v":1,"ok":true}'
-LOOK_NS = 1000
-"""What each look at the clock takes."""
-
-
-@dataclass
-class Call:
-    """What is asked or told, and the answers to it."""
-
-    world: World
-    answers: list[tuple[int, bytes]]
-    said: list[bytes] = field(default_factory=list)
-    answered: list[bytes] = field(default_factory=list)
-    due: tuple[int, bytes] | None = None
-
-    def ask(self, question: bytes) -> None:
-        assert self.due is None, "one question at a time"
-        self.said.append(question)
-        if self.answers:
-            delay_ns, payload = self.answers.pop(0)
-            self.due = self.world.now_ns + delay_ns, payload
-
-    def answer(self) -> bytes | None:
-        if self.due is None or self.due[0] > self.world.now_ns:
-            return None
-        self.answered.append(self.due[1])
-        self.due = None
-        return self.answered[-1]
-
-    def hang_up(self, *, lifts: bool = True) -> None:
-        self.due = None
-
-
-@dataclass
-class World:
-    """A clock, and sockets where things come in time."""
-
-    coming: list[tuple[int, list[bytes]]]
-    """When what comes, ns."""
-    answers: list[tuple[int, bytes]] = field(default_factory=list)
-    """How long after its question each comes, ns; then none any more."""
-    acknowledged: list[tuple[int, bytes]] = field(default_factory=list)
-    """The same of outcomes."""
-    now_ns: int = START_NS
-    slept_ns: int = 0
-    """What the computer has slept: the monotonic clock does not count it."""
-    came: list[list[bytes]] = field(default_factory=list)
-    renewed: int = 0
-
-    def __post_init__(self) -> None:
-        self.asking, self.telling = Call(self, self.answers), Call(self, self.acknowledged)
-        self.timing = Call(self, [])
-
-    def monotonic_ns(self) -> int:
-        self.now_ns += LOOK_NS
-        return self.now_ns
-
-    def boot_ns(self, _clock: int) -> int:
-        return self.monotonic_ns() + self.slept_ns
-
-    def receive(self) -> list[bytes] | None:
-        if not self.coming or self.coming[0][0] > self.now_ns:
-            return None
-        self.came.append(self.coming.pop(0)[1])
-        return self.came[-1]
-
-    def wait(self, timeout_ms: int) -> None:
-        calls = (self.asking.due, self.telling.due)
-        due_ns = [due for due, _ in self.coming[:1]] + [due[0] for due in calls if due]
-        self.now_ns = max(self.now_ns, min([self.now_ns + timeout_ms * MS, *due_ns]))
-
-    def renew(self) -> None:
-        self.renewed += 1
-
-    def close(self) -> None:
-        pass
-
-
-@contextmanager
-def client(world: World, ask: bool = False, same: bool | None = None) -> Iterator[Client]:
-    """A client in that world."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(graspd_client, "_Link", lambda *_: world)
-        clocks = {"monotonic_ns": world.monotonic_ns, "clock_gettime_ns": world.boot_ns}
-        patch.setattr(graspd_client, "time", SimpleNamespace(**clocks, CLOCK_BOOTTIME=7))
-        asks = ASK if ask else None
-        with Client("ipc:///nowhere", ask_endpoint=asks, same_computer=same) as made:
-            yield made
-
-
-def coming(*messages: tuple[str, Mapping[str, Any]]) -> list[tuple[int, list[bytes]]]:
-    """One message every 10 ms from now on, each by its verdict and what else differs."""
-    sent = []
-    for seq, (outcome, more) in enumerate(messages):
-        at_ns = START_NS + seq * 10 * MS
-        read_ns = at_ns - round(more.get("age_ms", 1.0) * MS)
-        sent.append((at_ns, frames(verdict(seq, read_ns, outcome, **more))))
-    return sent
+from tests.clients.false_daemon import TAKEN
+from tests.clients.messages import MS, TEACHES, frames, verdict
+from tests.clients.world import START_NS, World, client, coming
 
 
 def stream(*outcomes: str) -> list[tuple[int, list[bytes]]]:
     return coming(*((outcome, {}) for outcome in outcomes))
 
 
-def payload(seq: int, outcome: str = "stable", *, boot_id: str = "a", grasp: int = 1) -> bytes:
-    """An answer."""
-    message = verdict(seq, START_NS, outcome, boot_id=boot_id, grasp=grasp)
-    return json.dumps(message).encode()
-
-
-def test_it_waits_for_the_grasp_to_settle() -> None:
-    with client(World(stream(*["unknown"] * 5, "stable"))) as graspd:
-        answer = graspd.may_i_lift(0.5)
-    assert answer
-    assert answer.waited_s == pytest.approx(0.05, abs=0.002)
-
-
-def test_slip_is_a_no_at_once() -> None:
-    with client(World(stream("unknown", "slip", "stable"))) as graspd:
-        answer = graspd.may_i_lift(0.5)
-    assert not answer
-    assert (answer.verdict.decision, answer.verdict.seq) == ("slip", 1)
-
-
 @pytest.mark.parametrize(
-    ("outcomes", "reasons"),
-    [([], ("no-message",)), (["unknown"] * 100, ("moving",)), (["unknown"], ("silent",))],
+    ("outcomes", "decision", "reasons", "waited_s"),
+    [
+        (["unknown"] * 5 + ["stable"], "stable", (), 0.05),
+        (["unknown", "slip", "stable"], "slip", (), 0.01),
+        ([], "unknown", ("no-message",), 0.3),
+        (["unknown"] * 100, "unknown", ("moving",), 0.3),
+        (["unknown"], "unknown", ("silent",), 0.3),
+    ],
 )
-def test_at_the_deadline_the_answer_says_why(outcomes: list[str], reasons: tuple[str, ...]) -> None:
+def test_it_answers_once_it_is_known_or_time_is_over(
+    outcomes: list[str], decision: str, reasons: tuple[str, ...], waited_s: float
+) -> None:
     with client(World(stream(*outcomes))) as graspd:
         answer = graspd.may_i_lift(0.3)
-    assert (bool(answer), answer.verdict.reasons) == (False, reasons)
-    assert answer.waited_s == pytest.approx(0.3, abs=1e-3)
+    assert bool(answer) is (decision == "stable")
+    assert (answer.verdict.decision, answer.verdict.reasons) == (decision, reasons)
+    assert answer.waited_s == pytest.approx(waited_s, abs=2e-3)
 
 
 def test_stable_that_came_after_the_deadline_is_late() -> None:
@@ -187,41 +71,27 @@ def test_a_closed_client_says_no_without_waiting() -> None:
     world = World(stream("stable"))
     with client(world, ask=True) as graspd:
         graspd.close()
-        assert graspd.verdict().reasons == ("closed",)
+        began_ns = world.now_ns
+        assert graspd.verdict(1.0).reasons == ("closed",)
         assert not graspd.may_i_lift(1.0)
-    assert len(world.asking.said) == 0
+        assert graspd.wait_for_grasp(1.0) is None
+        answer = graspd.wait_for_slide(1.0)
+        assert (bool(answer), answer.verdict.reasons) == (True, ("closed",))
+    assert world.now_ns - began_ns < MS
+    assert world.asking.said == []
 
 
 def test_an_unknown_answer_is_asked_for_again() -> None:
-    answers = [(MS, payload(0, "unknown")), (MS, payload(1))]
-    world = World(stream(*["stable"] * 9), answers)
+    unknown, stable = (frames(verdict(0, START_NS, each))[1] for each in ("unknown", "stable"))
+    world = World(stream(*["stable"] * 9), [(MS, unknown), (MS, stable)])
     with client(world, ask=True) as graspd:
         assert graspd.may_i_lift(0.1)
     assert len(world.asking.said) == 2
 
 
-def watched(outcome: str = "unknown") -> list[tuple[int, list[bytes]]]:
-    """A stream of the warm-up."""
-    return coming(*[(outcome, TEACHES if outcome == "unknown" else WATCHED)] * 20)
-
-
-@pytest.mark.parametrize("outcome", ["unknown", "slip", "stable"])
-@pytest.mark.parametrize("ask", [False, True])
-def test_a_supervised_lift_must_be_asked_for(outcome: str, ask: bool) -> None:
-    answers = [(5 * MS, frames(supervised(0, START_NS))[1])] * 2 if ask else []
-    with client(World(watched(outcome), list(answers)), ask) as graspd:
-        answer = graspd.may_i_lift(0.1)
-        assert (bool(answer), bool(answer.verdict), answer.supervised) == (False, False, False)
-    with client(World(watched(outcome), list(answers)), ask) as graspd:
-        answer = graspd.may_i_lift(0.1, supervised=True)
-        assert (bool(answer), bool(answer.verdict), answer.supervised) == (True, False, True)
-        assert answer.verdict.decision == outcome
-        assert answer.waited_s < 0.02
-
-
 @pytest.mark.parametrize("not_true", [1, "yes", "false", object()])
 def test_only_true_asks_for_supervised_lifts(not_true: object) -> None:
-    with client(World(watched())) as graspd:
+    with client(World(coming(*[("unknown", TEACHES)] * 20))) as graspd:
         assert not graspd.may_i_lift(0.02, supervised=not_true)  # type: ignore[arg-type]
 
 
@@ -230,27 +100,6 @@ def grasps(number: int) -> World:
     sent = coming(*(("stable", {"grasp": grasp}) for grasp in range(1, number + 1)))
     answers = [(0, message[1]) for _, message in sent for _ in range(2)]
     return World(sent, answers, [(MS, TAKEN)] * number)
-
-
-def test_an_allowed_lift_never_told_is_counted_and_warned_of(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    world = grasps(35)
-    with client(world, ask=True) as graspd:
-        for number in range(1, 35):
-            answer = graspd.may_i_lift(1.0)
-            assert answer.verdict.grasp == number
-            assert graspd.may_i_lift(0.002).verdict.grasp == number
-            told = sum(each % 3 == 0 for each in range(1, number))
-            assert graspd.unreported == number - 1 - told
-            if number % 3 == 0:
-                assert graspd.tell(answer.verdict, "held")
-            world.now_ns = START_NS + number * 10 * MS
-        assert len(caplog.messages) == 3
-    assert graspd.unreported == 23  # the last one is over too
-    assert caplog.messages == [
-        f"{number} lifts were allowed, and their outcome not told" for number in (1, 11, 21)
-    ]
 
 
 def test_lifts_are_remembered_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,22 +111,6 @@ def test_lifts_are_remembered_in_bounded_memory(monkeypatch: pytest.MonkeyPatch)
             world.now_ns += 10 * MS
         assert graspd.unreported == 19
         assert len(graspd._lifts) == 4  # noqa: SLF001
-
-
-def test_an_outcome_not_kept_stays_unreported() -> None:
-    not_kept = b'{"v":1,"ok":false,"why":"not kept: No space left on device"}'
-    world = grasps(3)
-    world.acknowledged[:] = [(50 * MS, not_kept), (50 * MS, TAKEN)]
-    with client(world, ask=True) as graspd:
-        first = graspd.may_i_lift(1.0).verdict
-        world.now_ns += 10 * MS
-        assert graspd.may_i_lift(1.0)
-        told = graspd.tell(first, Outcome.SLIPPED)
-        assert (bool(told), told.why) == (False, "not kept: No space left on device")
-        assert graspd.unreported == 1
-        assert graspd.tell(first, Outcome.SLIPPED)
-        assert graspd.unreported == 0
-    assert world.telling.said == [b"outcome a 1 slip"] * 2
 
 
 def test_an_outcome_that_waits_for_the_disk_blocks_no_lift() -> None:
@@ -294,15 +127,16 @@ def test_an_outcome_that_waits_for_the_disk_blocks_no_lift() -> None:
         assert graspd.unreported == 0
 
 
-@pytest.mark.parametrize("word", ["held", "stable", Outcome.HELD])
-@pytest.mark.parametrize("bad", ["slipped", "slip", Outcome.SLIPPED])
-def test_an_outcome_has_a_name(word: str | Outcome, bad: str | Outcome) -> None:
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [("held", "stable"), ("stable", "stable"), (Outcome.HELD, "stable"), ("slipped", "slip"),
+     ("slip", "slip"), (Outcome.SLIPPED, "slip")],
+)  # fmt: skip
+def test_an_outcome_is_told_by_its_name(how: str | Outcome, told: str) -> None:
     world = World(stream("stable"))
-    lifted_on = Verdict(Decision.STABLE, grasp=1, boot_id="a")
     with client(world, ask=True) as graspd:
-        graspd.tell(lifted_on, word, wait_s=0.0)
-        graspd.tell(lifted_on, bad, "mug", wait_s=0.0)
-    assert world.telling.said == [b"outcome a 1 stable", b"outcome a 1 slip mug"]
+        graspd.tell(Verdict(Decision.STABLE, grasp=1, boot_id="a"), how, wait_s=0.0)
+    assert world.telling.said == [f"outcome a 1 {told}".encode()]
 
 
 @pytest.mark.parametrize("nothing", [True, False, None, 0, "", "Slip", "unknown", "true"])
@@ -339,3 +173,64 @@ def test_a_flood_does_not_hold_it_up() -> None:
     with client(world) as graspd:
         assert graspd.verdict().reasons == ("behind",)
         assert graspd.verdict().reasons == ("malformed",)
+
+
+TOLD = b'{"v":1,"t_mono_ns":77000000000}'
+
+
+def heard() -> World:
+    """A daemon of which a message comes every 100 ms."""
+    times = [START_NS + step * 100 * MS for step in range(120)]
+    return World([(at_ns, frames(verdict(seq, at_ns))) for seq, at_ns in enumerate(times)])
+
+
+def asked_at_ms(world: World, *, same: bool = False) -> list[int]:
+    """Times of the questions, by looking every 100 ms for 12 s."""
+    times: list[int] = []
+    with client(world, ask=True, same=same) as graspd:
+        for step in range(120):
+            world.now_ns = START_NS + step * 100 * MS
+            graspd.verdict()
+            if len(world.timing.said) > len(times):
+                times.append(step * 100)
+    assert set(world.timing.said) <= {b"clock"}
+    return times
+
+
+def test_an_answered_client_asks_the_clock_once_a_second() -> None:
+    world = heard()
+    world.timing.answers.extend([(5 * MS, TOLD)] * 20)
+    assert asked_at_ms(world) == pytest.approx(list(range(0, 12_000, 1000)), abs=200)
+
+
+def test_an_unanswered_client_asks_again_after_ten_seconds() -> None:
+    assert asked_at_ms(heard()) == [0, 10_000]
+
+
+def test_a_client_beside_the_daemon_asks_no_clock() -> None:
+    assert asked_at_ms(heard(), same=True) == []
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [b"", b"{}", b'{"v":2,"t_mono_ns":1}', b'{"v":1,"t_mono_ns":-1}', b'{"v":1,"ok":true}'],
+)
+def test_a_clock_that_is_not_understood_is_malformed(answer: bytes) -> None:
+    world = World([])
+    world.timing.answers.append((MS, answer))
+    with client(world, ask=True, same=False) as graspd:
+        graspd.verdict(0.01)
+        assert graspd.counts.malformed == 1
+
+
+def test_a_client_without_messages_reconnects_ever_more_seldom() -> None:
+    world = World([])
+    times_s = []
+    with client(world) as graspd:
+        for _ in range(400):
+            before = world.renewed
+            graspd.verdict(0.1)
+            if world.renewed > before:
+                times_s.append((world.now_ns - START_NS) / 1e9)
+    gaps = [after - before for before, after in zip([0.0, *times_s], times_s, strict=False)]
+    assert gaps == pytest.approx([1.0, 2.0, 4.0, 8.0, 10.0, 10.0], abs=0.15)

@@ -15,7 +15,7 @@ import zmq
 
 from deploy.clients.python.graspd_client import Client
 from tests.clients.building import asked, compiled_probe
-from tests.clients.test_both_ask import false_daemon, told
+from tests.clients.false_daemon import false_daemon
 from tests.conftest import ROOT
 
 HOURS_S, LIMIT_S = 1e6, 60.0
@@ -92,7 +92,7 @@ asyncio.run(forks())
 @pytest.mark.parametrize("program", [FORKS, FORKS_IN_A_LOOP])
 def test_a_forked_process_gets_an_error_at_once(tmp_path: Path, program: str) -> None:
     places = [f"ipc://{tmp_path}/{end}" for end in ("out", "ask")]
-    with false_daemon(tmp_path, told()):
+    with false_daemon(tmp_path):
         subprocess.run([sys.executable, "-c", program, *places], check=True, cwd=ROOT, timeout=60)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from deploy.clients.python import graspd_client
 from tests.clients.building import CPP
-from tests.clients.test_both_ask import false_daemon, told
+from tests.clients.false_daemon import false_daemon
 from tests.kit.waiting import wait_until
 
 EXAMPLE = CPP.parent / "ros2" / "grasp_node.py"
@@ -100,7 +100,7 @@ def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> Non
 
     publish()
     assert decisions == ["unknown no-message"]
-    with false_daemon(tmp_path, told()):
+    with false_daemon(tmp_path):
         wait_until(is_stable)
         wait_until(lambda: node.ask("~/may_i_lift") == (True, "stable"))
         wait_until(lambda: node.ask("~/held", data=True) == (True, ""))
@@ -109,7 +109,7 @@ def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> Non
 
 
 def test_the_node_says_why_it_refuses(node: Node, tmp_path: Path) -> None:
-    with false_daemon(tmp_path, told(), "unknown", reasons=["moving"]):
+    with false_daemon(tmp_path, outcome="unknown", reasons=["moving"]):
         wait_until(lambda: node.ask("~/may_i_lift") == (False, "unknown moving"))
         assert node.ask("~/held", data=True) == (False, "no lift was allowed")
     node.graspd.close()  # type: ignore[attr-defined]

@@ -1,0 +1,87 @@
+"""A daemon that publishes and answers what a test says, right or wrong."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from tests.clients.messages import TOPIC, verdict
+from tests.threads import at_work
+
+PERIOD_MS = 5
+PATIENT_MS = 5000.0
+"""Silence that this thread, on a busy machine, does not need."""
+TAKEN = b'{"v":1,"ok":true}'
+Answer = Callable[[dict[str, Any]], list[bytes]]
+"""What is answered, from the message that has just been published."""
+
+
+def told(**change: object) -> Answer:
+    """An answer that differs so from what has been published."""
+    return lambda published: [json.dumps(published | change).encode()]
+
+
+def of(outcome: str) -> Answer:
+    """The answer of that verdict."""
+    return lambda published: [
+        json.dumps(verdict(published["seq"], published["t_mono_ns"], outcome)).encode()
+    ]
+
+
+@contextmanager
+def false_daemon(
+    folder: Path,
+    answer: Answer | None = None,
+    outcome: str = "stable",
+    taken: Sequence[bytes] = (TAKEN,),
+    **more: object,
+) -> Iterator[list[bytes]]:
+    """Publishes that verdict all the time, with what is `more`, and answers so.
+
+    The frames of `taken` answer what is told. Gives what it is asked and told.
+    """
+    heard: list[bytes] = []
+    with at_work(partial(_serve, folder, answer or told(), outcome, taken, more, heard)):
+        yield heard
+
+
+def _serve(
+    folder: Path,
+    answer: Answer,
+    outcome: str,
+    taken: Sequence[bytes],
+    more: dict[str, Any],
+    heard: list[bytes],
+    stop: threading.Event,
+) -> None:
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.PUB) as out,
+        context.socket(zmq.ROUTER) as questions,
+    ):
+        out.linger = questions.linger = 0
+        out.bind(f"ipc://{folder}/out")
+        questions.bind(f"ipc://{folder}/ask")
+        seq = 0
+        while not stop.is_set():
+            grasp = 1 + seq // more.get("messages_each", 10**6)
+            fields = {"grasp": grasp, "silence_ms": PATIENT_MS, **more}
+            message = verdict(seq, time.monotonic_ns(), outcome, **fields)
+            out.send_multipart([TOPIC, json.dumps(message).encode()])
+            seq += 1
+            if questions.poll(PERIOD_MS):
+                who, *question = questions.recv_multipart()
+                heard.extend(question)
+                told_of = question[0].startswith((b"outcome ", b"not-lifting"))
+                assert told_of or question == [b"lift"]
+                frames = taken if told_of else answer(message)
+                if frames:
+                    questions.send_multipart([who, *frames])

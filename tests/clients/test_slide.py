@@ -1,0 +1,155 @@
+"""Watching over a lift: it is stopped for what slides, and for what is not known."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from deploy.clients.python.graspd_client import Client, SlideAnswer
+from tests.clients.building import Probe
+from tests.clients.false_daemon import false_daemon
+from tests.clients.world import World, client, coming
+from tests.kit.waiting import wait_until
+
+Words = Mapping[str, str | None]
+
+HELD: Words = {"ff": "touch", "th": "touch"}
+
+
+def lift(*words: Words | None, **more: object) -> list[tuple[int, list[bytes]]]:
+    """Messages, one every 10 ms, in which the fingers feel this; None: not told."""
+    told = ({} if felt is None else {"fingers": felt} for felt in words)
+    return coming(*(("unknown", each | more) for each in told))
+
+
+def watched(sent: list[tuple[int, list[bytes]]]) -> SlideAnswer:
+    with client(World(sent)) as graspd:
+        return graspd.wait_for_slide(0.3)
+
+
+def test_a_slide_stops_the_lift_at_once() -> None:
+    answer = watched(lift(*[HELD] * 5, {"ff": "touch", "th": "slide"}, *[HELD] * 30))
+    assert answer
+    assert (answer.sliding, answer.held) == (("th",), False)
+    assert answer.waited_s == pytest.approx(0.05, abs=0.002)
+
+
+def test_a_lift_that_holds_runs_its_time() -> None:
+    answer = watched(lift(*[HELD] * 40))
+    assert (bool(answer), answer.sliding, answer.held) == (False, (), True)
+    assert answer.waited_s == pytest.approx(0.3, abs=0.002)
+    assert answer.verdict.reasons == ("moving",)
+
+
+@pytest.mark.parametrize(
+    ("sent", "after_ms"),
+    [
+        # By the last reading that said so, which was 1 ms old, and 100 ms of age.
+        (lift(*[HELD] * 5), 40 + 99),
+        (lift(*[HELD] * 5, *[{"ff": "touch", "th": None}] * 40), 40 + 99),
+        (lift(*[HELD] * 5, *[None] * 40), 40 + 99),
+        (lift(*[HELD] * 5, *[HELD] * 40, age_ms=60.0), 300),
+        (lift(*[HELD] * 5, *[{"ff": "free", "th": "touch"}] * 40), 50),
+        (lift(*[HELD] * 5) + lift(*[HELD] * 40, boot_id="b")[5:], 50),
+        (lift(*[None] * 40), 100),
+        (lift(*[{"ff": "free", "th": "free"}] * 40), 100),
+        (lift(*[{"ff": None, "th": None}] * 40), 100),
+        ([], 100),
+    ],
+    ids=[
+        *("silence", "not known", "not told", "60 ms old", "let go", "another start"),
+        *("never told", "open", "never known", "nothing comes"),
+    ],
+)
+def test_what_is_not_known_stops_the_lift_within_the_age(
+    sent: list[tuple[int, list[bytes]]], after_ms: int
+) -> None:
+    answer = watched(sent)
+    assert answer.held is (after_ms == 300)
+    assert bool(answer) is not answer.held
+    assert answer.sliding == ()
+    assert answer.waited_s == pytest.approx(after_ms / 1e3, abs=0.012)
+
+
+def test_one_reading_that_cannot_be_used_stops_no_lift() -> None:
+    nothing: Words = {"ff": None, "th": None}
+    assert not watched(lift(*[HELD] * 5, nothing, *[HELD] * 5, nothing, *[HELD] * 30))
+
+
+@pytest.mark.parametrize(("passing", "sliding"), [("slide", ("th",)), ("free", ())])
+def test_what_passed_between_two_looks_stops_the_lift(
+    passing: str, sliding: tuple[str, ...]
+) -> None:
+    sent = lift(*[HELD] * 5, {"ff": "touch", "th": passing}, *[HELD] * 30)
+    late_ns = sent[8][0]  # four messages wait for one look
+    answer = watched(
+        [
+            (max(at_ns, late_ns) if seq >= 5 else at_ns, message)
+            for seq, (at_ns, message) in enumerate(sent)
+        ]
+    )
+    assert (bool(answer), answer.held, answer.sliding) == (True, False, sliding)
+    assert answer.waited_s == pytest.approx(0.08, abs=0.012)
+
+
+def test_words_of_an_old_reading_are_not_told() -> None:
+    with client(World(lift(HELD, age_ms=101.0))) as graspd:
+        assert graspd.verdict().fingers == {"ff": None, "th": None}
+    with client(World(lift(HELD, age_ms=90.0))) as graspd:
+        assert graspd.verdict().fingers == HELD
+
+
+@pytest.mark.parametrize(
+    ("max_age_ms", "timeout_s", "later", "passes", "answer"),
+    [
+        (5000, 0.1, {}, False, "0 1"),
+        (5000, 2.0, {"th": "slide"}, False, "1 0 th"),
+        (5000, 2.0, {"th": "slide"}, True, "1 0 th"),
+        (5000, 2.0, {"ff": "free"}, False, "1 0"),
+        (5000, 2.0, {"ff": "free"}, True, "1 0"),
+        (100, 2.0, {"ff": None}, False, "1 0"),
+    ],
+    ids=["held", "slide", "slid", "let go", "had let go", "not known"],
+)
+def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
+    probe: Probe,
+    tmp_path: Path,
+    max_age_ms: int,
+    timeout_s: float,
+    later: Words,
+    passes: bool,
+    answer: str,
+) -> None:
+    """`passes`: it is over when the client looks again."""
+    fingers = dict(HELD)
+    with (
+        false_daemon(tmp_path, outcome="unknown", fingers=fingers),
+        Client(f"ipc://{tmp_path}/out", max_age_ms=5000) as other,
+    ):
+
+        def become(felt: Words) -> None:
+            """Returns once a message has said so."""
+            fingers.update(felt)
+            wait_until(lambda: other.verdict(0.1).fingers == fingers)
+
+        def is_answered() -> bool:
+            """On a machine that stands still the probe may begin to look too late for it."""
+            fingers.update(HELD)
+            wait_until(lambda: probe.ask("slide", 0.01) == "0 1")  # it has received them
+            probe.tell("slide", timeout_s)
+            probe.flush()
+            time.sleep(0.1)
+            if passes:
+                probe.send_signal(signal.SIGSTOP)
+            become(later)
+            if passes:
+                become(HELD)
+                probe.send_signal(signal.SIGCONT)
+            return probe.line() == answer
+
+        probe.tell("client", f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask", max_age_ms)
+        wait_until(is_answered)

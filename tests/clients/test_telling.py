@@ -1,0 +1,115 @@
+"""Both clients tell how a lift ended to a daemon that answers what it should not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
+from tests.clients.either import Connect, Grasp
+from tests.clients.false_daemon import TAKEN, false_daemon
+from tests.clients.messages import verdict
+from tests.clients.test_both import DEADLINE_S, LONG_S
+from tests.kit.waiting import wait_until
+
+LIFTED_ON = Grasp("0f0e0d0c0b0a09080706050403020100", 42)
+ANSWERS: dict[str, tuple[list[bytes], str]] = {
+    "taken": ([TAKEN], ""),
+    "with a later field": ([b'{"v":1,"ok":true,"later":[1]}'], ""),
+    "refused": ([b'{"v":1,"ok":false,"why":"unknown grasp: no"}'], "unknown grasp: no"),
+    "of a later version": ([b'{"v":2,"ok":true}'], "version"),
+    "refused without why": ([b'{"v":1,"ok":false}'], "malformed"),
+    "refused with a number": ([b'{"v":1,"ok":false,"why":1}'], "malformed"),
+    "a verdict": ([json.dumps(verdict()).encode()], "malformed"),
+    "not JSON": ([b"yes"], "malformed"),
+    "empty": ([b""], "malformed"),
+    "of two frames": ([TAKEN] * 2, "malformed"),
+    "nothing": ([], "no-answer"),
+}
+
+
+@pytest.mark.parametrize(("frames", "why"), ANSWERS.values(), ids=ANSWERS)
+def test_an_outcome_is_taken_only_if_the_answer_says_so(
+    connect: Connect, tmp_path: Path, frames: Sequence[bytes], why: str
+) -> None:
+    with false_daemon(tmp_path, taken=frames) as heard:
+        wait_s = LONG_S if frames else DEADLINE_S
+        assert connect(tmp_path).tell(LIFTED_ON, "slip", "mug", wait_s) == why
+    assert heard == [f"outcome {LIFTED_ON.boot_id} 42 slip mug".encode()]
+
+
+@pytest.mark.parametrize("name", [None, "035_power-drill", "_Z.a-9", "x" * 64])
+def test_an_outcome_has_the_object_as_it_was_given(
+    connect: Connect, tmp_path: Path, name: str | None
+) -> None:
+    with false_daemon(tmp_path) as heard:
+        assert connect(tmp_path).tell(LIFTED_ON, "slip", name) == ""
+    assert heard == [f"outcome {LIFTED_ON.boot_id} 42 slip {name or ''}".rstrip().encode()]
+
+
+@pytest.mark.parametrize("name", ["a mug", "mug,cup", "müg", "mug\n", "x" * 65, "=1", "a/b"])
+def test_a_malformed_object_name_is_not_sent(connect: Connect, tmp_path: Path, name: str) -> None:
+    with false_daemon(tmp_path) as heard:
+        with pytest.raises(ValueError, match="no name of an object: 1 to 64 ASCII letters, "):
+            connect(tmp_path).tell(LIFTED_ON, "slip", name)
+        assert heard == []
+
+
+def test_an_outcome_needs_a_grasp_an_endpoint_and_a_client(tmp_path: Path) -> None:
+    lifted_on = Verdict(Decision.STABLE, grasp=42, boot_id="a" * 32)
+    asking = Client(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask")
+    with asking as graspd, pytest.raises(ValueError, match="of no grasp"):
+        graspd.tell(graspd.verdict(), Outcome.SLIPPED)
+    assert asking.tell(lifted_on, Outcome.SLIPPED).why == "closed"
+    with Client(f"ipc://{tmp_path}/out") as graspd, pytest.raises(ValueError, match="ask_endpoint"):
+        graspd.tell(lifted_on, Outcome.SLIPPED)
+
+
+def test_a_told_grasp_is_offered_no_more(connect: Connect, tmp_path: Path) -> None:
+    with false_daemon(tmp_path):
+        graspd = connect(tmp_path)
+        assert graspd.tell(graspd.lift(LONG_S).grasp, "slip") == ""
+        told = ("outcome-told",)
+        wait_until(lambda: graspd.lift(DEADLINE_S, supervised=True).reasons == told)
+        assert graspd.grasp(DEADLINE_S) is None
+
+
+def test_a_yes_that_no_lift_follows_is_offered_again(connect: Connect, tmp_path: Path) -> None:
+    with false_daemon(tmp_path) as heard:
+        graspd = connect(tmp_path)
+        assert graspd.tell(graspd.lift(LONG_S).grasp, "not-lifted") == ""
+        assert heard[-1].endswith(b" 1 not-lifted")
+        assert graspd.lift(LONG_S).may
+        assert graspd.unreported == 0
+
+
+def test_an_outcome_not_kept_stays_unreported(connect: Connect, tmp_path: Path) -> None:
+    not_kept = b'{"v":1,"ok":false,"why":"not kept: No space left on device"}'
+    with false_daemon(tmp_path, taken=[not_kept], messages_each=10):
+        graspd = connect(tmp_path)
+        first = graspd.lift(LONG_S).grasp
+        assert graspd.tell(first, "slip") == "not kept: No space left on device"
+        wait_until(lambda: graspd.lift(LONG_S).grasp != first)
+        assert graspd.unreported > 0
+
+
+def test_lifts_never_told_are_counted_and_warned_of(
+    connect: Connect, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lifted: dict[Grasp, bool] = {}
+    with false_daemon(tmp_path, messages_each=10):
+        graspd = connect(tmp_path)
+        while len(lifted) < 24:
+            tell = len(lifted) % 4 == 3
+            said = graspd.lift(LONG_S)
+            assert said.may
+            before = [told for each, told in lifted.items() if each != said.grasp]
+            assert graspd.unreported == before.count(False)
+            lifted[said.grasp] = lifted.get(said.grasp, False) or tell
+            assert not tell or graspd.tell(said.grasp, "slip") == ""
+    assert caplog.messages + graspd.warned == [
+        f"{number} lifts were allowed, and their outcome not told" for number in (1, 11)
+    ]

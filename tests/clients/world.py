@@ -1,0 +1,115 @@
+"""The Python client with a clock and sockets that tests move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from deploy.clients.python import graspd_client
+from deploy.clients.python.graspd_client import Client
+from tests.clients.messages import MS, frames, verdict
+
+START_NS = 1000 * MS
+ASK = "ipc:///nowhere.ask"
+LOOK_NS = 1000
+"""What each look at the clock takes."""
+
+
+@dataclass
+class Call:
+    """What is asked or told, and the answers to it."""
+
+    world: World
+    answers: list[tuple[int, bytes]]
+    said: list[bytes] = field(default_factory=list)
+    answered: list[bytes] = field(default_factory=list)
+    due: tuple[int, bytes] | None = None
+
+    def ask(self, question: bytes) -> None:
+        assert self.due is None, "one question at a time"
+        self.said.append(question)
+        if self.answers:
+            delay_ns, payload = self.answers.pop(0)
+            self.due = self.world.now_ns + delay_ns, payload
+
+    def answer(self) -> bytes | None:
+        if self.due is None or self.due[0] > self.world.now_ns:
+            return None
+        self.answered.append(self.due[1])
+        self.due = None
+        return self.answered[-1]
+
+    def hang_up(self, *, lifts: bool = True) -> None:
+        self.due = None
+
+
+@dataclass
+class World:
+    """A clock, and sockets where things come in time."""
+
+    coming: list[tuple[int, list[bytes]]]
+    """When what comes, ns."""
+    answers: list[tuple[int, bytes]] = field(default_factory=list)
+    """How long after its question each comes, ns; then none any more."""
+    acknowledged: list[tuple[int, bytes]] = field(default_factory=list)
+    """The same of outcomes."""
+    now_ns: int = START_NS
+    slept_ns: int = 0
+    """What the computer has slept: the monotonic clock does not count it."""
+    came: list[list[bytes]] = field(default_factory=list)
+    renewed: int = 0
+
+    def __post_init__(self) -> None:
+        self.asking, self.telling = Call(self, self.answers), Call(self, self.acknowledged)
+        self.timing = Call(self, [])
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += LOOK_NS
+        return self.now_ns
+
+    def boot_ns(self, _clock: int) -> int:
+        return self.monotonic_ns() + self.slept_ns
+
+    def receive(self) -> list[bytes] | None:
+        if not self.coming or self.coming[0][0] > self.now_ns:
+            return None
+        self.came.append(self.coming.pop(0)[1])
+        return self.came[-1]
+
+    def wait(self, timeout_ms: int) -> None:
+        calls = (self.asking.due, self.telling.due)
+        due_ns = [due for due, _ in self.coming[:1]] + [due[0] for due in calls if due]
+        self.now_ns = max(self.now_ns, min([self.now_ns + timeout_ms * MS, *due_ns]))
+
+    def renew(self) -> None:
+        self.renewed += 1
+
+    def close(self) -> None:
+        pass
+
+
+@contextmanager
+def client(world: World, ask: bool = False, same: bool | None = None) -> Iterator[Client]:
+    """A client in that world."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(graspd_client, "_Link", lambda *_: world)
+        clocks = {"monotonic_ns": world.monotonic_ns, "clock_gettime_ns": world.boot_ns}
+        patch.setattr(graspd_client, "time", SimpleNamespace(**clocks, CLOCK_BOOTTIME=7))
+        asks = ASK if ask else None
+        with Client("ipc:///nowhere", ask_endpoint=asks, same_computer=same) as made:
+            yield made
+
+
+def coming(*messages: tuple[str, Mapping[str, Any]]) -> list[tuple[int, list[bytes]]]:
+    """One message every 10 ms from now on, each by its verdict and what else differs."""
+    sent = []
+    for seq, (outcome, more) in enumerate(messages):
+        at_ns = START_NS + seq * 10 * MS
+        read_ns = at_ns - round(more.get("age_ms", 1.0) * MS)
+        sent.append((at_ns, frames(verdict(seq, read_ns, outcome, **more))))
+    return sent
