@@ -22,8 +22,8 @@ WATCHES, STILL = {"supervised": True}, {"still_ms": 240.0}
 NO_RISK = {"target": 0.05, "lifts": 1, "slips": 0}
 Fields = dict[str, Any]
 Case = tuple[Fields, Answer | None, Fields, str]
-"""What is published besides `stable`, the answer (None: not asked), what is wanted, and what is
-said."""
+"""What is published besides `stable`, the answer (None: not asked), what is asked for, and
+what is said."""
 
 ANSWERS: dict[str, Case] = {
     "the same": ({}, told(), {}, "stable"),
@@ -125,7 +125,7 @@ def test_a_no_says_why(
 
 
 @pytest.mark.parametrize("still_ms", [-1.0, float("nan"), float("inf")])
-def test_a_stillness_that_is_no_time_is_refused(
+def test_a_stillness_that_is_not_a_time_is_refused(
     connect: Connect, tmp_path: Path, still_ms: float
 ) -> None:
     with pytest.raises(ValueError, match="still_ms"):

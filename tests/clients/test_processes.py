@@ -61,39 +61,11 @@ with Client(out, ask_endpoint=ask) as graspd:
 """
 """A child that ends by itself, with all that its interpreter does at the end; then the parent."""
 
-FORKS_IN_A_LOOP = """
-import asyncio, os, sys
-from deploy.clients.python.graspd_client import AsyncClient
 
-
-async def forks():
-    async with AsyncClient(sys.argv[1], ask_endpoint=sys.argv[2]) as graspd:
-        assert await graspd.wait_for_grasp(1e6)
-        waiting = asyncio.create_task(graspd.wait_for_grasp(1e6))  # for the next one, in vain
-        await asyncio.sleep(0.05)
-        child = os.fork()
-        if child == 0:
-            try:
-                await waiting
-            except RuntimeError as error:
-                os._exit(f"of process {os.getppid()}: make another one" not in str(error))
-            os._exit(2)
-        while not (ended := os.waitpid(child, os.WNOHANG))[0]:
-            await asyncio.sleep(0.05)
-        assert os.waitstatus_to_exitcode(ended[1]) == 0
-        assert not waiting.done()
-        waiting.cancel()
-
-
-asyncio.run(forks())
-"""
-
-
-@pytest.mark.parametrize("program", [FORKS, FORKS_IN_A_LOOP])
-def test_a_forked_process_gets_an_error_at_once(tmp_path: Path, program: str) -> None:
+def test_a_forked_process_gets_an_error_at_once(tmp_path: Path) -> None:
     places = [f"ipc://{tmp_path}/{end}" for end in ("out", "ask")]
     with false_daemon(tmp_path):
-        subprocess.run([sys.executable, "-c", program, *places], check=True, cwd=ROOT, timeout=60)
+        subprocess.run([sys.executable, "-c", FORKS, *places], check=True, cwd=ROOT, timeout=60)
 
 
 DROPPED = """

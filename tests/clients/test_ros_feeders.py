@@ -8,7 +8,6 @@ import sys
 from array import array
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -29,70 +28,50 @@ SENSORS = 5
 """Length of `BiotacAll.tactiles`: first, middle, ring and little finger, thumb (sr_robot_msgs)."""
 
 
-@dataclass
-class Stamp:
-    """`ros::Time`, and `builtin_interfaces/Time` of ROS 2."""
-
-    sec: int
-    nanosec: int
-
-    def to_sec(self) -> float:
-        return self.sec + self.nanosec / 1e9
+class Biotac(SimpleNamespace):
+    """`sr_robot_msgs/Biotac`."""
 
 
-@dataclass
-class Header:
-    """`std_msgs/Header`; `seq` is not read in ROS 2, which has none."""
-
-    seq: int
-    stamp: Stamp
+class BiotacAll(SimpleNamespace):
+    """`sr_robot_msgs/BiotacAll`."""
 
 
-@dataclass
-class Biotac:
-    """`sr_robot_msgs/Biotac`. An absent sensor shows this memory (Shadow's documentation)."""
-
-    pac0: int = 0
-    pac1: int = 0
-    pdc: int = -9784
-    tac: int = 32518
-    tdc: int = 0
-    electrodes: array[int] = field(default_factory=lambda: array("h", [0] * 24))
+class JointState(SimpleNamespace):
+    """`sensor_msgs/JointState`."""
 
 
-@dataclass
-class BiotacAll:
-    header: Header
-    tactiles: list[Biotac]
+ABSENT = Biotac(pac0=0, pac1=0, pdc=-9784, tac=32518, tdc=0, electrodes=array("h", [0] * 24))
+"""What shows for an absent sensor is this memory (Shadow's documentation)."""
 
 
-@dataclass
-class JointState:
-    header: Header
-    name: list[str]
-    position: tuple[float, ...]
-
-
-def header(number: int) -> Header:
-    return Header(number, Stamp(START_S, number * 10_000_000))
+def header(number: int) -> SimpleNamespace:
+    """`std_msgs/Header`; its stamp is read in ROS 1 by `to_sec`, `seq` only there."""
+    time_s = START_S + number / 100
+    stamp = SimpleNamespace(sec=START_S, nanosec=number * 10_000_000, to_sec=lambda: time_s)
+    return SimpleNamespace(seq=number, stamp=stamp)
 
 
 def sweep(number: int, *, repeats: int | None = None) -> BiotacAll:
     """Counts of a hand with three sensors: 100 times the place of the sensor, and the number."""
-    sensors = [Biotac() for _ in range(SENSORS)]
+    sensors = [ABSENT] * SENSORS
     for place in (0, 1, 4):
-        counts = [1000 + 100 * place + number] * 24
-        sensors[place] = Biotac(pdc=2779, tac=2006, tdc=2247, electrodes=array("h", counts))
-    return BiotacAll(header(number if repeats is None else repeats), sensors)
+        counts = array("h", [1000 + 100 * place + number] * 24)
+        sensors[place] = Biotac(pac0=0, pac1=0, pdc=2779, tac=2006, tdc=2247, electrodes=counts)
+    return BiotacAll(header=header(number if repeats is None else repeats), tactiles=sensors)
 
 
-ARM = JointState(header(900), ["ra_elbow_joint"], (1.5,))
-BOTH = JointState(header(1), ["rh_FFJ3", "lh_FFJ3", "rh_THJ5"], (0.5, 0.9, -0.1))
+def joint_state(number: int, angles: dict[str, float]) -> JointState:
+    return JointState(header=header(number), name=[*angles], position=tuple(angles.values()))
+
+
+ARM = joint_state(900, {"ra_elbow_joint": 1.5})
+BOTH = joint_state(1, {"rh_FFJ3": 0.5, "lh_FFJ3": 0.9, "rh_THJ5": -0.1})
+WITHOUT_ANGLES = JointState(header=header(2), name=BOTH.name, position=())
 MESSAGES = (
     *(sweep(number) for number in (1, 2, 3)),
     *(sweep(4, repeats=3), sweep(5, repeats=3)),
     sweep(6),
-    *(ARM, BOTH, JointState(header(2), BOTH.name, ())),
+    *(ARM, BOTH, WITHOUT_ANGLES),
 )
 """The topic repeats its third message twice. Joints of an arm come on the topic of the hand's."""
 

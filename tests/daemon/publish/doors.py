@@ -22,6 +22,7 @@ from graspd.daemon.judge.reasons import Moment
 from graspd.daemon.publish.companion import KEPT, Answer, PublishedVerdict, Reply, at_once
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener
+from graspd.daemon.publish.porter import Frames
 from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Report
 from graspd.models.judge.grasp_judge import Opinion
@@ -243,3 +244,15 @@ def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[b
         publisher.door.check()
         publisher.send(b"verdict.right", b"first")
     return subscriber.recv_multipart()
+
+
+def receive(door: Door, wanted: int = 1) -> list[Frames]:
+    """Questions, once there are enough."""
+    received: list[Frames] = []
+
+    def have_come() -> bool:
+        received.extend(door.receive())
+        return len(received) >= wanted
+
+    wait_until(have_come)
+    return received

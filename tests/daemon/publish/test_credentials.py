@@ -10,7 +10,7 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,11 @@ from graspd.daemon import scene
 from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.listener import Listener
-from graspd.daemon.publish.porter import Frames
 from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
-from tests.daemon.publish.doors import WAIT_MS, Asked, Peers, published
-from tests.kit.waiting import wait_until
+from tests.daemon.publish.doors import WAIT_MS, Asked, Peers, published, receive
 from tests.ports import free_port
 
 ROBOT, STRANGER = b"user 1000", b"user 1001"
@@ -46,17 +44,6 @@ def door() -> Iterator[tuple[Door, str]]:
         assert opened.close()
         for listener in listeners:
             listener.close()
-
-
-def first_of(receive: Callable[[], list[Frames]]) -> Frames:
-    got: list[Frames] = []
-
-    def has_come() -> bool:
-        got.extend(receive())
-        return bool(got)
-
-    wait_until(has_come)
-    return got[0]
 
 
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -90,7 +77,7 @@ def test_a_peer_cannot_name_its_own_user(door: tuple[Door, str], forged: bytes) 
         rogue.sendall(hello((forged, b"localhost:4242:4242:1")))
         assert rogue.recv(100)
         rogue.sendall(QUESTION)
-        assert first_of(door[0].receive) == [NAME, b"user %d" % os.getuid(), b"lift"]
+        assert receive(door[0]) == [[NAME, b"user %d" % os.getuid(), b"lift"]]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
@@ -99,9 +86,9 @@ def test_another_user_with_the_same_routing_id_is_told_apart(door: tuple[Door, s
     said = (GREETING + hello()).hex(), QUESTION.hex()
     # A DEALER of libzmq would connect again, and take its routing id back.
     with subprocess.Popen([*command, "0", *said]) as owner:
-        assert first_of(door[0].receive) == [NAME, b"user 0", b"lift"]
+        assert receive(door[0]) == [[NAME, b"user 0", b"lift"]]
         with subprocess.Popen([*command, "65534", *said]) as rogue:
-            assert first_of(door[0].receive) == [NAME, b"user 65534", b"lift"]
+            assert receive(door[0]) == [[NAME, b"user 65534", b"lift"]]
             rogue.kill()
         owner.kill()
 

@@ -7,11 +7,9 @@ import json
 import os
 import signal
 import socket
-import stat
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,9 +19,17 @@ import zmq
 from graspd.daemon.process.signals import StopSignal
 from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.listener import Listener
-from graspd.daemon.publish.porter import QUESTIONS_MAX, Frames, Plan
+from graspd.daemon.publish.porter import QUESTIONS_MAX, Plan
 from graspd.daemon.publish.sockets import Door
-from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message, halt, processes
+from tests.daemon.publish.doors import (
+    WAIT_MS,
+    Peers,
+    Publisher,
+    first_message,
+    halt,
+    processes,
+    receive,
+)
 from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
@@ -56,16 +62,6 @@ def has_ipv6() -> bool:
         except OSError:
             return False
     return True
-
-
-def receive(door: Door, wanted: int) -> list[Frames]:
-    """Questions, once there are enough."""
-    deadline_s = time.monotonic() + WAIT_MS / 1e3
-    received: list[Frames] = []
-    while len(received) < wanted:
-        assert time.monotonic() < deadline_s
-        received += door.receive()
-    return received
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -141,46 +137,16 @@ def test_a_door_on_a_port_that_is_taken_is_refused(tmp_path: Path) -> None:
         Publisher(endpoint)
 
 
-def test_the_socket_file_keeps_its_mode_and_survives_opening_again(
-    tmp_path: Path, peers: Peers
-) -> None:
-    listener = Listener(f"ipc://{tmp_path}/v", 0o640)
-    for _ in range(2):
-        door = Door([listener])
-        subscriber = peers.subscribe(listener.endpoint)
-        deadline_s = time.monotonic() + WAIT_MS / 1e3
-        while not subscriber.poll(10):
-            assert time.monotonic() < deadline_s
-            door.send(b"verdict.right", b"{}")
-        assert door.close()
-        assert stat.S_IMODE((tmp_path / "v").stat().st_mode) == 0o640
-    listener.close()
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
-def test_a_question_gets_its_answer_by_routing_id(
-    asked: tuple[Door, str], peers: Peers, kind: int
-) -> None:
-    door, endpoint = asked
-    asker = peers.connect(kind, endpoint, name=b"controller")
-    asker.send(b"judge")
-    delimiter = [b""] if kind == zmq.REQ else []
-    assert receive(door, 1) == [[b"controller", ME, *delimiter, b"judge"]]
-    assert door.answer([b"controller", *delimiter, b"{}"])
-    assert asker.recv_multipart() == [b"{}"]
-
-
-def test_a_client_that_reconnects_takes_its_routing_id_along(
+def test_answers_go_by_the_routing_id_that_reconnects(
     asked: tuple[Door, str], peers: Peers
 ) -> None:
     door, endpoint = asked
-    for number in range(2):
-        asker = peers.connect(zmq.DEALER, endpoint, name=b"controller")
+    for kind, delimiter in ((zmq.REQ, [b""]), (zmq.DEALER, []), (zmq.DEALER, [])):
+        asker = peers.connect(kind, endpoint, name=b"controller")
         asker.send(b"judge")
-        assert receive(door, 1) == [[b"controller", ME, b"judge"]]
-        door.answer([b"controller", b"%d" % number])
-        assert asker.recv() == b"%d" % number
+        assert receive(door, 1) == [[b"controller", ME, *delimiter, b"judge"]]
+        assert door.answer([b"controller", *delimiter, b"{}"])
+        assert asker.recv_multipart() == [b"{}"]
 
 
 def test_a_message_of_many_frames_is_cut(asked: tuple[Door, str], peers: Peers) -> None:
@@ -249,17 +215,6 @@ def test_the_process_ends_with_the_daemon_and_leaves_no_file(tmp_path: Path) -> 
     )
     wait_until(lambda: not Path(f"/proc/{int(killed.stdout)}").exists())
     assert {path.name for path in tmp_path.iterdir()} == {"v", "v.lock"}
-
-
-def test_connections_take_no_descriptor_of_the_daemon(tmp_path: Path) -> None:
-    with Publisher(f"ipc://{tmp_path}/v"), contextlib.ExitStack() as stack:
-        before = len(os.listdir("/proc/self/fd"))
-        (process,) = processes()
-        for _ in range(50):
-            peer = stack.enter_context(socket.socket(socket.AF_UNIX))
-            peer.connect(f"{tmp_path}/v")
-        wait_until(lambda: len(os.listdir(f"/proc/{process}/fd")) > 50)
-        assert len(os.listdir("/proc/self/fd")) == before + 50  # the other ends
 
 
 def test_its_process_ends_when_a_thread_of_it_has_ended(tmp_path: Path) -> None:

@@ -58,20 +58,15 @@ def test_jitter_is_of_readings_in_a_row(
     assert deadlines.jitter.max_us == pytest.approx(longest_us)
 
 
-def test_a_verdict_a_period_after_its_reading_is_late() -> None:
+@pytest.mark.parametrize(("period_ns", "late", "counted"), [(PERIOD_NS, 1, 3), (None, 0, 0)])
+def test_a_verdict_a_period_after_its_reading_is_late(
+    period_ns: int | None, late: int, counted: int
+) -> None:
     deadlines = Deadlines()
     for seq, age_ms in enumerate((0.5, 10.0, 10.5, 2.0)):
-        deadlines.add(reading(seq * PERIOD_NS, seq=seq), age_ms, PERIOD_NS)
-    assert deadlines.late == 1
+        deadlines.add(reading(seq * PERIOD_NS, seq=seq), age_ms, period_ns)
+    assert (deadlines.late, deadlines.jitter.count) == (late, counted)
     assert deadlines.worst_age_ms == 10.5
-
-
-def test_without_a_period_nothing_is_late() -> None:
-    deadlines = Deadlines()
-    for seq in range(3):
-        deadlines.add(reading(seq * PERIOD_NS, seq=seq), 500.0, None)
-    assert (deadlines.late, deadlines.jitter.count) == (0, 0)
-    assert deadlines.worst_age_ms == 500.0
 
 
 def verdict(outcome: Decision) -> Verdict:
@@ -103,17 +98,14 @@ def test_scores_follow_their_definitions_with_slip_positive() -> None:
     assert summary.as_dict(1.0, None)["reasons"] == {"stale": 3}
 
 
-def test_no_labels_means_no_scores() -> None:
+@pytest.mark.parametrize(("slipped", "scores"), [(None, None), (False, {"accuracy": 1.0})])
+def test_a_score_without_lifts_of_its_kind_is_left_out(
+    slipped: bool | None, scores: dict[str, float] | None
+) -> None:
     summary = RunSummary()
-    summary.add(verdict(Decision.STABLE), None)
-    assert summary.tally.scores() is None
-    assert not any("recorded" in line for line in summary.lines(1.0, None))
-
-
-def test_a_score_without_a_denominator_is_left_out() -> None:
-    summary = RunSummary()
-    summary.add(verdict(Decision.STABLE), False)
-    assert summary.tally.scores() == {"accuracy": 1.0}
+    summary.add(verdict(Decision.STABLE), slipped)
+    assert summary.tally.scores() == scores
+    assert any("recorded" in line for line in summary.lines(1.0, None)) is (scores is not None)
 
 
 def test_what_stable_is_worth_counts_each_lift_of_known_outcome() -> None:

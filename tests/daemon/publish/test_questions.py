@@ -1,40 +1,102 @@
-"""Questions to the daemon: each gets one answer, and nothing that comes in hurts."""
+"""Questions and outcomes told: each gets one answer, and nothing that comes in hurts."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from typing import Any, Literal
 
+import jsonschema
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from graspd.daemon.publish.porter import Frames
+from graspd.daemon.publish.companion import KEPT, Answer, Reply, Told
+from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome, schema
+from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.publish.questions import Questions
-from tests.daemon.publish.doors import USER, Asked, published
+from graspd.daemon.trust.lift_book import GraspId, Peer, Report
+from tests.daemon.fakes import FINGERS, Clock
+from tests.daemon.publish.doors import USER, published
+from tests.daemon.publish.doors import Asked as Requests
+from tests.kit.loops import SentMessages
 
-PATIENCE_NS = 1_000_000_000
+BOOT = "0123456789abcdef" * 2
+NOW_NS = 10**12
+BOTH: tuple[Literal["stable", "slip"], ...] = ("stable", "slip")
 
 
-@pytest.fixture
-def sent() -> list[Frames]:
-    """What was answered."""
-    return []
+def outbox(output: SentMessages) -> Outbox:
+    return Outbox(
+        "right", FINGERS, "fake", "0" * 64, [output], Clock(NOW_NS), lambda: 5.0, boot_id=BOOT
+    )
 
 
-@pytest.fixture
-def questions(sent: list[Frames]) -> Questions:
-    def send(frames: Sequence[bytes]) -> bool:
-        sent.append([*frames])
+def test_outcomes_are_published_as_the_schema_says() -> None:
+    output = SentMessages()
+    sender = outbox(output)
+    for outcome in BOTH:
+        sender.outcome(Report(GraspId(BOOT, 3), outcome, "mug"))
+    assert [topic for topic, _ in output.sent] == [b"outcome.right"] * 2
+    payloads = [payload for _, payload in output.sent]
+    assert [decode_outcome(payload) for payload in payloads] == [
+        OutcomeMessage(
+            boot_id=BOOT, seq=seq, t=5.0, t_mono_ns=NOW_NS, grasp=3, outcome=outcome, object="mug"
+        )
+        for seq, outcome in enumerate(BOTH)
+    ]
+    for payload in payloads:
+        jsonschema.validate(json.loads(payload), schema() | {"$ref": "#/$defs/OutcomeMessage"})
+
+
+def test_an_outcome_of_an_earlier_start_names_it() -> None:
+    output = SentMessages()
+    sender = outbox(output)
+    for boot_id, judged_by in ((BOOT, None), ("f" * 32, "f" * 32)):
+        sender.outcome(Report(GraspId(boot_id, 3), "slip"))
+        message = decode_outcome(output.sent[-1][1])
+        assert (message.boot_id, message.grasp, message.grasp_boot_id) == (BOOT, 3, judged_by)
+
+
+TELLER = b"teller"
+
+
+class Asked:
+    """Questions, and what was answered to whom."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[bytes, ...]] = []
+        self.questions = Questions(self._send, 10**9)
+
+    def _send(self, frames: Sequence[bytes]) -> bool:
+        self.sent.append(tuple(frames))
         return True
 
-    return Questions(send, PATIENCE_NS)
+    def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
+        """Tell an outcome, which is not a question."""
+        requests = requests or Requests(takes_the_seventh)
+        self.questions.take([[peer, USER, *frames]], 0, requests)
+        assert requests.times == 0
+        answer: dict[str, Any] = json.loads(self.sent[-1][-1])
+        assert self.sent[-1] == (peer, *frames[:-1], self.sent[-1][-1])
+        return answer
 
 
-def test_the_daemons_clock_is_told_at_once_and_judges_nothing(
-    questions: Questions, sent: list[Frames]
-) -> None:
-    requests = Asked()
-    questions.take([[b"asker", USER, b"clock"]], 1_234_567_890_123, requests)
-    assert sent == [[b"asker", b'{"v":1,"t_mono_ns":1234567890123}']]
-    assert (requests.times, questions.counters["clocks"], questions.waiting) == (0, 1, {})
+def takes_the_seventh(report: Report) -> Reply:
+    return KEPT if report.grasp == GraspId(BOOT, 7) else Reply(Told.UNKNOWN_GRASP, "no such")
+
+
+@pytest.fixture
+def asked() -> Asked:
+    return Asked()
+
+
+def test_the_daemons_clock_is_told_at_once_and_judges_nothing(asked: Asked) -> None:
+    requests = Requests()
+    asked.questions.take([[b"asker", USER, b"clock"]], 1_234_567_890_123, requests)
+    assert asked.sent == [(b"asker", b'{"v":1,"t_mono_ns":1234567890123}')]
+    assert (requests.times, asked.questions.counters["clocks"]) == (0, 1)
+    assert asked.questions.waiting == {}
 
 
 @pytest.mark.parametrize(
@@ -51,22 +113,111 @@ def test_the_daemons_clock_is_told_at_once_and_judges_nothing(
     ],
 )
 def test_other_frames_than_questions_are_counted_and_not_answered(
-    questions: Questions, sent: list[Frames], frames: list[bytes]
+    asked: Asked, frames: list[bytes]
 ) -> None:
-    requests = Asked()
-    questions.take([[b"asker", USER, *frames]], 0, requests)
+    requests = Requests()
+    asked.questions.take([[b"asker", USER, *frames]], 0, requests)
     assert requests.times == 0
-    questions.take([[b"asker", USER, b"judge"]], 0, requests)
-    questions.answer(published(b"{}"))
-    assert sent == [[b"asker", b"{}"]]
-    assert questions.counters["malformed"] == 1
+    asked.questions.take([[b"asker", USER, b"judge"]], 0, requests)
+    asked.questions.answer(published(b"{}"))
+    assert asked.sent == [(b"asker", b"{}")]
+    assert asked.questions.counters["malformed"] == 1
 
 
 def test_before_the_first_reading_silence_is_the_answer(
-    questions: Questions, monkeypatch: pytest.MonkeyPatch
+    asked: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    requests, silences = Asked(), list[bool]()
+    requests, silences = Requests(), list[bool]()
     monkeypatch.setattr(requests, "silence", lambda: silences.append(True))
-    questions.take([[b"asker", USER, b"judge"]], 0, requests)
-    questions.serve([], PATIENCE_NS, requests)
+    asked.questions.take([[b"asker", USER, b"judge"]], 0, requests)
+    asked.questions.serve([], 10**9, requests)
     assert silences == [True]
+
+
+SLIP, STABLE = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
+
+
+def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
+    assert asked.tell(TELLER, STABLE) == {"v": 1, "ok": True}
+    assert asked.tell(TELLER, b"", STABLE) == {"v": 1, "ok": True}
+    refused = asked.tell(TELLER, f"outcome {BOOT} 8 slip".encode())
+    assert refused == {"v": 1, "ok": False, "why": "unknown grasp: no such"}
+    assert len(asked.questions.waiting) == 0
+    assert asked.questions.counters["outcomes"] == 2
+    assert asked.questions.counters["outcomes_refused"] == 1
+    assert asked.questions.counters["malformed"] == 0
+
+
+def test_an_outcome_to_be_kept_is_answered_when_kept(asked: Asked) -> None:
+    requests = Requests(takes_the_seventh)
+    waiting: list[Answer] = []
+    requests.waiting = waiting
+    texts = [f"outcome {BOOT} {grasp} slip".encode() for grasp in (7, 8, 7)]
+    messages = [[TELLER, USER, text] for text in texts]
+    asked.questions.take(messages, 0, requests)
+    assert [json.loads(frames[-1]) for frames in asked.sent] == [
+        {"v": 1, "ok": False, "why": "unknown grasp: no such"}
+    ]
+    waiting[0](Reply(Told.NOT_KEPT, "full"))
+    waiting[1](KEPT)
+    assert [json.loads(frames[-1]) for frames in asked.sent[1:]] == [
+        {"v": 1, "ok": False, "why": "not kept: full"},
+        {"v": 1, "ok": True},
+    ]
+    assert asked.questions.counters["outcomes_refused"] == 2
+    assert asked.questions.counters["outcomes"] == 1
+
+
+def test_a_repeated_outcome_is_answered_as_taken_and_repeated(asked: Asked) -> None:
+    answer = asked.tell(TELLER, SLIP, requests=Requests(lambda _report: Reply(Told.REPEATED)))
+    assert answer == {"v": 1, "ok": True, "repeated": True}
+    assert asked.questions.counters["outcomes"] == 1
+
+
+NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", "a=1", "a|b", "~")
+"""What a spreadsheet or a shell takes for more than a name."""
+
+
+@pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "_.-", "x" * 64, "Z"])
+def test_the_object_arrives_as_it_was_told(asked: Asked, name: str | None) -> None:
+    requests = Requests()
+    text = f"outcome {BOOT} 7 slip" + (f" {name}" if name else "")
+    answer = asked.tell(TELLER, text.encode(), requests=requests)
+    assert answer == {"v": 1, "ok": True}
+    assert requests.outcomes == [Report(GraspId(BOOT, 7), "slip", name, Peer(TELLER, USER))]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "outcome",
+        f"outcome {BOOT} 7",
+        f"outcome {BOOT} 7 Slip",
+        f"outcome {BOOT} 7 slip ",
+        f"outcome {BOOT} -7 slip",
+        f"outcome {BOOT[:-1]} 7 slip",
+        f"outcome {BOOT.upper()} 7 slip",
+        "outcome \xff",
+        f"outcome {BOOT} 7 slip a mug",
+        f"outcome {BOOT} 7 slip mug,cup",
+        f"outcome {BOOT} 7 slip mug\n",
+        f"outcome {BOOT} 7 slip m\xfcg",
+        f"outcome {BOOT} 7 slip " + "x" * 65,
+        *(f"outcome {BOOT} 7 slip {name}" for name in NO_NAMES),
+    ],
+)
+def test_an_outcome_that_is_malformed_is_answered_and_counted(asked: Asked, text: str) -> None:
+    answer = asked.tell(TELLER, text.encode("latin-1"))
+    assert answer["ok"] is False
+    assert answer["why"].startswith("malformed")
+    assert asked.questions.counters["malformed"] == 1
+
+
+@given(st.lists(st.binary(max_size=200), min_size=1, max_size=20))
+def test_all_texts_after_the_word_get_an_answer(texts: list[bytes]) -> None:
+    asked = Asked()
+    for text in texts:
+        answer = asked.tell(TELLER, b"outcome " + text, requests=Requests())
+        assert answer["v"] == 1
+    counters = asked.questions.counters
+    assert counters["malformed"] + counters["outcomes"] == len(texts)

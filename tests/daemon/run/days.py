@@ -276,7 +276,6 @@ class Day:
             patch.setattr(sockets, "Listener", lambda *_: SimpleNamespace(close=lambda: None))
             patch.setattr(uuid, "uuid4", lambda: uuid.UUID(int=ids.getrandbits(128)))
             patch.setattr(os, "fsync", self.disk.fsync)
-            patch.setattr(os, "replace", partial(self.disk.replace, os.replace))
             yield
 
     def _check_kept(self, parts: Parts) -> None:

@@ -155,32 +155,3 @@ def test_the_rehearsal_goes_through_a_whole_grasp() -> None:
     assert pipeline.hand.state in (GateState.RELEASED, GateState.IDLE)
     assert pipeline.session is not None
     assert pipeline.session.grasps == 1
-
-
-RTTIME_US = 500_000
-"""As `LimitRTTIME` of the unit, but a tenth: longest computing without a sleep."""
-
-
-def test_the_kernel_sees_an_overloaded_loops_rests_as_sleep(tmp_path: Path) -> None:
-    """Who computes in realtime for longer than its limit without sleeping is ended."""
-    if not fifo_may_be_had():
-        pytest.skip("SCHED_FIFO is refused here")
-    said = in_a_process(
-        f"""
-import time
-from graspd.daemon.run.overload import LoadShedder
-RLIMIT_RTTIME = 15  # linux/asm-generic/resource.h
-resource.setrlimit(RLIMIT_RTTIME, ({RTTIME_US // 2}, {RTTIME_US}))
-with RealtimeMode(Realtime(priority=1, cpus=(max(os.sched_getaffinity(0)),))):
-    shedder = LoadShedder(time.monotonic_ns(), live=True)
-    end_s = time.monotonic() + 1.2
-    while time.monotonic() < end_s:
-        judged_s = time.monotonic() + 0.03
-        while time.monotonic() < judged_s:
-            pass
-        shedder.yield_processor(time.monotonic_ns())
-print("lives on")
-""",
-        tmp_path,
-    )
-    assert said.endswith("lives on\n")
