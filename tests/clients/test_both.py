@@ -14,7 +14,7 @@ from tests.kit.waiting import wait_until
 
 LONG_S, DEADLINE_S = 100.0, 0.3
 """For what is allowed in the end, and for what never is."""
-UNKNOWN = {"outcome": "unknown"}
+UNKNOWN, SLIP = {"outcome": "unknown"}, {"outcome": "slip"}
 WATCHED = UNKNOWN | TEACHES
 """What is published in the warm-up."""
 WATCHES, STILL = {"supervised": True}, {"still_ms": 240.0}
@@ -38,19 +38,14 @@ ANSWERS: dict[str, Case] = {
     "empty": ({}, lambda _: [b""], {}, "unknown"),
     "of two frames": ({}, lambda published: told()(published) * 2, {}, "unknown"),
     "alone, to unknown": (UNKNOWN, of("stable"), {}, "unknown"),
-    "alone, to slip": ({"outcome": "slip"}, of("stable"), {}, "unknown"),
+    "alone, to slip": (SLIP, of("stable"), {}, "unknown"),
 }
 SUPERVISED: dict[str, Case] = {
     "supervised": (WATCHED, told(), WATCHES, "supervised"),
     "supervised, not asked for": (WATCHED, told(), {}, "unknown"),
     "supervised, and nothing is asked": (WATCHED, None, WATCHES, "supervised"),
     "stable and supervised": ({"supervised": True}, None, WATCHES, "supervised"),
-    "slip and supervised": (
-        {"outcome": "slip", "supervised": True},
-        None,
-        WATCHES,
-        "supervised",
-    ),
+    "slip and supervised": (SLIP | {"supervised": True}, None, WATCHES, "supervised"),
     "answer not supervised": (WATCHED, told(supervised=False), WATCHES, "unknown"),
     "answer of another grasp": (WATCHED, told(grasp=2), WATCHES, "unknown"),
     "moving too": (WATCHED, told(reasons=["unproven", "moving"]), WATCHES, "unknown"),
@@ -154,10 +149,10 @@ def test_a_no_takes_the_lift_back(
     ("published", "watch", "found"),
     [
         ({}, False, 1),
-        ({"outcome": "slip"}, False, 1),
+        (SLIP, False, 1),
         (UNKNOWN, False, None),
         ({"early": True}, False, None),
-        ({"outcome": "slip", "early": True}, False, None),
+        (SLIP | {"early": True}, False, None),
         ({"supervised": True, "early": True}, True, None),
         (WATCHED, False, None),
         (WATCHED, True, 1),

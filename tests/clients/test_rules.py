@@ -106,14 +106,6 @@ def test_a_lift_under_supervision_is_not_stable(cpp: Probe | None) -> None:
     assert said(cpp, verdict(0, START_NS, "slip", supervised=True)).supervised
 
 
-def test_another_version_is_unknown_until_this_one_comes_again(cpp: Probe | None) -> None:
-    rules = Rules(cpp)
-    rules.take(frames(verdict(0, START_NS) | {"v": 2}))
-    assert rules.at().reasons == ("version",)
-    rules.take(frames(verdict(1, START_NS)))
-    assert rules.at()
-
-
 @pytest.mark.parametrize(
     ("later_ms", "reasons"), [(99, ()), (100, ("stale",)), (101, ("silent",)), (-2, ("clock",))]
 )

@@ -38,62 +38,47 @@ def test_a_slide_stops_the_lift_at_once() -> None:
     assert answer.waited_s == pytest.approx(0.05, abs=0.002)
 
 
-def test_a_lift_that_holds_runs_its_time() -> None:
-    answer = watched(lift(*[HELD] * 40))
-    assert (bool(answer), answer.sliding, answer.held) == (False, (), True)
-    assert answer.waited_s == pytest.approx(0.3, abs=0.002)
-    assert answer.verdict.reasons == ("moving",)
+def waiting(sent: list[tuple[int, list[bytes]]]) -> list[tuple[int, list[bytes]]]:
+    """The same, but from the sixth on four messages wait for one look."""
+    late_ns = sent[8][0]
+    return sent[:5] + [(max(at_ns, late_ns), message) for at_ns, message in sent[5:]]
 
 
-@pytest.mark.parametrize(
-    ("sent", "after_ms"),
-    [
-        # By the last reading that said so, which was 1 ms old, and 100 ms of age.
-        (lift(*[HELD] * 5), 40 + 99),
-        (lift(*[HELD] * 5, *[{"ff": "touch", "th": None}] * 40), 40 + 99),
-        (lift(*[HELD] * 5, *[None] * 40), 40 + 99),
-        (lift(*[HELD] * 5, *[HELD] * 40, age_ms=60.0), 300),
-        (lift(*[HELD] * 5, *[{"ff": "free", "th": "touch"}] * 40), 50),
-        (lift(*[HELD] * 5) + lift(*[HELD] * 40, boot_id="b")[5:], 50),
-        (lift(*[None] * 40), 100),
-        (lift(*[{"ff": "free", "th": "free"}] * 40), 100),
-        (lift(*[{"ff": None, "th": None}] * 40), 100),
-        ([], 100),
-    ],
-    ids=[
-        *("silence", "not known", "not told", "60 ms old", "let go", "another start"),
-        *("never told", "open", "never known", "nothing comes"),
-    ],
-)
-def test_what_is_not_known_stops_the_lift_within_the_age(
-    sent: list[tuple[int, list[bytes]]], after_ms: int
+NOTHING: Words = {"ff": None, "th": None}
+SLID: Words = {"ff": "touch", "th": "slide"}
+LET_GO: Words = {"ff": "free", "th": "touch"}
+ENDS: dict[str, tuple[list[tuple[int, list[bytes]]], int, tuple[str, ...]]] = {
+    # By the last reading that said so, which was 1 ms old, and 100 ms of age.
+    "silence": (lift(*[HELD] * 5), 40 + 99, ()),
+    "not known": (lift(*[HELD] * 5, *[{"ff": "touch", "th": None}] * 40), 40 + 99, ()),
+    "not told": (lift(*[HELD] * 5, *[None] * 40), 40 + 99, ()),
+    "let go": (lift(*[HELD] * 5, *[LET_GO] * 40), 50, ()),
+    "another start": (lift(*[HELD] * 5) + lift(*[HELD] * 40, boot_id="b")[5:], 50, ()),
+    "never told": (lift(*[None] * 40), 100, ()),
+    "open": (lift(*[{"ff": "free", "th": "free"}] * 40), 100, ()),
+    "never known": (lift(*[NOTHING] * 40), 100, ()),
+    "nothing comes": ([], 100, ()),
+    "slid between two looks": (waiting(lift(*[HELD] * 5, SLID, *[HELD] * 30)), 80, ("th",)),
+    "let go between two looks": (waiting(lift(*[HELD] * 5, LET_GO, *[HELD] * 30)), 80, ()),
+    "held": (lift(*[HELD] * 40), 300, ()),
+    "held, by readings of 60 ms": (lift(*[HELD] * 5, *[HELD] * 40, age_ms=60.0), 300, ()),
+    "held, two readings not usable": (
+        lift(*[HELD] * 5, NOTHING, *[HELD] * 5, NOTHING, *[HELD] * 30),
+        300,
+        (),
+    ),
+}
+"""What comes in a lift of 300 ms, after how many it ends, and what slides."""
+
+
+@pytest.mark.parametrize(("sent", "after_ms", "sliding"), ENDS.values(), ids=ENDS)
+def test_what_slides_or_is_not_known_stops_the_lift(
+    sent: list[tuple[int, list[bytes]]], after_ms: int, sliding: tuple[str, ...]
 ) -> None:
     answer = watched(sent)
-    assert answer.held is (after_ms == 300)
+    assert (answer.held, answer.sliding) == (after_ms == 300, sliding)
     assert bool(answer) is not answer.held
-    assert answer.sliding == ()
     assert answer.waited_s == pytest.approx(after_ms / 1e3, abs=0.012)
-
-
-def test_one_reading_that_cannot_be_used_stops_no_lift() -> None:
-    nothing: Words = {"ff": None, "th": None}
-    assert not watched(lift(*[HELD] * 5, nothing, *[HELD] * 5, nothing, *[HELD] * 30))
-
-
-@pytest.mark.parametrize(("passing", "sliding"), [("slide", ("th",)), ("free", ())])
-def test_what_passed_between_two_looks_stops_the_lift(
-    passing: str, sliding: tuple[str, ...]
-) -> None:
-    sent = lift(*[HELD] * 5, {"ff": "touch", "th": passing}, *[HELD] * 30)
-    late_ns = sent[8][0]  # four messages wait for one look
-    answer = watched(
-        [
-            (max(at_ns, late_ns) if seq >= 5 else at_ns, message)
-            for seq, (at_ns, message) in enumerate(sent)
-        ]
-    )
-    assert (bool(answer), answer.held, answer.sliding) == (True, False, sliding)
-    assert answer.waited_s == pytest.approx(0.08, abs=0.012)
 
 
 def test_words_of_an_old_reading_are_not_told() -> None:

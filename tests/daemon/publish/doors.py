@@ -7,7 +7,8 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -34,6 +35,8 @@ WAIT_MS = 100_000
 QUIET_S = 0.3
 
 Keys = tuple[bytes, bytes]
+CURVE: dict[str, object] = {"secret_key": "daemon.key_secret", "clients": "clients"}
+"""A scene with keys beside it."""
 
 
 USER = b"user 1000"
@@ -154,13 +157,12 @@ class KeyedDoor:
         self.port = free_port()
         self.endpoint = f"tcp://127.0.0.1:{self.port}"
         self._ask = f"tcp://127.0.0.1:{free_port()}"
-        text = {
-            "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        sections: dict[str, dict[str, object]] = {
             "publish": {"endpoint": self.endpoint},
             "ask": {"endpoint": self._ask},
-            "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
+            "curve": CURVE,
         }
-        self.sockets = Sockets(scene.parse(text, folder / "scene.toml"))
+        self.sockets = Sockets(scene_of(folder, **sections))
         self.public = load_pair(folder / "daemon.key_secret")[0]
         self.context = zmq.Context()
         self.connected: list[zmq.Socket[bytes]] = []
@@ -244,6 +246,28 @@ def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[b
         publisher.door.check()
         publisher.send(b"verdict.right", b"first")
     return subscriber.recv_multipart()
+
+
+@contextmanager
+def opened_door(folder: Path, mode: int | None = None) -> Iterator[tuple[Door, str]]:
+    """A door with sockets `v` for messages and `ask` for questions, and the endpoint of that."""
+    listeners = [Listener(f"ipc://{folder}/{name}", mode) for name in ("v", "ask")]
+    door = Door(listeners)
+    yield door, listeners[1].endpoint
+    assert door.close()
+    for listener in listeners:
+        listener.close()
+
+
+def scene_of(folder: Path, **sections: dict[str, object]) -> scene.Scene:
+    """A scene with sockets `v` and `ask` in a folder, and what else is in its sections."""
+    usual: dict[str, dict[str, object]] = {
+        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        "publish": {"endpoint": f"ipc://{folder}/v"},
+        "ask": {"endpoint": f"ipc://{folder}/ask"},
+    }
+    text = {name: usual.get(name, {}) | sections.get(name, {}) for name in usual | sections}
+    return scene.parse(text, folder / "scene.toml")
 
 
 def receive(door: Door, wanted: int = 1) -> list[Frames]:

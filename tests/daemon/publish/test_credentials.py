@@ -20,12 +20,20 @@ import zmq
 from graspd.daemon import scene
 from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.keys import load_pair, make
-from graspd.daemon.publish.listener import Listener
 from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
-from tests.daemon.publish.doors import WAIT_MS, Asked, Peers, published, receive
+from tests.daemon.publish.doors import (
+    CURVE,
+    WAIT_MS,
+    Asked,
+    Peers,
+    opened_door,
+    published,
+    receive,
+    scene_of,
+)
 from tests.ports import free_port
 
 ROBOT, STRANGER = b"user 1000", b"user 1001"
@@ -38,12 +46,8 @@ def door() -> Iterator[tuple[Door, str]]:
     """A door that other users can reach, and its socket for questions."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
-        listeners = [Listener(f"ipc://{folder}/{name}", 0o666) for name in ("v", "ask")]
-        opened = Door(listeners)
-        yield opened, f"{folder}/ask"
-        assert opened.close()
-        for listener in listeners:
-            listener.close()
+        with opened_door(Path(folder), 0o666) as (opened, endpoint):
+            yield opened, endpoint.removeprefix("ipc://")
 
 
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -93,53 +97,44 @@ def test_another_user_with_the_same_routing_id_is_told_apart(door: tuple[Door, s
         owner.kill()
 
 
-def wanted(folder: Path, tell: list[str], ask: str, curve: bool = False) -> scene.Scene:
-    text: dict[str, Any] = {
-        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
-        "publish": {"endpoint": f"ipc://{folder}/v"},
-        "ask": {"endpoint": ask, "tell": tell},
-    }
-    if curve:
-        text["curve"] = {"secret_key": "daemon.key_secret", "clients": "clients"}
-    return scene.parse(text, folder / "scene.toml")
+def may_lift(sockets: Sockets, credential: bytes) -> bool:
+    assert sockets.questions is not None
+    lifts = LiftBook()
+    lifts.note(SEVENTH, bytes(8), stable=True)
+    sockets.questions.take([[NAME, credential, b"lift"]], 0, Asked())
+    sockets.on_verdict(published(lifts=lifts))
+    return lifts.lifter is not None
 
 
-def test_tellers_are_users_or_keys_of_the_scene(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("credential", "may"),
+    [(b"user 12345", True), (b"user 0", True), (b"user 1", False), (b"", False), (b"key x", False)],
+)
+def test_tellers_are_users_of_the_scene(tmp_path: Path, credential: bytes, may: bool) -> None:
+    with Sockets(scene_of(tmp_path, ask={"tell": ["root", "12345"]})) as sockets:
+        assert may_lift(sockets, credential) is may
+
+
+def test_tellers_are_keys_of_the_scene(tmp_path: Path) -> None:
     make(tmp_path, "daemon")
     public = load_pair(make(tmp_path / "clients", "controller")[1])[0]
     make(tmp_path / "clients", "dashboard")
-    for ask, curve, credentials in (
-        (f"ipc://{tmp_path}/ask", False, (b"user 12345", b"user 1", b"", b"key x")),
-        (
-            f"tcp://127.0.0.1:{free_port()}",
-            True,
-            (b"key controller", b"", b"key ", b"key dashboard", b"key " + public, b"user 0"),
-        ),
-    ):
-        tell = ["controller"] if curve else ["root", "12345"]
-        with Sockets(wanted(tmp_path, tell, ask, curve)) as sockets:
-            assert sockets.questions is not None
-            lifts, may = LiftBook(), []
-            lifts.note(SEVENTH, bytes(8), stable=True)
-            for credential in credentials:
-                peer = [[NAME, credential, b"lift"]]
-                sockets.questions.take(peer, 0, Asked())
-                before = lifts.lifter
-                sockets.on_verdict(published(lifts=lifts))
-                may.append(lifts.lifter != before)
-                lifts.lifter = None
-                lifts.note(SEVENTH, bytes(8), stable=True)
-        assert may == [credential == credentials[0] for credential in credentials]
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    ask: dict[str, object] = {"endpoint": endpoint, "tell": ["controller"]}
+    with Sockets(scene_of(tmp_path, ask=ask, curve=CURVE)) as sockets:
+        assert may_lift(sockets, b"key controller")
+        for other in (b"", b"key ", b"key dashboard", b"key " + public, b"user 0"):
+            assert not may_lift(sockets, other)
 
 
 def test_a_teller_that_is_not_a_user_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PublishError, match="there is no user no-such-user"):
-        Sockets(wanted(tmp_path, ["no-such-user"], f"ipc://{tmp_path}/ask"))
+        Sockets(scene_of(tmp_path, ask={"tell": ["no-such-user"]}))
 
 
 def test_tellers_cannot_be_checked_on_plain_tcp(tmp_path: Path) -> None:
     with pytest.raises(scene.SceneError, match=r"ask\.tell needs an ipc:// socket"):
-        wanted(tmp_path, ["root"], "tcp://127.0.0.1:5555")
+        scene_of(tmp_path, ask={"endpoint": "tcp://127.0.0.1:5555", "tell": ["root"]})
 
 
 def test_a_killed_daemon_takes_the_outcome_after_its_restart(tmp_path: Path, peers: Peers) -> None:

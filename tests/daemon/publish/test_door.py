@@ -27,6 +27,7 @@ from tests.daemon.publish.doors import (
     Publisher,
     first_message,
     halt,
+    opened_door,
     processes,
     receive,
 )
@@ -40,12 +41,8 @@ ME = b"user %d" % os.getuid()
 @pytest.fixture
 def asked(tmp_path: Path) -> Iterator[tuple[Door, str]]:
     """A door with a socket for questions, and its endpoint."""
-    listeners = [Listener(f"ipc://{tmp_path}/{name}") for name in ("v", "ask")]
-    door = Door(listeners)
-    yield door, listeners[1].endpoint
-    assert door.close()
-    for listener in listeners:
-        listener.close()
+    with opened_door(tmp_path) as opened:
+        yield opened
 
 
 def endpoint_of(scheme: str, folder: Path) -> str:
@@ -178,11 +175,12 @@ def test_only_a_peer_that_floods_is_disconnected(asked: tuple[Door, str], peers:
     assert receive(door, 1) == [[b"polite", ME, b"judge"]]
 
 
-def test_peers_reconnect_after_the_end_of_its_process(tmp_path: Path, peers: Peers) -> None:
-    listeners = [Listener(f"ipc://{tmp_path}/{name}") for name in ("v", "ask")]
-    door = Door(listeners)
-    subscriber = peers.subscribe(listeners[0].endpoint)
-    asker = peers.connect(zmq.DEALER, listeners[1].endpoint)
+def test_peers_reconnect_after_the_end_of_its_process(
+    asked: tuple[Door, str], tmp_path: Path, peers: Peers
+) -> None:
+    door, endpoint = asked
+    subscriber = peers.subscribe(f"ipc://{tmp_path}/v")
+    asker = peers.connect(zmq.DEALER, endpoint)
     for _ in range(2):
         while subscriber.poll(0):
             subscriber.recv_multipart()
@@ -196,9 +194,6 @@ def test_peers_reconnect_after_the_end_of_its_process(tmp_path: Path, peers: Pee
         wait_until(is_served)
         (process,) = processes()
         os.kill(process, signal.SIGKILL)
-    assert door.close()
-    for listener in listeners:
-        listener.close()
 
 
 def test_the_process_ends_with_the_daemon_and_leaves_no_file(tmp_path: Path) -> None:

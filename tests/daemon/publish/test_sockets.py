@@ -9,30 +9,19 @@ import select
 import signal
 import stat
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zmq
 
-from graspd.daemon import scene
 from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.sockets import Sockets
 from graspd.daemon.trust.lift_book import GraspId
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import USER, Asked, Peers, halt, processes, published
+from tests.daemon.publish.doors import USER, Asked, Peers, halt, processes, published, scene_of
 from tests.kit.waiting import PATIENCE_S, wait_until
 
 HOSTILE_MESSAGES = 2_000
-
-
-def wanted(folder: Path, **publish: object) -> scene.Scene:
-    text: dict[str, Any] = {
-        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
-        "publish": {"endpoint": f"ipc://{folder}/v", **publish},
-        "ask": {"endpoint": f"ipc://{folder}/ask"},
-    }
-    return scene.parse(text, folder / "scene.toml")
 
 
 @pytest.mark.parametrize(
@@ -44,7 +33,7 @@ def test_readings_are_published_at_the_rate_of_the_scene(
 ) -> None:
     clock = Clock()
     jitter = random.Random(3)
-    with Sockets(wanted(tmp_path, tactile_hz=tactile_hz), clock) as sockets:
+    with Sockets(scene_of(tmp_path, publish={"tactile_hz": tactile_hz}), clock) as sockets:
         times = 0
         for number in range(10 * sensor_hz):
             clock.now_ns = number * 10**9 // sensor_hz + jitter.randrange(1_000_000)
@@ -54,7 +43,7 @@ def test_readings_are_published_at_the_rate_of_the_scene(
 
 def test_readings_after_a_pause_catch_up_nothing(tmp_path: Path) -> None:
     clock = Clock()
-    with Sockets(wanted(tmp_path, tactile_hz=10.0), clock) as sockets:
+    with Sockets(scene_of(tmp_path, publish={"tactile_hz": 10.0}), clock) as sockets:
         assert sockets.wanted(b"tactile.right")
         clock.now_ns += 10 * 10**9
         assert [sockets.wanted(b"tactile.right") for _ in range(3)] == [True, False, False]
@@ -64,7 +53,7 @@ def test_questions_and_outcomes_reach_the_loop_and_are_answered(
     tmp_path: Path, peers: Peers
 ) -> None:
     requests = Asked()
-    with Sockets(wanted(tmp_path)) as sockets:
+    with Sockets(scene_of(tmp_path)) as sockets:
         asker = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask")
         asker.send(b"judge")
         asker.send(b"outcome " + b"0" * 32 + b" 7 slip")
@@ -87,7 +76,7 @@ def test_questions_and_outcomes_reach_the_loop_and_are_answered(
 
 def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers: Peers) -> None:
     requests = Asked()
-    with Sockets(wanted(tmp_path)) as sockets:
+    with Sockets(scene_of(tmp_path)) as sockets:
         sockets.before_wait(requests)
         peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask").send(b"judge")
         while not requests.times:  # it may be ready for less
@@ -96,7 +85,7 @@ def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers:
 
 
 def test_subscribers_that_hear_late_are_in_the_health(tmp_path: Path) -> None:
-    with Sockets(wanted(tmp_path)) as sockets:
+    with Sockets(scene_of(tmp_path)) as sockets:
         assert sockets.health == {}
         (process,) = processes()
         halt(process)
@@ -113,7 +102,7 @@ def test_subscribers_that_hear_late_are_in_the_health(tmp_path: Path) -> None:
 
 
 def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:
-    sockets = Sockets(wanted(tmp_path))
+    sockets = Sockets(scene_of(tmp_path))
     assert sockets.questions is not None
     sockets.questions.take([[b"asker", USER, b"judge"]], 0, Asked())
     sockets.close()
@@ -127,7 +116,7 @@ def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) 
 
 def test_socket_files_have_the_scenes_mode_and_group(tmp_path: Path) -> None:
     group = grp.getgrgid(os.getgroups()[0] if os.getgroups() else os.getgid()).gr_name
-    with Sockets(wanted(tmp_path, file_mode="0620", group=group)):
+    with Sockets(scene_of(tmp_path, publish={"file_mode": "0620", "group": group})):
         for name in ("v", "ask"):
             status = (tmp_path / name).stat()
             assert stat.S_IMODE(status.st_mode) == 0o620
@@ -138,7 +127,7 @@ def test_socket_files_have_the_scenes_mode_and_group(tmp_path: Path) -> None:
 def test_only_owner_and_group_may_ask(tmp_path: Path, publish: str | None, mode: int) -> None:
     former = os.umask(0o022)
     try:
-        with Sockets(wanted(tmp_path, file_mode=publish)):
+        with Sockets(scene_of(tmp_path, publish={"file_mode": publish})):
             assert stat.S_IMODE((tmp_path / "ask").stat().st_mode) == mode
             published = stat.S_IMODE((tmp_path / "v").stat().st_mode)
             assert published == (0o755 if publish is None else int(publish, 8))
@@ -148,7 +137,7 @@ def test_only_owner_and_group_may_ask(tmp_path: Path, publish: str | None, mode:
 
 def test_an_unknown_group_is_said(tmp_path: Path) -> None:
     with pytest.raises(PublishError, match="no group no-such-group"):
-        Sockets(wanted(tmp_path, group="no-such-group"))
+        Sockets(scene_of(tmp_path, publish={"group": "no-such-group"}))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -171,7 +160,7 @@ def junk(rng: random.Random) -> list[bytes]:
 @pytest.mark.parametrize(("door", "kind"), [("v", zmq.XSUB), ("ask", zmq.DEALER)])
 def test_hostile_messages_do_no_harm(tmp_path: Path, peers: Peers, door: str, kind: int) -> None:
     rng, requests = random.Random(1), Asked()
-    with Sockets(wanted(tmp_path)) as sockets:
+    with Sockets(scene_of(tmp_path)) as sockets:
         questions = sockets.questions
         assert questions is not None
         hostile = peers.connect(kind, f"ipc://{tmp_path}/{door}")

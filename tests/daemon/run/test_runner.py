@@ -89,10 +89,6 @@ class Running:
                 return True
         return False
 
-    def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, str]:
-        self.process.send_signal(number)
-        return self.end()
-
     def end(self) -> tuple[int, str]:
         said = self.process.communicate(timeout=PATIENCE_S)[1]
         return self.process.returncode, said
@@ -110,21 +106,20 @@ def test_ready_comes_first_and_then_the_watchdog_is_fed(running: Running) -> Non
     for _ in range(3):
         assert running.told("WATCHDOG=1") == ["WATCHDOG=1"]
     assert "readings/s" in running.told("STATUS=running")[0]
-    code, said = running.stop()
-    assert code == 0, said
-    assert running.told("STOPPING=1")
-    assert running.stops()
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_daemon_and_is_logged(running: Running, number: signal.Signals) -> None:
     seen = running.verdict(like=lambda verdict: verdict.seq >= 20)
-    code, said = running.stop(number)
+    running.process.send_signal(number)
+    code, said = running.end()
     *_, last = said.splitlines()
     ended = re.fullmatch(rf"graspd: INFO: ended by {number.name} after \S+ s: (\d+) read.*", last)
     assert ended is not None, last
     assert code == 0
     assert int(ended[1]) > seen.seq
+    assert running.told("STOPPING=1")
+    assert running.stops()
 
 
 def test_an_ended_table_logs_a_judgement_a_row(
