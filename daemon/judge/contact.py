@@ -1,7 +1,8 @@
 """Tare and contact: the resting count of each electrode, its noise, and which fingers touch.
 
 A touch lowers the counts of several electrodes (BioTac SP manual, section 5). They fall below their
-baseline, and below the finger's median electrode. Supply and temperature move all alike.
+baseline, and below the finger's median electrode. Supply voltage and temperature move all
+electrodes alike.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ The electrodes of an opening finger rise one sweep after the other, which looks 
 LONG_HOLD_NS = 60_000_000_000
 """Duration of a hold after which a finger is tared again, ns.
 
-Electrodes of one finger drift apart by 0.2 counts/s (measured on three sensors): by then more than
-half of a touch.
+Electrodes of one finger drift apart by 0.2 counts/s (measured on three sensors). After this time
+the drift is more than half of `TOUCH_COUNTS`.
 """
 ALONE_NS = 30_000_000_000
 """Time for which a finger touches without all others before it is tared again: no grasp, ns."""
@@ -70,7 +71,7 @@ Sensors that warm up drift by 0.56 to 0.84 counts/s upward (measured on three). 
 falls faster would follow a slow touch.
 """
 MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a Gaussian over its median absolute deviation."""
+"""Ratio of a Gaussian's standard deviation to its median absolute deviation."""
 
 Floats = NDArray[np.float64]
 
@@ -89,15 +90,15 @@ class Touch:
     Touching: below the median electrode, because sensors drift.
     """
     depth: float = 0.0
-    """Deepest fall of the hold, counts; it fades."""
+    """Deepest fall of the hold, counts; it fades by `DEPTH_FADES_COUNTS_PER_S`."""
     lowest: float = 0.0
-    """Smallest fall since it let go, counts. The next touch is measured from there."""
+    """Smallest fall since the finger let go, counts. The next touch is measured from it."""
     let_go_ns: int | None = None
     """Time of the end of the last touch. None: it never touched."""
     since_ns: int | None = None
-    """Time of the begin of the touch. None: it does not touch."""
+    """Time at which the touch began. None: the finger does not touch."""
     alone_since_ns: int | None = None
-    """Time since which it touches without all the others. None: it does not."""
+    """Time since which this finger has touched while another did not. None: not the case."""
     held_long: bool = False
     """True at the sweep in which a long hold ends."""
     untouched: int = 0
@@ -144,8 +145,8 @@ class Touch:
     def has_lost_rest(self, t_ns: int, middle: float) -> bool:
         """Return True if the finger must be tared again. Call it while not all fingers touch.
 
-        A finger must after a long hold, when it as a whole rests above its baseline, and when it
-        has touched alone for over `ALONE_NS`. `middle`: fall of its median electrode, counts.
+        Reasons for a new tare: a long hold has ended, the whole finger rests above its baseline, or
+        it has touched alone for over `ALONE_NS`. `middle`: fall of its median electrode, counts.
         """
         if not self.touching:
             # A finger that rests higher was tared while it touched, or has drifted far.
@@ -192,11 +193,11 @@ class Window:
         """Yield the tare of each of these fingers; None: it moved. Call it with a full window."""
         oldest = self.number % WINDOW
         sweeps = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
-        # Electrode by electrode, as 32-bit numbers, they are sorted in a quarter of the time.
+        # Counts that are contiguous by electrode and 32 bits wide sort in a quarter of the time.
         window = np.ascontiguousarray(sweeps.transpose(1, 2, 0), dtype=np.int32)
         halves = _median(window[..., WINDOW // 2 :]) - _median(window[..., : WINDOW // 2])
         baseline = _median(window)
-        # Twice as large they are whole numbers.
+        # A median may end in .5: doubled, all values are whole numbers.
         twice = np.abs(2 * window - (2.0 * baseline).astype(np.int32)[..., np.newaxis])
         sigmas = MAD_TO_SIGMA * (_median(twice) / 2.0)
         usable = np.logical_and.reduce(self.usable, axis=0)
@@ -261,7 +262,7 @@ class Contact:
                 middles[finger] = falls.item(finger, number // 2)
                 touch.follow(t_ns, elapsed_s, deep, deep - middles[finger])
             else:
-                # With too few electrodes it is not known any more, until it is tared again.
+                # With too few usable electrodes, contact is unknown until the next tare.
                 self.tared[finger] = False
                 touch.end()
             self.touching[finger] = touch.touching
@@ -286,7 +287,10 @@ class Contact:
     def _falls(
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float64], list[int]]:
-        """Return each finger's falls, ascending, and the number of those, the first, that count."""
+        """Return each finger's falls, ascending, and how many of them are of usable electrodes.
+
+        Falls of other electrodes are infinite, so they come last.
+        """
         falls, numbers = median.astype(np.float64), self._known
         np.subtract(self.baseline, falls, out=falls)
         if usable is not None:
@@ -301,14 +305,14 @@ class Contact:
         self.touches[finger] = Touch(self.touches[finger].threshold)
 
     def _settle(self, finger: int, rest: Rest, t_ns: int) -> None:
-        """Take over how a finger rests."""
+        """Adopt a new tare; a known baseline changes at most at the speed limits."""
         touch, former, baseline = self.touches[finger], self.baseline[finger], rest.baseline
         elapsed_s = 0.0 if touch.tared_ns is None else max(t_ns - touch.tared_ns, 0) / 1e9
         touch.tared_ns = t_ns
         if self.tared[finger]:
             lowest = former - DOWN_COUNTS_PER_S * elapsed_s
             highest = former + UP_COUNTS_PER_S * elapsed_s
-            # An electrode that was not known before is taken as it is.
+            # The baseline of an electrode that had none is not limited.
             limited = np.minimum(np.maximum(baseline, lowest), highest)
             baseline = np.where(np.isfinite(former), limited, baseline)
         self.baseline[finger] = np.where(rest.known, baseline, np.inf)
@@ -318,7 +322,7 @@ class Contact:
 
 
 def _median(values: NDArray[np.number]) -> Floats:
-    """Sort along the last axis and return the median: a fifth of the time of `np.median` here."""
+    """Sort in place along the last axis; return the medians, in a fifth of `np.median`'s time."""
     values.sort()
     number = values.shape[-1]
     low, high = values[..., (number - 1) // 2], values[..., number // 2]

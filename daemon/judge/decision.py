@@ -1,4 +1,4 @@
-"""The limits of each part with their defaults, and the final word: nothing else makes a verdict.
+"""The limits of each part with their defaults, and `decide`, which alone makes a verdict.
 
 A scene's `[gate]` takes its defaults from the limits here, in its own units.
 """
@@ -72,26 +72,26 @@ class Limits:
 
 
 class HoldDown(msgspec.Struct, frozen=True, gc=False):
-    """A judgement by which a grasp was not `stable`: it holds later ones of the grasp down."""
+    """A judgement that was not `stable`. Later judgements of its grasp may not be `stable` yet."""
 
     grasp: int
     until_ns: int
-    """Time of a reading, ns, from which on it no longer counts."""
+    """Time of the first reading to which it no longer applies, ns."""
     decision: Decision
 
     def at(self, grasp: int, made_ns: int) -> HoldDown:
-        """Return itself while it counts against this `grasp` at `made_ns`, else `NOTHING_HELD`."""
+        """Return itself if it applies to this `grasp` at `made_ns`, else `NOTHING_HELD`."""
         return self if grasp == self.grasp and made_ns < self.until_ns else NOTHING_HELD
 
     def allows(self, decision: Decision) -> bool:
-        """Return True unless the decision is `stable`, and this one is not."""
+        """Return False if `decision` is `stable` and that of this judgement is not."""
         return decision is not Decision.STABLE or self.decision is Decision.STABLE
 
 
 NOTHING_HELD: Final = HoldDown(0, 0, Decision.STABLE)
-"""No judgement yet: grasps are numbered from 1."""
+"""Value before any judgement. It applies to no grasp, because grasps are numbered from 1."""
 HELD: Final = Moment(0)
-"""Moment of a hand that holds still, to decide by the network's answer alone."""
+"""Moment of a hand that holds still. With it `decide` goes by the network's answer alone."""
 
 
 def decide(
@@ -107,8 +107,9 @@ def decide(
     """Return the decision, and the reasons if it is `unknown`. Any doubt makes it `unknown`.
 
     `p_slip`: probability of slip, 0..1; None: the network gave none. `objections`: reasons against
-    the reading, or against the one that was judged. `age_ns`: age of the reading. `withheld`: why
-    the risk forbids `stable`; None: it does not. `held`: result of `HoldDown.at`.
+    this reading, or against the earlier one that the network judged. `age_ns`: age of the
+    reading. `withheld`: why the risk forbids `stable`; None: it does not. `held`: result of
+    `HoldDown.at`.
     """
     reasons = [*objections]
     if not (moment.in_contact and moment.settled):

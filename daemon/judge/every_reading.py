@@ -34,10 +34,10 @@ class EveryReading:
         *,
         in_time: bool = True,
     ) -> tuple[Moment, NDArray[np.uint16] | None]:
-        """Take in the counts of a reading, shape (fingers, 24); return them to be judged.
+        """Return the state of the grasp, and the counts, shape (fingers, 24), to be judged.
 
-        None in their place if the reading cannot be used. Unless it is `in_time` it is judged all
-        the same, and refused as stale.
+        The counts are None if the reading cannot be used. A reading that is not `in_time` is
+        judged too, and refused as stale.
         """
         self.grasp += 1
         if checked.reasons:
@@ -49,7 +49,7 @@ class EveryReading:
         return Moment(self.grasp, judges=False, judged=False)
 
     def count_from(self, grasp: int) -> None:
-        """Give the next grasp the number after this."""
+        """Give the next grasp the number `grasp` + 1."""
         self.grasp = grasp
 
     def health(self) -> dict[str, Reason]:
@@ -66,7 +66,7 @@ class EveryReading:
         """Ignore missing readings: no grasp continues the one before."""
 
     def restart(self) -> None:
-        """Ignore it, as `interrupt`."""
+        """Ignore a restart: no grasp continues the one before."""
 
     def forget(self) -> None:
-        """Ignore it: nothing is known of the sensors."""
+        """Ignore an exchange of sensors: nothing is known of them."""

@@ -1,4 +1,4 @@
-"""Sensors that take the place of others, and the knowledge of them."""
+"""An exchange of sensors, and what is known of the new ones."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from graspd.models.trust.risk import Count
 
 
 class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An exchange of sensors, with what is known of those that are there now."""
+    """An exchange of sensors, with what is known of the new ones."""
 
     session: SessionState | None = None
     learned: LearnerState | None = None
     proven: Count = 0
-    """Outcomes that count for their warm-up."""
+    """Number of outcomes with them that count for the warm-up of the risk."""
     budget: float | None = None
-    """Slips that were affordable with them, under the risk that is set; None: not known."""
+    """Number of slips that the configured risk still allowed with them; None: not known."""
     tared: bool = False
-    """True if the tare that is known is theirs."""
+    """True if the current tare was made with the new sensors."""
 
 
 NOTHING_KNOWN: Final = Exchanged()

@@ -4,8 +4,8 @@ A grasp lasts from the first touch until nothing touches. It is judged when all 
 have kept still until nothing can slide unseen; with `early`, first when nothing moves fast. It
 settles by the strict limit of motion and continues by the loose one, so that the verdict on a hand
 that holds does not come and go. From then on it is refreshed many times a second and when the
-controller asks. Times are those of the readings, so a stall or a burst of old readings settles
-nothing. `phase.TRANSITIONS` has all ways from one state to the next.
+controller asks. It counts time by the readings' own times, so a stall or a burst of old readings
+settles nothing. `phase.TRANSITIONS` has all ways from one state to the next.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from graspd.daemon.judge.stillness import ONES, Motion
 from graspd.daemon.judge.windows import LONG_NS, SHORT_NS
 
 REFRESH_NS = 50_000_000
-"""Age at which a verdict is refreshed, ns: half of `STANDS_NS`, so that it never grows older,
-however slow the readings are, and though one of them is lost."""
+"""Age at which a verdict is refreshed, ns: half of `STANDS_NS`, so that it is never older than
+that, even with slow readings of which one is lost."""
 STANDS_NS = 100_000_000
 """Age above which a verdict no longer stands, ns."""
 CHANGE_COUNTS = 40.0
@@ -36,25 +36,25 @@ different one, and must settle again."""
 RELEASE_NS = 100_000_000
 """How long the gate stays in `released` before `idle`, ns."""
 JUST_SHORT_NS = LONG_NS - 1_000_000
-"""Longest stillness, ns, of a hand of which something may slide slowly."""
+"""Longest stillness that counts while slow slides are not excluded, ns."""
 
 
 class Stillness:
-    """For how long all required fingers have touched and kept still."""
+    """Measures for how long all required fingers have touched and kept still."""
 
     def __init__(self) -> None:
         self.touches = False
         """True if all required fingers touch."""
         self.lasts_ns = 0
-        """Time of touch and stillness; less than the long window if something may slide."""
+        """Duration of touch and stillness, ns; below `LONG_NS` unless slow slides are excluded."""
         self.sure = False
-        """True if it has settled with slow slides excluded: the loose limit holds from then on."""
+        """True if the grasp settled with slow slides excluded, so that the loose limit holds."""
         self.early = False
-        """True if it was judged while something might slide slowly: it is judged again, unasked."""
+        """True if it was judged before slow slides were excluded. It is judged again, unasked."""
         self.moved_since_ns: int | None = None
         """Time since which a judged grasp has moved. None: it does not move."""
         self._touched_ns = 0
-        """Time at which all required fingers touched; means nothing unless `touches`."""
+        """Time from which on all required fingers touch; meaningless unless `touches`."""
         self._since_ns: int | None = None
         """Time since which touch and stillness have lasted. None: something moves."""
 
@@ -65,9 +65,10 @@ class Stillness:
         self.touches = touches
 
     def follow(self, t_ns: int, disturbed: bool, is_sure: bool) -> None:
-        """Take in whether something is against it, and whether slow slides are excluded.
+        """Update `lasts_ns` for the reading of `t_ns`.
 
-        The windows say for how long nothing has moved; the touch must have lasted as long.
+        `disturbed`: something moves or forbids settling, so counting starts again. `is_sure`: slow
+        slides are excluded. Stillness counts back by the window's length, at most to the touch.
         """
         if disturbed:
             self._since_ns, self.lasts_ns = None, 0
@@ -82,7 +83,7 @@ class Stillness:
         self._since_ns, self.lasts_ns = since_ns, max(t_ns - since_ns, 0)
 
     def settle(self) -> None:
-        """Continue by the loose limit if slow slides are excluded."""
+        """Use the loose limit from now on if slow slides are excluded."""
         self.sure = self.sure or self.lasts_ns >= LONG_NS
 
     def unsettle(self) -> None:
@@ -91,31 +92,31 @@ class Stillness:
         self.moved_since_ns = None
 
     def restart(self, t_ns: int) -> None:
-        """Count from `t_ns` on."""
+        """Count stillness from `t_ns` on."""
         self._since_ns, self.lasts_ns = None, 0
         self._touched_ns = min(self._touched_ns, t_ns)
 
 
 class Question:
-    """Whether the network is to judge: the controller asks, or the verdict grows old."""
+    """Says when the network must judge: the controller asks, or the verdict grows old."""
 
     def __init__(self, on_request: bool, lasts_ns: int) -> None:
-        """`on_request`: only when asked. `lasts_ns`: time after which a question is dropped."""
+        """`on_request`: judge only when asked. `lasts_ns`: time until a question is dropped, ns."""
         self._on_request = on_request
         self._lasts_ns = lasts_ns
         self.asked = False
         """True while the controller waits for a judgement."""
         self._until_ns: int | None = None
-        """None until the first reading after the question."""
+        """Time at which the question is dropped, ns. None: no reading came since the question."""
         self._judged_ns = 0
         """Time of the last judgement."""
 
     def ask(self) -> None:
-        """Take in a question; its time runs from the next reading on."""
+        """Note a question of the controller. Its timeout runs from the next reading on."""
         self.asked, self._until_ns = True, None
 
     def follow(self, t_ns: int) -> None:
-        """Drop a question that has waited for too long."""
+        """Drop the question if it has timed out by `t_ns`. Call it while `asked`."""
         if self._until_ns is None:
             self._until_ns = t_ns + self._lasts_ns
         elif t_ns > self._until_ns:
@@ -127,18 +128,25 @@ class Question:
         return self.asked or not self._on_request
 
     def is_due(self, t_ns: int, fresh: bool) -> bool:
-        """Return True if a judged grasp is to be judged again."""
+        """Return True if the reading of `t_ns` is to judge a judged grasp again.
+
+        `fresh`: the reading has new values.
+        """
         age_ns = t_ns - self._judged_ns
         return age_ns > STANDS_NS or (fresh and (self.asked or age_ns >= REFRESH_NS))
 
     def answer(self, t_ns: int, *, first: bool) -> bool:
-        """Note a judgement; return False if it only refreshes one that was not the `first`."""
+        """Note a judgement at `t_ns`. Return True if it is the grasp's `first` or answers a
+        question.
+
+        It is False if the judgement is a periodic refresh.
+        """
         answers = first or (self.asked and self._on_request)
         self._judged_ns, self.asked = t_ns, False
         return answers
 
     def restart(self) -> None:
-        """Count the time of a question from the next reading on: time went back."""
+        """Restart the timeout of a question at the next reading. Call it where time went back."""
         self._until_ns = None
 
 
@@ -146,7 +154,7 @@ class Gate:
     """Follows the grasps of one hand."""
 
     def __init__(self, fingers: Sequence[Finger], limits: HandLimits, motion: Motion) -> None:
-        """`fingers`: those of the readings, in their order. `motion`: how they move."""
+        """`fingers`: the rows of a reading. `motion`: their motion, which the caller updates."""
         required = fingers if limits.required is None else limits.required
         self._fingers = tuple(fingers)
         self.required = frozenset(fingers).intersection(required)
@@ -156,7 +164,7 @@ class Gate:
         self.phase, self._still = Phase(), Stillness()
         self._question = Question(limits.on_request, limits.gate.request_ns)
         self._reference = np.zeros((len(fingers), ELECTRODES), dtype=np.float32)
-        """Shape (fingers, 24): counts where it had settled; means nothing before."""
+        """Counts at the first judgement of the grasp, shape (fingers, 24); meaningless before."""
         self._last_ns: int | None = None
         """Time of the last reading."""
         self._opened_ns = 0
@@ -167,7 +175,9 @@ class Gate:
         self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
-        """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
+        """Ask for a judgement. It is dropped if no grasp settles in `request_ns` from the next
+        reading.
+        """
         self._question.ask()
 
     def step(
@@ -182,12 +192,13 @@ class Gate:
         in_time: bool = True,
         fresh: bool = True,
     ) -> Moment:
-        """Take in a reading of `t_ns` whose motion is known; return where in a grasp it is.
+        """Take in a reading of `t_ns`, after `motion` has; return the state of the grasp.
 
         `median`: counts, shape (fingers, 24). `usable`: electrodes that can be used, same shape;
-        None: all. `objections` of other parts keep the grasp from settling: no tare, joints that
-        move. The grasp is judged only `in_time` and by `fresh` values, or by the newest once the
-        verdict is too old to stand. `fingers` goes into the moment as it is.
+        None: all. `objections` of other parts, such as moving joints, keep the grasp from settling.
+        `in_time`: the reading is not late; only then it is judged. `fresh`: it has new values;
+        without them it is judged only if the verdict is older than `STANDS_NS`. `fingers` goes
+        into the moment as it is.
         """
         phase, still, motion = self.phase, self._still, self._motion
         self._last_ns = t_ns
@@ -221,7 +232,7 @@ class Gate:
         judges: bool = False,
         judged: bool = False,
     ) -> Moment:
-        """Return where in a grasp the hand is, and forget the changes that led there."""
+        """Return the state of the grasp with the pending changes, and clear these."""
         phase, still = self.phase, self._still
         is_judged, reasons = phase.state is GateState.JUDGED, self._objections
         if not (reasons or is_judged):
@@ -249,9 +260,9 @@ class Gate:
         )
 
     def restart(self, t_ns: int) -> None:
-        """Have the grasp settle again, and forget the motion: readings are missing.
+        """Have the grasp settle again, and forget the motion.
 
-        Call it too where `t_ns`, the time of the next one, went back.
+        Call it before the next reading, of `t_ns`, if readings are missing or time went back.
         """
         if self._last_ns is not None and t_ns < self._last_ns:
             self._opened_ns = t_ns
@@ -297,7 +308,7 @@ class Gate:
         usable: NDArray[np.bool_] | None,
         limits: MotionLimits,
     ) -> tuple[Reason, ...]:
-        """Check that the judged grasp is still the same; return what else is against it."""
+        """Leave `judged` if the grasp has changed; return reasons to withhold the verdict now."""
         still = self._still
         if not still.touches:
             self._go(ways.LET_GO, t_ns)
@@ -328,10 +339,11 @@ class Gate:
         return fresh and is_asked and self.phase.state is GateState.SETTLED
 
     def _judge(self, t_ns: int, median: NDArray[np.uint16]) -> bool:
-        """Enter `judged`, or stay there; return False if that only refreshes a judgement."""
+        """Enter `judged`, or stay there; return False if this is only a periodic refresh."""
         first = self.phase.state is not GateState.JUDGED
         if first:
-            # Kept when it is judged again: else a grasp that creeps would never be another.
+            # A later judgement keeps it. Otherwise a grasp that creeps would never count as
+            # changed.
             self._reference = median.astype(np.float32)
             self._still.early = self._still.lasts_ns < LONG_NS
             self._still.moved_since_ns = None
@@ -339,7 +351,7 @@ class Gate:
         return self._question.answer(t_ns, first=first)
 
     def _nearest_to_limit(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
-        """Per finger: motion in the window closer to its limit, and that limit."""
+        """Return each finger's motion in the window that is closer to its limit, and that limit."""
         motion: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
         now, most = self._motion, self._motion.loose if self._still.sure else self._motion.strict
@@ -347,7 +359,7 @@ class Gate:
         for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * slide_limit:
                 moves, limit = slides, slide_limit
-            # In a third of the time of `round` to two digits.
+            # This takes a third of the time of `round` to two digits.
             motion[finger] = round(100.0 * moves) / 100.0 if moves < math.inf else None
             limits[finger] = round(100.0 * limit) / 100.0
         return motion, limits

@@ -54,7 +54,7 @@ class FreshMedian:
         self._fresh = np.zeros((MEDIAN_SWEEPS, *shape), dtype=np.uint16)
         """The last three fresh values, oldest first, shape (3, fingers, 24)."""
         self._last = np.full(shape, NO_COUNT, dtype=np.uint16)
-        """The last value, fresh or not."""
+        """The last value of each electrode, fresh or not."""
         self._held = np.zeros(shape, dtype=np.bool_)
         """True where the last value repeated the one before."""
         self._number = np.zeros(shape, dtype=np.uint8)
@@ -72,9 +72,9 @@ class FreshMedian:
     def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_] | None) -> None:
         """Take in one sweep, shape (fingers, 24).
 
-        `usable`: False for electrodes whose values are forgotten; None: all can be used. A value
-        that repeats the one before is not fresh. If it comes a third time it is: a palm's data of
-        71.43 Hz never repeats twice.
+        `usable`: False for electrodes whose fresh values start again; None: all can be used. A
+        value that repeats the last one is not fresh. A third equal value is fresh, because data
+        of a palm at 71.43 Hz never repeat twice.
         """
         oldest, middle, newest = self._fresh
         fresh = (counts != self._last) | self._held
@@ -102,7 +102,7 @@ class FreshMedian:
         usable: NDArray[np.bool_] | None,
         fresh: NDArray[np.bool_],
     ) -> None:
-        """Count the fresh values; until there are three, the first stands for those missing."""
+        """Count the fresh values, and fill `_fresh` with the first one until there are three."""
         if usable is not None:
             self._number[~usable] = 0
         first = fresh & (self._number == 0)
@@ -113,17 +113,17 @@ class FreshMedian:
 
 @dataclass(slots=True)
 class FingerWord:
-    """Motion of a finger during its touch; a touch that ends, or a gap, resets it."""
+    """Finds the state of one finger by its motion in the current touch."""
 
     was_still: bool = False
-    """True if it has kept still at some time of this touch."""
+    """True if the finger has kept still at some time of this touch."""
     moves_since_ns: int | None = None
-    """Time since which it moves. None: it does not."""
+    """Time since which the finger moves. None: it does not."""
 
     def touch(self, t_ns: int, moves: bool | None) -> FingerState | None:
         """Return the state at `t_ns` of a finger that touches.
 
-        `moves` says whether it moves more than one that holds; None: not known.
+        `moves`: True if it moves more than a finger that holds; None: not known.
         """
         if moves is None:
             self.let_go()
@@ -145,7 +145,7 @@ class HandTracker:
     """Follows contact, joints and gate of one hand, and says when a grasp is to be judged."""
 
     def __init__(self, fingers: Sequence[Finger], limits: HandLimits) -> None:
-        """`fingers` are those of the readings, in their order."""
+        """`fingers`: the rows of a reading."""
         self._fingers = tuple(fingers)
         self._fresh = FreshMedian((len(fingers), ELECTRODES))
         self._contact = Contact(len(fingers))
@@ -161,7 +161,7 @@ class HandTracker:
         self._last_ns: int | None = None
         """Time of the last usable reading."""
         self._interrupted = False
-        """True if the next reading does not continue those before."""
+        """True if readings are missing before the next one."""
 
     @property
     def tared(self) -> tuple[Finger, ...]:
@@ -185,7 +185,7 @@ class HandTracker:
         return np.where(known, contact.baseline, 0.0)
 
     def health(self) -> dict[str, Reason]:
-        """Return what is not well: fingers without a tare, and `joints`."""
+        """Return the current problem of each finger without a tare, and of `joints`."""
         tared, joints, last_ns = self.tared, self._joints, self._last_ns
         findings: dict[str, Reason] = {
             finger: Reason.NOT_TARED for finger in self._fingers if finger not in tared
@@ -204,12 +204,12 @@ class HandTracker:
         self.restart()
 
     def count_from(self, grasp: int) -> None:
-        """Give the next grasp the number after this, unless one is held."""
+        """Give the next grasp the number `grasp` + 1, unless a grasp is held now."""
         if self.gate.phase.state in OPEN:
             self.gate.phase.grasp = grasp
 
     def ask(self) -> None:
-        """Judge the current grasp once it has settled: the controller waits for the verdict."""
+        """Ask for a judgement of the current grasp once it has settled."""
         self.gate.ask()
 
     def restart(self) -> None:
@@ -236,7 +236,8 @@ class HandTracker:
     ) -> tuple[Moment, NDArray[np.uint16] | None]:
         """Take in the counts of a reading, shape (fingers, 24), made at `t_ns`.
 
-        Return where in a grasp the hand is, and the counts to judge; None: judge nothing.
+        `checked`: result of `Health.check`. `in_time`: False if the reading is late. Return the
+        state of the grasp and the counts to judge; None in their place: judge nothing.
         """
         if checked.reasons:
             if self._is_after_gap(t_ns):
@@ -274,7 +275,7 @@ class HandTracker:
         return self.gate.moment(touching, dict.fromkeys(self._fingers))
 
     def _feel(self, t_ns: int) -> dict[Finger, FingerState | None]:
-        """Return what each finger feels by the reading just observed."""
+        """Return the state of each finger at the reading just observed."""
         motion, loose, contact = self.motion, self.motion.loose, self._contact
         feelings: dict[Finger, FingerState | None] = {}
         for place, finger in enumerate(self._fingers):
@@ -287,12 +288,12 @@ class HandTracker:
             is_known = fast < math.inf and slow < math.inf
             if loose.fast[place] < fast < math.inf or loose.slow[place] < slow < math.inf:
                 feelings[finger] = word.touch(t_ns, True)
-            else:  # what is known keeps to its limit
+            else:  # all motion that is known is within its limit
                 feelings[finger] = word.touch(t_ns, False if is_known else None)
         return feelings
 
     def _follow_time(self, t_ns: int) -> None:
-        """Forget what does not continue at the time of a usable reading."""
+        """Forget the state that a usable reading of `t_ns` does not continue."""
         last_ns = self._last_ns
         if last_ns is not None and not -OUTAGE_NS <= t_ns - last_ns <= OUTAGE_NS:
             self._contact.forget()

@@ -46,11 +46,11 @@ A finger that touches moves many electrodes. In a table each reading is another 
 all differ.
 """
 JUMPS_MAX = 2.0
-"""Most recent jumps of a sound electrode. More within about ten readings are a loose contact."""
+"""Most recent jumps of a sound electrode. More jumps in about ten readings are a loose contact."""
 JUMPS_FADE = 0.9
 """Factor by which earlier jumps count less with each reading."""
 JUMPS_FORGOTTEN = 1e-9
-"""Smallest remainder of a jump that still counts; it is reached after 200 readings."""
+"""Weight below which a past jump is forgotten; it is reached after 200 readings."""
 LIMITS = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
 """Limits of three 16-bit differences; see `_compare`. Negative ones wrap round, so they are large.
 
@@ -120,9 +120,9 @@ class Health:
         self._faults = reading.faults
         railed = self._compare(counts)
         sound, faults = None, 0
-        # Nearly all readings are sound, and that is seen with a few cheap operations.
+        # Nearly all readings are sound, which a few cheap operations find out.
         if reading.faults.tobytes() != self._no_faults:
-            # Flagged counts were not read: they neither repeat anything nor hide that others do.
+            # Flagged counts were not read, so they take no part in the search for repeats.
             sound = reading.faults == 0
             faults = int(np.bitwise_or.reduce(reading.faults, axis=None))
             self._changed[~sound] = self._number
@@ -146,7 +146,9 @@ class Health:
         return Checked((), broken)
 
     def electrodes(self) -> dict[tuple[int, int], Reason]:
-        """Return why electrodes are broken now, by (finger, electrode 0..23)."""
+        """Return the current reason of each broken electrode, by (row of the finger, electrode
+        0..23).
+        """
         findings: dict[tuple[int, int], Reason] = {}
         for where, reason in (
             (self._jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
@@ -186,7 +188,7 @@ class Health:
     def _recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
         """Take in a sweep, shape (fingers, 24). Return True if some finger sent it before.
 
-        `sound` tells which of the counts were read; None: all. The others may be anything.
+        `sound`: True for counts that were read; None: all were.
         """
         past, place = self._past, self._number % SWEEPS
         now = kept = counts.T
@@ -203,7 +205,7 @@ class Health:
             same = (both >= READ_MIN) & (both + unread >= EQUAL_MIN)
             for finger in np.flatnonzero(same.any(axis=1)):
                 again = True
-                # A sweep that comes again takes the place of the former one: none is forgotten.
+                # A repeated sweep takes the place of its first copy, so no other is forgotten.
                 past[:, finger, same[finger].argmax()] = past[:, finger, place]
         past[:, :, place] = kept
         return again

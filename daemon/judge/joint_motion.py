@@ -1,4 +1,4 @@
-"""Whether the joints that send angles keep still."""
+"""Check that the joints which send angles keep still."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RAD_PER_S = 0.1
 One count of a Hall sensor is 0.0006 rad, so noise alone shows up to 0.02 rad/s.
 """
 WINDOW_NS = 80_000_000
-"""Least time between the two angles of which a speed is made, ns."""
+"""Shortest time between two angles from which a speed is computed, ns."""
 LATE_NS = 150_000_000
 """Age of the angles above which the grasp cannot settle, ns."""
 LOST_NS = 1_000_000_000
@@ -25,11 +25,11 @@ FROZEN_NS = 1_000_000_000
 The noise of a Hall sensor is one count, so even a single joint changes many times in it.
 """
 ANGLES = 16
-"""Number of angles remembered of a window; of faster readings, some are left out."""
+"""Number of readings of a set that are kept for a window. Faster readings are thinned out."""
 LOST_MAX = 64
 """Most names of lost joints that are remembered; a hand has 24 joints."""
 SOURCES_MAX = 8
-"""Most sets of joints that are followed apart; a sender may send one finger at a time."""
+"""Most sets of joints that are followed separately, such as those of one finger."""
 
 
 class JointMotion:
@@ -47,12 +47,12 @@ class JointMotion:
         self.lost: list[str] = []
         """Joints whose angles no longer come."""
         self._waits_since_ns: int | None = None
-        """Time since which no set is known. None: it was always so."""
+        """Time since which no set is known. None: not noticed yet."""
         self._changed_ns: int | None = None
         """Time of the last change of any angle. None: no angle came yet."""
 
     def observe(self, reading: JointReading, t_ns: int) -> None:
-        """Take in the angles of `t_ns`, a time on the clock of the sweeps.
+        """Take in angles made at `t_ns`, on the same clock as the sweeps.
 
         A joint whose angle is NaN counts as not sent.
         """
@@ -69,19 +69,19 @@ class JointMotion:
         latest_ns = self.latest_ns.get(names, t_ns)
         before = past[-1][1] if past else None
         if not 0 <= t_ns - latest_ns <= LATE_NS:
-            past.clear()  # time went back, or it is not known what the joints did meanwhile
+            past.clear()  # time went back, or the joints may have moved in a gap
         self.latest_ns[names] = t_ns
         if not past or t_ns - past[-1][0] >= WINDOW_NS // ANGLES:
             angles = reading.position_rad[valid]
             past.append((t_ns, angles))
-            del past[: -(ANGLES + 2)]  # and one at each end of the window
-            # Joints without an earlier angle say nothing: they may come and go.
+            del past[: -(ANGLES + 2)]  # one more at each end of the window
+            # The first angles of a set are not a change, because sets may come and go.
             changed = before is not None and angles.tobytes() != before.tobytes()
             if changed or self._changed_ns is None or t_ns < self._changed_ns:
                 self._changed_ns = t_ns
 
     def objection(self, t_ns: int) -> Reason | None:
-        """Return the reason why joints forbid settling at `t_ns`. None: they are still, or lost."""
+        """Return why the joints forbid settling at `t_ns`. None: they are still, or lost."""
         self._drop_lost(t_ns)
         if not self.past:
             if self._waits_since_ns is None or self._waits_since_ns > t_ns:
@@ -94,7 +94,7 @@ class JointMotion:
         return Reason.JOINTS_FROZEN if self.is_frozen else None
 
     def misses_some(self, t_ns: int) -> bool:
-        """Return True if judging continues at `t_ns` without joints that should be there."""
+        """Return True if joints are missing at `t_ns` and judging continues without them."""
         return self.is_lost(t_ns) or bool(set(self.lost).difference(*self.past))
 
     @property
@@ -113,7 +113,7 @@ class JointMotion:
         )
 
     def _drop_lost(self, t_ns: int) -> None:
-        """Forget joints that no longer come, and those of a time that has gone back."""
+        """Forget sets whose last reading is older than `LOST_NS`, or later than `t_ns`."""
         for names, latest_ns in list(self.latest_ns.items()):
             if -LATE_NS <= t_ns - latest_ns <= LOST_NS:
                 continue
@@ -128,7 +128,7 @@ class JointMotion:
             del past[0]
         if now_ns - past[0][0] < WINDOW_NS:
             return False
-        # Against every moment of the window: two alone would miss what swings.
+        # Each angle of the window is compared with the newest: the ends alone would miss a swing.
         moved = np.abs(np.array([then for _, then in past]) - now).max(axis=1)
         ages_ns = [max(now_ns - at_ns, WINDOW_NS) for at_ns, _ in past]
         return bool((moved <= RAD_PER_S * np.array(ages_ns) / 1e9).all())

@@ -1,4 +1,4 @@
-"""How much fingers that hold move: the limits of motion, in units of each finger's noise."""
+"""The limits of motion within which a finger holds still, in units of its noise."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from graspd.daemon.judge.windows import MEAN_ABS
 SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
 """Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
 CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
-"""A held touch relaxes: median speed of its electrodes, root mean square, and standard deviation of
-its logarithm. With the noise it is what 44 held touches of one sensor showed, in windows of 50 to
-240 ms."""
+"""Creep of a held touch, which relaxes: median of its electrodes' root mean square speed, counts/s,
+and standard deviation of that speed's logarithm. Both were measured on 44 held touches of one
+sensor, in windows of 50 to 240 ms."""
 FAST_SHARE = 0.1
 """Share of the false alarms that the short window may have where the long one decides."""
 LOOSE_SHARE = 0.1
-"""Share of `false_alarms` by which the loose limit is laid, as noise and creep alone pass it. The
-pressure of a real hold wanders as well: together they pass it in `false_alarms` of the time."""
+"""Share of `false_alarms` in which noise and creep alone pass the loose limit. The pressure of a
+real hold wanders as well; with it the limit is passed in `false_alarms` of the time."""
 
 
 class Tails(NamedTuple):
-    """How far a finger that holds may be above what is usual, in standard deviations."""
+    """Allowed motion of a finger that holds, in standard deviations above the usual motion."""
 
     slow: float
     """In the long window."""
@@ -36,7 +36,7 @@ class Tails(NamedTuple):
 
     @classmethod
     def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
-        """Return them by `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
+        """Return the tails for `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
         if not 0.0 < false_alarms < 0.5:
             raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
         finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
@@ -48,7 +48,7 @@ class SlowNoise(NamedTuple):
     """Noise in the long window."""
 
     extent: float
-    """Sum of the squares of the times around their mean, s**2."""
+    """Sum of the squares of the window's times, counted from their mean, s**2."""
     squares: list[float]
     """Sum of the squares of each finger's noise, counts**2."""
     spreads: list[float]
@@ -65,11 +65,11 @@ class MotionLimits:
         self.forget()
 
     def forget(self) -> None:
-        """Say that no motion is known, so that nothing is within."""
+        """Clear the limits: no motion is known, so no finger is within."""
         self.fast = self.slow = self._ones
         """Largest motion of each finger over the short and over the long window."""
         self.early = self.sure = False
-        """True if all fingers keep within `fast`; within both: slow slides are excluded too."""
+        """`early`: True if all fingers are within `fast`. `sure`: within `slow` too."""
 
     def lay(
         self,
@@ -78,10 +78,10 @@ class MotionLimits:
         slow: Sequence[float] = (),
         slow_noise: SlowNoise | None = None,
     ) -> None:
-        """Lay the limits of fingers that move so; `slow_noise` is None before a long window.
+        """Set the limits by each finger's noise, and `early` and `sure` by its motion.
 
         `fast`, `slow`: motion in units of noise. `fast_noise`: mean absolute slopes that noise
-        makes, counts/s.
+        makes, counts/s. `slow_noise`: None before the long window is full.
         """
         self.fast = _fast_limits(self._alone, fast_noise)
         self.early = all(map(le, fast, self.fast))
@@ -90,7 +90,7 @@ class MotionLimits:
             return
         self.slow = self._slow_limits(slow_noise)
         is_within = self.early
-        if self._beside != self._alone:  # where the long window decides, the short one is looser
+        if self._beside != self._alone:  # the short window is looser where the long one decides
             is_within = all(map(le, fast, _fast_limits(self._beside, fast_noise)))
         self.sure = is_within and all(map(le, slow, self.slow))
 
@@ -100,7 +100,7 @@ class MotionLimits:
         for noise, spread in zip(squares, spreads, strict=True):
             stretch = extent / noise
             usual = 1.0 + CREEP_COUNTS_PER_S**2 * stretch
-            # Noise and creep know nothing of each other: their deviations add up as squares do.
+            # Noise and creep are independent, so the squares of their deviations add up.
             above = math.hypot(self._tail * spread * usual, self._creep * stretch)
             limits.append(math.sqrt(usual + above))
         return limits
@@ -112,7 +112,7 @@ def creep(tail: float) -> float:
 
 
 def _usual(tail: float) -> tuple[float, float]:
-    """Return a finger's mean absolute slope at a tail: by its noise, in units of it, and by creep,
+    """Return a finger's mean absolute slopes at `tail`: by noise, in units of the noise; by creep,
     counts/s."""
     return math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)
 

@@ -12,10 +12,10 @@ IDLE, CLOSING, SETTLED, JUDGED, RELEASED = GateState
 
 
 class Transition(NamedTuple):
-    """One way from states to another."""
+    """A transition from any of several states to another."""
 
     states: tuple[GateState, ...]
-    """States at which it begins."""
+    """States from which it starts."""
     when: str
     """Event that makes the gate take it."""
     to: GateState
@@ -33,21 +33,21 @@ GAP = Transition((SETTLED, JUDGED), "readings are missing", CLOSING, Cause.GAP)
 OPENED = Transition((CLOSING, SETTLED, JUDGED), "nothing touches", RELEASED, Cause.CONTACT_LOST)
 FORGOTTEN = Transition((RELEASED,), "nothing touches for 100 ms", IDLE, Cause.TIME)
 TRANSITIONS = TOUCHED, STILL, ANSWERED, SURE, MOVED, CHANGED, LET_GO, GAP, OPENED, FORGOTTEN
-"""All of them, as deploy/wire/README.md shows them."""
+"""All transitions, in the order of deploy/wire/README.md."""
 
 
 class Phase:
-    """State of the gate, the number of the grasp, and the changes that no moment has told yet."""
+    """State of the gate, number of the grasp, and changes that no `Moment` has reported yet."""
 
     def __init__(self) -> None:
         self.state = IDLE
         self.grasp = 0
-        """Touches until now; the number of the current grasp."""
+        """Number of the current grasp, which is the number of first touches so far."""
         self.changes: list[GateChange] = []
-        """Since the last moment: three of a reading, and one of a restart before it."""
+        """Changes since the last `Moment`: at most three by a reading, and one by a restart."""
 
     def take(self, way: Transition, t_ns: int) -> bool:
-        """Take a way at a reading of `t_ns`; False: it does not begin at the state of now."""
+        """Take a transition at a reading of `t_ns`; False: it does not start from this state."""
         former = self.state
         if former not in way.states:
             return False

@@ -45,17 +45,17 @@ class Judgement(msgspec.Struct, frozen=True, gc=False):
     decision: Decision
     reasons: tuple[Reason, ...]
     p_slip: float | None
-    """After what outcomes have taught; None exactly when the decision is unknown."""
+    """Probability of slip after learning from outcomes; None exactly if the decision is unknown."""
     moment: Moment
     """State of the grasp."""
     opinion: Opinion
     """Answer of the network for the grasp, maybe of an earlier reading."""
     assessment: Assessment | None = None
-    """Worth of `opinion` now; None: without learning and without a risk."""
+    """Assessment of `opinion` by the outcomes known now; None: no learning and no risk."""
     risk: RiskOutcomes | None = None
     """Outcomes of `stable` lifts before this verdict; None like `assessment`."""
     supervised: bool = False
-    """True if its lift, watched, would teach what is not known: ask for it."""
+    """True if the outcome of a supervised lift would teach the learner: ask for one."""
     session_calibrated: bool | None = None
     """True if the session is known well enough; None for a model that needs none."""
     judged_counts: NDArray[np.uint16] | None = None
@@ -78,7 +78,7 @@ class Pipeline:
         needs_session: bool = False,
         trust: Trust | None = None,
     ) -> None:
-        """`clock` gives monotonic ns; without `hand` each reading is a grasp.
+        """`clock` returns monotonic ns; without `hand` each reading is a grasp.
 
         Unless it `learns`, the session stays what it is; with `needs_session` nothing is judged
         before it is calibrated. Raises `ModelError` if the model is for other fingers.
@@ -103,7 +103,7 @@ class Pipeline:
         self.lifts = LiftBook() if trust is None else trust.lifts
         """Which grasps were judged, and how their lifts ended."""
         self.boot_id = ""
-        """Identifies the start of the daemon in the names of its grasps."""
+        """Id of this start of the daemon; it is part of the name of each grasp."""
         self.hand: HandTracker | EveryReading
         """Says when a grasp is to be judged."""
         if hand is None:
@@ -115,20 +115,20 @@ class Pipeline:
 
             self.hand = HandTracker(fingers, hand)
         self.read_rest = self.hand.read_rest
-        """Gives where each electrode rests, counts, shape (fingers, 24); None: a table."""
+        """Function that returns the resting counts, shape (fingers, 24); None: a table has none."""
         self._moment = self.hand.silent()
         """Moment of the last reading."""
         self._opinion = NO_OPINION
         """Answer of the network for the current grasp."""
         self._assessment: Assessment | None = None
-        """Worth of `_opinion` when it was given."""
+        """Assessment of `_opinion` when it was given."""
         self._held = NOTHING_HELD
         self._to_learn: tuple[Examined, Opinion] | None = None
         """Grasp that the session is to take in, as it was judged first. None: none."""
         self._learnt_grasp = 0
-        """The grasp that the session took in last, or is about to."""
+        """Number of the last grasp that the session took in, or is about to."""
         self._late: bool | None = None
-        """Argument of `expect_late` for the next reading. None: its age says if it is late."""
+        """Argument of `expect_late` for the next reading. None: the reading's age decides."""
         self.on_exchange: Callable[[Exchanged], None] | None = None
         """Called when the sensors were exchanged, with what was known of the new ones."""
 
@@ -138,7 +138,7 @@ class Pipeline:
         return self.hand.on_request
 
     def session_then(self) -> SessionState | None:
-        """Return the state of the session with the grasp that is held, as if it were over."""
+        """Return the session's state as if the grasp that is held were over."""
         session = self.session
         if session is None:
             return None
@@ -152,17 +152,17 @@ class Pipeline:
             session.restore(state)
 
     def ask(self) -> None:
-        """Judge the current grasp once it has settled: the controller waits for the verdict."""
+        """Ask for a judgement of the current grasp once it has settled."""
         self.hand.ask()
 
     def expect_late(self, *, judged: bool) -> None:
-        """In a replay: the next reading was late when it was live; `judged`: the network ran."""
+        """Treat the next replayed reading as late. `judged`: the network ran when it was live."""
         self._late = judged
 
     def sensors_exchanged(self, known: Exchanged | None = None) -> None:
         """Forget session, grasp and maybe the tare: the sensors were exchanged.
 
-        Continue from what is `known` of them; None: nothing. Raises `ValueError` if that is of
+        `known`: what is known of the new sensors; None: nothing. Raises `ValueError` if it is of
         another model.
         """
         if known is None:
@@ -193,7 +193,7 @@ class Pipeline:
         return self.lifts.tell(grasp, slipped=slipped)[0]
 
     def skip(self) -> None:
-        """Note that readings were left out before the next one: anything may have moved."""
+        """Note that readings were left out before the next one, so the grasp must settle again."""
         self.hand.interrupt()
 
     def observe_joints(self, reading: JointReading) -> None:
@@ -235,7 +235,9 @@ class Pipeline:
         return judgement
 
     def silence(self, last_t_ns: int) -> Judgement:
-        """Return the judgement when no reading came for too long since that of `last_t_ns`."""
+        """Return the judgement when no reading has come for too long after the last, of
+        `last_t_ns`.
+        """
         moment = self.hand.silent()
         lift = GraspId(self.boot_id, moment.grasp)
         worth, risk = None, None
@@ -244,7 +246,9 @@ class Pipeline:
         return self._conclude(last_t_ns, 0, (Reason.STALE,), lift, moment, NO_OPINION, worth, risk)
 
     def health(self) -> dict[str, Reason]:
-        """Return what is not well: electrodes such as `ff_7`, fingers, joints, model, session."""
+        """Return the current problems: of electrodes such as `ff_7`, fingers, joints, model,
+        session.
+        """
         findings = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
         for (finger, place), reason in self._health.electrodes().items():
             findings[electrode_name(self._fingers[finger], place)] = reason
@@ -258,7 +262,7 @@ class Pipeline:
     def learn(self) -> None:
         """Take the grasp that was judged last into the session, if it is over.
 
-        A grasp is judged only by those before it. Learning takes as long as judging."""
+        A grasp is judged only by the grasps before it. Learning takes as long as judging."""
         now = self._moment
         is_over = now.state is None or now.state in OPEN or now.grasp != self._learnt_grasp
         if self._to_learn is not None and is_over:
@@ -266,7 +270,7 @@ class Pipeline:
             self._to_learn = None
 
     def _keep_to_learn(self, examined: Examined, grasp: int) -> None:
-        """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
+        """Keep a grasp for `learn` as it was judged first; later calls for it have no effect."""
         has_grasp = self.session is not None and examined.grasp is not None
         if self._learns and has_grasp and grasp != self._learnt_grasp:
             self._to_learn, self._learnt_grasp = (examined, self._opinion), grasp
@@ -277,9 +281,9 @@ class Pipeline:
     def _assess(
         self, grasp: GraspId, opinion: Opinion
     ) -> tuple[Assessment | None, RiskOutcomes | None]:
-        """Return what the grasp is worth by the outcomes that are known now, and these.
+        """Return the assessment of the grasp by the outcomes known now, and these outcomes.
 
-        `opinion`: the answer to this reading.
+        `opinion`: the network's answer to this reading.
         """
         if self.trust is None:
             return None, None
@@ -311,9 +315,9 @@ class Pipeline:
         risk: RiskOutcomes | None,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
-        """Return the judgement of a reading that is `unusable` for these reasons, or for none.
+        """Return the judgement of a reading; `unusable` has the reasons against using it.
 
-        A judgement that is not `stable` is kept, to hold down later ones.
+        A judgement that is not `stable` is kept as `HoldDown` of later ones.
         """
         calibrated = None if self.session is None else self.session.calibrated
         objections = unusable
@@ -333,7 +337,7 @@ class Pipeline:
                 if said is not Decision.STABLE:
                     until_ns = made_ns + self._limits.steady_ns
                     self._held, held = HoldDown(moment.grasp, until_ns, said), NOTHING_HELD
-        # Taken last, so that a slow inference counts too.
+        # The age is taken last, so that it includes a slow inference.
         age_ns = self.clock() - t_ns if self._late is None else self._limits.max_age_ns + 1
         decision, reasons = decide(
             p_slip, objections, moment, age_ns, self._limits, withheld=withheld, held=held

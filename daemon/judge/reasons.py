@@ -1,4 +1,4 @@
-"""Words of a verdict: decisions, reasons for `unknown`, and states of the gate.
+"""Enumerations of a verdict: decisions, reasons for `unknown`, and states of the gate.
 
 A new reason needs a member of `Reason`, a line of `ADVICE`, a line in deploy/wire/README.md, and
 `graspd schema > deploy/wire/messages.schema.json`. The part that notices it adds it to the
@@ -156,7 +156,7 @@ UNREADABLE = frozenset(
 FOLLOWING = {*NEEDS, Reason.JOINTS_LATE}
 """Reasons that last until readings come: without any, there is nothing to do about them."""
 _ORDER = {reason: (reason in NEEDS, place) for place, reason in enumerate(Reason)}
-"""Link, sensors, electrodes, the rest; last what is not `Need.ACT`."""
+"""Sort key of each reason: as in `Reason`, but those that are not `Need.ACT` come last."""
 WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
 """Reasons that still permit a supervised lift; any other reason forbids it."""
 
@@ -164,7 +164,7 @@ WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
 def to_act_on(reasons: Iterable[Reason]) -> list[Reason]:
     """Return the reasons to show to a person, in the order in which to act on them.
 
-    While the sensors cannot be read, to close the hand does not help: `OF_THE_HAND` is left out.
+    Reasons in `OF_THE_HAND` are left out while the sensors cannot be read.
     """
     shown = set(reasons)
     if not UNREADABLE.isdisjoint(shown):
@@ -173,10 +173,10 @@ def to_act_on(reasons: Iterable[Reason]) -> list[Reason]:
 
 
 def parts_to_act_on(health: Mapping[str, Reason]) -> dict[Reason, list[str]]:
-    """Return the parts that are not well by their reason, in the order in which to act on them.
+    """Return the parts with a problem by its reason, in the order in which to act on them.
 
-    A finger stands for its 24 electrodes. Parts that only follow from the link or from such a
-    finger are left out.
+    A finger's name stands for its electrodes if all 24 are listed. Reasons that only follow from
+    a silent link or from such a finger are left out.
     """
     fingers: dict[str, list[Reason]] = {}
     for part, reason in health.items():

@@ -1,4 +1,4 @@
-"""Whether the fingers keep still: how each moves, in units of its own noise.
+"""Measure how each finger moves, in units of its own noise, to find whether it keeps still.
 
 A sweep goes through `SpikeFilter`, `StepRing` and `NoiseBlocks`; `MotionLimits` say what is still.
 """
@@ -29,21 +29,24 @@ from graspd.daemon.judge.windows import (
 )
 
 SPIKE_COUNTS = 20.0
-"""A value that jumps further is believed once the next one does too. Spikes last for one sweep:
-those of a sensor are 25 counts or more; noise jumps so far in one value of three thousand."""
+"""Largest step that is believed at once, counts. A larger one is believed if the next value has it
+too. Spikes last for one sweep and are at least 25 counts high. Noise steps this far in one value of
+three thousand."""
 SPIKE_SWEEPS_MAX = 3
-"""Sweeps that a spike lasts where values come more slowly than sweeps and are held."""
+"""Most sweeps that a spike lasts if values come more slowly than sweeps and are repeated."""
 SPIKES_MAX = 4
-"""More electrodes of a finger that jump in one sweep are motion: noise does that less than once a
-year."""
+"""Most electrodes of a finger that spike in one sweep. More are motion: by noise alone they would
+jump together less than once a year."""
 QUARTILE = 0.95
-"""Lower quartile of the blocks' variances over their mean; the same for white noise."""
+"""Ratio of the lower quartile of the blocks' variances to their mean, for white noise."""
 BLOCKS_MIN = 4
-"""Blocks from which on noise is known."""
+"""Fewest blocks by which noise is known."""
 SIGMA_COUNTS = (0.5, 10.0)
-"""An electrode wavers no less, as counts are whole numbers, and no more: measured 2.9 to 4.3."""
+"""Smallest and largest assumed noise of an electrode, counts; measured 2.9 to 4.3. Counts are whole
+numbers, so even a quiet one has some."""
 SOUND_MIN = 12
-"""A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
+"""Fewest electrodes of a finger, of 24, usable for the whole window; with fewer its motion is
+unknown."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
 EACH_STEP = np.ones(STEPS, dtype=np.float32)
 Sweep = NDArray[np.float32]
@@ -53,7 +56,7 @@ Usable = NDArray[np.bool_]
 
 
 class SpikeFilter:
-    """Leaves out what has jumped for one sweep alone, or is held for a few."""
+    """Removes spikes, which last for one sweep or are repeated for up to `SPIKE_SWEEPS_MAX`."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
@@ -62,16 +65,16 @@ class SpikeFilter:
         self._came = np.zeros(shape, dtype=np.float32)
         """The last sweep as it came."""
         self._jumped = np.zeros(shape, dtype=np.uint8)
-        """Number of sweeps for which an electrode has jumped and was not believed."""
+        """Number of sweeps in a row in which an electrode's value was left out as a spike."""
         self._jumps = np.zeros(shape, dtype=np.float32)
 
     def begin(self, sweep: Sweep) -> None:
-        """Believe a sweep that continues nothing."""
+        """Take the first sweep as it is."""
         self.clean = self._came = sweep
         self._jumped.fill(0)
 
     def believe(self, which: Usable) -> None:
-        """Believe the next values of these electrodes: they have nothing to jump from."""
+        """Take the next values of these electrodes as they are: they have no value to jump from."""
         self._jumped[which] = SPIKE_SWEEPS_MAX
 
     def add(self, sweep: Sweep) -> Sweep:
@@ -94,33 +97,38 @@ class SpikeFilter:
 
 
 class StepRing:
-    """The last steps of a hand, and since when its electrodes can be used."""
+    """The last steps of a hand, and the time since which each electrode is usable.
+
+    A step is the mean of the sweeps of at least `STEP_NS`.
+    """
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
         self.times_ns: list[int] = []
-        """Times of the steps that are remembered, oldest first."""
+        """Times of the steps that are kept, ns, oldest first."""
         self.times_s = np.zeros(2 * STEPS)
         """Times of `steps` since the first sweep, s."""
         self.steps = np.zeros((2 * STEPS, *shape), dtype=np.float32)
-        """The steps that are remembered are a slice, which moves right, then back to the left."""
+        """Buffer of steps. The kept ones are a slice from `first`; it moves right, then to 0."""
         self.first = 0
         """Index of the oldest entry in `steps`."""
         self.usable_since_ns = np.zeros(shape, dtype=np.int64)
-        """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
+        """Time since which each electrode is usable, ns; gaps of up to `LOST_MAX` sweeps are
+        ignored.
+        """
         self.sweeps = 0
-        """Sweeps of the step at hand."""
+        """Number of sweeps in the unfinished step."""
         self.crowded = False
-        """True if the step of the last sweep has too many: they came late and all at once."""
+        """True if the step has over `STEP_SWEEPS_MAX` sweeps, which came late and all at once."""
         self.last_ns: int | None = None
         """Time of the last sweep that ended a step. None: there is none."""
         self._all_usable_since_ns = 0
         self._lost = np.zeros(shape, dtype=np.uint8)
-        """Number of sweeps for which it has not been usable, up to `LOST_MAX` and one."""
+        """Number of sweeps for which each electrode was not usable, at most `LOST_MAX` + 1."""
         self._total = np.zeros(shape, dtype=np.float32)
-        """Sum of the sweeps of the step at hand."""
+        """Sum of the sweeps in the unfinished step."""
         self._total_ns = 0
-        """Sum of the times of these sweeps since the step before, ns."""
+        """Sum of these sweeps' times, counted from the end of the last step, ns."""
         self._begun_ns = 0
         """Time of the first sweep."""
 
@@ -131,13 +139,13 @@ class StepRing:
         self.last_ns = None
 
     def begin(self, t_ns: int) -> None:
-        """Take the first sweep, of `t_ns`, for the end of a step."""
+        """Start with the first sweep, of `t_ns`, as the end of a step."""
         self.last_ns = self._all_usable_since_ns = self._begun_ns = t_ns
         self._lost.fill(LOST_MAX)
         self.usable_since_ns.fill(t_ns)
 
     def find_lost(self, usable: Usable | None) -> Usable | None:
-        """Take in which electrodes are usable; return those lost for too long. None: all are."""
+        """Return the electrodes unusable for over `LOST_MAX` sweeps. `usable` None: all are."""
         if usable is None:
             self._lost.fill(0)
             return None
@@ -147,7 +155,7 @@ class StepRing:
         return gone
 
     def lose(self, gone: Usable, t_ns: int) -> None:
-        """Do not use these electrodes in the step at hand."""
+        """Count the electrodes `gone` as unusable until the end of the step at `t_ns`."""
         self._all_usable_since_ns = t_ns + STEP_NS
         self.usable_since_ns[gone] = t_ns + STEP_NS
 
@@ -177,9 +185,9 @@ class StepRing:
         return True
 
     def since(self, begin: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return the steps from number `begin` on, shape (steps, fingers * 24), and their times.
+        """Return the steps from index `begin` on, shape (steps, fingers * 24), and their times.
 
-        Times are counted from their mean, s.
+        The times are counted from their mean, s.
         """
         times_ns, first = self.times_ns[begin:], self.first + begin
         number = len(times_ns)
@@ -188,7 +196,9 @@ class StepRing:
         return steps, self.times_s[first : first + number] - mean_ns / 1e9
 
     def mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
-        """Return each finger's mean over electrodes usable since step `begin`; infinite: too few.
+        """Return each finger's mean over its electrodes usable since step `begin`.
+
+                It is infinite for a finger with fewer than `SOUND_MIN` of them.
 
         `values`: shape (fingers * 24,).
         """
@@ -203,24 +213,24 @@ class StepRing:
 
 
 class NoiseBlocks:
-    """How much the electrodes waver, by the differences of steps, in blocks."""
+    """Measures the electrodes' noise by the differences of steps, in blocks of `BLOCK_STEPS`."""
 
     def __init__(self, fingers: int) -> None:
         self.sums = np.zeros((APART, fingers))
-        """Sums of the squared differences of steps 1 to `APART` apart, of the block at hand."""
+        """Sums of squared differences of steps 1 to `APART` apart, in the unfinished block."""
         self.number = 0
-        """Blocks so far."""
+        """Number of finished blocks."""
         self._blocks = np.zeros((BLOCKS, APART, fingers))
-        """Their means, written round and round."""
+        """Ring buffer of the blocks' mean squared differences, counts**2."""
         self._steps = 0
-        """Steps of the block at hand."""
+        """Number of steps in the unfinished block."""
         self._pending = 0
-        """The last of these, which are still to be taken into it."""
+        """Number of these steps, the last ones, that are not in `sums` yet."""
         self._noise: Noise | None = None
-        """Worked out when it is needed, once for each new block."""
+        """Cached result of `noise`. None: a block was added since."""
 
     def reset(self) -> None:
-        """Forget the block at hand."""
+        """Forget the unfinished block."""
         self._steps = self._pending = 0
         self.sums.fill(0.0)
 
@@ -243,12 +253,12 @@ class NoiseBlocks:
             self.reset()
 
     def lose(self, gone: Usable, ring: StepRing) -> None:
-        """Take in the pending steps before these electrodes are lost."""
+        """Add the pending steps to the block before the electrodes `gone` become unusable."""
         if self._pending and (ring.usable_since_ns[gone] <= ring.times_ns[-1 - APART]).any():
             self._fill(ring)
 
     def _fill(self, ring: StepRing) -> None:
-        """Take the pending steps into the block, by the electrodes that are usable until now."""
+        """Add the pending steps to the block, using the electrodes that are usable until now."""
         end = ring.first + len(ring.times_ns)
         since_ns = np.array(ring.times_ns[-self._pending - APART : -APART])
         begin, self._pending = end - self._pending, 0
@@ -259,7 +269,9 @@ class NoiseBlocks:
             sums += ((np.square(differences) * usable) @ ONES / numbers).sum(axis=0)
 
     def noise(self) -> Noise:
-        """Return the motion that noise seems to be. Call it with `BLOCKS_MIN` blocks."""
+        """Return the motion that noise alone seems to show. Call it with at least `BLOCKS_MIN`
+        blocks.
+        """
         if self._noise is None:
             number = min(self.number, BLOCKS)
             squares = np.sort(self._blocks[:number], axis=0)[number // 4]
@@ -276,14 +288,14 @@ class Motion:
 
     Fast motion shows in a short window, as the mean of the electrodes' absolute slopes. Slow slides
     stop and turn; they show in a long one, as the root mean square of the electrodes' deviations
-    from their means. Each is divided by what noise alone makes of it. There are two limits of it: a
+    from their means. Both are divided by the value that noise alone gives. Each has two limits: a
     hand settles by the strict one, and continues by the loose one.
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
         """`false_alarms`: share of a settled hand's sweeps that may pass the loose limit, 0..0.5.
 
-        With `early` the short window may have as large a share itself. Raises `ValueError` for
+        With `early` the short window alone may have the same share. Raises `ValueError` for
         another share.
         """
         shape = (fingers, ELECTRODES)
@@ -296,16 +308,16 @@ class Motion:
         )
         self._unknown = [math.inf] * fingers
         self.fast = self.slow = self._unknown
-        """How each finger moves over the short and over the long window, in units of its noise;
-        infinite where that is not known."""
+        """Motion of each finger in the short and in the long window, in units of its noise;
+        infinite: not known."""
         self.looked = False
-        """True if that was worked out for the last step, which is not always needed."""
+        """True if `fast` and `slow` were computed for the last step."""
         self.known = False
-        """True if it is known of all fingers how they moved in the short window."""
+        """True if the motion of all fingers in the short window is known."""
 
     @property
     def slides(self) -> bool:
-        """True if a finger is known to move slowly, or to have moved within the long window."""
+        """True if a finger moved more in the long window than the strict limit."""
         limits = self.strict.slow
         return any(limit < move < math.inf for move, limit in zip(self.slow, limits, strict=True))
 
@@ -316,7 +328,7 @@ class Motion:
         self._say_unknown()
 
     def forget(self) -> None:
-        """Forget the noise too: the sensors may be others."""
+        """Forget motion and noise: the sensors may have been exchanged."""
         self.reset()
         self.blocks.forget()
 
@@ -330,8 +342,8 @@ class Motion:
     ) -> None:
         """Take in the sweep of `t_ns`, shape (fingers, 24), and which electrodes are usable.
 
-        `usable` is None if all are. How the fingers move is not worked out, and not known, where it
-        is not `wanted`. Times must not go back; call `reset` where they do, and after a gap.
+        `usable`: None if all are. `wanted`: False leaves the motion unknown, to save time. Times
+        must not go back: call `reset` before a reading whose time does, and after a gap.
         """
         ring, sweep = self.ring, counts.astype(np.float32)
         if ring.last_ns is None:
@@ -353,7 +365,7 @@ class Motion:
             self._say_unknown()
 
     def _look(self) -> None:
-        """Work out how the fingers move within the steps."""
+        """Compute the fingers' motion from the steps, and the limits."""
         self._say_unknown()
         times_ns, self.looked = self.ring.times_ns, True
         now_ns, last = times_ns[-1], len(times_ns) - STEPS_MIN
@@ -371,7 +383,7 @@ class Motion:
         self.loose.lay(self.fast, fast_noise, self.slow, slow_noise)
 
     def _follow_fast(self, begin: int, noise: Noise) -> list[float]:
-        """Find how steps moved; return the mean absolute slopes that noise makes, counts/s."""
+        """Set `fast` by the steps from `begin` on; return each finger's noise slope, counts/s."""
         steps, line = self.ring.since(begin)
         extent = line.dot(line).item()
         slopes = np.abs((line / extent).astype(np.float32).dot(steps))
@@ -380,7 +392,7 @@ class Motion:
         return by_noise
 
     def _follow_slow(self, begin: int, noise: Noise) -> SlowNoise:
-        """Find how far steps have spread; return what noise makes of that."""
+        """Set `slow` by the steps from `begin` on; return the noise in that window."""
         steps, line = self.ring.since(begin)
         number, each_step = len(line), EACH_STEP[: len(line)]
         squares = each_step.dot(np.square(steps - each_step.dot(steps) / number))

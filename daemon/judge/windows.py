@@ -19,9 +19,9 @@ STEP_SWEEPS_MAX = 10
 """Most sweeps of a step. More came late and all at once, so their motion is not known."""
 SHORT_NS, LONG_NS = 100_000_000, 240_000_000
 STEPS = LONG_NS // STEP_NS + 2
-"""Number of steps remembered: the long window, and one at each end of it."""
+"""Number of steps kept: those of the long window, and one more at each end."""
 STEPS_MIN = 3
-"""Fewest steps of a window. With slow sweeps it lasts longer than `SHORT_NS`."""
+"""Fewest steps of a window. With slow sweeps the short window is longer than `SHORT_NS`."""
 APART = 3
 """Number of steps after which noise is no longer correlated.
 
@@ -29,7 +29,7 @@ Sensors show a correlation of 0.32 after one sweep and 0.03 after two. A palm's 
 also repeats 2 of 7 values.
 """
 BLOCK_STEPS, BLOCKS = 24, 16
-"""Steps of a block, and blocks remembered: about 4 s at 100 Hz.
+"""Steps of a block, and number of blocks kept: about 4 s at 100 Hz.
 
 The noise is the lower quartile of the blocks, so a hand that closes or opens does not change it.
 """
@@ -41,8 +41,8 @@ SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))
 """`SLOPE_ECHO[n, k-1]`: lag-k autocorrelation of a centred ramp of n samples; scales the slope's
 variance for correlated noise."""
 SPREAD_ECHO = np.zeros((STEPS + 1, APART - 1))
-"""`SPREAD_ECHO[n, k-1]`: share of the pairs of n samples that are k steps apart; correlated noise
-spreads less by that."""
+"""`SPREAD_ECHO[n, k-1]`: share of the pairs of n samples that are k steps apart. Times the noise's
+correlation it is the share by which the samples spread less."""
 for _number in range(STEPS_MIN, STEPS + 1):
     for _lag in range(1, APART):
         _line = np.arange(_number) - (_number - 1) / 2.0
