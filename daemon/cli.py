@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
-    """Return the named command with its arguments. Raises `SystemExit` for a wrong line."""
+    """Return a function that runs the command line. Raises `SystemExit` if that is wrong."""
     arguments = sys.argv[1:] if arguments is None else arguments
     named = next((word for word in arguments if not word.startswith("-")), None)
     if named in LINUX and not is_linux():
@@ -103,7 +103,7 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         except _input_errors() as error:
             problem = str(error)
         except OSError as error:
-            if error.filename is None:  # not of the file system
+            if error.filename is None:  # not an error of the file system
                 raise
             complain(f"{error.filename}: {error.strerror}")
             return FAILED
@@ -117,10 +117,8 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 
 
 def _input_errors() -> tuple[type[Exception], ...]:
-    """Return the errors that say which input is wrong. A command lets them pass.
-
-    They are imported only here, when a command has failed.
-    """
+    """Return the errors that say which input is wrong. Commands do not catch them. They are
+    imported only here, when a command has failed."""
     from graspd.daemon.scene import SceneError
     from graspd.daemon.session.file import SessionFileError
     from graspd.drivers.base import DriverError

@@ -1,4 +1,4 @@
-"""graspd in a program or a notebook: a model that judges grasps, and recordings judged again."""
+"""graspd in a program or a notebook: a model that judges grasps, and replayed recordings."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ ARGUMENTS = {"--as ": "read_as=", "--rate-hz": "rate_hz=", "--model ": "model="}
 class GraspModel:
     """A trained model that judges grasps; it refuses those that the daemon would refuse.
 
-    It is pickled as its path and digest, for processes of one's own on the same computer.
+    It is pickled as path and digest, so that other processes on this computer can load it.
     """
 
     classes_ = np.array(CLASSES)
@@ -66,7 +66,7 @@ class GraspModel:
         """Order of the fingers in the counts."""
         self._judge = GraspJudge.of(model, Limits.slip_threshold)
         self._turns: dict[int, threading.Lock] = {}
-        """Lock of each process, held while it judges: it has one session, the network one input."""
+        """Lock of each process by its id. Threads share the session and the network's input."""
 
     def __repr__(self) -> str:
         return f"<GraspModel {self.name} of {', '.join(self.fingers)}>"
@@ -124,7 +124,7 @@ class GraspModel:
         return probabilities
 
     def _turn(self) -> threading.Lock:
-        """Return what a thread holds while it judges; the thread itself is lost in a fork."""
+        """Return the lock of this process, which a thread holds while it judges."""
         own = os.getpid()
         if any(turn.locked() for pid, turn in list(self._turns.items()) if pid != own):
             raise RuntimeError(
@@ -134,7 +134,7 @@ class GraspModel:
 
     def _examine(self, values: NDArray[np.float64]) -> Examined:
         counts = np.where(np.isnan(values), 0.0, values).astype(np.uint16)
-        broken = at_rail(counts)  # as is a NaN, which is 0 there
+        broken = at_rail(counts)  # includes NaN, which is 0 here
         return self._judge.examine(counts, broken if broken.any() else None)
 
     def _begin(
@@ -227,12 +227,12 @@ def judge(
     read_as: ReadAs | None = None,
     rate_hz: float | None = None,
 ) -> Iterator[Verdict]:
-    """Yield the verdict on each reading, as `graspd replay RECORDING...` says it.
+    """Yield the verdict on each reading, as `graspd replay RECORDING...` prints it.
 
-    `recordings`: grasp tables or streams, or the files of one run in order (MCAP); or a table
-    as `read_grasps` and `read_recording` return it. `model`: a name or a path; by default the one
-    that judged then, of tables and streams small-session. `read_as` and `rate_hz` decide for tables
-    that may be streams (deploy/RECORDING.md). A warning at the end says why nothing, or little, was
+    `recordings`: grasp tables or streams, or the files of one run in order (MCAP); or a table as
+    `read_grasps` and `read_recording` return it. `model`: a name or a path; by default the recorded
+    one, and small-session for tables and streams. `read_as` and `rate_hz` decide for tables that
+    may be streams (deploy/RECORDING.md). A warning at the end says why nothing, or little, was
     judged. Raises `SceneError`, `RecordingError`, `ModelError` or `ValueError`.
     """
     said: list[str] = []
@@ -272,7 +272,7 @@ def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
         recordings = [recordings]
     try:
         paths = [Path(path) for path in recordings]
-    except (TypeError, NotImplementedError) as error:  # NotImplementedError: of a memoryview
+    except (TypeError, NotImplementedError) as error:  # a memoryview raises NotImplementedError
         given = type(recordings).__name__
         raise ValueError(
             f"it judges files and tables, not {given}: GraspModel.predict takes counts"
@@ -283,7 +283,7 @@ def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
 
 
 def _refuse_coarse(table: Any, time: str | None) -> None:  # noqa: ANN401
-    """Raise `ValueError` for times that are rounded by a hundredth of a step, or more."""
+    """Raise `ValueError` if float32 rounds times by a hundredth of their step, or more."""
     times = np.asarray(table[time]) if time is not None else np.empty(0)
     if times.dtype == np.float32 and len(times) > 1:
         step = np.median(np.abs(np.diff(times.astype(float))))
@@ -297,7 +297,7 @@ def _refuse_coarse(table: Any, time: str | None) -> None:  # noqa: ANN401
 
 @contextmanager
 def _named_as_given(path: Path) -> Iterator[None]:
-    """Have errors name the table that was given, and not the file that it was written into."""
+    """Make errors name the given table instead of the temporary file at `path`."""
     try:
         yield
     except (RecordingError, SceneError) as error:
@@ -308,7 +308,7 @@ def _named_as_given(path: Path) -> Iterator[None]:
 
 
 def _in_arguments(said: str) -> str:
-    """Return an error with arguments in place of the options of the command line."""
+    """Return an error's text with arguments of `judge` in place of command-line options."""
     for option, argument in ARGUMENTS.items():
         said = said.replace(option, argument)
     return said

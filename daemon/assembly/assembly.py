@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 DEFAULT_MODEL = "small-session"
 RECORDED_MAX_AGE_MS = 1000.0
-"""Time without a reading, ms, that counts as silence where a table is replayed at some speed."""
+"""Time without a reading that counts as silence in a replay at a given speed, ms."""
 NO_SILENCE_NS = 3_600_000_000_000
-"""Time without a reading, ns, that counts as silence: no pause of a recording does."""
+"""Value of the silence limit, ns, that no pause of a recording reaches."""
 
 
 def model_path(scene: Scene) -> Path:
@@ -58,9 +58,9 @@ def load_model(scene: Scene) -> TactileModel:
 
 
 def keep_digest(model: TactileModel) -> Iterator[str]:
-    """Write a card beside an own model without one: a later change of the model is refused.
+    """Write a card beside a user's model that has none, so that a later change of it is refused.
 
-    Yield a warning if that is impossible.
+    Yield a warning if the card cannot be written.
     """
     about = model.path.with_suffix(".json")
     if not zoo.ships(model.path, model.sha256) and not about.exists():

@@ -73,7 +73,7 @@ class Assembly:
         self.companions: list[Companion] = []
         """Companions opened so far: sockets, session keeper, recorder."""
         self.keep: Callable[[Answer], None] = at_once
-        """Function that gives an answer once the present state is on the disk."""
+        """Function that calls its argument, an `Answer`, once the present state is on the disk."""
         self._outputs: list[Output] = []
         self._parts = parts
         self._stack = stack
@@ -92,7 +92,7 @@ class Assembly:
         return sockets
 
     def open_drivers(self) -> None:
-        """Open the drivers; tap a recorded link. Raises `LinkError` or `SceneError`."""
+        """Open the drivers; tap the link if it is recorded. Raises `LinkError` or `SceneError`."""
         record, drivers = self._parts.scene.record, self._parts.drivers
         if record is not None and record.raw:
             from graspd.daemon.record.link_log import tap_of
@@ -120,7 +120,7 @@ class Assembly:
         keeper = SessionKeeper(pipeline, scene.hand.fingers, tactile, folder)
         self._stack.callback(keeper.save)
         self.keep = keeper.keep
-        self.companions.insert(0, keeper)  # its answers must come before the socket is read
+        self.companions.insert(0, keeper)  # it must answer before the socket is read
 
     def record(self) -> None:
         """Record if the scene asks for it. Call after `keep_session`. Raises `SceneError`."""
@@ -145,7 +145,7 @@ class Assembly:
 
 
 def build_recorder(parts: Parts, options: Record, boot_id: str, tap: Tap | None) -> Recorder:
-    """Start the recorder of the scene's `[record]`. Raises `SceneError` without `mcap`."""
+    """Start the recorder of `[record]`. Raises `SceneError` if the package `mcap` is missing."""
     require_mcap("[record]")
     from graspd.daemon.record.recorder import PATIENCE_S, Recorder, ReplayRecorder
 

@@ -19,7 +19,7 @@ NO_SWEEPS = "gate mode `every` judges each row of a grasp table; a sweep of a st
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A scene, and what its recordings decide."""
+    """A scene, and the settings that the headers of its recordings decide."""
 
     scene: Scene
     mode: GateMode
@@ -86,8 +86,8 @@ class Plan:
 def recorded_kind(options: ReplayTactile) -> Kind:
     """Return what the recordings are: MCAP, bags, or `Kind.TEXT` for tables and streams.
 
-    Raises `RecordingError` for files of two kinds, and keys that are for tables alone; `SceneError`
-    for files of another kind, or without the package that reads them.
+    Raises `RecordingError` for files of two kinds, and for keys that only tables have. Raises
+    `SceneError` for files of another kind, or if the package that reads them is missing.
     """
     kind, first = kind_of_all(options.recordings), options.recordings[0]
     if kind is Kind.MCAP:
@@ -100,7 +100,7 @@ def recorded_kind(options: ReplayTactile) -> Kind:
 
 
 def require_mcap(what: str) -> None:
-    """Raise `SceneError`, with advice, if `what` lacks the package of the extra `record`."""
+    """Raise `SceneError`, with advice, if a package that `what` needs is not installed."""
     try:
         require("mcap", what, "record")
     except ModuleNotFoundError as error:

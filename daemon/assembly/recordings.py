@@ -1,4 +1,4 @@
-"""Build what judges recordings again, from session and learning in their headers."""
+"""Build the judge of a replay from session and learning in the headers of recordings."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ LOST_HEADER = (
 
 
 class Same(Companion):
-    """Counts the verdicts of a replay that are not those of the run."""
+    """Counts the verdicts of a replay that differ from the recorded ones."""
 
     def __init__(self) -> None:
         self.said: Said | None = None
-        """Verdict of the run on the next reading. None: not recorded."""
+        """Recorded verdict on the next reading. None: not recorded."""
         self.compared = self.differ = 0
 
     def on_verdict(self, published: PublishedVerdict) -> None:
@@ -76,9 +76,9 @@ class RecordedRun(Source):
         self._companion = Companion()
         self.same = Same()
         self._same_model = self._as_then = False
-        """True if the model, and session and learning, are those of the run."""
+        """`_same_model`: True if the model is the run's. `_as_then`: session and learning too."""
         self._same_grasps = True
-        """False in another gate mode, where recorded outcomes are of other grasps."""
+        """False with another gate mode: recorded outcomes then belong to other grasps."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not continue where the file before it ends", path)

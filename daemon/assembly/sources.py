@@ -1,4 +1,4 @@
-"""Build scene and judge of what is judged again: grasp tables and streams (CSV), link logs."""
+"""Build scene and judge to replay grasp tables and streams (CSV), ROS bags and link logs."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from graspd.drivers.recordings.player import LinkLogDriver
 
 DRAWS = "replay"
-"""Id of the start whose draws say which lifts of a table are supervised: each time the same."""
+"""`boot_id` of a replayed table. It fixes the random draws of the lifts to supervise."""
 LINK_LOGS = {Kind.SERIAL: "spi", **dict.fromkeys(CAN_LOGS, "can")}
-"""Kinds of link logs, and the driver of such a link."""
+"""Name of the driver for each kind of link log."""
 LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session")
 """Sections of a scene that change verdicts; a link log has no joints."""
 
@@ -43,7 +43,9 @@ class Source:
         self._where = where
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the scene with these sections; the model's thresholds stay. `mode`: of the gate.
+        """Return the scene with `publish` and `model` in place; the model's thresholds stay.
+
+        `mode`: mode of the gate; None: as recorded.
 
         Raises `SceneError`.
         """
@@ -65,15 +67,15 @@ class Source:
         """Pass the recorded outcomes to `companion`, if there are any."""
 
     def companions(self) -> list[Companion]:
-        """Return what else follows the replay."""
+        """Return further companions of the replay's loop."""
         return []
 
     def end(self) -> None:
-        """Say how the replay differs from the run, if that is known."""
+        """Print how the replay differs from the run, if that is known."""
 
 
 class Tables(Source):
-    """Grasp tables, streams and ROS bags, which do not say how they were judged."""
+    """Grasp tables, streams and ROS bags, which have no record of how they were judged."""
 
     def __init__(
         self,
@@ -85,10 +87,8 @@ class Tables(Source):
         loop: bool = False,
         strict: bool = False,
     ) -> None:
-        """`sections`: of the scene, where it differs from one that plays `paths`.
-
-        `read_as`, `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags.
-        """
+        """`sections`: sections of the scene that replace the defaults for playing `paths`.
+        `read_as`, `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags."""
         self._paths = [path.absolute() for path in paths]
         self._strict = strict
         tactile = {"driver": "replay", "recordings": self._paths, "loop": loop}

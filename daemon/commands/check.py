@@ -1,4 +1,4 @@
-"""`graspd check SCENE`: is it right, what is in, what is left out."""
+"""`graspd check SCENE`: check a scene, and print what it contains and what is left out."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
 
 WRONG = 2
 USUAL_PERIOD_NS = 10_000_000
-"""Time between readings where only the device knows it, ns."""
+"""Assumed time between readings if only the device knows it, ns."""
 COIN = 0.5
-"""Lowest possible confidence: a smaller `min_confidence` has no effect."""
+"""Lowest possible confidence in a verdict. A smaller `min_confidence` has no effect."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _shared(first: scene.Scene, second: scene.Scene) -> Iterator[str]:
-    """Yield what two scenes both name and only one of them can have."""
+    """Yield the key and value of each resource that both scenes claim, so they cannot both run."""
     taken = dict(_taken(second))
     for what, name in _taken(first):
         if taken.get(what) == name:
@@ -84,7 +84,7 @@ def _endpoints(wanted: scene.Scene) -> list[str]:
 
 
 def _taken(wanted: scene.Scene) -> Iterator[tuple[str, str]]:
-    """Yield what a scene takes for itself, with the key that names it."""
+    """Yield the key and the name of each resource that a running scene has for itself."""
     yield "hand.name", wanted.hand.name
     if wanted.keeps_session:
         yield "session.folder", os.path.realpath(wanted.session_path)
@@ -170,7 +170,8 @@ def _unreachable(what: str, name: str, path: str) -> Iterator[str]:
 
 
 def _try_drivers(plan: Plan) -> int | None:
-    """Construct the drivers, open those of files; return the period, ns, None if unknown."""
+    """Construct the drivers, and open one that plays files; return the period of readings, ns.
+    None: the period is not known."""
     driver, *_ = assembly.build_drivers(plan)
     with contextlib.closing(driver):
         assembly.open_file(plan.scene, driver)
@@ -248,7 +249,7 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
 
 
 def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
-    """Say after what time a grasp is judged."""
+    """Return in words after what time a grasp is judged."""
     usual = ", as usual" if period_ns is None else ""
     period_ns = period_ns or USUAL_PERIOD_NS
     step_ns = max(math.ceil(STEP_NS / period_ns), 1) * period_ns

@@ -25,7 +25,7 @@ UPSTREAM = "https://raw.githubusercontent.com/3dperceptionlab/biotacsp-stability
 
 
 class DataError(Exception):
-    """A file cannot be had, or is not the one it should be."""
+    """A file is not available, or has another content than expected."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Get every file that is not there yet; 0 when all are there and right."""
+    """Get every missing file; return 0 if all files are there and their content is right."""
     for file in TABLES:
         try:
             said = _get(args, file)

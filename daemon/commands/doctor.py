@@ -1,4 +1,4 @@
-"""`graspd doctor [SCENE]`: what hardware, model and privileges are there, and what is wrong."""
+"""`graspd doctor [SCENE]`: examine hardware, model and privileges, and say what is wrong."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ WAIT_S = 0.005
 """Longest wait between two looks at the drivers, s: a recording has no descriptor to wait on."""
 BRIDGE_NAME = "graspd"
 BRIDGE_VENDOR = 0x2E8A
-"""Raspberry Pi, which makes the Pico. Other ports are greeted only if their name is the bridge's:
-unknown devices may not like it."""
+"""USB vendor id of Raspberry Pi, which makes the Pico. Bytes are sent to other ports only if their
+name is the bridge's, because they may disturb unknown devices."""
 MARKS = {Level.OK: "ok ", Level.WARNING: "!  ", Level.ERROR: "!! "}
 COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
 NARROWEST = 40
-"""Lines are not wrapped to fewer columns."""
+"""Fewest columns to which lines are wrapped."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
-"""Faults of a device that explain why no touch is detected; so does `FRAMES_LOST` as an error."""
+"""Faults of a device that explain why no touch is detected. `FRAMES_LOST` as an error does too."""
 FINGER_COLUMNS = 25
 """Width of a finger in the table of electrodes."""
 USUAL_COLUMNS = 80
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Examine; 0 if nothing is wrong, 1 if something is. Raises `SceneError` or `DriverError`."""
     report: dict[str, Any] = {}
-    logging.disable(logging.WARNING)  # what drivers warn of is among the findings
+    logging.disable(logging.WARNING)  # findings repeat the warnings of drivers
     try:
         if args.scene is None:
             findings = _computer(report, args.listen)
@@ -104,7 +104,7 @@ def _coloured(line: str) -> str:
 def examine(
     driver: Driver, statistics: ElectrodeStatistics | None, seconds: float
 ) -> list[Finding]:
-    """Return what is wrong with an open driver, causes only.
+    """Return the findings on an open driver, without consequences of other findings.
     `statistics`: of its readings in `seconds`; None for joint angles."""
     device, counters = driver.describe(), driver.counters.as_dict()
     told = device_findings(driver.name, device, counters)
@@ -169,7 +169,7 @@ def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
 def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
     findings = [*_listen(wanted, report, listen_s), model_finding(wanted)]
     advised = {finding.advice for finding in findings if finding.advice}
-    # The graspd that holds the port holds the sockets as well: that is said once.
+    # A graspd that holds the port also holds the sockets. One finding is enough.
     sockets = [finding for finding in socket_findings(wanted) if finding.advice not in advised]
     return [*findings, *key_findings(wanted), *sockets, *realtime_findings(wanted)]
 
@@ -217,7 +217,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed the statistics for `listen_s`; return the time that the readings took, s."""
+    """Feed the statistics for `listen_s`; return their number times the mean period, s."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         poll = select.poll()
@@ -237,7 +237,7 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
 
 
 def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:
-    """Add what electrodes say. A fault of the whole device replaces all absent fingers."""
+    """Add findings on electrodes. A fault of the whole device replaces those on absent fingers."""
     electrodes = statistics.findings()
     absent = [finding for finding in electrodes if finding.cause is Cause.SENSOR_ABSENT]
     whole = [
@@ -256,7 +256,7 @@ def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> li
 
 
 def _table(electrodes: dict[str, dict[str, list[float]]], columns: int) -> Iterator[str]:
-    """Yield mean, deviation and faulty readings, as many fingers abreast as fit."""
+    """Yield a table of mean, deviation and faulty readings, with as many fingers abreast as fit."""
     abreast = max(1, (columns - 4) // FINGER_COLUMNS)
     fingers = list(electrodes)
     for first in range(0, len(fingers), abreast):

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the table; 0 if it has a grasp, 1 if it cannot be written or none has an outcome."""
+    """Write the table; return 1 if it cannot be written or no grasp has an outcome, else 0."""
     if args.out.exists() and not args.force:
         raise UsageError(f"{args.out} is there already: --force replaces it")
     from graspd.daemon.record.export import collect, write

@@ -1,4 +1,4 @@
-"""`graspd keys`: make and list the CURVE keys of a daemon and of those who may connect to it."""
+"""`graspd keys`: make and list the CURVE keys of a daemon and of peers that may connect."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graspd.daemon.publish.keys import KeysError
 
 FOLDER = Path("/etc/graspd/keys")
 CLIENTS = "clients"
-"""Folder, beside the daemon's own keys, with the public keys of those who may connect."""
+"""Folder, beside the daemon's own keys, with the public keys of peers that may connect."""
 WRONG = 2
 
 
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make or list; 2 if keys that are there are wrong. Raises `KeysError`."""
+    """Make or list keys; return 2 if existing keys are wrong. Raises `KeysError`."""
     if args.action == "list":
         return _list(args)
     public, secret = keys.make(args.dir, args.name)

@@ -28,7 +28,7 @@ TITLES = {
     "session": "other objects, another day",
     "days": "other objects, each day by others",
 }
-"""Question of each protocol, for people."""
+"""Meaning of each protocol, for people."""
 SHOWN = {
     "known objects": ("cv",),
     "other objects": ("objects", "objects-whole"),

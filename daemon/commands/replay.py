@@ -49,7 +49,7 @@ from graspd.models.runtime import TactileModel
 
 WAIT_MAX_S = 3600
 REPLAY_QUEUE = 1000
-"""Most messages that wait for a subscriber: a recording is not live, a late message is as good."""
+"""Most messages that wait for a subscriber. In a replay a late message is still useful."""
 RUNNING, OFF = "running", "off"
 DEMO_RISK = 0.05
 DEMO_TITLE = "A day on which the sensors drift. All grasps are synthetic: no hand made them."
@@ -205,7 +205,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     source.tell(shown)
     timing = LoopTiming(
         parts.scene.max_age_ns if isinstance(source, Tables) else assembly.NO_SILENCE_NS,
-        sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
+        sleep=Sleep(boot_clock=time.monotonic_ns),  # sleep does not age a recording
     )
     with ExitStack() as stack:
         around = Assembly(parts, stack)
@@ -233,7 +233,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:
-    """Return True if each reading is a grasp whose outcome both methods can be held against."""
+    """Return True if each reading is a grasp with an outcome, so that the two methods compare."""
     fingers = parts.model.contract.fingers
     if args.json or args.verbose or not isinstance(source, Tables) or fingers != TABLE_FINGERS:
         return False
@@ -253,7 +253,7 @@ def _day_table(args: argparse.Namespace, parts: Parts) -> DayTable:
 
 
 def _source(args: argparse.Namespace) -> Source:
-    """Return what plays the recordings. Imports only what this kind of them needs."""
+    """Return the source that plays the recordings. Imports only modules for their kind."""
     kind = kind_of_all(args.recordings)
     given = {"--loop": args.loop, "--strict": args.strict, "--as": args.read_as}
     refuse_options(args.recordings[0], kind, given | {"--rate-hz": args.rate_hz})
@@ -273,7 +273,7 @@ def _source(args: argparse.Namespace) -> Source:
 
 
 def _tables(args: argparse.Namespace) -> Tables:
-    """Return tables that are judged as the command line says."""
+    """Return the tables, with the options of the command line for judging them."""
     if args.scene is not None:
         first = args.recordings[0]
         problem = f"is {kind_of(first).value}: --scene is for what came over a link"
@@ -296,13 +296,13 @@ def _tables(args: argparse.Namespace) -> Tables:
 
 
 def _risk(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the keys of `[risk]` that are given."""
+    """Return the keys of `[risk]` that the command line sets, with their values."""
     given = {name: getattr(args, name) for name in RISK_OPTIONS}
     return {name: value for name, value in given.items() if value is not None}
 
 
 def _parts(args: argparse.Namespace, source: Source) -> Parts:
-    """Make what plays and judges. Raises `SessionFileError` for a session of another hand."""
+    """Make the driver and the judge. Raises `SessionFileError` for a session of another hand."""
     chosen = {}
     if args.model is not None:
         chosen["path" if args.model.endswith(".onnx") else "name"] = args.model
@@ -322,7 +322,7 @@ def _parts(args: argparse.Namespace, source: Source) -> Parts:
 def _restore_session(
     args: argparse.Namespace, source: Source, pipeline: Pipeline, fingers: Sequence[str]
 ) -> None:
-    """Give a judge the session that it begins with: the recorded one, or that of a file."""
+    """Restore the session with which a judge begins: the recorded one, or one from a file."""
     if args.session == RUNNING:
         source.restore(pipeline)
     if args.session in (RUNNING, OFF) or pipeline.session is None:

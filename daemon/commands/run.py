@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from graspd.daemon.run.systemd import Systemd
 
 DESCRIPTORS = 65_536
-"""Descriptors for all peers: libzmq 4.3.5 ends the process where a Unix socket finds none left."""
+"""Limit of open descriptors, for all peers. libzmq 4.3.5 ends a process that has none left."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _held_by(endpoint: str | None) -> str:
-    """Name the processes that hold a port, if there is one and /proc can be read."""
+    """Return text that names the processes on the endpoint's port; "" if none is found."""
     if endpoint is None:
         return ""
     from graspd.daemon.doctor.computer import port_holders
@@ -69,7 +69,7 @@ def _allow_descriptors() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     limit = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < limit:
-        with contextlib.suppress(OSError):  # a service manager that forbids it has set its own
+        with contextlib.suppress(OSError):  # forbidden: the service manager has set it
             resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
 
 
@@ -81,7 +81,7 @@ def _manager(stack: ExitStack) -> Systemd | None:
 
     manager = Systemd.of(os.environ)
     if manager is not None:
-        faulthandler.enable()  # where the loop hung when the watchdog ended it
+        faulthandler.enable()  # shows where the loop hung when the watchdog ends it
         stack.callback(manager.close)
         stack.callback(manager.stopping)
     return manager

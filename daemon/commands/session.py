@@ -1,4 +1,4 @@
-"""`graspd session show|reset|seed|settle SCENE`: calibration, and what outcomes taught."""
+"""`graspd session show|reset|seed|settle SCENE`: kept calibration and learning."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show, reset or seed the kept session."""
+    """Show, reset, seed or settle the kept session; return the exit code."""
     wanted = scene.load(args.scene)
     model = assembly.load_model(wanted)
     learns = wanted.learn.enabled or wanted.risk is not None
@@ -105,11 +105,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
-    """Show what is kept; return 2 if a file cannot be read."""
+    """Show the kept sessions; return 2 if a file cannot be read, else 0."""
     path, found = wanted.session_path, look(wanted.session_path)
     sessions, calibrated = _continued(wanted, model, _readable(found))
     if isinstance(next(iter(found.values()), None), SessionFileError):
-        calibrated = False  # it may have been of other sensors
+        calibrated = False  # the unreadable session may be of other sensors
     if as_json:
         documents = [
             {"file": f"{n}{ENDING}", **msgspec.to_builtins(one), "trust": _learned(one.trust)}
@@ -128,7 +128,7 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
 
 
 def _readable(found: Found) -> dict[int, KeptSession]:
-    """Return the sessions; complain about each file that cannot be read."""
+    """Return the sessions by file number; complain about each file that cannot be read."""
     for problem in found.values():
         if isinstance(problem, SessionFileError):
             complain(str(problem))
@@ -138,7 +138,8 @@ def _readable(found: Found) -> dict[int, KeptSession]:
 def _continued(
     wanted: scene.Scene, model: TactileModel, sessions: dict[int, KeptSession]
 ) -> tuple[dict[int, KeptSession], bool]:
-    """Return the sessions, first what a start continues, and whether it is calibrated then."""
+    """Return the sessions, and True if the daemon would start calibrated. The sessions that a start
+    would continue come first."""
     pipeline = assembly.build_pipeline(Plan.of(wanted), model)
     fingers, kept = tuple(wanted.hand.fingers), list(sessions.values())
     used, learned, problems = continue_kept(pipeline, fingers, newest_of_each(kept))
@@ -189,7 +190,7 @@ def _when(kept: KeptSession) -> str:
 
 
 def _learned(state: TrustState | None) -> dict[str, Any] | None:
-    """Return what outcomes have taught; None if that is nothing."""
+    """Return figures of what was learned from outcomes; None: nothing was."""
     if state is None:
         return None
     return {
@@ -206,7 +207,7 @@ def _learned(state: TrustState | None) -> dict[str, Any] | None:
 
 
 def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.ReplayTactile) -> None:
-    """Judge the recordings as the daemon does, tell their outcomes, and keep the session."""
+    """Judge the recordings as the daemon does, report their outcomes, and keep the session."""
     mode: GateMode | None = "every" if kind_of_all(played.recordings) is Kind.MCAP else None
     plan = Plan.of(_on_recordings(wanted, played, mode))
     pipeline = assembly.build_pipeline(plan, model)
@@ -256,9 +257,10 @@ def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.Replay
 
 
 def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: str | None) -> None:
-    """Tell how open lifts ended, as their controller would have; show which are open.
+    """Report how open lifts ended, in place of their controller; without `told` list them.
 
-    A lift that was announced before an exchange of sensors is open in the files of both.
+    `names`: the lifts; empty: all. `told`: their outcome. A lift announced before an exchange of
+    sensors is open in the files of both sensors' sessions.
     """
     path, trust = wanted.session_path, assembly.build_pipeline(Plan.of(wanted), model).trust
     with SessionFolder(path) as folder:
@@ -268,7 +270,7 @@ def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: st
             raise SessionFileError(f"{path}: no lifts are kept")
         known: dict[str, Lift] = {}
         for kept in mine.values():
-            known = _restored_lifts(trust, kept, path) | known  # the file used last knows best
+            known = _restored_lifts(trust, kept, path) | known  # the last used file prevails
         lifts = [name for name, lift in known.items() if lift.is_awaited]
         if unknown := set(names).difference(lifts):
             raise SessionFileError(f"{', '.join(unknown)}: not open")
@@ -289,7 +291,7 @@ def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: st
 
 
 def _restored_lifts(trust: Trust, kept: KeptSession, path: Path) -> dict[str, Lift]:
-    """Restore what was learned; return its lifts by name. Raises `SessionFileError`."""
+    """Restore kept learning into `trust`; return the lifts by name. Raises `SessionFileError`."""
     if kept.trust is None:
         return {}
     try:
@@ -301,8 +303,11 @@ def _restored_lifts(trust: Trust, kept: KeptSession, path: Path) -> dict[str, Li
 
 
 def _taught(trust: Trust, *, proves: bool) -> TrustState:
-    """Return what recorded outcomes have taught; if it `proves`, that the warm-up is over.
-    Their lifts were not made on a `stable` verdict: the bound of `[risk]` does not count them."""
+    """Return the state learned from recorded outcomes, without their lifts.
+
+    The bound of `[risk]` counts only lifts of `stable` verdicts, which these were not. `proves`:
+    True if the outcomes count for the warm-up.
+    """
     state = trust.state()
     risk = replace(state.risk, lifts=0, slips=0, proven=state.risk.proven if proves else 0)
     return replace(state, risk=risk, lifts=LiftBook().state())
@@ -311,7 +316,7 @@ def _taught(trust: Trust, *, proves: bool) -> TrustState:
 def _rest(
     wanted: scene.Scene, model: TactileModel, recordings: scene_drivers.ReplayTactile
 ) -> tuple[float, ...] | None:
-    """Return where the recorded electrodes rest at the first tare; None: that is not recorded."""
+    """Return the resting count of each recorded electrode at the first tare; None: no tare."""
     played = Plan.of(_on_recordings(wanted, recordings, mode=None))
     pipeline = assembly.build_pipeline(played, model, learns=False)
     read_rest = pipeline.read_rest
@@ -343,14 +348,14 @@ def _on_recordings(
     wanted: scene.Scene, recordings: scene_drivers.ReplayTactile, mode: GateMode | None
 ) -> scene.Scene:
     """Return the scene with recordings in place of its sensors, and without `[risk]`."""
-    max_age_ms = assembly.NO_SILENCE_NS / 1e6  # a recording is not late, however slow the computer
+    max_age_ms = assembly.NO_SILENCE_NS / 1e6  # a recorded reading is never late
     gate = wanted.gate.model_copy(update={"mode": mode, "max_age_ms": max_age_ms})
     changes = {"tactile": recordings, "joints": None, "gate": gate, "risk": None}
     return wanted.model_copy(update=changes)
 
 
 def _judge(plan: Plan, pipeline: Pipeline, unjudged: Unjudged) -> list[Judgement]:
-    """Judge the recordings; tell each known outcome after its grasp."""
+    """Return the judgement of each recorded grasp; report each known outcome after it."""
     judgements: list[Judgement] = []
     for reading in _readings(plan):
         unjudged.on_reading(reading)

@@ -1,4 +1,4 @@
-"""`graspd scene`, `schema` and `manual`: print a text that is ready."""
+"""`graspd scene`, `schema` and `manual`: print scene, schema or manual page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graspd.daemon.publish.messages import schema
 from graspd.daemon.scene import explained
 
 MANUAL = Path(__file__).parent / "shell" / "graspd.1"
-"""Made of the command line's parsers by `python -m tests.daemon.commands.shell_files`."""
+"""Manual page, made from the parsers by `python -m tests.daemon.commands.shell_files`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,5 +51,5 @@ def run(args: argparse.Namespace) -> int:
 
 
 def schema_text() -> str:
-    """Return the schema as the file `deploy/wire/messages.schema.json` holds it."""
+    """Return the text of the file `deploy/wire/messages.schema.json`."""
     return json.dumps(schema(), indent=2, sort_keys=True) + "\n"

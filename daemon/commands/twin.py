@@ -1,4 +1,4 @@
-"""`graspd twin KIND`: stands in for hardware, to try graspd and a controller without a hand."""
+"""`graspd twin KIND`: simulate hardware, to try graspd and a controller without a hand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TARGETS = {
     "joints": "udp://127.0.0.1:9871",
     "datagrams": "udp://127.0.0.1:9872",
 }
-"""Address to which a twin of datagrams sends by default."""
+"""Default address to which each twin of UDP datagrams sends."""
 PROBABILITIES = {
     "bit-flip": "one random bit of it flips",
     "drop": "it is lost",
@@ -253,4 +253,4 @@ def _serve_datagrams(
 
 
 SERVE = {"spi": _serve_spi, "can": _serve_can}
-"""Function that serves each kind; the others send datagrams."""
+"""Function that runs the twin of each kind; all other kinds send datagrams."""

@@ -25,7 +25,7 @@ PORT = 8377
 FOXGLOVE_PORT = 8765
 """Default port of Foxglove's viewers."""
 NICENESS = 10
-"""A daemon on the same processor comes first: drawing takes a tenth of one."""
+"""Niceness of the viewer, so that a daemon comes first. Drawing takes a tenth of a processor."""
 HANDS_MAX = 8
 """Most hands in one page or terminal."""
 FAILED = 1
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show until stopped; 1 if the port cannot be had. Raises `UsageError`."""
+    """Show until stopped; return 1 if the port is not available. Raises `UsageError`."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)
     with contextlib.ExitStack() as stack:

@@ -16,11 +16,11 @@ NETWORK = Path("/sys/class/net")
 ARPHRD_CAN = "280"
 """Type of a CAN interface in `/sys/class/net/*/type`."""
 LISTENING = {"tcp": {"0A"}, "udp": {"01", "07"}}
-"""States in `/proc/net` of a socket that has a port for itself."""
+"""States of listening sockets in `/proc/net`, by protocol."""
 TERMINAL_MAKER = "/dev/ptmx"
 IP_TIMEOUT_S = 5.0
 COMMAND_MAX = 400
-"""Characters of a command that are shown."""
+"""Most characters that are shown of a command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class SerialPort:
     vendor: int | None
     """USB vendor; None: not on USB."""
     product: str
-    """Product and manufacturer."""
+    """Names of product and manufacturer, as the device reports them."""
 
     def __str__(self) -> str:
         number = f", serial number {self.serial_number}" if self.serial_number else ""
@@ -108,7 +108,7 @@ def can_interfaces(
         with suppress(OSError):
             if (interface / "type").read_text().strip() == ARPHRD_CAN:
                 state = (interface / "operstate").read_text().strip()
-                # The kernel knows no more of an interface without a carrier (vcan).
+                # An interface without a carrier, such as vcan, is `unknown` and works.
                 states[interface.name] = "up" if state == "unknown" else state
     details = _details(ip) if states else {}
     interfaces = []
@@ -121,7 +121,7 @@ def can_interfaces(
 
 
 def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
-    """Return what `ip` tells of CAN controllers, by interface; empty where it is missing or old."""
+    """Return what `ip` prints on CAN controllers, by interface; empty if it is missing or old."""
     try:
         answer = subprocess.run(ip, capture_output=True, timeout=IP_TIMEOUT_S, check=True).stdout
         links = [(link["ifname"], link.get("linkinfo", {})) for link in json.loads(answer)]
@@ -135,8 +135,10 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
 
 
 def file_holders(path: str | Path) -> list[Process]:
-    """Return other processes that have locked a file, or else have it open, if /proc may be read.
-    The program that made a pseudo-terminal has it open, too, and is left out."""
+    """Return other processes that have locked a file, or if none has, those that have it open.
+
+    Without the right to read /proc the list is empty. The program that made a pseudo-terminal also
+    has it open, and is left out."""
     try:
         there = os.stat(path)
     except OSError:
@@ -170,7 +172,7 @@ def port_holders(protocol: str, port: int) -> list[Process]:
 
 
 def _with_open(files: Collection[object]) -> set[int]:
-    """Return processes with one of these files (device, inode) or sockets (inode) open."""
+    """Return ids of processes with one of these files (device, inode) or sockets (inode) open."""
     pids = set()
     for descriptor in PROC.glob("[0-9]*/fd/*"):
         with suppress(OSError):

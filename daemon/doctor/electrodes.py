@@ -12,18 +12,18 @@ from graspd.daemon.doctor.finding import Cause, Finding, Level, Trouble, fine
 from graspd.drivers.base import ElectrodeFault, TactileReading
 
 RAIL_COUNTS = 20
-"""Largest distance of a mean from 0 or 4095 that is a rail; 0.3 % of loaded electrodes come
-this low."""
+"""Largest distance of a mean from 0 or 4095, counts, at which an electrode counts as at a rail;
+0.3 % of loaded electrodes come this low."""
 QUIET_COUNTS = 40.0
-"""Largest standard deviation of an untouched electrode; 3 to 12 counts were measured."""
+"""Largest standard deviation of an untouched electrode, counts; 3 to 12 were measured."""
 TOUCH_ELECTRODES = 5
 """Fewest electrodes of a finger that a touch moves. If fewer move, they are restless."""
 STILL_READINGS = 10
 """Equal counts in a row after which an electrode is frozen; noise of 3 counts prevents that."""
 RESTLESS_READINGS = 30
-"""Fewest readings to call an electrode restless; with fewer, one spike would do."""
+"""Fewest readings to call an electrode restless. With fewer, one spike would be enough."""
 FAULTY_FRACTION = 0.5
-"""Share of faulty readings from which an electrode is missing instead of unreliable."""
+"""Share of faulty readings from which on an electrode counts as missing, not as unreliable."""
 NAMED_MAX = 6
 """Most electrodes that are named in a finding; further ones are counted."""
 WORDS = ElectrodeFault.PARITY | ElectrodeFault.ERROR_WORD | ElectrodeFault.NOT_A_COUNT
@@ -66,11 +66,11 @@ class ElectrodeStatistics:
         """Readings with a fault, shape (fingers, 24)."""
         self.fault_bits = np.zeros(shape, dtype=np.uint8)
         self.mean = np.zeros(shape)
-        """Counts, over readings without a fault."""
+        """Mean counts over readings without a fault, shape (fingers, 24)."""
         self._sound = np.zeros(shape, dtype=np.int64)
         self._squares = np.zeros(shape)
         self._previous = np.full(shape, np.nan)
-        """Counts of the last reading, NaN where that had a fault."""
+        """Counts of the last reading; NaN for its faulty electrodes."""
         self._steps = np.zeros(shape, dtype=np.int64)
         self._step_squares = np.zeros(shape)
 
@@ -121,7 +121,7 @@ class ElectrodeStatistics:
             advice = "Reset the board. Check that no relay or recording repeats old data."
             what = f"{name}: all counts are frozen"
             return [Finding(Level.ERROR, what, Cause.REPEATED, advice)]
-        # A dead electrode is at a rail and has no noise: one of the two alone is not enough.
+        # A dead electrode is both at a rail and without noise.
         found = [_missing(name, missing, faults)] if missing.any() else []
         found += _named(name, rail & still, "stuck at a rail", DEAD)
         found += _named(name, still & ~rail, "frozen", FROZEN)

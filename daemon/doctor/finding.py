@@ -1,4 +1,4 @@
-"""One thing that the doctor found: how bad it is, what causes it, and what to do about it."""
+"""A finding of the doctor: how bad it is, its cause, and what to do about it."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Trouble(NamedTuple):
     level: Level = Level.WARNING
 
     def finding(self, what: str) -> Finding:
-        """Return a finding of this trouble; `what`: text on what was seen."""
+        """Return a finding with this cause and advice; `what`: text on what was seen."""
         return Finding(self.level, what, self.cause, self.advice)
 
 
@@ -129,7 +129,7 @@ def fine(what: str) -> Finding:
 def roots(findings: Iterable[Finding]) -> list[Finding]:
     """Drop findings that another cause explains, and put the others in the order of `Cause`.
 
-    A cause is as bad as what follows from it.
+    A cause gets the worst level of the findings that it explains.
     """
     findings = list(findings)
     causes = {finding.cause for finding in findings}

@@ -11,12 +11,12 @@ from graspd.drivers.base import DeviceFault, Fact, LinkCause
 RATE_FRACTION = 0.9
 """Share of the nominal rate below which the link is slow."""
 TOO_MUCH = {Cause.DAMAGED: 0.05, Cause.FRAMES_LOST: 0.1}
-"""Share of frames from which damage or loss is an error. Each loss hides motion for 240 ms, so at a
-tenth of 100 readings/s hardly a grasp is ever known to be still."""
+"""Share of frames from which on damage or loss is an error. Each loss hides motion for 240 ms, so
+with a tenth of 100 readings/s lost, hardly any grasp is ever known to be still."""
 BAD_MIN = 5
-"""With fewer bad frames their share is not known."""
+"""Fewest bad frames by which their share is known."""
 WHOLES = "frames", "packets", "readings"
-"""Counters of what comes, by link."""
+"""Counters of everything that arrives; each kind of link has one of them."""
 NOT_FRAMES = frozenset(
     {"not_counts", "missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
 )
@@ -30,7 +30,7 @@ AGAIN = "Look longer (--listen 20). If it continues, check"
 FLAPS_MIN = 3
 """Fewest losses of a link while the doctor listens that are an error."""
 BETWEEN = frozenset({LinkCause.UNKNOWN, LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.NO_ANSWER})
-"""Causes that a link shows between its losses; they are not reported beside the losses."""
+"""Causes that a flapping link shows between losses; they are not reported beside `LINK_LOST`."""
 NOT_OURS: dict[Cause, tuple[str, ...]] = {
     Cause.VERSION: ("bad_lengths",),
     Cause.MESSAGES: ("bad_messages",),
@@ -43,7 +43,8 @@ NOT_OURS: dict[Cause, tuple[str, ...]] = {
         *("foreign_frames", "frames"),
     ),
 }
-"""Counters of a link that receives data but gives no reading; the first that is not 0 counts."""
+"""Counters, by cause, that explain why a link receives data but gives no reading. The first cause
+with a counter above 0 is reported."""
 NOT_OURS_ADVICE = {
     Cause.VERSION: "No known palm sends this length. Other firmware, or a relay that adds bytes.",
     Cause.MESSAGES: "They are of another form than deploy/wire/TACTILE.md or JOINTS.md.",
@@ -87,7 +88,8 @@ COUNTERS: dict[Cause, tuple[str, ...]] = {
     ),
     Cause.RECORDING: ("cut_off", "malformed"),
 }
-"""Counters of a link that is up. Others show at the electrodes or are harmless."""
+"""Counters, by cause, of faults while a link is up. Other counters are harmless, or their faults
+show in the statistics of electrodes."""
 ADVICE = {
     Cause.LINK_LOST: f"It went away and came back. {AGAIN} plug, hub and supply.",
     Cause.RESTARTED: f"The board was reset. {AGAIN} its supply and reset line.",
@@ -188,7 +190,7 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
 def device_findings(
     driver: str, device: Mapping[str, Fact], counters: Mapping[str, int] | None = None
 ) -> list[Finding]:
-    """Judge the facts of a device one by one; of a link that is not up only why."""
+    """Return a finding on each fact of a device; if its link is not up, only the reason."""
     facts = dict(device)
     link = facts.pop("link", None)
     if link is not None and link.fault is not None:
@@ -217,7 +219,7 @@ def device_findings(
 
 
 def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
-    """Return a finding for each trouble that the counters of a link that is up show."""
+    """Return a finding for each fault that the counters of a link show while it is up."""
     found = []
     for cause, names in COUNTERS.items():
         if counted := _counted(names, counters):

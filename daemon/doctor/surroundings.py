@@ -58,7 +58,7 @@ def model_finding(wanted: Scene) -> Finding:
 
 
 def explained(finding: Finding, section: DriverSection) -> list[Finding]:
-    """Return a finding on the link of `section` with what this computer knows of its cause."""
+    """Return a finding on the link of `section`, improved by what this computer shows."""
     device = section.device
     if device is None:
         return [finding]
@@ -111,7 +111,7 @@ def ip_link(name: str, tactile: CanTactile | None) -> str:
 
 
 def socket_findings(wanted: Scene) -> list[Finding]:
-    """Judge whether the sockets of the scene can be made; each cause once."""
+    """Return findings on whether the sockets of the scene can be made; each cause once."""
     ask = wanted.ask_endpoint
     sockets = [("publish", wanted.endpoint)]
     sockets += [] if ask is None else [("ask", ask)]
@@ -145,7 +145,7 @@ def key_findings(wanted: Scene) -> list[Finding]:
 
 
 def realtime_findings(wanted: Scene) -> list[Finding]:
-    """Try `[realtime]` for a moment; return what this user may not have."""
+    """Try `[realtime]` for a moment; return findings on the rights that this user lacks."""
     if wanted.realtime is None:
         return []
     with RealtimeMode(wanted.realtime) as mode:
@@ -177,7 +177,8 @@ def _held(finding: Finding, holders: Sequence[computer.Process]) -> Finding:
 
 
 def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
-    """Prefer what the kernel says of the interface to what the driver concluded."""
+    """Replace the driver's finding by one on the kernel's state of the interface, if that explains
+    it."""
     interfaces = {interface.name: interface for interface in computer.can_interfaces()}
     here, line = interfaces.get(tactile.channel), ip_link(tactile.channel, tactile)
     if here is None:
@@ -224,7 +225,7 @@ def _is_reached(path: Path) -> bool:
     """Return False if a folder on the way may not be entered."""
     try:
         path.stat()
-    except OSError as error:  # that it is not there is another finding
+    except OSError as error:  # a missing path is another finding
         return not isinstance(error, PermissionError)
     return True
 

@@ -288,9 +288,7 @@ class Contact:
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float64], list[int]]:
         """Return each finger's falls, ascending, and how many of them are of usable electrodes.
-
-        Falls of other electrodes are infinite, so they come last.
-        """
+        Falls of other electrodes are infinite, so they come last."""
         falls, numbers = median.astype(np.float64), self._known
         np.subtract(self.baseline, falls, out=falls)
         if usable is not None:

@@ -1,7 +1,5 @@
-"""The limits of each part with their defaults, and `decide`, which alone makes a verdict.
-
-A scene's `[gate]` takes its defaults from the limits here, in its own units.
-"""
+"""The limits of each part with their defaults, and `decide`, which alone makes a verdict. A scene's
+`[gate]` takes its defaults from the limits here, in its own units."""
 
 from __future__ import annotations
 

@@ -176,8 +176,7 @@ class Gate:
 
     def ask(self) -> None:
         """Ask for a judgement. It is dropped if no grasp settles in `request_ns` from the next
-        reading.
-        """
+        reading."""
         self._question.ask()
 
     def step(

@@ -147,8 +147,7 @@ class Health:
 
     def electrodes(self) -> dict[tuple[int, int], Reason]:
         """Return the current reason of each broken electrode, by (row of the finger, electrode
-        0..23).
-        """
+        0..23)."""
         findings: dict[tuple[int, int], Reason] = {}
         for where, reason in (
             (self._jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
@@ -186,10 +185,8 @@ class Health:
         return railed
 
     def _recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
-        """Take in a sweep, shape (fingers, 24). Return True if some finger sent it before.
-
-        `sound`: True for counts that were read; None: all were.
-        """
+        """Take in a sweep, shape (fingers, 24). Return True if some finger sent it before. `sound`:
+        True for counts that were read; None: all were."""
         past, place = self._past, self._number % SWEEPS
         now = kept = counts.T
         if sound is not None:

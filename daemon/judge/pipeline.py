@@ -236,8 +236,7 @@ class Pipeline:
 
     def silence(self, last_t_ns: int) -> Judgement:
         """Return the judgement when no reading has come for too long after the last, of
-        `last_t_ns`.
-        """
+        `last_t_ns`."""
         moment = self.hand.silent()
         lift = GraspId(self.boot_id, moment.grasp)
         worth, risk = None, None
@@ -247,8 +246,7 @@ class Pipeline:
 
     def health(self) -> dict[str, Reason]:
         """Return the current problems: of electrodes such as `ff_7`, fingers, joints, model,
-        session.
-        """
+        session."""
         findings = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
         for (finger, place), reason in self._health.electrodes().items():
             findings[electrode_name(self._fingers[finger], place)] = reason
@@ -282,9 +280,7 @@ class Pipeline:
         self, grasp: GraspId, opinion: Opinion
     ) -> tuple[Assessment | None, RiskOutcomes | None]:
         """Return the assessment of the grasp by the outcomes known now, and these outcomes.
-
-        `opinion`: the network's answer to this reading.
-        """
+        `opinion`: the network's answer to this reading."""
         if self.trust is None:
             return None, None
         features = self._judge.features
@@ -315,10 +311,8 @@ class Pipeline:
         risk: RiskOutcomes | None,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
-        """Return the judgement of a reading; `unusable` has the reasons against using it.
-
-        A judgement that is not `stable` is kept as `HoldDown` of later ones.
-        """
+        """Return the judgement of a reading; `unusable` has the reasons against using it. A
+        judgement that is not `stable` is kept as `HoldDown` of later ones."""
         calibrated = None if self.session is None else self.session.calibrated
         objections = unusable
         if opinion.refusal is not None:

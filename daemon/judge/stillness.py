@@ -1,7 +1,5 @@
-"""Measure how each finger moves, in units of its own noise, to find whether it keeps still.
-
-A sweep goes through `SpikeFilter`, `StepRing` and `NoiseBlocks`; `MotionLimits` say what is still.
-"""
+"""Measure how each finger moves, in units of its own noise, to find whether it keeps still. A sweep
+goes through `SpikeFilter`, `StepRing` and `NoiseBlocks`; `MotionLimits` say what is still."""
 
 from __future__ import annotations
 
@@ -114,8 +112,7 @@ class StepRing:
         """Index of the oldest entry in `steps`."""
         self.usable_since_ns = np.zeros(shape, dtype=np.int64)
         """Time since which each electrode is usable, ns; gaps of up to `LOST_MAX` sweeps are
-        ignored.
-        """
+        ignored."""
         self.sweeps = 0
         """Number of sweeps in the unfinished step."""
         self.crowded = False
@@ -270,8 +267,7 @@ class NoiseBlocks:
 
     def noise(self) -> Noise:
         """Return the motion that noise alone seems to show. Call it with at least `BLOCKS_MIN`
-        blocks.
-        """
+        blocks."""
         if self._noise is None:
             number = min(self.number, BLOCKS)
             squares = np.sort(self._blocks[:number], axis=0)[number // 4]

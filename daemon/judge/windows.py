@@ -29,10 +29,8 @@ Sensors show a correlation of 0.32 after one sweep and 0.03 after two. A palm's 
 also repeats 2 of 7 values.
 """
 BLOCK_STEPS, BLOCKS = 24, 16
-"""Steps of a block, and number of blocks kept: about 4 s at 100 Hz.
-
-The noise is the lower quartile of the blocks, so a hand that closes or opens does not change it.
-"""
+"""Steps of a block, and number of blocks kept: about 4 s at 100 Hz. The noise is the lower quartile
+of the blocks, so a hand that closes or opens does not change it."""
 LOST_MAX = 3
 """Most sweeps in a row for which an unusable electrode keeps its last value."""
 MEAN_ABS = math.sqrt(2.0 / math.pi)

@@ -3,8 +3,8 @@
 import os
 
 LIBRARIES = {
-    # numpy's threads for large matrices, one per processor, spin. With locked memory each takes
-    # its whole stack. The matrices of graspd are small.
+    # numpy starts a thread per processor for large matrices, which spins. With locked memory each
+    # takes its whole stack. The matrices of graspd are small.
     "OPENBLAS_NUM_THREADS": "1",
     # Plugins of other installed packages do not belong in a daemon.
     "PYDANTIC_DISABLE_PLUGINS": "__all__",

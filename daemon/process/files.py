@@ -1,4 +1,4 @@
-"""Read files without waiting; replace files in one step. Works where Python lacks POSIX, too."""
+"""Read files without waiting; replace files in one step. Works on systems without POSIX, too."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class SceneError(Exception):
 
 
 def is_linux() -> bool:
-    """Return True if Python has the calls of Linux that the daemon rests on."""
+    """Return True if Python has the Linux calls that the daemon needs."""
     return hasattr(os, "eventfd")
 
 
@@ -48,7 +48,7 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
 def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
     """Replace the file at `path` in one step.
 
-    Readers always see a whole file, also after a power cut. After an `OSError` it is the old one.
+    Readers always see a whole file, also after a power cut. After an `OSError` the old file stays.
     """
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
     handle = os.open(part, open_flags(os.O_WRONLY | os.O_CREAT | os.O_EXCL), 0o600)

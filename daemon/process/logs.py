@@ -51,7 +51,7 @@ class JournalFormatter(logging.Formatter):
 class RateLimit(logging.Filter):
     """Filter that passes a burst of each kind of message, then one per window.
 
-    A window in which nothing was held back gives the burst back.
+    After a window in which nothing was held back, a burst passes again.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -61,7 +61,7 @@ class RateLimit(logging.Filter):
         """Start of the window, s, number of messages in it, and limit, by kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True to pass a message; the first of a window gives the number held back."""
+        """Return True to pass a message; the first in a window gets the number held back before."""
         now_s, kind = self._clock(), f"{record.name} {record.msg}"
         if kind not in self._kinds and len(self._kinds) >= KINDS_MAX:
             return True

@@ -16,14 +16,14 @@ HANGUP: signal.Signals | None = getattr(signal, "SIGHUP", None)
 
 
 def stopping() -> list[signal.Signals]:
-    """Return the signals that stop the process; not SIGHUP where `nohup` has it ignored."""
+    """Return the signals that stop the process, without SIGHUP if `nohup` has it ignored."""
     if HANGUP is None or signal.getsignal(HANGUP) is signal.SIG_IGN:
         return [signal.SIGINT, signal.SIGTERM]
     return [signal.SIGINT, signal.SIGTERM, HANGUP]
 
 
 class StopSignal:
-    """Handler that keeps the signal that stops the process."""
+    """Handler that records the first signal that stops the process."""
 
     def __init__(self) -> None:
         self.received: signal.Signals | None = None

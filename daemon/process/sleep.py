@@ -1,4 +1,4 @@
-"""Detect sleep of the computer, in which the monotonic clock stands and old readings look new."""
+"""Detect sleep of the computer. The monotonic clock stops in it, so old readings look new."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 SLEPT_NS = 50_000_000
 """Smallest difference of the clocks that counts as sleep, ns; the scheduler causes less."""
 LOOKS = 3
-"""Number of looks at the clocks at the start; the scheduler interrupts some of them."""
+"""Number of times that the clocks are compared at the start; some comparisons are interrupted."""
 
 boottime_ns = (
     partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)

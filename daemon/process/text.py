@@ -28,7 +28,7 @@ def coloured(text: str, colour: Colour) -> str:
 
 
 def did_you_mean(wrong: str, words: Iterable[str]) -> str:
-    """Return advice with the word nearest to `wrong`, which begins with "; "; "" if none is."""
+    """Return "; did you mean ..." with the word nearest to `wrong`; "" if none is near."""
     import difflib  # imported here, as few runs need it
 
     near = difflib.get_close_matches(wrong, list(words), n=1)

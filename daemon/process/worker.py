@@ -65,7 +65,7 @@ class Worker(Generic[R]):
         return self._results.get()
 
     def close(self, wait_s: float) -> bool:
-        """End the thread; return False if its job runs on after `wait_s`."""
+        """End the thread; return False if its job still runs after `wait_s`."""
         thread, self._thread = self._thread, None
         if thread is None:
             return True

@@ -1,8 +1,8 @@
-"""Messages, sockets and the process that has them, questions, keys."""
+"""Messages, sockets, the process that holds these, questions of peers, and keys."""
 
 
 class PublishError(Exception):
     """An endpoint cannot be opened, or its thread has ended."""
 
     taken: str | None = None
-    """Endpoint that another program uses; None: the error has another cause."""
+    """Endpoint that is in use by another program; None: the error has another cause."""

@@ -17,11 +17,12 @@ R = TypeVar("R")
 
 
 class Told(StrEnum):
-    """Result for an outcome. A refusal has the word that `why` begins with on the wire."""
+    """Result of reporting an outcome. The value of a refusal is the first word of `why` on the
+    wire."""
 
     KEPT = "kept"
     REPEATED = "repeated"
-    """Known before, and on the disk."""
+    """The outcome was known before, and is on the disk."""
     UNKNOWN_START = "unknown boot_id"
     UNKNOWN_GRASP = "unknown grasp"
     NOT_YOURS = "not yours"
@@ -32,11 +33,11 @@ class Told(StrEnum):
 
 
 class Reply(NamedTuple):
-    """Answer to a peer that told an outcome."""
+    """Answer to a peer that reported an outcome."""
 
     told: Told
     detail: str = ""
-    """Why it is refused, for a person."""
+    """Why the outcome is refused, as text for a person; empty if it is taken."""
 
 
 KEPT: Final = Reply(Told.KEPT)
@@ -45,12 +46,12 @@ Answer = Callable[[Reply], None]
 
 
 def at_once(answer: Answer) -> None:
-    """Answer at once that all is kept. Used where outcomes are not saved."""
+    """Answer at once that the outcome is kept. Used where outcomes are not saved."""
     answer(KEPT)
 
 
 class LoopEvent(Enum):
-    """Event that changes later verdicts; a recording has it, besides the readings."""
+    """Event, other than a reading, that changes later verdicts; recordings contain it."""
 
     ASKED = "asked"
     SKIPPED = "skipped"
@@ -69,26 +70,26 @@ class PublishedVerdict(NamedTuple):
     payload: bytes
     """JSON."""
     reading: TactileReading | None
-    """None after silence."""
+    """Reading that was judged; None: the verdict reports silence."""
     is_answer: bool
     """True if this verdict answers the controllers that asked."""
     grasp: GraspId
     lifts: LiftBook
     keep: Callable[[Answer], None] = at_once
-    """Calls its argument once all until now is on the disk."""
+    """Function that calls its argument once the state at this verdict is on the disk."""
 
 
 class Requests(Protocol):
     """Interface of the loop for requests of peers."""
 
     def ask(self) -> None:
-        """Ask for a verdict, by which a controller decides whether to lift."""
+        """Request a judgement for a controller that decides whether to lift."""
 
     def silence(self) -> None:
         """Publish that no reading has come."""
 
     def outcome(self, report: Report, answer: Answer) -> None:
-        """Tell the outcome of a lift; `answer` is called once it is on the disk, or refused."""
+        """Report the outcome of a lift; `answer` is called once it is on the disk, or refused."""
 
 
 class Companion:
@@ -98,10 +99,10 @@ class Companion:
     """
 
     filenos: Sequence[int] = ()
-    """Descriptors that end the loop's wait when they become readable, now."""
+    """Current descriptors that end the loop's wait when they become readable."""
 
     def before_wait(self, requests: Requests) -> int | None:
-        """Act before the loop waits, such as on the messages of peers, through `requests`.
+        """Act before the loop waits, for example pass messages of peers on to `requests`.
 
         Return the latest end of the wait, monotonic ns; None: no limit.
         """

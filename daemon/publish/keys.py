@@ -25,9 +25,9 @@ CLIENTS_MAX = 1000
 """Most keys of peers."""
 FILE_MAX_BYTES = 1 << 16
 SERVICE = "graspd"
-"""User of the service, whose keys root may look at."""
+"""User of the service, whose keys root may read."""
 LINKS_MAX = 40
-"""Symbolic links on the way to a file (path_resolution(7))."""
+"""Most symbolic links on the way to a file (path_resolution(7))."""
 
 
 class KeysError(SceneError):
@@ -38,14 +38,17 @@ class Clients(NamedTuple):
     """Peers that may connect."""
 
     admitted: dict[bytes, str]
-    """Names of peers, by public key, Z85."""
+    """Name of each peer by its public key, Z85."""
     refused: list[str]
     """Errors of the other key files."""
 
 
 def make(folder: Path, name: str) -> tuple[Path, Path]:
-    """Make `NAME.key` and `NAME.key_secret` (mode 0600), never over others. Raises `KeysError`."""
-    from zmq.auth import create_certificates  # the daemon itself makes none
+    """Make `NAME.key` and `NAME.key_secret` (mode 0600); return their paths.
+
+    Raises `KeysError`, also if one of the files exists.
+    """
+    from zmq.auth import create_certificates  # imported here, as the daemon itself makes no keys
 
     if not NAME.fullmatch(name) or name.startswith("."):
         raise KeysError(f"{name!r} is not a name for a key: letters, digits, '_', '-' and '.'")
@@ -53,7 +56,7 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
     for path in (public, secret):
         if path.exists():
             raise KeysError(f"{path} is there already; remove it to make a new one")
-    former = os.umask(0o077)  # before there is anything to read
+    former = os.umask(0o077)  # set before a file exists that others could read
     try:
         folder.mkdir(parents=True, exist_ok=True)
         create_certificates(folder, name)
@@ -66,12 +69,12 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
 
 
 def load_pair(path: Path) -> tuple[bytes, bytes]:
-    """Return public and secret key of a file that only its owner reads. Raises `KeysError`."""
+    """Return public and secret key, Z85. Raises `KeysError`, also if others may read the file."""
     public, secret = _load(path, "the key")
     if secret is None:
         raise KeysError(f"{path}: has no secret key; name the {SECRET} file")
     mode = stat.S_IMODE(path.stat().st_mode)
-    if mode & 0o077 and hasattr(os, "geteuid"):  # elsewhere rights are not in the mode
+    if mode & 0o077 and hasattr(os, "geteuid"):  # on Windows the mode does not show the rights
         raise KeysError(f"{path}: mode {mode:04o}; others may read it: chmod 600")
     return public, secret
 

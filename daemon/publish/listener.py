@@ -72,7 +72,7 @@ class Listener:
             os.chown(path, -1, group)
         if self._mode is not None:
             os.chmod(path, self._mode)
-        made.listen(BACKLOG)  # not before: no peer has connected while all could
+        made.listen(BACKLOG)  # last, so that no peer connects before mode and group are set
 
     def fileno(self) -> int:
         """Return the descriptor of the listening socket. Raises `PublishError` after `close`."""
@@ -96,10 +96,10 @@ class Listener:
 
 
 def user_id(name: str) -> int:
-    """Return the number of a user of `ask.tell`, by name or number. Raises `PublishError`."""
+    """Return the id of a user named in `ask.tell`, by name or by number. Raises `PublishError`."""
     try:
         return int(name) if name.isdecimal() else pwd.getpwnam(name).pw_uid
-    except (KeyError, ValueError):  # the second one for a number of over 4300 digits
+    except (KeyError, ValueError):  # ValueError: a number of over 4300 digits
         raise PublishError(f"ask.tell: there is no user {name}") from None
 
 
@@ -148,7 +148,7 @@ def _refuse_living(path: Path) -> None:
             probe.connect(str(path))
         except ConnectionRefusedError:
             return  # the process that bound it has ended
-        except OSError:  # a full queue, another type of socket, no permission: it is alive
+        except OSError:  # a full queue, another type of socket, no permission: the process is alive
             pass
     raise PublishError(f"{path} is the socket of another program that runs")
 
@@ -169,4 +169,4 @@ def _locked(path: Path) -> int:
             if os.fstat(descriptor).st_nlink:
                 stack.pop_all()
                 return descriptor
-            # Its former holder removed it after we had opened it.
+            # Its former holder removed the file after we had opened it.

@@ -47,7 +47,7 @@ OUTAGE_PERIODS = 10
 
 
 class LatencyHistogram:
-    """Histogram of durations with buckets of equal ratio, in constant memory."""
+    """Histogram of durations, us, with buckets of equal ratio, in constant memory."""
 
     def __init__(self) -> None:
         self.buckets = [0] * BUCKETS
@@ -82,9 +82,9 @@ class Deadlines:
 
     def __init__(self) -> None:
         self.jitter = LatencyHistogram()
-        """Time between two readings less the driver's period, us."""
+        """Differences of the time between two readings and the driver's period, us."""
         self.late = 0
-        """Readings whose verdict came more than a period after their last byte."""
+        """Number of readings whose verdict came more than a period after their last byte."""
         self.worst_age_ms = 0.0
         """Longest time from a reading's last byte to its verdict, ms."""
         self._last_seq = -1
@@ -164,11 +164,12 @@ class Outbox:
         reading: TactileReading | None = None,
         period_ns: int | None = None,
     ) -> tuple[Verdict, bytes]:
-        """Send one verdict, after the changes of the gate; return it, plain and encoded.
+        """Send the changes of the gate, then the verdict; return the verdict, plain and encoded.
 
-        `received_ns`: when the driver handed the reading over. `silence_ns`: time without a message
-        after which subscribers take the grasp for unknown. `reading`, None after silence, is
-        counted as late or in time by its sensor's `period_ns`; None: that is not known.
+        `received_ns`: when the driver handed the reading over, monotonic. `silence_ns`: time
+        without a message after which subscribers must count the grasp as unknown. `reading`: the
+        judged one, None after silence. `period_ns`: period of its sensor, by which it counts as
+        late; None: not known.
         """
         moment, worth = judgement.moment, judgement.assessment
         valid = judgement.decision is not Decision.UNKNOWN
@@ -232,7 +233,7 @@ class Outbox:
         self._send("outcome", encode(message))
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
-        """Send one reading, with the newest joint angles, to the outputs that want it now."""
+        """Send a reading with the newest joint angles to the outputs whose `wanted` is True now."""
         topic = self._topics["tactile"]
         wanting = [output for output in self._outputs if output.wanted(topic)]
         if not wanting:
@@ -286,8 +287,8 @@ class Outbox:
     ) -> Status:
         """Send and return one status.
 
-        `drivers`: counters of drivers and companions, by part. `beside`: parts of companions that
-        are not well.
+        `drivers`: counters of drivers and companions, by part. `beside`: current problems of
+        companions, by part.
         """
         session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
         deadlines = self._deadlines

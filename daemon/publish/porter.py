@@ -1,13 +1,13 @@
-"""The process that has the ZeroMQ sockets of peers, so that no peer can end the daemon.
+"""The process that holds the ZeroMQ sockets of peers, so that no peer can end the daemon.
 
-libzmq 4.3.5 ends its process where a peer has a full queue, sends a heartbeat and hangs up, and
-where memory or descriptors end. `Door` starts this process, and starts it again. It reads the
-keys of peers too.
+libzmq 4.3.5 ends its process if a peer with a full queue sends a heartbeat and hangs up, and if
+memory or descriptors run out. `Door` starts this process, and restarts it. The process also reads
+the keys of peers.
 
 A call of a PUB, XPUB or ROUTER socket does not return while peers flood it, so threads serve them.
-`zmq.proxy` copies messages to the subscribers, in C. Questions go through `Courier`: `zmq.proxy`
-would take a thousand before it sends an answer. PUB, ROUTER and the sockets to the loop have an
-I/O thread each: a flood of one does not delay the others.
+`zmq.proxy` copies messages to the subscribers, in C. Questions go through `Courier`, because
+`zmq.proxy` would take a thousand before it sends an answer. PUB, ROUTER and the sockets to the loop
+have an I/O thread each, so a flood on one does not delay the others.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Frames = list[bytes]
 Socket = zmq.Socket[bytes]
 
 MESSAGES, QUESTIONS, ECHO = "messages", "questions", "echo"
-"""Sockets to the loop, in a folder that only the daemon's user may enter."""
+"""Names of the sockets to the loop, in a folder that only the daemon's user may enter."""
 MESSAGE_MAX_BYTES: Final = 1024
 """Longest frame of a peer. An outcome has 128 bytes, the handshake with keys 257 (RFC 26)."""
 TO_SUBSCRIBERS, TO_ASKERS, TO_LOOP = 1, 2, 4
@@ -66,15 +66,15 @@ LINGER_MS: Final = 500
 CLOSE_S: Final = 1
 """Longest wait at closing for libzmq's threads, s; the watchdog waits 2 s."""
 LOOK_MS: Final = 1000
-"""Time between two looks at threads and keys, ms."""
+"""Time between two checks of threads and keys, ms."""
 MEMORY_MAX_BYTES: Final = 512 << 20
 """Most memory of the process; it takes 20 MiB, and 4 KiB for each peer."""
 REVOKED: Final = 3
 """Exit code after a key was removed: libzmq cannot disconnect a single peer."""
 END: Final = b"e"
-"""Read from stdin at an orderly end of the daemon."""
+"""Byte on stdin at an orderly end of the daemon. Without it the daemon was killed."""
 LOOP_CAME, SUBSCRIBER_CAME = b"l", b"s"
-"""Written to stdout when the loop's own subscriber has connected, or another one."""
+"""Bytes on stdout when the loop's own subscriber, or another subscriber, has connected."""
 ZAP_DOMAIN: Final = "graspd"
 """libzmq asks the authenticator only if there is a domain (RFC 27)."""
 FAILED: Final = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
@@ -85,11 +85,11 @@ PROBLEMS: Final = {
     0x11000001: "it takes another key for the daemon's",
     0x11000002: "it has no key",
 }
-"""Problem of a peer by the value of its failed handshake (ZMQ_PROTOCOL_ERROR_*)."""
+"""Mistake of a peer, by the value of its failed handshake (ZMQ_PROTOCOL_ERROR_*)."""
 
 
 class Plan(NamedTuple):
-    """Sockets that the process serves; `Door` writes them to stdin as a line, a JSON list."""
+    """Sockets that the process serves. `Door` writes the plan to stdin as one line, a JSON list."""
 
     folder: str
     """Folder of the sockets to the loop."""
@@ -100,18 +100,18 @@ class Plan(NamedTuple):
     high_water_mark: int
     """Most messages that wait for one subscriber."""
     processors: Sequence[int]
-    """Processors that may be used, also after a start by a loop that is restricted to some."""
+    """Processors to use. The loop that starts the process may be restricted to fewer."""
     keys: Sequence[str] | None
     """Public and secret key of the daemon for `tcp://`, Z85, and the folder of peers' keys."""
 
 
 packed: Final = msgspec.msgpack.encode
-"""Returns frames as one: libzmq ends a process whose peer ends between two frames of a message."""
+"""Packs frames into one. libzmq ends a process whose peer ends between two frames."""
 unpacked: Final = msgspec.msgpack.Decoder(Frames).decode
 
 
 class Proxy(threading.Thread):
-    """Copies messages between two sockets until their context ends, and closes them."""
+    """Copies messages between two sockets until their context ends, then closes the sockets."""
 
     def __init__(self, endpoint: str, front: Socket, back: Socket) -> None:
         """`front`, `back`: sockets that only this thread may use after `start`."""
@@ -135,9 +135,9 @@ class Proxy(threading.Thread):
 
 
 class Courier(Proxy):
-    """Carries questions of the peers to the loop, a few at a time, and all answers back.
+    """Carries questions of peers to the loop, a few at a time, and all answers back.
 
-    Behind the routing id it puts a frame of its own with the sender's credential.
+    After the routing id it inserts a frame with the sender's credential.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class Courier(Proxy):
             for _ in range(QUESTIONS_MAX):
                 if not self._carry_question():
                     break
-            if self._back.poll(PAUSE_MS):  # meanwhile more questions wait
+            if self._back.poll(PAUSE_MS):  # an answer ends the pause; questions wait
                 self._carry_answers()
 
     def _carry_answers(self) -> None:
@@ -165,7 +165,7 @@ class Courier(Proxy):
             self._front.send_multipart(unpacked(self._back.recv()), zmq.NOBLOCK)
 
     def _carry_question(self) -> bool:
-        """Carry one, cut at `FRAMES_MAX`; False if there is none or no room."""
+        """Carry one question, cut to `FRAMES_MAX` frames; False: none waits, or no room."""
         if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
             return False
         first = self._front.recv(copy=False)
@@ -178,7 +178,7 @@ class Courier(Proxy):
         return True
 
     def _credential(self, frame: zmq.Frame) -> bytes:
-        """Return `user <uid>` by the kernel, `key <name>` by the handshake, or nothing."""
+        """Return `user <uid>` as the kernel says, `key <name>` by the handshake, or b""."""
         with suppress(zmq.ZMQError):  # libzmq knows nothing of the sender
             if self.endpoint.startswith("ipc://"):
                 _, *numbers = str(frame.get("Peer-Address")).rsplit(":", 3)  # uid, gid, pid
@@ -190,7 +190,7 @@ class Courier(Proxy):
 
 
 class Lookout(threading.Thread):
-    """Warns of peers whose handshake fails, and tells `Door` who has come.
+    """Warns of peers whose handshake fails, and reports new subscribers to `Door`.
 
     Monitors must be read all the time: libzmq waits where the queue of one is full. They are read
     until their context ends.
@@ -215,7 +215,7 @@ class Lookout(threading.Thread):
                     event, endpoint = monitor.recv_multipart()
                     kind, value = EVENT.unpack(event)
                     if kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                        with suppress(BlockingIOError):  # it has been told often enough
+                        with suppress(BlockingIOError):  # `Door` has unread reports of it already
                             os.write(1, LOOP_CAME if endpoint == self._echo else SUBSCRIBER_CAME)
                         continue
                     problem = PROBLEMS.get(value, "it does not speak ZeroMQ with keys")
@@ -257,12 +257,12 @@ class Porter:
 
     def _serve_subscribers(self, number: int) -> None:
         most = self._plan.high_water_mark
-        at_once = max(most // 10, 1)  # more of them would overflow the queues of subscribers
+        at_once = max(most // 10, 1)  # larger batches would overflow the queues of subscribers
         messages = self._socket(zmq.PULL, TO_LOOP, received=at_once)
         messages.bind(self._own(MESSAGES))
         peers = self._socket(zmq.PUB, TO_SUBSCRIBERS, most, SUBSCRIPTIONS_QUEUED)
         self._watch(peers, number, int(zmq.EVENT_HANDSHAKE_SUCCEEDED))
-        peers.bind(self._own(ECHO))  # by the same I/O thread: late where others hear late
+        peers.bind(self._own(ECHO))  # same I/O thread: late when subscribers are
         self._listen(peers, number)
         self._threads.append(Proxy(self._plan.endpoints[number], messages, peers))
 
@@ -280,7 +280,8 @@ class Porter:
         return f"ipc://{self._plan.folder}/{name}"
 
     def _socket(self, kind: int, by: int, sent: int = 1, received: int = 1) -> Socket:
-        """Return a socket that queues at most this many messages of each peer."""
+        """Return a socket of a `kind` (zmq.PUB, ...) with the I/O threads `by` (`TO_...`). `sent`,
+        `received`: most messages that it queues for and from each peer."""
         made = self._context.socket(kind)
         made.linger = 0
         made.affinity = by
@@ -288,7 +289,7 @@ class Porter:
         return made
 
     def _watch(self, made: Socket, number: int, events: int = 0) -> None:
-        """Have these events of a socket reported, before a peer can connect to it."""
+        """Watch `events` of a socket, then let it accept the peers of endpoint `number`."""
         if self._keys_at(number) is not None:
             events |= FAILED
         if events:
@@ -341,16 +342,16 @@ class Porter:
 
     def _end(self) -> None:
         """Disconnect all peers, after they had `LINGER_MS` to take what is queued."""
-        signal.alarm(2 * CLOSE_S)  # ends the process, if `Door` has not
+        signal.alarm(2 * CLOSE_S)  # ends the process if `Door` has not by then
         if self._authenticator is not None:
             self._authenticator.stop()
         self._context.term()
 
 
 def main() -> None:
-    """Serve what the first line of stdin says until stdin ends."""
+    """Serve the `Plan` in the first line of stdin until stdin ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the daemon says when to end
+        signal.signal(number, signal.SIG_IGN)  # only the daemon decides when to end
     logs.set_up(os.environ)
     stdin = open(0, "rb", buffering=0)  # noqa: SIM115 - open to the end
     plan = Plan(*json.loads(stdin.readline()))
@@ -359,7 +360,7 @@ def main() -> None:
         os.sched_setaffinity(0, plan.processors)
     with suppress(OSError):  # a service manager that forbids it has limits of its own
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
-        Path("/proc/self/oom_score_adj").write_text("1000")  # before the daemon
+        Path("/proc/self/oom_score_adj").write_text("1000")  # to be ended before the daemon
     os._exit(Porter(plan).serve(0))
 
 

@@ -49,12 +49,12 @@ class Question:
     lifts: bool
     """True for `lift`, False for `judge`."""
     offer: tuple[GraspId, Decision] | None = None
-    """Grasp that the peer may lift, and its verdict, before that is answered."""
+    """Grasp that the peer may lift, and its verdict, which is not sent yet. None: no offer."""
     kept: bool | None = None
-    """True once the offer is on the disk, False if it cannot be."""
+    """True: the offer is on the disk. False: it cannot be saved. None: not known yet."""
 
     def keep(self, offer: tuple[GraspId, Decision], reply: Reply) -> None:
-        """Note whether an offer is on the disk."""
+        """Note by `reply` whether this `offer` is on the disk; ignore an outdated offer."""
         if offer == self.offer:
             self.kept = reply.told is Told.KEPT
 
@@ -70,11 +70,11 @@ class Questions:
     ) -> None:
         """`send`: sends an answer's frames; returns False if it drops them.
 
-        `patience_ns`: longest time until a question is answered, ns. `tells`: whether a credential
-        may lift and tell; None: that of the first peer that lifts.
+        `patience_ns`: longest time until a question is answered. `tells`: returns True if a
+        credential may lift and report outcomes; None: only the first credential that lifts may.
         """
         self.counters: Counter[str] = Counter()
-        """Questions and outcomes by what became of them; `dropped` counts answers."""
+        """Number of questions and outcomes by their result; `dropped` counts answers."""
         self._send = send
         self._patience_ns = patience_ns
         self._tells = tells
@@ -83,7 +83,7 @@ class Questions:
         self._last: PublishedVerdict | None = None
 
     def serve(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> int | None:
-        """Take messages that arrived by `now_ns`, and give answers that are due by then.
+        """Handle messages that arrived by `now_ns`; answer questions that are due by then.
 
         Return the latest time of the next answer, monotonic ns; None: no question waits.
         """
@@ -110,7 +110,7 @@ class Questions:
             elif well_formed and text == NOT_LIFTING:
                 self._take_back(envelope, peer, requests)
             elif well_formed and text == CLOCK:
-                # `now_ns` is later than the question: an age by it is never too small.
+                # The question came before `now_ns`, so an age computed by it is never too small.
                 self._answer(envelope, b'{"v":1,"t_mono_ns":%d}' % now_ns)
                 self.counters["clocks"] += 1
             else:
@@ -190,9 +190,9 @@ class Questions:
                 self._give_up(peer, reason)
 
     def answer(self, published: PublishedVerdict, now_ns: int | None = None) -> None:
-        """Answer with this verdict.
+        """Answer waiting questions with this verdict.
 
-        `now_ns`: answer only questions that are due by then, or wait for the disk; None: all.
+        `now_ns`: answer only questions that are due by then or wait for the disk; None: answer all.
         """
         self._last = published
         for peer, question in list(self.waiting.items()):

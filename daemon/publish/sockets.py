@@ -1,7 +1,7 @@
-"""The sockets of a scene: the loop's end of them, and the process that has them, `porter`.
+"""The sockets of a scene: the loop's end of them, and the process `porter` that holds them.
 
-The loop uses only sockets to that process: libzmq may end where a hostile peer connects. Then
-`check` starts the process again, and peers reconnect.
+The loop uses only sockets to that process, because a hostile peer can make libzmq end its
+process. `check` then restarts it, and peers reconnect.
 """
 
 from __future__ import annotations
@@ -51,22 +51,22 @@ ANSWERS_QUEUED: Final = 512
 SUBSCRIBES_S: Final = 0.1
 """Longest time from a peer's handshake to its first subscription, s."""
 RECONNECT_MS: Final = 10
-"""Time between two tries to reach the process that starts, ms."""
+"""Time between two tries to reach the process while it starts, ms."""
 START_S: Final = 30.0
-"""Longest start of the process at the first time, s."""
+"""Longest time of the first start of the process, s."""
 AGAIN_S, AGAIN_MAX_S = 0.1, 0.8
-"""Shortest and longest time between two starts, s; doubled where one follows another."""
+"""Shortest and longest pause before a restart, s. It doubles while restarts follow each other."""
 LATE_S: Final = 0.2
-"""Time from which a status that the loop has not received itself is late, s."""
+"""Time in which the loop must receive its own status, s. After that, subscribers are late."""
 TACTILE = b"tactile."
 HIGH_WATER_MARK = 10
 """Most messages that wait for a subscriber: a tenth of a second of verdicts at 100 Hz."""
 NEVER_NS = 10**18
-"""Longest period of readings, ns: one after thirty years."""
+"""Period of readings that are never sent, ns: thirty years."""
 
 
 class Sockets(Companion):
-    """The sockets, open until `close`."""
+    """The sockets of one scene, open until `close`."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class Sockets(Companion):
         """None after `close`."""
         self.questions: Questions | None = None
         self._listeners: list[Listener] = []
-        """Endpoint of the messages, then that of the questions, if peers may ask."""
+        """Listener for subscribers, then the one for questions, if peers may ask."""
         try:
             self._listen(wanted)
             self._door = Door(self._listeners, high_water_mark or HIGH_WATER_MARK, keys)
@@ -114,7 +114,7 @@ class Sockets(Companion):
             self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6), tells)
 
     def _tells(self, wanted: Scene) -> Callable[[bytes], bool]:
-        """Return whether the scene lets a credential lift and tell."""
+        """Return a function: True if the scene lets a credential lift and report outcomes."""
         names = () if wanted.ask is None else wanted.ask.tell or ()
         if (wanted.ask_endpoint or "").startswith("ipc://"):
             return {b"user %d" % user_id(name) for name in names}.__contains__
@@ -132,7 +132,7 @@ class Sockets(Companion):
         if self._tactile_period_ns is None:
             return False
         now_ns = self._clock()
-        # Half a period early is in time: readings at this very rate jitter.
+        # Half a period early is in time, because readings at exactly this rate jitter.
         if now_ns < self._tactile_due_ns - self._tactile_period_ns // 2:
             return False
         self._tactile_due_ns = max(self._tactile_due_ns, now_ns) + self._tactile_period_ns
@@ -151,7 +151,7 @@ class Sockets(Companion):
         return self.questions.serve(self._door.receive(), self._clock(), requests)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Answer the questions with an answer; with another verdict only those that are due."""
+        """Answer all questions if `published.is_answer`, else only those that are due."""
         if self.questions is not None:
             self.questions.answer(published, None if published.is_answer else self._clock())
 
@@ -195,8 +195,9 @@ class Door:
     ) -> None:
         """Raises `PublishError` if no process can serve the endpoints.
 
-        `listeners`: that of subscribers; a second one takes questions. `high_water_mark`: most
-        messages that wait for one subscriber. `keys`: as in `Plan`; None: `tcp://` is open to all.
+        `listeners`: the first is for subscribers, an optional second one for questions.
+        `high_water_mark`: most messages that wait for one subscriber. `keys`: as in `Plan`; None:
+        `tcp://` is open to all.
         """
         try:
             self._folder = tempfile.mkdtemp(prefix="graspd-")
@@ -213,9 +214,9 @@ class Door:
         )
         self._context: zmq.Context[Socket] = zmq.Context()
         self._unheard = b""
-        """Last status, until it comes back."""
+        """Last published status, until the loop's own subscriber receives it; then b""."""
         self._due_s = 0.0
-        """Time from which that is late, monotonic s."""
+        """Time from which this status is late, monotonic s."""
         self.is_late = False
         """True if the loop's own subscriber received the last status late, or has not yet."""
         self._out = self._socket(zmq.PUSH, porter.MESSAGES, sent=high_water_mark)
@@ -223,9 +224,9 @@ class Door:
         self._echo.subscribe(STATUS)
         self._ask = self._socket(zmq.DEALER, porter.QUESTIONS, ANSWERS_QUEUED, ASK_QUEUE)
         self._again_s, self._pause_s = 0.0, AGAIN_S
-        """Earliest next start of the process, monotonic s, and the pause before that, s."""
+        """Earliest time of the next restart, monotonic s, and the pause before it, s."""
         self._told = b""
-        """Output of the process: who has connected."""
+        """Output of the process so far: `LOOP_CAME` and `SUBSCRIBER_CAME`."""
         self._process: subprocess.Popen[bytes] | None = None
         try:
             self._process = self._start()
@@ -238,11 +239,11 @@ class Door:
             raise
 
     def _socket(self, kind: int, name: str, sent: int = 1, received: int = 1) -> Socket:
-        """Return a socket to the process that queues at most this many messages."""
+        """Return a socket to the process; `sent`, `received`: most messages that it queues."""
         made = self._context.socket(kind)
         made.linger = 0
         made.sndhwm, made.rcvhwm = sent, received
-        # No answer waits for a process that has ended. A subscriber would lose half a message.
+        # No answer is queued for a process that has ended. A subscriber would lose half a message.
         made.immediate = kind != zmq.SUB
         made.reconnect_ivl = RECONNECT_MS
         if name != porter.QUESTIONS or len(self._plan.endpoints) > 1:
@@ -256,7 +257,7 @@ class Door:
         self._again_s = now_s + self._pause_s
         try:
             process = subprocess.Popen(
-                [sys.executable, "-P", "-m", porter.__name__],  # -P: no module of this folder
+                [sys.executable, "-P", "-m", porter.__name__],  # -P: not from this folder
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -276,7 +277,7 @@ class Door:
         return int(self._ask.getsockopt(zmq.FD))
 
     def send(self, topic: bytes, payload: bytes) -> bool:
-        """Publish one message; False if it is dropped because the process is behind."""
+        """Publish one message; return False if it is dropped because the process is behind."""
         if topic.startswith(STATUS):
             self._unheard, self._due_s = payload, time.monotonic() + LATE_S
             self.is_late = False
@@ -295,9 +296,9 @@ class Door:
         return received
 
     def check(self) -> None:
-        """Start the process again if it has ended; note if subscribers hear late.
+        """Restart the process if it has ended; set `is_late`.
 
-        Call it in each round.
+        Call it in each round of the loop.
         """
         if self._unheard:
             self._hear_echo(0.0)
@@ -329,7 +330,8 @@ class Door:
         return came
 
     def _is_told(self, what: bytes, timeout_s: float, stop: StopSignal | None = None) -> bool:
-        """Wait until the process has written it; False after `timeout_s`, or at its end."""
+        """Wait until the process has written `what`; return False after `timeout_s` or at its end.
+        Also returns False when `stop` becomes readable."""
         if self._process is None or (told := self._process.stdout) is None:
             return False
         poll = select.poll()
@@ -351,7 +353,7 @@ class Door:
         """Disconnect all peers, after they had `LINGER_MS` to take what is queued.
         False if the process had to be killed after `CLOSE_S`. May be called again."""
         until_s = time.monotonic() + LINGER_MS / 1e3
-        # The end of the process loses what is not published yet.
+        # Messages that the process has not published are lost when it ends.
         while (
             not self._echo.closed and self._unheard and (left_s := until_s - time.monotonic()) > 0
         ):
@@ -368,7 +370,7 @@ class Door:
         if process is None:
             return True
         with process:
-            with suppress(OSError):  # it has ended
+            with suppress(OSError):  # the process has ended
                 _write(process, porter.END)
             try:
                 process.wait(CLOSE_S)
@@ -394,5 +396,5 @@ def _load_keys(curve: Curve) -> tuple[str, str, str]:
     from graspd.daemon.publish import keys  # only where there are any
 
     public, secret = keys.load_own(curve.secret_key)
-    keys.load_clients(curve.clients)  # raises `KeysError` where it can be mended
+    keys.load_clients(curve.clients)  # raises `KeysError` now, while the user is there to mend it
     return public.decode(), secret.decode(), str(curve.clients)

@@ -1,4 +1,4 @@
-"""Make a grasp table of recorded grasps with outcomes, as in the BioTac SP Stability Set."""
+"""Make a table of recorded grasps with outcomes, in the format of the BioTac SP Stability Set."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Grasp:
     """Counts last judged before the outcome, shape (fingers, 24)."""
     slipped: bool
     object_name: str | None = None
-    """Name of the object; None: the controller did not tell it."""
+    """Name of the object; None: not reported."""
 
 
 @dataclass(slots=True)

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) -> pd.DataFrame:
     """Return grasps with known outcome: columns `object`, `slipped` and, finger by finger, counts.
 
-    `path`: a grasp table, or a recording (MCAP); `-` is standard input. `read_as="table"` decides
-    for a table of which many rows repeat each other. Grasps without an outcome are left out, with a
+    `path`: a grasp table, or a recording (MCAP); `-` is standard input. Pass `read_as="table"`
+    for a table in which many rows repeat each other. Grasps without an outcome are left out, with a
     warning that counts them. Raises `RecordingError`.
     """
     with files_of([Path(path)]) as (file,):
@@ -73,8 +73,8 @@ def read_recording(
 ) -> pd.DataFrame:
     """Return a stream, one row a reading: `t` in seconds, counts, then joint angles in radians.
 
-    `path`: a stream, a recording (MCAP) or a ROS bag; `-` is standard input. A count that is
-    missing or damaged is NaN; an angle is the newest one. A stream without times needs
+    `path`: a stream, a recording (MCAP) or a ROS bag; `-` is standard input. A missing or
+    damaged count is NaN. Each row has the newest angles. A stream without times needs
     `read_as="stream"` and `rate_hz`. Raises `RecordingError`.
     """
     with files_of([Path(path)]) as (file,):

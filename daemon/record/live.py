@@ -25,7 +25,7 @@ class LiveServer:
 
     def __init__(self, port: int) -> None:
         """Serve on `port`; 0: any free one. Raises `RuntimeError` if it is in use."""
-        # Logging through Python, its threads could wait for one that waits for their lock.
+        # If the library logged through Python, its threads and a logging thread could deadlock.
         foxglove.set_log_level(logging.CRITICAL)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}

@@ -21,8 +21,8 @@ from graspd.models.session_statistics import SessionState
 MODE: Final = 0o640
 """File mode of recordings; not readable for all users, as they show what a hand did."""
 ROTATE_BYTES: Final = 256_000_000
-"""Size of the files from which the next ones begin, or a quarter of what is kept, if that is less:
-small enough to copy and open."""
+"""Size at which new files begin, bytes, or a quarter of the size kept if that is less. Such files
+are small enough to copy and open."""
 FILES_MAX: Final = 1000
 """Most recordings of a hand, so that a folder can be listed: six weeks of hours."""
 METADATA: Final = "graspd"
@@ -34,7 +34,7 @@ _TEXTS: Final = ("boot_id", "model", "model_sha256", "trust")
 
 
 class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
-    """Description of the run, with session and learning where the file begins."""
+    """Description of the run, with the state of session and learning at the start of the file."""
 
     fingers: tuple[str, ...]
     """Fingers in the order of a reading's rows."""
@@ -46,13 +46,13 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
     model: str
     model_sha256: str
     file: int = 0
-    """Number of the file in the run; one is skipped after a failure of the disk."""
+    """Number of the file in the run; a failure of the disk skips one number."""
     wall_minus_monotonic_ns: int = 0
     """Wall time less the daemon's monotonic time, ns."""
     grasps: int = 0
     """Number of the run's last grasp before the file."""
     session: SessionState | None = None
-    """Statistics of the session, with a grasp that is held; None: the model has no session."""
+    """Statistics of the session, a held grasp included; None: the model has no session."""
     trust: bytes = b""
     """State of learning, from `graspd.daemon.trust.trust.encode`; empty without learning."""
 
@@ -65,7 +65,7 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, texts: Mapping[str, str]) -> Self:
-        """Return the header in `texts`; what has a default may be missing. Raises `ValueError`."""
+        """Return the header in `texts`, without which defaults apply. Raises `ValueError`."""
         known = texts.keys() & cls.__struct_fields__
         fields: dict[str, Any] = {name: texts[name] for name in known}
         for name in known.difference(_TEXTS):
@@ -134,7 +134,7 @@ class McapWriter(RecordingFile):
     def write(self, topic: bytes, payload: bytes, at_ns: int) -> None:
         """Write a message (JSON) of `topic`. `at_ns`: its monotonic time.
 
-        Its log time is later than that of the message before, so that the order can be restored.
+        Each log time is later than the last one, so that the order can be restored.
         """
         if topic not in self._channels:
             self._channels[topic] = self._register(topic.decode()), count()
@@ -181,7 +181,7 @@ def make_room(options: Record, hand: str) -> int:
 
 
 def rotate_bytes(options: Record) -> float:
-    """Return the size of the files from which the next ones begin, bytes."""
+    """Return the size of files at which new ones begin, bytes."""
     return min(ROTATE_BYTES, options.keep_mb * 1e6 / 4)
 
 

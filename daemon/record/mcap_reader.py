@@ -1,7 +1,7 @@
 """Read the MCAP files of recordings, in the order of log time. Needs the extra `record`.
 
-Other tools sort, cut and pack such files again: messages may stand in any order, and the metadata
-of graspd anywhere or nowhere.
+Other tools may have sorted, cut or repacked a file. Its messages may stand in any order, and the
+metadata of graspd anywhere or nowhere.
 """
 
 from __future__ import annotations
@@ -40,13 +40,14 @@ RECORD_MAX_BYTES: Final = 64 << 20
 CHUNK_MAX_BYTES: Final = 8 << 20
 """Largest unpacked chunk, bytes; graspd writes 1 MB, other tools 4 MB."""
 LOOSE_MAX_BYTES: Final = 1 << 20
-"""Size from which messages outside of chunks are a part of their own, bytes."""
+"""Size at which consecutive messages outside of chunks become a new part, bytes."""
 OPEN_MAX_BYTES: Final = 128 << 20
-"""Most bytes of parts whose times overlap; a part for each topic has a tenth of it."""
+"""Most unpacked bytes of parts that are open at once, because their times overlap. A file with one
+part for each topic needs a tenth of it."""
 PARTS_MAX: Final = 100_000
 """Most parts of a file; an hour at 100 Hz has 250."""
 RATIO_MAX: Final = 100
-"""Largest ratio of unpacked to packed bytes; held grasps have 12, zeros 36."""
+"""Largest ratio of unpacked to packed bytes; a recorded hold has 12, zeros have 36."""
 SEVERAL: Final = "is of several recordings put together: replay each alone"
 
 _DAMAGE = (
@@ -74,7 +75,7 @@ class _Part:
     """Messages that stand together: a chunk, or messages outside of chunks."""
 
     begin_ns: int
-    """Log time, ns; no message is older."""
+    """Log time of the oldest message, ns."""
     place: int
     """First byte of the content in the file."""
     length: int
@@ -231,7 +232,8 @@ class McapReader:
 
     @contextmanager
     def _in_order_of(self, parts: Sequence[_Part]) -> Iterator[None]:
-        """Copy a packed file unpacked, if steps back in it would each begin at its start."""
+        """Unpack a compressed file into a temporary one if its parts must be read out of order.
+        Each step back in a compressed stream would otherwise begin at its start."""
         places = [part.place for part in reversed(parts)]
         if places == sorted(places) or not is_packed(self.path):
             yield
@@ -239,7 +241,7 @@ class McapReader:
         packed = self._stream
         with TemporaryFile() as self._stream:
             packed.seek(0)
-            with suppress(OSError):  # damage is known already
+            with suppress(OSError):  # damage was noted before
                 shutil.copyfileobj(packed, self._stream)
             yield
         self._stream = packed
@@ -297,7 +299,7 @@ class McapReader:
 
 
 class _Made(msgspec.Struct):
-    """Part of a `tactile` message that is about its recording."""
+    """Fields of a `tactile` message from which the header is made."""
 
     boot_id: str
     t_mono_ns: int
@@ -305,7 +307,7 @@ class _Made(msgspec.Struct):
 
 
 class _Judge(msgspec.Struct):
-    """Part of a `verdict` message that is about its recording."""
+    """Fields of a `verdict` message from which the header is made."""
 
     model: str
     model_sha: str
@@ -323,7 +325,7 @@ class _Implied:
     model: tuple[str, str] = ("", "")
 
     def take(self, message: RecordedMessage) -> None:
-        """Take in a message; its time is the log time. One that cannot be read tells nothing."""
+        """Take in a message whose `at_ns` is the log time. A malformed one is ignored."""
         try:
             if message.kind == Topic.TACTILE:
                 made = msgspec.json.decode(message.payload, type=_Made)

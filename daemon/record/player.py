@@ -31,15 +31,15 @@ from graspd.drivers.recordings.player import ReadingsDriver
 _log = logging.getLogger(__name__)
 
 RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage | Said
-"""An event of `EVENTS`, an outcome, an exchange of sensors, or what belongs to the next reading:
-that it was late, that it changed the gate, or its verdict."""
+"""An event of `EVENTS`, an outcome or an exchange of sensors. `Late`, `GateMessage` and `Said` are
+about the next reading: it was late, it changed the gate, or its verdict."""
 _Item = Reading | RecordedEvent
 LATE = b'{"judged":false}'
 """Mark of a reading that may have been late."""
 STALE = f'"{Reason.STALE}"'.encode()
 """Part of the verdict on a late reading."""
 HELD_MAX = 64
-"""Most messages that may stand between a reading and what is about it."""
+"""Most messages that may stand between a reading and the messages about it."""
 
 
 @dataclass(slots=True)
@@ -82,7 +82,7 @@ class McapReplayDriver(ReadingsDriver[_Item]):
         if taken is None:
             return ()
         at_ns, item = taken
-        if isinstance(item, Said):  # its reading follows at once
+        if isinstance(item, Said):  # the reading of this verdict follows at once
             if self.on_event is not None:
                 self.on_event(item)
             return self.read_ready()
@@ -140,10 +140,10 @@ class McapReplayDriver(ReadingsDriver[_Item]):
 
 
 def _in_order(recording: McapReader) -> Iterator[RecordedMessage]:
-    """Yield the messages to play, those about a reading before it, at its time.
+    """Yield the messages to play; messages about a reading come before it, with its time.
 
-    The mark of a late reading may be lost where entries are; its verdict says it too. Without a
-    verdict the last reading before a loss counts as late.
+    The `late` mark of a reading may be lost; its verdict shows it as well. Without a verdict the
+    last reading before a loss counts as late.
     """
     held: list[RecordedMessage] = []
     was_in_time = is_judged = False
@@ -152,7 +152,7 @@ def _in_order(recording: McapReader) -> Iterator[RecordedMessage]:
             yield message._replace(at_ns=held[0].at_ns) if held else message
         elif message.kind == Topic.VERDICT:
             was_in_time = STALE not in message.payload
-            if held and not is_judged:  # later ones are on silence
+            if held and not is_judged:  # later verdicts are about silence
                 is_judged = True
                 yield message._replace(at_ns=held[0].at_ns)
         elif message.kind == Topic.TACTILE:
@@ -174,7 +174,7 @@ def _in_order(recording: McapReader) -> Iterator[RecordedMessage]:
 
 
 def _called_late(held: Sequence[RecordedMessage]) -> Iterator[RecordedMessage]:
-    """Yield a reading and what follows it, with a mark that it was late and not judged."""
+    """Yield the held reading and messages with a `late` mark before them."""
     if held:
         yield held[0]._replace(kind=Topic.LATE, payload=LATE)
     yield from held

@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 FLUSH_NS: Final = 1_000_000_000
-"""Longest time whose data a killed daemon or a power cut loses, ns."""
+"""Longest time of data that is lost if the daemon is killed or the power fails, ns."""
 ROTATE_NS: Final = 3_600_000_000_000
-"""Age of the files from which the next ones begin, ns: an hour."""
+"""Age of files at which new ones begin, ns: an hour."""
 QUEUE_MAX: Final = 20_000
 """Most queued entries: 12 MB, a minute of readings. Later ones are dropped."""
 RETRY_NS: Final = 60_000_000_000
@@ -54,10 +54,10 @@ FLUSH_AFTER: Final = 0.8
 CLOSE_S: Final = 0.5
 """Longest wait of `close` for the thread, s."""
 PATIENCE_S: Final = 60.0
-"""Longest wait for the disk, s, of a run as fast as possible, for which no hand waits."""
+"""Longest wait for the disk in a replay as fast as possible, s. No hand waits for it."""
 
 MakeHeader = Callable[[], RecordingHeader]
-"""Function that makes the header of what was copied; called in the thread."""
+"""Function that makes a header from a copied state; the thread calls it."""
 
 LINK: Final = b""
 """Topic of entries that are link traffic."""
@@ -83,7 +83,7 @@ class _Open:
 
 
 class Recorder(Companion):
-    """Record one run of the daemon. Methods never raise, and block only with patience."""
+    """Records one run of the daemon. Methods never raise; they block for at most `patience_s`."""
 
     def __init__(
         self,
@@ -117,7 +117,7 @@ class Recorder(Companion):
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
         self._room = QUEUE_MAX
-        """Most entries of the queue; 0 after a drop, until that is noted in the recording."""
+        """Most entries of the queue; 0 after a drop, until the recording has a note of it."""
         self._patience_s = patience_s
         self._taken = threading.Event()
         """Set after the thread has taken the entries of the queue."""
@@ -157,7 +157,7 @@ class Recorder(Companion):
             self._put(self._names[Topic.JUDGED], making)
 
     def on_event(self, event: LoopEvent) -> None:
-        """Record an event; of equal ones in a row only the first, but each `TAKEN_BACK`."""
+        """Record an event. Equal events in a row are recorded once, except `TAKEN_BACK`."""
         topic = self._names[Topic(event.value)]
         if topic != self._last_topic or event is LoopEvent.TAKEN_BACK:
             self._put(topic, EVENT)
@@ -177,7 +177,7 @@ class Recorder(Companion):
             self._last_topic = topic
 
     def _goes_on(self) -> bool:
-        """Return False, and drop an entry, while the queue is full; note it once there is room."""
+        """Return True, after noting drops, if the queue has room; else count a drop."""
         if len(self._queue) >= QUEUE_MAX:
             self._dropped += 1
             self._room = 0
@@ -207,7 +207,7 @@ class Recorder(Companion):
             self._flush_due_ns = 0
             self.go_round()
         except BaseException:
-            self._counted["failures"] += 1  # a bug of graspd: the status must not say `writing`
+            self._counted["failures"] += 1  # a bug of graspd, which the status shows
             log.exception("record: nothing is recorded any more")
             raise
         finally:
@@ -328,9 +328,9 @@ class Recorder(Companion):
 
 
 class ReplayRecorder(Recorder):
-    """Record a run that plays recordings, at any pace, by the times of its readings.
+    """Records a replay at any pace, with the times of its readings.
 
-    All messages are recorded as if each reading had come at its time, and the rest at once.
+    Messages are recorded as if each reading had arrived at its own time.
     """
 
     _base_ns: int | None = None
@@ -338,7 +338,7 @@ class ReplayRecorder(Recorder):
     _now_ns = 0
     """Time of the last reading, ns."""
     _ahead_ns = 0
-    """Its time of playing less `_now_ns`."""
+    """Time at which the last reading was played, less `_now_ns`, ns."""
 
     def on_reading(self, reading: Reading) -> None:
         if self._base_ns is None:
@@ -353,7 +353,7 @@ class ReplayRecorder(Recorder):
         super()._put(topic, content, at_ns)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Record it, and wait for the disk before the next reading is handed over."""
+        """Record a verdict, and wait for the disk before the next reading is played."""
         super().on_verdict(published)
         self._taken.clear()
         is_full = len(self._queue) >= QUEUE_MAX // 2
@@ -370,7 +370,7 @@ def _moved(content: object, ahead_ns: int) -> dict[str, object]:
 
 
 def _message(content: object) -> dict[str, Any]:
-    """Return the message that an entry has or makes."""
+    """Return the decoded message of an entry, which may be a function that makes it."""
     if callable(content):
         return cast(dict[str, Any], msgspec.to_builtins(content()))
     return cast(dict[str, Any], msgspec.json.decode(cast(bytes, content)))

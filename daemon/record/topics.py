@@ -1,6 +1,7 @@
 """The topics of a recording, their schemas, and the messages that are not published.
 
-Viewers read neither null nor nested lists: recorded messages are without, and schemas are plain.
+Viewers read neither null nor nested lists, so recorded messages have neither, and schemas are
+plain.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ TABLE: Final = (
     f"{ELECTRODES} * f + e - 1, with f from 0 and e from 1."
 )
 UNKNOWN: Final = "unknown"
-"""State of a finger that is not known. A viewer draws the last state on where there is none."""
+"""State of a finger that is not known. Without a value a viewer would continue the last state."""
 _ANGLES = msgspec.Meta(
     extra_json_schema={"properties": {name: {"type": "number"} for name in sorted(JOINTS)}}
 )
@@ -65,7 +66,7 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
     t_mono_ns: Count
     """Monotonic time of the verdict, ns."""
     grasp: Count
-    """Number of the verdict's grasp. After a further judgement the last message counts."""
+    """Number of the verdict's grasp. The last message on a grasp counts."""
     counts: list[list[Count]]
     """Counts by finger and electrode, in the header's order, before repair."""
     repaired: list[str] = []
@@ -85,21 +86,21 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Late(msgspec.Struct, frozen=True):
-    """The last reading was late, so its verdict is `stale`; a replay must not find it in time."""
+    """Mark that the last reading was late, so its verdict is `stale` in a replay too."""
 
     judged: bool
-    """True if the network judged it all the same."""
+    """True if the network judged the reading all the same."""
 
 
 class Said(msgspec.Struct, frozen=True):
-    """Part of a verdict by which a replay is held against the run."""
+    """Part of a verdict by which a replay is compared with the recorded run."""
 
     verdict: str
     judged: bool = True
 
 
 class Event(msgspec.Struct, frozen=True):
-    """An event; its topic tells which."""
+    """An event; its topic is its kind."""
 
 
 class Topic(StrEnum):
@@ -149,7 +150,7 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
 """Type of the messages by the first part of their topic."""
 EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED, Topic.TAKEN_BACK)
 PLAYED: Final = (*EVENTS, Topic.TACTILE, Topic.JOINTS, Topic.OUTCOME, Topic.EXCHANGED)
-"""Topics that a replay repeats, in their order."""
+"""Topics whose messages a replay plays."""
 EVENT: Final = b"{}"
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
@@ -162,7 +163,7 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """Return name and JSON Schema by topic; viewers know names of `foxglove`."""
+    """Return name and JSON Schema by topic. Viewers know the names that begin with `foxglove`."""
     described = {}
     for topic, message in MESSAGES.items():
         family = "foxglove" if message in (RawImage, Log) else "graspd"
@@ -196,7 +197,7 @@ def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
 
 
 def boot_id_of(payload: bytes) -> bytes:
-    """Return the run of a `tactile` message. Raises `ValueError`."""
+    """Return the `boot_id` of a `tactile` message. Raises `ValueError`."""
     return str(_decode(payload)["boot_id"]).encode()
 
 
@@ -221,7 +222,7 @@ def flat(value: object) -> object:
 
 
 def _part(name: str, value: object) -> object:
-    if name == "fingers" and isinstance(value, dict):  # of a verdict
+    if name == "fingers" and isinstance(value, dict):  # in a verdict
         return {finger: UNKNOWN if state is None else state for finger, state in value.items()}
     return flat(value)
 

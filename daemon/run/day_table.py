@@ -1,4 +1,4 @@
-"""A table of grasps, 25 a line: the published method beside graspd, by how the lifts ended."""
+"""A table of grasps, 25 a line, that compares the published method and graspd by outcomes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = f"{'stable':>7}{'slipped':>11}{'good lifts kept':>17}"
 
 
 class DayTable(Companion):
-    """Writes a line for every `GRASPS` grasps, and what they come to at the end."""
+    """Writes a line for every `GRASPS` grasps, and the totals at the end."""
 
     def __init__(
         self, title: str, published: TactileModel, model: str, warnings: Sequence[str] = ()
@@ -44,7 +44,7 @@ class DayTable(Companion):
         )
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Count a grasp."""
+        """Count the grasp of a verdict; write a line if it is complete."""
         verdict, reading = published.verdict, published.reading
         note = None if reading is None else reading.annotation
         if reading is None or note is None or note.slipped is None:
@@ -85,7 +85,7 @@ class DayTable(Companion):
         self._write("Each verdict and all scores: --verbose.")
 
     def _figures(self) -> list[str]:
-        """Return the three figures that matter."""
+        """Return the lines of the three most important figures."""
         published, graspd = self._whole
         return [
             f"`stable` that slipped  {_slips(graspd)}, published {_slips(published)}",

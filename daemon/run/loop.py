@@ -41,15 +41,15 @@ REFUSALS: Final = {
         Told.CONTRADICTS, "another outcome of this grasp was told before"
     ),
 }
-"""Answers to an outcome that is refused."""
+"""Answer to a refused outcome by its status."""
 STATUS_PERIOD_NS: Final = 1_000_000_000
 """Time between two status messages, ns."""
 SILENCE_PERIODS: Final = 10
-"""Number of missing readings that count as silence, if that is longer than the age limit."""
+"""Number of missing readings that count as silence, if their time is above the age limit."""
 DRAINS_MAX: Final = 8
 """Most extra reads of the driver in one round, so that a flood cannot hold the loop."""
 BLOCKED_NS: Final = 50_000
-"""Difference of wait and processor time, ns, from which the thread must have slept."""
+"""Difference of a wait's duration and processor time from which on the thread slept, ns."""
 
 
 class Ended(Enum):
@@ -62,7 +62,7 @@ class Ended(Enum):
 
 
 POLL = getattr(selectors, "PollSelector", selectors.DefaultSelector)
-"""Selector by poll(2); where there is none, recordings are replayed by another one."""
+"""Selector by poll(2). Systems without it, which only replay recordings, use another one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ class Loop:
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
         """Have the companions act; wait for input, or until something is due."""
-        # Without asking their descriptors: sending a message resets them.
+        # This does not depend on their descriptors, which sending a message resets.
         ends_ns = [before_wait(self) for before_wait in self._before_wait]
         watched = list[int]()
         for companion in self._companions:
@@ -191,7 +191,7 @@ class Loop:
             idle_ns -= time.thread_time_ns() - worked_ns
         if idle_ns >= BLOCKED_NS:
             self._shedder.waited(now_ns)
-        else:  # work was waiting already
+        else:  # input was waiting already
             self._shedder.yield_processor(now_ns)
 
     def _watch(self, watched: list[int], selector: selectors.BaseSelector) -> None:
@@ -202,7 +202,7 @@ class Loop:
         self._watched = watched
 
     def _take_readings(self) -> bool:
-        """Judge and publish the waiting readings; return False if none is tactile."""
+        """Judge and publish the waiting readings; return False if no tactile reading waited."""
         readings, backlog = self._read()
         received_ns = began_ns = self._clock()
         taken = False
@@ -229,11 +229,11 @@ class Loop:
             self._shedder.record_cost(judged_ns - began_ns)
             began_ns = judged_ns
         if taken:
-            self._pipeline.learn()  # the verdicts are published: now there is time
+            self._pipeline.learn()  # last, when the verdicts are published and there is time
         return taken
 
     def _read(self) -> tuple[list[Reading], int]:
-        """Return the waiting readings, and the number of tactile ones."""
+        """Return the waiting readings, and how many of them are tactile."""
         readings: list[Reading] = []
         for driver in self._drivers:
             readings += driver.read_ready()
@@ -346,7 +346,7 @@ class Loop:
     def outcome(self, report: Report, answer: Answer) -> None:
         """Learn, publish and save the outcome of a judged grasp's lift; then call `answer`."""
         lifts, grasp = self._pipeline.lifts, report.grasp
-        if grasp.boot_id == self._outbox.boot_id:  # the book of a replay has the recorded ids
+        if grasp.boot_id == self._outbox.boot_id:  # the lift book of a replay has the recorded ids
             grasp = GraspId(self._pipeline.boot_id, grasp.grasp)
         if not lifts.may_report(grasp, report.peer):
             answer(NOT_YOURS)

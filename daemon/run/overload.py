@@ -20,7 +20,7 @@ from graspd.drivers.base import ElectrodeFault, TactileReading
 BACKLOG_MAX_NS: Final = 10_000_000
 """Longest backlog whose readings are all judged, ns; one sensor period if that is longer."""
 COST_SAMPLES: Final = 4
-"""Number of latest readings whose shortest time is the cost of one; so a stall does not count."""
+"""Number of latest readings. The shortest of their times is the cost, so a stall does not count."""
 REPORT_AFTER_NS: Final = 3_000_000_000
 """Duration of skipping after which overload is reported, ns."""
 PAUSE_NS: Final = 1_000_000_000
@@ -29,12 +29,10 @@ RECOVERED_AFTER_NS: Final = 5_000_000_000
 """Time without a skipped reading, ns, after which the overload is over."""
 YIELD_AFTER_NS: Final = 10_000_000
 YIELD_AFTER_RECORDED_NS: Final = 1_000_000_000
-"""Times without a wait after which the loop yields the processor, ns: live, and of recordings."""
+"""Times without a wait after which the loop yields the processor, ns: live, and in a replay."""
 YIELD_SHARE: Final = 10
-"""Time worked divided by the time of a yield. The kernel would take 5 % of a realtime thread.
-
-See sched(7), sched_rt_runtime_us.
-"""
+"""Working time divided by the time of a yield. The kernel would take 5 % of a realtime thread. See
+sched(7), sched_rt_runtime_us."""
 YIELD_MAX_NS: Final = 5_000_000
 """Longest yield, ns."""
 

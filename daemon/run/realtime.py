@@ -73,7 +73,7 @@ class RealtimeMode(Companion):
 
     def _raise(self, priority: int) -> None:
         try:
-            # Threads started later are ordinary. Only root may take the flag back.
+            # The flag gives threads started later ordinary priority. Only root may clear it.
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, policy, os.sched_param(priority))
         except OSError as error:
@@ -88,7 +88,7 @@ class RealtimeMode(Companion):
         unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
         problem = "limited"
         if unlimited or _may_lock():
-            # Only used pages: most of a library of 20 MB is never used.
+            # Only used pages are locked: most of a library of 20 MB is never used.
             if _libc().mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) == 0:
                 return
             problem = os.strerror(ctypes.get_errno())

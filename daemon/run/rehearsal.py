@@ -27,8 +27,8 @@ COUNTS_MAX = 4000.0
 
 
 def grasps(training: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
-    """Yield counts (fingers, 24): rest, long enough to tare, then grasps like the training's."""
-    # One standard deviation along each axis: the centre itself is unlike any grasp.
+    """Yield counts, shape (fingers, 24): a rest to tare, then grasps like those of `training`."""
+    # The grasp is one standard deviation off along each axis, as the centre is unlike any grasp.
     sides = 1.0 - 2.0 * (np.arange(np.size(training.centre)) % 2)
     away = np.linalg.solve(training.whitening_matrix().T, sides)
     typical = np.array(training.centre) + away.reshape(np.shape(training.centre))

@@ -1,4 +1,4 @@
-"""The controller of a replay, which tells outcomes, and tables that a model was trained on."""
+"""The controller of a replay, which reports outcomes, and tables that a model was trained on."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from graspd.models.runtime import TactileModel
 class _Lift(NamedTuple):
     report: Report
     allowed: bool
-    """True if the verdict was `stable`, or asked for a supervised lift."""
+    """True if the verdict was `stable` or requested a supervised lift."""
     over: bool
     """True if the next reading is certainly another grasp."""
 
 
 class Controller(Companion):
-    """Tell the recorded outcome of each judged grasp before the next grasp, as a robot does."""
+    """Reports the recorded outcome of each judged grasp before the next grasp, as a robot does."""
 
     def __init__(self, *, only_lifted: bool) -> None:
-        """`only_lifted`: True tells outcomes of `stable` verdicts and supervised lifts only."""
+        """`only_lifted`: True reports outcomes of `stable` verdicts and supervised lifts only."""
         self._only_lifted = only_lifted
         self._requests: Requests | None = None
         self._lift: _Lift | None = None
@@ -41,7 +41,7 @@ class Controller(Companion):
         self._requests = requests
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Keep the grasp of a verdict; tell the outcome of the grasp before it."""
+        """Keep the grasp of a verdict; report the outcome of the grasp before it."""
         verdict, reading = published.verdict, published.reading
         if self._lift is not None and self._lift.report.grasp.grasp != verdict.grasp:
             self.tell()
@@ -60,12 +60,12 @@ class Controller(Companion):
         )
 
     def after_round(self) -> None:
-        """Tell the outcome if each reading is a grasp, whose lift is then over."""
+        """Report the outcome if each reading is a grasp, whose lift is over at once."""
         if self._lift is not None and self._lift.over:
             self.tell()
 
     def tell(self) -> None:
-        """Tell the outcome of the current lift, if there is one."""
+        """Report the outcome of the current lift, if it has one."""
         lift, self._lift = self._lift, None
         if lift is None or self._requests is None or (self._only_lifted and not lift.allowed):
             return
@@ -73,17 +73,17 @@ class Controller(Companion):
 
 
 def _sent(object_name: str | None) -> str | None:
-    """Return the name if outcomes allow it, else None; tables may have any text."""
+    """Return the name if an outcome message may contain it, else None. Tables may have any text."""
     return object_name if re.fullmatch(OBJECT_PATTERN, object_name or "") else None
 
 
 def trained_on(
     layouts: Mapping[Path, Layout], models: Sequence[TactileModel]
 ) -> list[dict[str, str]]:
-    """Return for each model those recordings that have grasps which it was trained on.
+    """Return for each model the recordings with grasps on which it was trained.
 
-    `layouts`: of the recordings, as of a `Plan`. The name of each recording comes with what is
-    known of it, as text. A table is known under any name. All models judge the same fingers.
+    Each result maps names of recordings to a text on the grasps that are known. A table is found
+    by its content, not by its name. `layouts`: see `Plan`. All models judge the same fingers.
     Raises `RecordingError` and `ModelError`.
     """
     known = [known_grasps.of_model(model) for model in models]

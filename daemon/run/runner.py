@@ -40,7 +40,7 @@ def prepare(path: Path) -> Parts:
 
         try:
             rehearse(parts.plan)
-        except ModelError as error:  # the file has changed; the model in memory is good
+        except ModelError as error:  # only the file has changed: the model in memory is good
             log.warning("no rehearsal: %s", error)
     return parts
 
@@ -55,16 +55,16 @@ def enter_realtime(running: scene.Scene, stack: ExitStack) -> RealtimeMode | Non
 
 
 def _controller(wanted: scene.Scene) -> Controller | None:
-    """Return what tells recorded outcomes, if the scene wants it."""
+    """Return the controller that reports recorded outcomes; None if the scene has none."""
     if not isinstance(wanted.tactile, ReplayTactile) or not wanted.tactile.outcomes:
         return None
-    from graspd.daemon.run.replaying import Controller  # only where a scene wants it
+    from graspd.daemon.run.replaying import Controller  # imported only if it is used
 
     return Controller(only_lifted=True)
 
 
 class RunLog(Companion):
-    """Log one line at the end of a run: how long it was, what was judged, why it ended."""
+    """Logs one line at the end of a run: its duration, its judgements, and why it ended."""
 
     def __init__(self) -> None:
         self._start_s = time.monotonic()
@@ -92,7 +92,7 @@ class RunLog(Companion):
 
 
 def run_scene(path: Path, stop: StopSignal, *, manager: Systemd | None = None) -> Ended:
-    """Run a scene file until something ends the loop; return what.
+    """Run a scene file until something ends the loop; return the cause.
 
     `manager`: the service manager, if it started this process. Raises `SceneError`, `ModelError`,
     `RecordingError`, `PublishError` or `DriverError`.
@@ -147,7 +147,7 @@ class Runner:
             self._manager.ready(f"ready: {running.tactile.driver}, {parts.model.contract.name}")
 
     def run(self) -> Ended:
-        """Run the loop until something ends it; return what, and log it."""
+        """Run the loop until something ends it; log and return the cause."""
         if self._loop is None:
             raise RuntimeError("the parts are not open")
         cause = "an error"

@@ -22,7 +22,7 @@ NAME_MAX = 80
 """Most printed characters of an object's name."""
 COLOURS = {Decision.STABLE: Colour.GREEN, Decision.SLIP: Colour.RED}
 WINDOW: Final = 50
-"""Number of `stable` lifts in a row among which the most slips are counted."""
+"""Number of `stable` lifts in a row for the figure `worst`."""
 WAITING_MAX: Final = 1024
 """Most grasps that wait for their outcome."""
 WORTH: Final = {
@@ -159,7 +159,7 @@ class RunSummary:
         """Number of verdicts with at least one repaired electrode."""
         self.latency = LatencyHistogram()
         self.readings = 0
-        """Number of verdicts with a gate; 0 without one."""
+        """Number of verdicts in a run with a gate; 0 without one."""
         self.grasps = 0
         self.again = 0
         """Number of further judgements of the same grasp."""
@@ -169,7 +169,7 @@ class RunSummary:
     def add(self, verdict: Verdict, slipped: bool | None, grasp: GraspId | None = None) -> None:
         """Count one verdict. `slipped`: its recorded outcome; None: not recorded.
 
-        `grasp`: its grasp, if that is of another start than the verdict, as in a replay.
+        `grasp`: id of its grasp, if that is from another start than the verdict, as in a replay.
         """
         grasp = grasp or GraspId(verdict.boot_id, verdict.grasp)
         self.latency.add(verdict.latency_us)
@@ -280,10 +280,10 @@ class Printer(Companion):
             return
         line = published.payload.decode() if self._as_json else _line(verdict, annotation)
         sys.stdout.write(line + "\n")
-        sys.stdout.flush()  # also into a pipe: readings may come in real time
+        sys.stdout.flush()  # also into a pipe, because readings may come in real time
 
     def _is_news(self, verdict: Verdict) -> bool:
-        """Return True if the verdict is new; without a gate each is of a new grasp."""
+        """Return True if the verdict differs from the last; without a gate it is always new."""
         if verdict.gate is None or verdict.judged or verdict.gate is not self._gate:
             self._gate = verdict.gate
             return True

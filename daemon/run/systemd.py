@@ -15,7 +15,7 @@ from graspd.daemon.publish.messages import Status
 log = logging.getLogger("graspd")
 
 FEEDINGS_PER_TIMEOUT = 4
-"""Number of feedings within the watchdog's timeout; systemd recommends two."""
+"""Number of keep-alive messages in a watchdog timeout; systemd recommends two."""
 NS_PER_US = 1000
 
 
@@ -36,7 +36,7 @@ class Systemd(Companion):
         self._due_ns = clock()
         self._warned = False
         self._late = 0
-        """Late readings until the last status."""
+        """Count of late readings in the last status."""
         kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
         self._socket = socket.socket(socket.AF_UNIX, kind)
 
@@ -63,11 +63,11 @@ class Systemd(Companion):
         self._send(f"STATUS={in_a_line(status, late)}")
 
     def before_wait(self, requests: Requests) -> int | None:
-        """Return the time of the next feeding, monotonic ns; None without a watchdog."""
+        """Return the time of the next keep-alive message, monotonic ns; None without a watchdog."""
         return None if self._watchdog_us is None else self._due_ns
 
     def after_round(self) -> None:
-        """Feed the watchdog if it is due."""
+        """Send a keep-alive message to the watchdog if one is due."""
         if self._watchdog_us is not None and self._clock() >= self._due_ns:
             self._due_ns = self._clock() + self._period_ns
             self._send("WATCHDOG=1")

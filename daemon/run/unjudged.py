@@ -1,4 +1,4 @@
-"""Why recorded readings were not judged, in words."""
+"""Explain to a person why recorded readings were not judged."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from graspd.daemon.publish.companion import Companion, PublishedVerdict
 from graspd.drivers.base import ANGLE_MAX_RAD, DriverCounters, JointReading, Reading
 
 STEPS: Final = 20
-"""Steps between readings whose median says how far apart they are."""
+"""Number of steps between readings whose median is the usual step."""
 STEP_MAX_S: Final = GAP_NS / 2e9
-"""Longest usual step, s: with a longer one each lost reading is a gap, after which a grasp must
+"""Longest usual step, s. With a longer one each lost reading is a gap, after which a grasp must
 settle again."""
 STEP_MIN_S: Final = 1e-4
 """Shortest step of a sensor, s: a sweep of 24 electrodes takes a hundred times as long."""
 UNITS: Final = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
-"""Units of a time that is read as seconds, by their number in a second."""
+"""Names of units in which times may be by mistake, by the number of units in a second."""
 CAUSES_MAX: Final = 3
 """Most reasons to write."""
 
@@ -33,7 +33,7 @@ CAUSES_MAX: Final = 3
 class Unjudged(Companion):
     """Follows a replay, and finds why grasps are not judged.
 
-    Times and angles of a wrong unit are said as soon as they are seen.
+    Times and angles in a wrong unit are reported as soon as they are seen.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
@@ -47,16 +47,16 @@ class Unjudged(Companion):
         self._fingers: tuple[Finger, ...] = ()
         self._was_tared = False
         self._now: Counter[Reason] = Counter()
-        """Reasons of the grasp at hand."""
+        """Count of each reason during the current grasp."""
         self._grasp = 0
         self._is_judged = False
         self._unreadable: Counter[Reason] = Counter()
-        """Reasons of readings that cannot be used."""
+        """Count of each reason of readings that cannot be used."""
         self.readings = 0
         self.judged = 0
         """Grasps that were judged."""
         self.not_judged: Counter[Reason] = Counter()
-        """Most frequent reason of each grasp that was not."""
+        """Number of unjudged grasps by their most frequent reason."""
 
     def on_reading(self, reading: Reading) -> None:
         """Look at the angles of joints."""
@@ -64,7 +64,7 @@ class Unjudged(Companion):
             self._look_at_angles(reading)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Take in a verdict, unless it is on silence."""
+        """Take in a verdict, unless it reports silence."""
         if published.reading is not None:
             self.add(published.judgement, published.reading.made_ns)
 
@@ -135,7 +135,7 @@ class Unjudged(Companion):
                 yield f"{number} {reason}: {ADVICE[reason]}"
 
     def _rest_in_words(self) -> str:
-        """Return for how long the hand must be open at the rate of the readings."""
+        """Return text on how long the hand must be open for a tare at the rate of the readings."""
         rest_s = WINDOW * median(self._steps_s) if self._steps_s else 1.0
         return (
             f"no {WINDOW} readings of an open hand come first ({rest_s:.2g} s at this rate): it is "
@@ -143,7 +143,7 @@ class Unjudged(Companion):
         )
 
     def _damage_in_words(self) -> str | None:
-        """Return why most readings cannot be used; None: most can."""
+        """Return text on why most readings cannot be used; None: most can."""
         for reason, number in self._unreadable.most_common(1):
             if 2 * number > self.readings:
                 return f"{number} of {self.readings} readings {reason}: {ADVICE[reason]}"
@@ -157,7 +157,7 @@ class Unjudged(Companion):
         self._last_ns = made_ns
 
     def _step_in_words(self) -> str | None:
-        """Return what is wrong with the times of the readings; None: nothing."""
+        """Return text on what is wrong with the times of the readings; None: nothing."""
         if not self._steps_s or not self._fingers:
             return None
         step_s = median(self._steps_s)

@@ -35,7 +35,7 @@ class KeptSession(
     """A session, and what outcomes taught in it."""
 
     statistics: SessionState | None
-    """Statistics of a session model; None if no model needed any."""
+    """Statistics of a session model; None: the model needs none."""
     fingers: tuple[str, ...]
     """Fingers in the order of the statistics."""
     serials: dict[str, str]
@@ -49,7 +49,7 @@ class KeptSession(
 
     @property
     def model(self) -> str:
-        """Digest of the model that `trust` is of; empty: not known."""
+        """SHA-256 of the model to which `trust` belongs; empty: not known."""
         return "" if self.trust is None else self.trust.model
 
     @property
@@ -59,9 +59,9 @@ class KeptSession(
 
     @property
     def is_empty(self) -> bool:
-        """True if it has neither a grasp nor an outcome of its sensors."""
+        """True if the session has neither a grasp nor an outcome with its sensors."""
         trust = self.trust
-        # Without learning only the warm-up counts; the slips are of the sensors before, too.
+        # Without learning only the warm-up counts: `slips` includes those with earlier sensors.
         taught = trust is not None and (trust.learner.outcomes or trust.risk.proven)
         return not (self.grasps or taught)
 
@@ -109,7 +109,7 @@ def restore_kept(kept: KeptSession, fingers: Sequence[str], session: SessionCali
 
 
 def of_fingers(kept: KeptSession, fingers: Sequence[str]) -> None:
-    """Raise `SessionFileError` if the session is of other fingers."""
+    """Raise `SessionFileError` if the session is for other fingers or another order."""
     if kept.fingers != tuple(fingers):
         raise SessionFileError(
             f"the kept session is of the fingers {', '.join(kept.fingers)}, "

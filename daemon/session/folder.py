@@ -14,21 +14,19 @@ from graspd.daemon.process.files import require_linux, sync_folder
 from graspd.daemon.session.file import KeptSession, SessionFileError, load, write
 
 KEPT_MAX: Final = 5
-"""Most sessions that are kept, beside an empty one that runs.
-
-An empty one goes first, then the one that was used longest ago.
-"""
+"""Most sessions that are kept, not counting a running one that is still empty. Empty sessions are
+deleted first, then the one that was used longest ago."""
 DAMAGED_MAX: Final = 16
-"""Most files that cannot be read and stay; the oldest goes."""
+"""Most unreadable files that are kept; the oldest is deleted."""
 LOCK: Final = "lock"
 """Name of the file that is locked."""
 ENDING: Final = ".session"
-"""End of the names of the others; before it is a number."""
+"""Ending of a session file's name, which is a number and this."""
 NUMBER: Final = re.compile(r"[1-9][0-9]{0,8}")
-"""The numbers; files with other names are not of graspd."""
+"""Pattern of that number; files with other names do not belong to graspd."""
 
 Found = dict[int, KeptSession | SessionFileError]
-"""Content of each file, or why it cannot be read, by its number, the last used first."""
+"""Content of each file, or the error in reading it, by file number, the last used first."""
 
 
 class SessionFolder:
@@ -38,7 +36,7 @@ class SessionFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Nothing is locked yet: see `lock`."""
+        """`path`: the folder. Nothing is locked or read yet: see `lock` and `load`."""
         self.path = path
         self._kept: dict[int, KeptSession] = {}
         """Sessions that were loaded or saved, by the number of their file."""
@@ -76,7 +74,7 @@ class SessionFolder:
                 f"{self.path}: in use by another graspd, stop that one first"
             ) from error
         for part in self.path.glob(f"*{ENDING}.{'[0-9a-f]' * 8}"):
-            with suppress(OSError):  # left by a daemon that was killed while it wrote
+            with suppress(OSError):  # delete the file of a daemon that was killed while it wrote
                 part.unlink()
 
     def close(self) -> None:
@@ -93,7 +91,7 @@ class SessionFolder:
         self.close()
 
     def load(self) -> Found:
-        """Return what `look` finds. Raises `SessionFileError`."""
+        """Return the result of `look`; `save` may replace its files. Raises `SessionFileError`."""
         found = look(self.path)
         self._kept = {n: kept for n, kept in found.items() if isinstance(kept, KeptSession)}
         self._damaged = [number for number in found if number not in self._kept]
@@ -101,7 +99,7 @@ class SessionFolder:
         return found
 
     def save(self, sessions: Sequence[KeptSession]) -> None:
-        """Keep these sessions, first the one that runs, in place of those that were loaded.
+        """Save these sessions, first the one that runs, in place of those that were loaded.
 
         Raises `SessionFileError`, after which the sessions on the disk are whole.
         """
@@ -117,7 +115,7 @@ class SessionFolder:
                 if number is None:
                     number = self._free()
                     self._write(number, each)
-                    self._running = None  # its file must have a higher number
+                    self._running = None  # the running session's file needs a higher number
                 elif number == self._running:
                     self._running = None
                 stay.add(number)
@@ -133,7 +131,7 @@ class SessionFolder:
             raise _not_kept(self.path, error) from error
 
     def replace(self, number: int, kept: KeptSession) -> None:
-        """Replace a single file, which stays as old as it is. Raises `SessionFileError`."""
+        """Replace the file `number`; its place in the order stays. Raises `SessionFileError`."""
         self.lock()
         try:
             self._write(number, kept)
@@ -141,7 +139,7 @@ class SessionFolder:
             raise _not_kept(self.path, error) from error
 
     def remove(self) -> bool:
-        """Delete all that was kept; return False if that is nothing. Raises `SessionFileError`."""
+        """Delete all kept sessions; return False if there were none. Raises `SessionFileError`."""
         numbers = _numbers(self.path)
         try:
             for number in numbers:
@@ -151,7 +149,7 @@ class SessionFolder:
         return bool(numbers)
 
     def _lock_late(self) -> None:
-        """Lock what was loaded without. Raises `SessionFileError` if that has changed since."""
+        """Lock the loaded folder. Raises `SessionFileError` if its files have changed since."""
         loaded = self._kept, self._damaged
         self.lock()
         try:
@@ -172,7 +170,7 @@ class SessionFolder:
 
 
 def look(folder: Path) -> Found:
-    """Return what each file in a folder holds. Raises `SessionFileError`."""
+    """Return the content of each session file in a folder. Raises `SessionFileError`."""
     found: Found = {}
     for number in _numbers(folder):
         try:

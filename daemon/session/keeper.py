@@ -49,11 +49,11 @@ UNEXPECTED: Final = "it could not be written"
 SEEDED: Final = "the seeded session names no sensors: it is used once %d grasps fit it"
 
 Sessions = tuple[KeptSession, ...]
-"""All that is saved: the session that runs, then the others."""
+"""All sessions to save: the one that runs, then the others."""
 
 
 class SessionKeeper(SensorWatch):
-    """Restore, save and drop one session. A failure of the disk is only a warning."""
+    """Restores and saves the sessions of a run. A failure of the disk is only a warning."""
 
     def __init__(
         self,
@@ -64,9 +64,8 @@ class SessionKeeper(SensorWatch):
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Restore the last session of these fingers, and what this model learned with its sensors.
-
-        State that `pipeline` does not use stays kept. A folder that is in use is tried again.
-        """
+        State that `pipeline` does not use stays kept. A folder in use is locked later, when
+        free."""
         self._session = pipeline.session
         self._trust = pipeline.trust
         super().__init__(pipeline, tactile)
@@ -74,11 +73,11 @@ class SessionKeeper(SensorWatch):
         self._folder = folder
         self._clock = clock
         self._unused: TrustState | None = None
-        """State of learning that was kept, where this run does not learn."""
+        """Kept state of learning, to be saved again unchanged, in a run that does not learn."""
         self._others: tuple[KeptSession, ...] = ()
         """Sessions of other fingers, models or sensors, the last used first."""
         self._warned = ""
-        """Why the last save failed, as it was logged; empty: it did not."""
+        """Logged reason why the last save failed; empty: it succeeded."""
         try:
             folder.lock()
         except SessionFileError as error:
@@ -89,7 +88,7 @@ class SessionKeeper(SensorWatch):
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._waiting: deque[Answer] = deque()
         self._in_writing = 0
-        """Number of the first answers, which wait for the current save."""
+        """Number of answers, the first in the queue, that the current save makes due."""
         self._worker: Worker[Sessions] = Worker("session")
         self.filenos = self._worker.filenos
 
@@ -100,7 +99,7 @@ class SessionKeeper(SensorWatch):
             self._start_save()
 
     def keep(self, answer: Answer) -> None:
-        """Call `answer` after the present state is saved, or cannot be."""
+        """Call `answer` once the present state is saved, or saving it has failed."""
         if len(self._waiting) == WAITING_MAX:
             self._waiting.popleft()(BUSY)
             self._in_writing = max(self._in_writing - 1, 0)
@@ -108,7 +107,7 @@ class SessionKeeper(SensorWatch):
         self._start_save()
 
     def save(self) -> None:
-        """Save for the last time and give all answers, within `2 * WAIT_S`."""
+        """Save for the last time and give all answers, in at most `2 * WAIT_S`."""
         self.wait(WAIT_S)
         self._start_save()
         self.wait(WAIT_S)
@@ -151,7 +150,7 @@ class SessionKeeper(SensorWatch):
         return state
 
     def _answer(self, count: int, reply: Reply) -> None:
-        """Give the first `count` answers."""
+        """Call the first `count` waiting answers with `reply`."""
         self._in_writing = 0
         for _ in range(count):
             self._waiting.popleft()(reply)
@@ -179,7 +178,7 @@ class SessionKeeper(SensorWatch):
         self._others = tuple(each for each in kept if each not in (continued, learned))
         if used is None:
             if any(is_of_unknown_sensors(each) for each in self._others):
-                self._sensors_exchanged()  # nothing is judged before they are known
+                self._sensors_exchanged()  # nothing is judged before the sensors are known
             return
         self._serials, self._rest = numbers(used.serials), self._rest_of(used.rest)
         grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
@@ -188,7 +187,7 @@ class SessionKeeper(SensorWatch):
             self._unused = learned.trust
         elif learned is not None and self._trust is not None:
             log.info("%d outcomes restored", self._trust.learner.outcomes)
-        if isinstance(found[0], SessionFileError):  # it may have been of other sensors
+        if isinstance(found[0], SessionFileError):  # the unreadable session may be of other sensors
             self._begin(None)
 
     def _with_serials(self, serials: Mapping[str, str]) -> KeptSession | None:
@@ -208,7 +207,11 @@ class SessionKeeper(SensorWatch):
         return self._former(is_there)
 
     def _former(self, is_there: Callable[[KeptSession], bool]) -> KeptSession | None:
-        """Return the last session of present sensors, with what this model learned with them."""
+        """Return the last used kept session of the sensors that are present now; None: no such one.
+
+        `is_there`: True for a session of these sensors. The session comes with this model's
+        learning with them, even if that was kept in another session.
+        """
         needs_none = self._session is None
         usable = (
             each
@@ -226,7 +229,7 @@ class SessionKeeper(SensorWatch):
         return replace(used, trust=next(learned, None))
 
     def _fits(self, seeded: KeptSession) -> bool:
-        """Return True if the grasps of this session, still a young one, fit a seeded one."""
+        """Return True if the grasps of the running, uncalibrated session fit a seeded one."""
         session, known = self._session, seeded.statistics
         if session is None or session.calibrated or session.grasps < FIT_GRASPS:
             return False
@@ -239,9 +242,10 @@ class SessionKeeper(SensorWatch):
         return np.array(kept).reshape(shape)
 
     def _begin(self, former: KeptSession | None, *, tared: bool = False) -> None:
-        """Keep the session for later; continue that of the new sensors, if there is one.
+        """Keep the running session for later; continue `former`, the session of the new sensors.
 
-        With `tared` these rest as they did: then they have their warm-up back too.
+        None: begin an empty one. `tared`: the new sensors rest as in `former`, so their warm-up
+        counts again.
         """
         leaving = self._now()
         if not leaving.is_empty:
@@ -252,7 +256,7 @@ class SessionKeeper(SensorWatch):
         self._save_due_ns = self._clock()
 
     def _take_up(self, former: KeptSession, *, tared: bool) -> bool:
-        """Continue a session of the new sensors; return False if it cannot be used."""
+        """Continue the kept session of the new sensors; return False if it cannot be used."""
         trust = former.trust
         learned = None if trust is None else trust.learner
         proves = tared and not is_of_unknown_sensors(former)
@@ -271,7 +275,7 @@ class SessionKeeper(SensorWatch):
         return True
 
     def _budget_of(self, former: TrustState) -> float | None:
-        """Return the budget that was kept, if it is of the risk that is set now."""
+        """Return the kept budget of slips; None if it was kept under another configured risk."""
         if self._trust is None:
             return None
         is_same = former.risk.max_slip_when_stable == self._trust.risk.limits.max_slip_when_stable
@@ -279,20 +283,23 @@ class SessionKeeper(SensorWatch):
 
 
 class Continued(NamedTuple):
-    """Kept sessions that a start continues; None: it has none."""
+    """Kept sessions that a start of the daemon continues."""
 
     used: KeptSession | None
-    """The session of these fingers."""
+    """Session of these fingers; None: not kept."""
     learned: KeptSession | None
-    """The one with the learning of this model with the same sensors."""
+    """Session that holds this model's learning with the same sensors; None: not kept."""
     problems: list[str]
-    """Why others are not continued."""
+    """Why other sessions are not continued."""
 
 
 def continue_kept(
     pipeline: Pipeline, fingers: Sequence[str], kept: Sequence[KeptSession]
 ) -> Continued:
-    """Restore the session that a start continues, of those that are kept, the last used first."""
+    """Restore calibration and learning at a start of the daemon; return from which sessions.
+
+    `kept`: all kept sessions, the last used first. The first that fits is restored.
+    """
     problems: list[str] = []
     used = next((each for each in kept if _continues(pipeline, fingers, each, problems)), None)
     learned = None if used is None else _restore_trust(pipeline.trust, used, kept, problems)
@@ -302,7 +309,8 @@ def continue_kept(
 def _continues(
     pipeline: Pipeline, fingers: Sequence[str], kept: KeptSession, problems: list[str]
 ) -> bool:
-    """Continue a session; return False if it is of other fingers or may be of other sensors."""
+    """Restore a session; return False if it is of other fingers or may be of other sensors. The
+    reason is added to `problems`."""
     try:
         of_fingers(kept, fingers)
         if pipeline.session is None:
@@ -320,7 +328,8 @@ def _continues(
 def _restore_trust(
     trust: Trust | None, used: KeptSession, kept: Sequence[KeptSession], problems: list[str]
 ) -> KeptSession | None:
-    """Restore what this model learned last with the sensors of `used`; return where it was."""
+    """Restore this model's last learning with the sensors of `used`; return its session. None: it
+    has none, or it cannot be restored, which is added to `problems`."""
     why: list[str] = []
     for each, learned in _taught_with(used, kept):
         try:
@@ -338,14 +347,15 @@ def _restore_trust(
 def _taught_with(
     used: KeptSession, kept: Sequence[KeptSession]
 ) -> Iterator[tuple[KeptSession, TrustState]]:
-    """Yield the sessions with the sensors of `used` that hold learning, it first, and that."""
+    """Yield each session with the sensors of `used` that holds learning, and the learning. `used`
+    itself comes first."""
     for each in (used, *kept):
         if each.trust is not None and is_of_sensors(each, used):
             yield each, each.trust
 
 
 def is_of_unknown_sensors(kept: KeptSession) -> bool:
-    """Return True if a session is seeded from grasps that say nothing of the sensors."""
+    """Return True if a session was seeded from grasps without rest or serials of the sensors."""
     return kept.statistics is not None and kept.rest is None and not numbers(kept.serials)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from statistics import median  # numpy's loads modules at its first call: the loop stops for 40 ms
+from statistics import median  # numpy's loads modules for 40 ms at first
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from graspd.models.session_statistics import SessionState
 
 Rest = NDArray[np.float64]
-"""Resting counts, shape (fingers, 24); 0: not known. They differ between sensors."""
+"""Resting counts, shape (fingers, 24), which differ between sensors; 0: not known."""
 
 UNTOLD: Final = (
     "%d fingers rest in another pattern than before: treated as other sensors, not calibrated; "
@@ -29,26 +29,26 @@ UNTOLD: Final = (
 MOVED_COUNTS: Final = 50.0
 """Smallest change of a finger's pattern, counts, that means another sensor, not drift.
 
-It is the median over the electrodes, after subtracting the change that all share. By the upper
-tail of the published grasps it is 4 to 23 between the halves of a day, 80 to 154 for the first
-finger between two days, and 26 to 122 between the sensors of one hand. An untouched sensor
-changes by 1 in ten seconds.
+The change is the median over the electrodes, after subtracting the change that all share. With
+rest read from the upper tail of the published grasps' counts it is 4 to 23 between the halves of
+a day, 80 to 154 for the first finger between two days, and 26 to 122 between the sensors of one
+hand. An untouched sensor changes by 1 in ten seconds.
 """
 FIT_GRASPS: Final = 10
-"""Grasps by which a seeded session is compared with sensors that it does not know."""
+"""Fewest grasps by which unknown sensors are compared with a seeded session."""
 FIT_SPREADS: Final = 1.0
-"""Largest distance of their mean from the session's, in the session's spreads, if it fits.
+"""Largest distance at which these grasps' mean fits a seeded session, in the session's spreads.
 
 The distance is the root mean square over the electrodes of a finger, of the finger that is farthest
-off. Over ten grasps of a published day it is 0.2 to 0.8 (1 to 99 %) from that day's session, and
-from 1.6 on from that of another day.
+off. For ten grasps of a published day it is 0.2 to 0.8 (1 to 99 %) to that day's session, and
+at least 1.6 to another day's.
 """
 KNOWN_MIN: Final = 12
-"""Fewest electrodes of a finger with known rest both times."""
+"""Fewest electrodes of a finger, known in both rests, by which the rests are compared."""
 FOLLOWED_COUNTS: Final = 5.0
 """Smallest change of an electrode, counts, that is saved; each save writes to the disk."""
 LOOK_EVERY: Final = 5
-"""Number of readings between two looks at the rest; a grasp settles more slowly."""
+"""Number of readings between two checks of the rest; a grasp takes longer to settle."""
 
 log = logging.getLogger("graspd")
 
@@ -63,12 +63,12 @@ class SensorWatch(Companion):
         self._serials: dict[str, str] = {}
         """Last known serial numbers, by finger."""
         self._rest: Rest | None = None
-        """Resting counts of these sensors when last kept; None: not known yet."""
+        """Resting counts of the present sensors when last saved; None: not known yet."""
         self._is_first_tare = True
         """True after a start, an outage or an exchange, until the next tare."""
         self._readings = 0
         self._looked_at = b""
-        """Last compared rest, as bytes; it changes at most four times a second."""
+        """Bytes of the last compared resting counts, which change at most four times a second."""
 
     def on_reading(self, reading: Reading) -> None:
         serials = self._tactile.serials
@@ -99,7 +99,7 @@ class SensorWatch(Companion):
         if before is not None and has_drifted(before, rest):
             moved = moved_fingers(before, rest)
         former = self._with_rest(rest, is_known=before is not None and not moved)
-        # A later tare of a single finger may be of one that touches.
+        # A later tare of a single finger may come from one that touches.
         if former is not None or (moved and self._is_first_tare):
             if moved:
                 log.warning(UNTOLD, len(moved))
@@ -110,18 +110,17 @@ class SensorWatch(Companion):
         self._is_first_tare = False
 
     def _with_serials(self, _serials: Mapping[str, str]) -> KeptSession | None:
-        """Return the session of the sensors with these serial numbers; None: not known."""
+        """Return the kept session of the sensors with these serial numbers; None: not known."""
         return None
 
     def _with_rest(self, _rest: Rest, *, is_known: bool) -> KeptSession | None:
-        """Return the session of sensors that rest like this; None: not known.
-
-        `is_known`: True if these are the sensors of the session that runs.
-        """
+        """Return the kept session of sensors with these resting counts; None: not known.
+        `is_known`: True if these are the sensors of the running session."""
         return None
 
     def _begin(self, _former: KeptSession | None, *, tared: bool = False) -> None:
-        """Continue a former session, whose sensors may be `tared`, or begin a new one."""
+        """Continue a former session, or begin an empty one (None). `tared`: the sensors rest as in
+        the former session."""
         self._sensors_exchanged()
         self._rest = None
 
@@ -132,12 +131,12 @@ def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def numbers(serials: Mapping[str, str]) -> dict[str, str]:
-    """Return the serial numbers among these, without what only names the sender of a link."""
+    """Return the real serial numbers, by finger; others only name the sender of a link."""
     return {finger: serial for finger, serial in serials.items() if "://" not in serial}
 
 
 def moved_fingers(before: Rest, now: Rest) -> list[int]:
-    """Return the fingers whose resting pattern changed more than drift explains."""
+    """Return the rows of fingers whose resting pattern changed more than drift explains."""
     moved = []
     for finger, (old, new) in enumerate(zip(before, now, strict=True)):
         both_known = (old > 0.0) & (new > 0.0)

@@ -1,1 +1,1 @@
-"""How far a verdict can be trusted: it learns from outcomes, and keeps a risk that is set."""
+"""Learning from outcomes of lifts, and the risk: the allowed share of slips when `stable`."""

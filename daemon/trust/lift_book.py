@@ -1,4 +1,4 @@
-"""The one book of lifts: what was said of each grasp, who lifts it, and how the lift ended."""
+"""The book of lifts: the verdict on each grasp, the peer that lifts it, and the outcome."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from msgspec.structs import replace
 from graspd.models.trust.learner import INPUT_MAX, vector
 
 LIFTS_MAX: Final = 256
-"""Grasps in the book: those of an hour and more. Outcomes of older ones are refused."""
+"""Most grasps in the book, those of an hour or more. Outcomes of older grasps are refused."""
 NAME_BYTES: Final = 16
 """Bytes at the start of a routing id that stay the same when a client reconnects."""
 NOT_ASSESSED: Final = b""
-"""Stands for the features of a grasp that nothing can be learned from: the model refused it, or
-the scene has no learner and no risk."""
+"""Value of `features` of a grasp from which nothing can be learned: the model refused it, or the
+scene has no learner and no risk."""
 
 
 class GraspId(NamedTuple):
-    """Names a grasp for ever."""
+    """Id of a grasp that is unique over all starts of the daemon."""
 
     boot_id: str
     """Id of the daemon's start that judged the grasp."""
     grasp: Annotated[int, msgspec.Meta(ge=0)]
-    """Its number since that start."""
+    """Number of the grasp since that start."""
 
 
 class Peer(NamedTuple):
-    """Connection of a program that asks and tells."""
+    """Connection of a program that asks for verdicts and reports outcomes."""
 
     routing_id: bytes
     credential: bytes
-    """User or key, which a peer cannot choose; where there is neither, its name."""
+    """User or key of the peer, which it cannot choose; its `name` if it has neither."""
 
     @property
     def name(self) -> tuple[bytes, bytes]:
-        """The part that stays the same when it reconnects."""
+        """Credential and the part of the routing id that stay the same when the peer reconnects."""
         return self.routing_id[:NAME_BYTES], self.credential
 
 
 class Report(NamedTuple):
-    """How a lift ended, as a peer tells it."""
+    """Outcome of a lift, as a peer reports it."""
 
     grasp: GraspId
     outcome: str
@@ -52,17 +52,17 @@ class Report(NamedTuple):
     object_name: str | None = None
     """Name of the lifted object; None: not told."""
     peer: Peer | None = None
-    """None: the daemon itself, when it replays a recording."""
+    """Peer that reports; None: the daemon itself, when it replays a recording."""
 
 
 class OutcomeStatus(StrEnum):
-    """Result of telling an outcome."""
+    """Result of reporting an outcome."""
 
     TAKEN = "taken"
     REPEATED = "repeated"
-    """Known already, and the same: ignored."""
+    """The same outcome is known already; the report is ignored."""
     CONTRADICTS = "contradicts"
-    """Known already, and the opposite: refused, the first one counts."""
+    """The opposite outcome is known already and stays; the report is refused."""
     UNKNOWN = "unknown"
     """The grasp was not judged or is too old; the outcome is refused."""
 
@@ -72,7 +72,7 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     id: GraspId
     stable: bool
-    """Whether it was called `stable`."""
+    """True if the grasp was called `stable`."""
     features: bytes | None
     """Features of the grasp, float64; `NOT_ASSESSED`: it had none.
 
@@ -80,11 +80,11 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     exchanged since.
     """
     slipped: bool | None = None
-    """None until the outcome is told."""
+    """Outcome: True for a slip. None: not known yet."""
     announced: bool = False
     """True once a `lift` question was answered `stable`."""
     owner: Peer | None = None
-    """Peer that was answered first that it may lift the grasp."""
+    """First peer that was answered that it may lift the grasp; None: no peer yet."""
 
     @property
     def is_outstanding(self) -> bool:
@@ -110,8 +110,8 @@ class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class LiftBook:
     """The last `LIFTS_MAX` judged grasps, and who may report how their lifts ended.
 
-    A peer owns a grasp once it was answered that it may lift it, and reports the outcome. Once it
-    has ended, another peer of its credential that may lift reports for it.
+    A peer that was answered that it may lift a grasp owns it and reports its outcome. Once that
+    peer has ended, another peer with the same credential that may lift reports for it.
     """
 
     def __init__(self) -> None:
@@ -119,13 +119,13 @@ class LiftBook:
         self._lifts: dict[GraspId, Lift] = {}
         """Oldest first."""
         self.lifter: Peer | None = None
-        """Peer that was answered last, since the start, that it may lift a grasp."""
+        """Last peer that was answered that it may lift a grasp; None: none since the start."""
         self.on_announced: Callable[[bool], None] = lambda _announced: None
         """Called with True after an announcement, with False after it was taken back."""
         self._unkept: set[GraspId] = set()
-        """Grasps whose outcome was taken and is not on the disk yet."""
+        """Grasps whose outcome was accepted and is not on the disk yet."""
         self.told: Counter[OutcomeStatus] = Counter()
-        """Number of outcomes, by what became of them."""
+        """Number of reported outcomes by their status."""
         self.unreported = 0
         """Number of grasps called `stable` that left the book before an outcome came."""
         self.outstanding = 0
@@ -154,7 +154,7 @@ class LiftBook:
 
         The first verdict counts, or the first that called the grasp `stable`: a controller lifts on
         that one. A grasp that was not assessed is entered again once it is. Nothing changes after
-        the outcome is known. Return True if an announced lift left the book untold.
+        the outcome is known. Return True if an announced lift left the book without an outcome.
         """
         lift = self._lifts.get(grasp)
         if lift is not None:
@@ -177,7 +177,8 @@ class LiftBook:
         return is_abandoned
 
     def claim(self, grasp: GraspId, peer: Peer) -> bool:
-        """Give a grasp to a peer that may lift it; False if it is another's, or its lift over."""
+        """Make a peer the owner of a grasp; return False if it has another owner or its lift is
+        over."""
         lift = self._lifts.get(grasp)
         if lift is None or lift.slipped is not None:
             return False
@@ -199,9 +200,10 @@ class LiftBook:
         self.on_announced(True)
 
     def take_back(self, grasp: GraspId | None) -> bool:
-        """Note that no lift of a grasp follows, and that none owns it; None: of the last announced.
+        """Note that no lift of a grasp follows, and remove its owner. None: the last announced
+        grasp.
 
-        False, and nothing changes, if the outcome is known, or the grasp is not.
+        Return False, and change nothing, if its outcome is known or the grasp is not in the book.
         """
         awaited = (lift.id for lift in reversed(self._lifts.values()) if lift.is_awaited)
         lift = self._lifts.get(grasp or next(awaited, GraspId("", 0)))
@@ -222,20 +224,21 @@ class LiftBook:
         return None
 
     def withdraw(self) -> None:
-        """Take back all announcements: another risk is set, which counts from the start."""
+        """Take back all announcements, because another risk is set, which counts from the start."""
         self._lifts = {grasp: replace(lift, announced=False) for grasp, lift in self._lifts.items()}
         self.announced = 0
         self._count()
 
     def owns(self, grasp: GraspId, peer: Peer) -> bool:
-        """True if this peer, by any of its connections, was the first that may lift the grasp."""
+        """Return True if this peer, on any of its connections, owns the grasp."""
         lift = self._lifts.get(grasp)
         return lift is not None and lift.owner is not None and lift.owner.name == peer.name
 
     def may_report(self, grasp: GraspId, peer: Peer | None) -> bool:
-        """True if this peer may tell the outcome: the owner of the grasp, or the daemon itself.
+        """Return True if this peer may report the outcome: the grasp's owner, or None (the daemon).
 
-        The last peer that may lift reports for other owners of its credential, and grasps of none.
+        The last peer that could lift may also report for other owners with its credential, and for
+        grasps without an owner.
         """
         lift = self._lifts.get(grasp)
         if peer is None or lift is None or self.owns(grasp, peer):
@@ -244,7 +247,7 @@ class LiftBook:
         return is_heir and self.lifter is not None and self.lifter.name == peer.name
 
     def tell(self, grasp: GraspId, *, slipped: bool) -> tuple[OutcomeStatus, Lift | None]:
-        """Enter an outcome; return what became of it, and the entry as it was before."""
+        """Enter an outcome; return its status, and the entry before it (None: no entry)."""
         lift = self._lifts.get(grasp)
         if lift is None:
             status = OutcomeStatus.UNKNOWN
@@ -262,7 +265,7 @@ class LiftBook:
         return status, lift
 
     def is_kept(self, grasp: GraspId) -> bool:
-        """True unless an outcome of the grasp was taken and is not on the disk yet."""
+        """Return False if an outcome of the grasp was accepted and is not on the disk yet."""
         return grasp not in self._unkept
 
     def keep(self, grasp: GraspId) -> None:
@@ -270,7 +273,7 @@ class LiftBook:
         self._unkept.discard(grasp)
 
     def exchanged(self) -> None:
-        """Note that a sensor was exchanged: outcomes still to come teach nothing any more."""
+        """Note that a sensor was exchanged: nothing is learned from outcomes still to come."""
         self._lifts = {grasp: replace(lift, features=None) for grasp, lift in self._lifts.items()}
 
     def state(self) -> LiftBookState:

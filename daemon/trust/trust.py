@@ -1,7 +1,5 @@
-"""The worth of a verdict: the model's opinion, corrected by outcomes, under the set risk.
-
-At each reading: `assess` the grasp; decide; `note` what was said. Tell each `outcome`.
-"""
+"""Assessment of grasps: the model's opinion, corrected by outcomes, under the configured risk. At
+each reading: `assess` the grasp, decide, and `note` the decision. Report each `outcome`."""
 
 from __future__ import annotations
 
@@ -26,14 +24,14 @@ from graspd.models.trust.learner import Learner, LearnerState, of_format_2
 from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskOutcomes, RiskState
 
 VERSION: Final = 3
-"""Format of a state. In format 2 a learner held what `at_told` returns, in 1 it had no residual."""
+"""Format of a state. In format 2 a learner held the result of `at_told`, in 1 no residual."""
 MAX_BYTES: Final = 1 << 20
 """Largest uncompressed state, bytes; three fingers with all outcomes still out take 620 kB."""
 DIGEST_BYTES: Final = 32
 
 
 class FormatError(ValueError):
-    """A state is of another format: another graspd kept it."""
+    """A state has another format: another version of graspd wrote it."""
 
 
 class _Versioned(msgspec.Struct, frozen=True):
@@ -41,7 +39,7 @@ class _Versioned(msgspec.Struct, frozen=True):
 
 
 class TrustState(_Versioned, frozen=True, forbid_unknown_fields=True):
-    """All that is learned; useless with another model or other fingers."""
+    """State of learner, risk and lift book. It fits only its model and fingers."""
 
     model: str
     learner: LearnerState
@@ -64,7 +62,7 @@ class Trust:
         self.learns = learns
         self.learner = Learner(inputs)
         self._judging = self.learner if learns else Learner(inputs)
-        """The learner by which grasps are judged; without learning, one that is never taught."""
+        """Learner that corrects judgements; without learning, one that never learns."""
         self.risk = Risk(limits or RiskLimits())
         self.lifts = LiftBook()
 
@@ -75,10 +73,10 @@ class Trust:
         inputs: NDArray[np.floating],
         former: Assessment | None,
     ) -> tuple[Assessment, RiskOutcomes]:
-        """Return what a grasp is worth, and the outcomes that are known until now.
+        """Return the assessment of a grasp, and the outcomes known until now.
 
-        `opinion`, `inputs`: the network's answer to this reading, and what it was given; without an
-        answer the `former` assessment is reviewed. Raises `ValueError` as `judge`.
+        `opinion`, `inputs`: the network's answer to this reading, and its input features. Without
+        an answer the `former` assessment is reviewed. Raises `ValueError` as `judge` does.
         """
         if opinion.p_slip is None:
             worth = self.review(grasp, former)
@@ -90,15 +88,19 @@ class Trust:
     def judge(
         self, grasp: GraspId, p_slip: float, margin: float, inputs: NDArray[np.floating]
     ) -> Assessment:
-        """Assess a grasp, as `assess` does; raises `ValueError` for what it cannot be."""
+        """Return the assessment of a grasp, by the function `assess` of graspd.models.trust.
+
+        `p_slip`, `margin`, `inputs`: answer and inputs of the network. Raises `ValueError` for
+        values that no network gives.
+        """
         awaited = self.lifts.awaited
         return assess(self._judging, self.risk, p_slip, margin, inputs, name=grasp, awaited=awaited)
 
     def review(self, grasp: GraspId, former: Assessment | None) -> Assessment:
-        """Return the assessment of a grasp that was judged before, None for none, as it is now.
+        """Return the `former` assessment of a grasp, updated by the outcomes reported since.
 
-        A grasp that was called `stable` stays allowed. Any other is allowed only if it was then and
-        is by the outcomes told since.
+        A grasp that was called `stable` stays allowed. Another one stays allowed only if these
+        outcomes still allow it. `former` None: not assessed yet.
         """
         if former is None:
             return Assessment(self._judging.outcomes)
@@ -115,7 +117,7 @@ class Trust:
             self.risk.take_untold()
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
-        """Take in how a lift ended; only an outcome that is `TAKEN` changes more than a counter."""
+        """Take in the outcome of a lift; only status `TAKEN` changes more than a counter."""
         status, lift = self.lifts.tell(grasp, slipped=slipped)
         if status is OutcomeStatus.TAKEN and lift is not None:
             self.risk.take(stable=lift.stable, slipped=slipped, proves=bool(lift.features))
@@ -133,7 +135,7 @@ class Trust:
     ) -> None:
         """Learn from the start, or from `learned`. Raises `ValueError` for another model's.
 
-        `proven`, `budget`: of the risk, as in `Exchanged`.
+        `proven`, `budget`: for the risk; see `Exchanged`.
         """
         self.learner.reset()
         if learned is not None:
@@ -151,7 +153,8 @@ class Trust:
         return state.model == self._model
 
     def restore(self, state: TrustState) -> None:
-        """Continue from an earlier state. Raises `ValueError`, and changes nothing, for another."""
+        """Continue from an earlier state. Raises `ValueError`, and changes nothing, if it does not
+        fit."""
         if not self.fits(state):
             raise ValueError("is of another model")
         learner, risk = Learner(self.learner.inputs), Risk(self.risk.limits)
@@ -166,13 +169,13 @@ class Trust:
 
 
 def encode(state: TrustState) -> bytes:
-    """Return a state as bytes, behind their SHA-256; takes some milliseconds."""
+    """Return the SHA-256 and the bytes of a state; takes some milliseconds."""
     data = zlib.compress(msgspec.msgpack.encode(state), 1)
     return hashlib.sha256(data).digest() + data
 
 
 def decode(data: bytes) -> TrustState:
-    """Reverse `encode`. Raises `ValueError` for what is damaged or no state, or `FormatError`."""
+    """Reverse `encode`. Raises `ValueError` for wrong data, `FormatError` for an old format."""
     digest, content = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
     if len(data) > MAX_BYTES or hashlib.sha256(content).digest() != digest:
         raise ValueError("is damaged, or nothing that was learned")
@@ -185,7 +188,7 @@ def decode(data: bytes) -> TrustState:
 
 
 def of_this_format(state: TrustState) -> TrustState:
-    """Return a state in the format of now. Raises `ValueError`, or `FormatError`."""
+    """Return a state in the current format. Raises `ValueError`, or `FormatError`."""
     _check(state.version)
     if state.version == VERSION:
         return state

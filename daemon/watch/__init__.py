@@ -1,1 +1,1 @@
-"""Seeing what the daemon says: a subscriber like any other, drawn in a terminal or in a page."""
+"""Viewers of the daemon's messages: ordinary subscribers that draw in a terminal or a page."""

@@ -16,13 +16,13 @@ from graspd.daemon.watch.snapshot import Link
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX: Final = 2000
-"""Most messages that wait in the socket: those of seven seconds."""
+"""Most messages that wait in the socket: seven seconds of them."""
 TAKEN_MAX: Final = 5000
 """Most messages taken in one call, more than can wait."""
 PAUSE_NS: Final = 1_000_000_000
 """Pause of the viewer, ns, after which it reconnects, because waiting messages are old."""
 RETRY_NS: Final = 5_000_000_000
-"""Time from a refusal to the next try, ns: the key may be known then."""
+"""Time from a refusal to the next try, ns. The daemon may know the key by then."""
 MESSAGE_MAX_BYTES: Final = 1 << 20
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Time between two heartbeats on TCP, and their timeout, as in the daemon, ms."""
@@ -36,7 +36,7 @@ EVENTS: Final = {
     int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): Link.NEEDS_KEY,
     int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): Link.NEEDS_KEY,
 }
-"""State of the connection after an event."""
+"""State of the connection after each event of the socket's monitor."""
 EVENTS_WITH_KEYS: Final = EVENTS | {
     int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): Link.TAKES_NO_KEYS,
     int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): Link.WRONG_DAEMON,
@@ -64,11 +64,11 @@ class Feed:
         self._clock = clock
         self._taken_ns = self._opened_ns = clock()
         self.empty_ns = self._opened_ns
-        """When no message waited last; those that `take` gives may be as old."""
+        """Last time at which no message waited, ns. Messages from `take` arrived after it."""
         self.looked_ns = self._opened_ns
-        """When the last message was looked for; it came before."""
+        """Time of the last look for a message, ns. Messages from `take` arrived before it."""
         self.stood_still = 0, 0
-        """When this process last stopped looking for longer than `PAUSE_NS`, and continued, ns."""
+        """Begin and end of this process's last pause of over `PAUSE_NS`, ns."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._events = EVENTS if keys is None else EVENTS_WITH_KEYS
         self._follow = 0
@@ -97,7 +97,7 @@ class Feed:
             self._socket.subscribe(topic)
 
     def take(self) -> Iterator[tuple[bytes, bytes]]:
-        """Yield topic and payload of each message that has come."""
+        """Yield topic and payload of each message that has arrived, at most `TAKEN_MAX`."""
         self._reconnect_if_needed()
         self._update_link()
         for _ in range(TAKEN_MAX):
@@ -132,7 +132,8 @@ class Feed:
             self._follow = FOLLOW if link.is_turned_away else 0
 
     def _obstacle(self) -> Link:
-        """Return why there is no connection, by the socket's file; over TCP that is not known."""
+        """Return why there is no connection, by the socket's file; over TCP the reason is not
+        known."""
         scheme, _, path = self._endpoint.partition("://")
         if scheme != "ipc":
             return Link.NOT_CONNECTED

@@ -1,4 +1,4 @@
-"""Verdicts, their evidence and the figures of a daemon, in words."""
+"""Texts for a person on verdicts, their evidence, and the figures of a daemon."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graspd.daemon.watch.snapshot import Line
 SURE_MS = LONG_NS / 1e6
 """Time without motion, ms, after which a slow slide is excluded."""
 LIKELY = 0.25
-"""Largest `p_slip` with which `stable` is shown as a promise."""
+"""Largest `p_slip` with which `stable` is shown without a doubt."""
 SHARE_MIN = 0.01
 """Smallest share that is shown as a number."""
 REFUSED = OutcomeStatus.CONTRADICTS, OutcomeStatus.UNKNOWN
@@ -23,7 +23,7 @@ SUPERVISED = Line(
 
 
 def doubt(verdict: Verdict) -> Line | None:
-    """Return in a word and a line why outcomes do not support this `stable`; None: they do."""
+    """Return why outcomes do not support this `stable`, as a word and a line; None: they do."""
     risk, p_slip = verdict.risk, verdict.p_slip
     if verdict.early:
         return Line("early", "it may still slide slowly, and is judged once more")
@@ -81,7 +81,7 @@ def percent(share: float) -> str:
 
 
 def likely(p_slip: float) -> str:
-    """Return a probability in percent; the first and the last percent are not told apart."""
+    """Return a probability in percent, with `< 1 %` and `> 99 %` at the ends."""
     if p_slip < SHARE_MIN:
         return "< 1 %"
     return "> 99 %" if p_slip > 1.0 - SHARE_MIN else f"{100 * p_slip:.0f} %"
@@ -93,7 +93,7 @@ def counted(count: int, what: str) -> str:
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Return how session and learning go, what matters most first; counts of 0 are left out."""
+    """Return lines on session and learning, the most important first; counts of 0 are left out."""
     if status is None:
         return []
     lines = []
@@ -126,7 +126,7 @@ def _count(what: str, count: int, noun: str, more: str = "") -> list[Line]:
 
 
 def timing(verdict: Verdict | None, status: Status | None, lost: int) -> list[Line]:
-    """Return rates, delays and losses; `lost`: messages that did not come here or were odd."""
+    """Return lines on rates, delays and losses; `lost`: missing or malformed messages here."""
     lines = [] if verdict is None else [Line("age", f"{verdict.age_ms:.1f} ms")]
     if status is not None:
         delays = status.latency_us

@@ -83,7 +83,7 @@ class Fingers:
 
 
 def _broken(places: Sequence[int], repaired: Sequence[bool]) -> str:
-    """Return places, from 0, as numbers from 1: "7 repaired; 8, 9 broken"."""
+    """Return electrodes, counted from 0, as text that counts from 1: "7 repaired; 8, 9 broken"."""
     kinds: dict[str, list[str]] = {"repaired": [], "broken": []}
     for place in places:
         kinds["repaired" if repaired[place] else "broken"].append(str(place + 1))
@@ -95,7 +95,7 @@ def _state(verdict: Verdict, finger: Finger) -> FingerState | None:
 
 
 def _motion(verdict: Verdict, finger: Finger) -> FingerMotion | None:
-    """Return the motion of a finger; None for one that is free, which has none."""
+    """Return the motion of a finger; None if the finger is free."""
     if verdict.motion is None or _state(verdict, finger) is FingerState.FREE:
         return None
     limit = (verdict.motion_limits or {}).get(finger, 0.0)
@@ -107,7 +107,7 @@ class GraspLog:
 
     def __init__(self) -> None:
         self._judged: dict[Key, tuple[Verdict, int]] = {}
-        """Last verdict of each grasp and when it came, ns; the newest last."""
+        """Last verdict of each grasp, and its time of arrival, ns; the newest last."""
         self._ended: dict[Key, str] = {}
 
     def take(self, verdict: Verdict, now_ns: int) -> None:
@@ -123,7 +123,7 @@ class GraspLog:
             self._ended.pop(oldest, None)
 
     def end(self, told: OutcomeMessage) -> None:
-        """Take in the outcome of a lift; one of a grasp that is not listed is ignored."""
+        """Take in the outcome of a lift; ignore it if the grasp is not in the log."""
         key = told.grasp_boot_id or told.boot_id, told.grasp
         if key in self._judged:
             self._ended[key] = told.outcome

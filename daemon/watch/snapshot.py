@@ -1,4 +1,4 @@
-"""Everything that is shown of one hand at one moment."""
+"""The content of a viewer for one hand at one moment."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Line(msgspec.Struct, frozen=True):
     what: str
     advice: str
     need: Need = Need.ACT
-    """Whether a person has to do something, if the line says what is not well."""
+    """Whether a person has to act, if the line reports a problem."""
 
 
 class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,7 +80,7 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     marked: list[int]
     """Pixels of electrodes that are broken or repaired."""
     broken: str
-    """Numbers of these electrodes, in words; empty: none."""
+    """Numbers of these electrodes, as text; empty: none."""
     motion: FingerMotion | None
     """Motion; None: the finger is free, or the daemon has no gate."""
     state: FingerState | None
@@ -119,7 +119,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Result of `figures.rests_on`; empty before the first message."""
     p_slip: float | None
     why: list[Line]
-    """Why the verdict is as it is; the first has one word to stand beside it."""
+    """Reasons of the verdict; the first line begins with one word to show beside it."""
     grasp: int | None
     gate: str | None
     contact: list[str] | None
@@ -134,7 +134,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     health: list[Line]
     """Parts that are not as they should be, first those to act on."""
     not_well: str
-    """Parts to act on in a few words, without what `why` says; empty: none, or not known."""
+    """Parts to act on in a few words, except those in `why`; empty: none, or not known."""
     state: str | None
     """`running`, `no readings` or `stopping`; None: not known."""
     model: str | None

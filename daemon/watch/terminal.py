@@ -46,7 +46,7 @@ OLD = "dim italic"
 HAND_COLUMNS = 80
 """Width of a hand that is shown beside another one, columns."""
 HALF_BAR = 10
-"""Width of a bar up to its mark, columns."""
+"""Width of a motion bar up to its mark, which is the limit, columns."""
 NAME_MAX = 40
 """Most characters shown of a received name."""
 NAMES_MAX = 1000
@@ -82,11 +82,11 @@ class Keyboard:
     """Typed keys: `q` ends, Tab shows the next hand, space what does not fit."""
 
     def __init__(self, stop: StopSignal) -> None:
-        """Wait for `stop` too."""
+        """`stop`: signal that also ends the wait."""
         self.tabs = 0
-        """How often Tab was typed."""
+        """Number of times that Tab was typed."""
         self.spaces = 0
-        """How often space was typed since then."""
+        """Number of times that space was typed since the last Tab."""
         self._stop = stop
         self._waited = select.poll()
         """Waits for signals and, while keys are read, for the keyboard."""
@@ -96,7 +96,7 @@ class Keyboard:
         """Wait for a tick; return True after a signal that ends, or `q`."""
         ready = [descriptor for descriptor, _ in self._waited.poll(TICK_S * 1000)]
         if self._stop.fileno() in ready:
-            os.read(self._stop.fileno(), SIGNALS_MAX)  # also of signals that do not end it
+            os.read(self._stop.fileno(), SIGNALS_MAX)  # also of other signals
         if self._stop.received is not None:
             return True
         for keyboard in ready:
@@ -132,9 +132,10 @@ class Keyboard:
 
 
 def draw(hands: Sequence[Snapshot], width: int, chosen: int, page: int) -> RenderableType:
-    """Return tables of all hands, or of hand number `chosen` if `width`, columns, is too small.
+    """Return tables of all hands, or only of hand number `chosen` if `width` (columns) is too
+    small.
 
-    `page`: how many pages of the lines that do not fit are skipped.
+    `page`: number of pages to skip of the lines that do not fit.
     """
     if len(hands) > 1 and width // len(hands) >= HAND_COLUMNS:
         beside = Table.grid(expand=True, padding=(0, 2))
@@ -146,12 +147,12 @@ def draw(hands: Sequence[Snapshot], width: int, chosen: int, page: int) -> Rende
 
 
 class Fitted:
-    """A head that stays, and below it one page of the rest; the last line counts what is cut."""
+    """A fixed head, and below it one page of the rest; the last line counts the lines cut off."""
 
     def __init__(
         self, head: RenderableType, wrong: RenderableType, rest: RenderableType, page: int
     ) -> None:
-        """`wrong` says what is wrong; its lines are counted apart."""
+        """`wrong`: lines on what is wrong, which are counted separately when cut off."""
         self._parts = head, wrong, rest
         self._page = page
 
@@ -187,7 +188,7 @@ def _hand(hands: Sequence[Snapshot], chosen: int, page: int) -> RenderableType:
         figures.add_row(label, Text(text))
     for label, text in _figures(seen):
         figures.add_row(label, Text(text), style=OLD if seen.tone is Tone.SILENT else None)
-    # An operator sees this clock stand still when nothing is drawn any more.
+    # This clock stops when nothing is drawn any more, which an operator sees.
     clock = time.strftime("%H:%M:%S", time.localtime(seen.t))
     keys = "q ends" if len(hands) == 1 else "q ends, tab: next hand"
     name = printable(seen.hand or "-", NAME_MAX)
@@ -203,7 +204,7 @@ def _table() -> Table:
 
 
 def _verdict(seen: Snapshot, *, wraps: bool = False) -> Text:
-    """Return the verdict, the word that says why, and what is not well."""
+    """Return the verdict, the word of its reason, and the parts to act on."""
     name = printable(seen.hand or "-", NAME_MAX)
     why = seen.why[0].what if seen.why else ""
     if seen.not_well:
@@ -247,7 +248,7 @@ def _finger(finger: FingerImage) -> str:
 
 
 def _motion(motion: FingerMotion) -> str:
-    """Return a bar: up to the mark the finger is still."""
+    """Return a bar of a finger's motion, with a mark at the limit below which it is still."""
     if motion.now is None:
         return "motion not known"
     share = min(motion.now / motion.limit, 2.0)

@@ -39,21 +39,21 @@ from graspd.daemon.watch.hand import Fingers, GraspLog
 from graspd.daemon.watch.snapshot import Line, Link, Snapshot, Tone
 
 TICK_S = 0.02
-"""Time between two looks at the feeds, s: silence is timed this exactly."""
+"""Time between two looks at the feeds, s, which is the resolution of silence."""
 SNAPSHOTS_HZ = 10
-"""Snapshots a second; a rate is taken over as many of them."""
+"""Snapshots a second. A rate is taken over this number of snapshots."""
 OVERLOADED = Line(
     "overloaded",
     "the PC is too busy to judge each reading: end other programs, or use a smaller model",
 )
 LATE_SHARE = 0.05
-"""Share of the readings of a second from which late ones are not well."""
+"""Share of late readings in a second from which on they are a problem."""
 FOLLOW = frozenset({Reason.SEQUENCE_GAP, Reason.STALE, Reason.HELD})
-"""Reasons that an overload brings about."""
+"""Reasons that an overload causes."""
 NO_VERDICT, LEANS = "no verdict yet", "leans to stable"
-"""Headlines beside the verdicts."""
+"""Headlines other than the verdicts."""
 NO_READINGS = "no readings"
-"""State of a daemon that says `silent`: here that word means that no message comes."""
+"""Text for the daemon's state `silent`. In the viewer "silent" means that no message comes."""
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
 LATE = "the daemon is there and says nothing: top shows whether this computer is too busy"
 SECONDS = 300
@@ -64,7 +64,7 @@ LATE_UNKNOWNS = 3
 A daemon without readings sends the next `unknown` only after `silence_ms`.
 """
 PROMPT_NS = 50_000_000
-"""Longest wait of a message for this viewer, ns, with which it tells how the clocks differ."""
+"""Longest time that a message may have waited here and still serve to compare the clocks, ns."""
 CATCHING_UP_NS = 1_000_000_000
 """Time to reconnect after the viewer itself stood still, ns."""
 NO_SHARE = -1
@@ -82,7 +82,7 @@ TONE_CODE = {
 
 
 class History:
-    """Remembers, for each second of the last `SECONDS`, which tones it had and the highest p_slip.
+    """Keeps the tones and the highest p_slip of each of the last `SECONDS` seconds.
 
     A tone is the colour class of the verdict that is shown.
     """
@@ -126,22 +126,23 @@ class View:
         """
         self.link = Link.CONNECTING
         self.stood_still = 0, 0
-        """When the viewer itself last stopped and continued, ns."""
+        """Begin and end of the viewer's own last pause, ns."""
         self._endpoint = endpoint
         self._hand = hand
         self._look, self._doctor = look, doctor
         self._wall = wall
         self._verdict: Verdict | None = None
         self._verdict_ns = 0
-        """When the last verdict came."""
+        """Time of arrival of the last verdict, ns."""
         self._clocks_ns: int | None = None
-        """Least time from the sending of a verdict, on the daemon's clock, to its arrival."""
+        """Smallest difference so far of a verdict's arrival here and its time on the daemon's
+        clock, ns."""
         self._gate: GateState | None = None
         self._status: Status | None = None
         self._grasps = GraspLog()
         self._fingers = Fingers()
         self._lost = self._late = 0
-        """Messages that are missing or odd; late readings of the last second."""
+        """`_lost`: missing or malformed messages. `_late`: late readings of the last second."""
         self._history = History()
 
     def take(
@@ -179,7 +180,7 @@ class View:
         last = self._verdict
         if last is not None and verdict.boot_id == last.boot_id:
             if verdict.seq <= last.seq:
-                return  # old or repeated: no sign of life
+                return  # an old or repeated message does not show that the daemon lives
             self._lost += verdict.seq - last.seq - 1
         elif last is not None:
             self._clocks_ns = None
@@ -188,10 +189,10 @@ class View:
         self._grasps.take(verdict, now_ns)
 
     def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
-        """Return when a verdict came, by its own time: it may have waited for this viewer."""
+        """Return the arrival of a verdict, ns, by its own time, because it may have waited here."""
         sent_ns = verdict.t_mono_ns + round(verdict.age_ms * 1e6)
         if self._verdict_ns < self.stood_still[1]:
-            self._clocks_ns = None  # the computer may have slept, with one of the clocks
+            self._clocks_ns = None  # one of the clocks may have stopped in a sleep of the computer
         if latest_ns - earliest_ns <= PROMPT_NS:
             way_ns = latest_ns - sent_ns
             self._clocks_ns = way_ns if self._clocks_ns is None else min(self._clocks_ns, way_ns)
@@ -320,7 +321,7 @@ def _line(reason: Reason) -> Line:
 
 
 def _late(former: Status | None, status: Status) -> int:
-    """Return the readings that were late between two statuses, if they are too many; else 0."""
+    """Return the number of late readings between two statuses; 0 if it is acceptable."""
     if former is None or former.boot_id != status.boot_id:
         return 0
     late = status.late_readings - former.late_readings
@@ -342,7 +343,7 @@ def _health(status: Status, late: int) -> list[Line]:
 
 
 def _not_well(health: Sequence[Line], why: Sequence[Line]) -> str:
-    """Return in a few words what to act on, without what the verdict itself says."""
+    """Return in a few words the parts to act on, except those in the verdict's reasons."""
     said = {line.advice for line in why}
     acts = [line.what for line in health if line.need is Need.ACT and line.advice not in said]
     more = f" and {len(acts) - 1} more" if len(acts) > 1 else ""
@@ -362,7 +363,7 @@ class HandFeed(NamedTuple):
 
 
 def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
-    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits."""
+    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits a tick."""
     due_s = 0.0
     while not is_over():
         for feed, view in hands:

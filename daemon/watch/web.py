@@ -30,7 +30,7 @@ SITES: Final = {None, "none", "same-origin"}
 CONNECTIONS_MAX: Final = 32
 """Most connections, each with a thread; an open page keeps one."""
 PATIENCE_S: Final = 5.0
-"""Longest silence of a browser within a request, and longest wait until it reads on, s."""
+"""Longest silence of a browser in a request, and longest wait until it continues to read, s."""
 SEND_BUFFER_BYTES: Final = 32 * 1024
 """Size of a connection's send buffer: a few snapshots. A slow browser misses later ones."""
 RETRY_MS: Final = 1000
@@ -44,7 +44,7 @@ class Newest:
         self._changed = threading.Condition()
         self._payload = b""
         self.number = 0
-        """0 before the first."""
+        """Number of the newest snapshot; 0: none yet."""
         self.closed = False
 
     def put(self, payload: bytes) -> None:
@@ -101,7 +101,7 @@ class Server(ThreadingHTTPServer):
         log.log(logging.DEBUG if gone else logging.ERROR, "%s: %r", client_address, failure)
 
     def server_close(self) -> None:
-        """End all pages."""
+        """Close the server and end the connections of all pages."""
         self.newest.close()
         super().server_close()
 
@@ -118,7 +118,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().setup()
 
     def parse_request(self) -> bool:
-        """Refuse what a page of this server does not ask."""
+        """Return False, after an error reply, for a request that this server's page never makes."""
         if not super().parse_request():
             return False
         hosts = self.headers.get_all("Host") or []
@@ -156,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _stream(self) -> None:
         newest = self.server.newest
-        number = newest.number  # the next one is sent first: this may be old
+        number = newest.number  # skip the present snapshot, which may be old
         self._begin("text/event-stream")
         self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
         while not newest.closed:
